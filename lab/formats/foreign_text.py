@@ -11,10 +11,12 @@ import difflib
 import io
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from lab.errors import InputError, one_line
+from lab.formats.recording_set.frame_files import locate
 
 #: A number with a decimal comma, one that may as well have a separator of thousands, and one with a decimal point.
 COMMA_NUMBER = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
@@ -82,6 +84,19 @@ def read_foreign_text(file: Path) -> ForeignText:
     return ForeignText(text, ("read as UTF-16",) if encoding.startswith("utf-16") else ())
 
 
+def remarks_on(folder: Path, names: Iterable[str]) -> list[str]:
+    """What was found in tables in `folder` beside plain UTF-8 with commas, one line for all that have it in common. Those that can't be read have
+    none."""
+    found: dict[str, list[Path]] = {}
+    for name in names:
+        with suppress(InputError):
+            for remark in read_foreign_csv(locate(folder, name)).remarks:
+                found.setdefault(remark, []).append(folder / name)
+    return [
+        f"{of[0]}{f' and {len(of) - 1} more files' if len(of) > 1 else ''}: {remark}" for remark, of in found.items()
+    ]
+
+
 def read_foreign_csv(file: Path) -> ForeignText:
     """The table in `file` with commas between cells and decimal points, line for line. Raises InputError without the path."""
     found = read_foreign_text(file)
@@ -134,9 +149,9 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
     names = list(known)
     asked = re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_")
     stem = asked.rpartition("_")[0]
-    for likes in (lambda one: one == asked, lambda one: stem and one.rpartition("_")[0] == stem):
-        if found := [one for one in names if likes(one)]:
-            return found[0]
+    same = [one for one in names if one == asked] or [one for one in names if stem and one.rpartition("_")[0] == stem]
+    if same:
+        return same[0]
     if len(asked) >= 4 and (found := [one for one in names if one.startswith(asked)]):
         return min(found, key=len)
     return next(iter(difflib.get_close_matches(asked, names, 1, LIKENESS)), None)

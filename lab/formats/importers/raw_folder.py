@@ -26,7 +26,7 @@ import numpy as np
 
 from lab.capture_kinds.base import Names, names_in
 from lab.errors import InputError
-from lab.formats.foreign_text import read_foreign_csv, read_foreign_text
+from lab.formats.foreign_text import read_foreign_text, remarks_on
 from lab.formats.importers.images import (
     IMAGES,
     decoded,
@@ -42,7 +42,6 @@ from lab.formats.importers.index_file import Index, capture_of_row, read_index
 from lab.formats.importers.readout import Readout, Tap, TapFiles, parse_taps, readout
 from lab.formats.importers.stated_settings import contradictions
 from lab.formats.recording_set import DataSheet, FolderFiles, Manifest, RecordingError, RecordingSet, parse_manifest
-from lab.formats.recording_set.frame_files import locate
 from sim.camera import Side
 
 INDEX, CAMERA = "index.csv", "camera.toml"
@@ -187,7 +186,7 @@ def _recording_set(
     )
     manifest, warnings = parse_manifest(text, where)
     remarks += [remark for one in readouts.values() for remark in one.remarks]
-    remarks += [f"{path / name}: {remark}" for name in _spectra(manifest) for remark in _spectrum_remarks(path, name)]
+    remarks += remarks_on(path, _spectra(manifest))
     remarks += contradictions(manifest, images, where)
     by_frame = {capture["frame"]: readouts[capture["side"]] for capture in captures if capture["side"] in readouts}
     return RecordingSet(
@@ -203,13 +202,6 @@ def _spectra(manifest: Manifest) -> list[str]:
     named = [path for capture in manifest.captures for _, what, path in names_in(capture) if what is Names.SPECTRUM]
     named += [path for camera in manifest.cameras.values() for path in (camera.quantum_efficiency or {}).values()]
     return list(dict.fromkeys(named))
-
-
-def _spectrum_remarks(path: Path, name: str) -> tuple[str, ...]:
-    try:
-        return read_foreign_csv(locate(path, name)).remarks
-    except InputError:  # told where the spectra are checked
-        return ()
 
 
 def _measured(captures: list[dict[str, Any]], images: dict[str, Path]) -> tuple[dict[Side, dict[str, Any]], list[str]]:
