@@ -126,10 +126,14 @@ def _line(row: TableRow) -> _Line:
         centre = float(np.average(wavelength_nm[high], weights=value[high]))
         return _Line(centre, float(np.trapezoid(value, wavelength_nm) / value.max()), spectrum)
     centre, width = row.known(CENTRE, 1.0), row.known(WIDTH, 0.1)
-    return _Line(
-        row.value("wavelength_nm", 1.0) if centre is None else centre,
-        row.value("bandwidth_nm", 0.1) if width is None else width,
-    )
+    centre = row.known("wavelength_nm", 1.0) if centre is None else centre
+    width = row.known("bandwidth_nm", 0.1) if width is None else width
+    if centre is None or width is None:
+        raise InputError(
+            f"{row.file}: row {row.number}: no {'centre' if centre is None else 'width'} of the line; write wavelength_nm and bandwidth_nm, {CENTRE} "
+            f"and {WIDTH}, or a {SPECTRUM}"
+        )
+    return _Line(centre, width)
 
 
 def _measured_spectrum(table: Path, name: str) -> Spectrum:

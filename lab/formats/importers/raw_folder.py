@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -149,6 +149,7 @@ def _recording_set(
     folder = FolderFiles(path)
     images: dict[str, Path] = {}
     captures: list[dict[str, Any]] = []
+    numbers: list[int] = []
     problems: list[str] = []
     used: Counter[str] = Counter()
     for number, row in index.rows:
@@ -163,6 +164,7 @@ def _recording_set(
         frame = f"frames/{stem if used[stem] == 1 else f'{stem}-{used[stem]}'}.npy"
         captures.append({"id": stem, "side": "left", "exposure_s": None} | capture | {"frame": frame})
         images[frame] = found or path / capture["frame"]
+        numbers.append(number)
     if problems:
         raise RecordingError(problems)
     measured, remarks = _measured(captures, images)
@@ -184,7 +186,11 @@ def _recording_set(
             "captures": captures,
         }
     )
-    manifest, warnings = parse_manifest(text, where)
+    try:
+        manifest, warnings = parse_manifest(text, where)
+    except RecordingError as error:
+        raise RecordingError(_by_row(error.problems, numbers)) from error
+    warnings = _by_row(warnings, numbers)
     remarks += [remark for one in readouts.values() for remark in one.remarks]
     remarks += remarks_on(path, _spectra(manifest))
     remarks += contradictions(manifest, images, where)
@@ -195,6 +201,21 @@ def _recording_set(
         warnings=tuple(dict.fromkeys((*index.remarks, *warnings, *remarks))),
         files=TapFiles(path, images, by_frame),
     )
+
+
+def _by_row(lines: Sequence[str], numbers: Sequence[int]) -> list[str]:
+    """Lines on captures as lines on their rows, one for all rows of which the same is said."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for line in lines:
+        parts = re.fullmatch(r"(.*: )captures\[(\d+)\]( \(.*?\))?(: .*)", line, re.S)
+        key, row = (
+            ((parts[1], parts[4]), f"row {numbers[int(parts[2])]}{parts[3] or ''}") if parts else ((line, ""), "")
+        )
+        found.setdefault(key, []).append(row)
+    return [
+        f"{before}{of[0]}{f' and {len(of) - 1} more' if len(of) > 1 else ''}{after}"
+        for (before, after), of in found.items()
+    ]
 
 
 def _spectra(manifest: Manifest) -> list[str]:
