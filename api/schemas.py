@@ -382,7 +382,9 @@ class SentAs(Schema):
         default=None, description="null: the archive is a recording set"
     )
     path: str = Field(default="", max_length=400, description="the picture, or the folder, inside the archive")
-    checkerboard: str = Field(default="", max_length=9, description="raw-folder: ROWSxCOLS of inner corners")
+    checkerboard: str = Field(
+        default="", max_length=9, description="checkerboard, raw-folder: ROWSxCOLS of inner corners"
+    )
     dots: str = Field(default="", max_length=9, description="dot-grid: ROWSxCOLS")
     square_mm: float | None = Field(
         default=None, gt=0, le=1e6, description="the checkerboard's squares, the dots' spacing"

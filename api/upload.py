@@ -138,7 +138,9 @@ class Inbox:
                 recordings = recording.read(_top(sent))
             else:
                 recordings = foreign.read(_top(sent, None))
-                recording.write(recordings, unpacked)
+                found: list[str] = []
+                recording.write(recordings, unpacked, told=found.extend)
+                recordings.warnings += tuple(found)
         except InputError as error:
             raise InputError(as_in_archive(str(error), place)) from None
         id = secrets.token_hex(8)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lab.capture_kinds.base import (
     Capture,
@@ -99,8 +99,24 @@ class CharucoCapture(Capture):
     dictionary: str
     squares: tuple[int, int]  # rows, cols
     square_mm: float = Field(gt=0)
-    marker_mm: float | None = Field(default=None, gt=0)  # None only where there are no markers
+    marker_mm: float | None = Field(
+        default=None, gt=0
+    )  # None only where there are no markers; a stated 0 says that there are none
     pose: PoseName
+    wavelength_nm: float | None = Field(default=None, gt=0)  # of light of one wavelength; None: white, or not known
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_markers(cls, stated: Any) -> Any:
+        """A marker of 0 mm is none: the board is a plain checkerboard, unless it is said to be a grid of dots."""
+        try:
+            none = isinstance(stated, dict) and float(stated["marker_mm"]) == 0.0
+        except (KeyError, TypeError, ValueError):
+            return stated
+        if not none:
+            return stated
+        dictionary = stated.get("dictionary")
+        return stated | {"marker_mm": None, "dictionary": "dots" if dictionary == "dots" else "none"}
 
     @property
     def has_markers(self) -> bool:

@@ -32,14 +32,17 @@ def import_(
         typer.Option(
             "--from",
             metavar="KIND",
-            help="emva1288, raw-folder, fits, slanted-edge, colorchecker, dot-grid, photon-transfer-table or spectral-table",
+            help="emva1288, raw-folder, fits, slanted-edge, colorchecker, dot-grid, checkerboard, photon-transfer-table or spectral-table",
         ),
     ],
     out_folder: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="the recording set to write; of a table, the fit's JSON")
     ],
     checkerboard: Annotated[
-        str, typer.Option(metavar="ROWSxCOLS", help="raw-folder: inner corners; the images are pairs leftNN, rightNN")
+        str,
+        typer.Option(
+            metavar="ROWSxCOLS", help="checkerboard: inner corners; raw-folder: of pairs of images leftNN, rightNN"
+        ),
     ] = "",
     dots: Annotated[str, typer.Option(metavar="ROWSxCOLS", help="dot-grid: dots of the plane grid")] = "",
     square_mm: Annotated[float, typer.Option(help="side of the checkerboard's squares, or spacing of the dots")] = 0.0,
@@ -93,8 +96,10 @@ def import_(
         return
     recordings = read_foreign(kind, path, options)
     warn(recordings.warnings)
+    found: list[str] = []
     with progress_bar("import") as advance:
-        folder = recording_set.write(recordings, out_folder, progress=advance)
+        folder = recording_set.write(recordings, out_folder, progress=advance, told=found.extend)
+    warn(tuple(found))
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
@@ -102,6 +107,7 @@ def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> 
     """A table holds no frames: its import is a fit."""
     from lab.fit.noise.level_table import fit_level_table
     from lab.fit.spectral.mean_table import fit_mean_table
+    from lab.formats.foreign_text import read_foreign_csv
     from lab.formats.importers.images import read_camera_file
     from lab.formats.recording_set import Manifest, RecordingSet
 
@@ -114,6 +120,7 @@ def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> 
     if camera is None:
         raise InputError(f"{described}: describes no left camera; write the keys without a table")
     check_writable(file)
+    warn(tuple(f"{path}: {remark}" for remark in read_foreign_csv(path).remarks))
     result = (fit_level_table if kind == LEVEL_TABLE else fit_mean_table)(path, camera)
     write_json(result, file)
     print_fit(RecordingSet(Manifest(cameras={"left": camera}, captures=())), result)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lab.errors import InputError, one_line
+from lab.formats.foreign_text import in_its_unit, nearest_name, read_foreign_csv
 
 
 @dataclass(frozen=True)
@@ -40,18 +41,25 @@ class TableRow:
 def table_rows(file: Path, needed: Sequence[str], known: Sequence[str]) -> list[TableRow]:
     """The rows of `file`, which has the columns `needed` and no others than `known`. Raises InputError with one line."""
     try:
-        reader = csv.reader(file.read_text(encoding="utf-8-sig").splitlines())
+        reader = csv.reader(read_foreign_csv(file).text.splitlines())
         header = [cell.strip() for cell in next(reader, [])]
         rows = [
             (reader.line_num, [cell.strip() for cell in row]) for row in reader if any(cell.strip() for cell in row)
         ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (InputError, csv.Error) as error:
         raise InputError(f"{file}: can't be read ({one_line(error)}); give a CSV") from error
     unknown = [name for name in header if name not in known]
     missing = [name for name in needed if name not in header]
     if unknown or missing:
         told = [f"missing: {', '.join(missing)}"] if missing else []
-        told += [f"unknown: {', '.join(unknown)}"] if unknown else []
+        near = {name: nearest_name(name, known) for name in unknown}
+        told += (
+            [
+                f"unknown: {', '.join(name + (f' (write {in_its_unit(one)})' if one else '') for name, one in near.items())}"
+            ]
+            if unknown
+            else []
+        )
         raise InputError(f"{file}: columns {'; '.join(told)}; columns are {', '.join(known)}, in these units")
     if not rows:
         raise InputError(f"{file}: holds no levels; write one row a level and channel")

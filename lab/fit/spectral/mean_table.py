@@ -2,7 +2,9 @@
 
 One row a light and channel, CSV with a header. Columns: `kind` (dark, narrowband), `exposure_s`, `mean_dn`, `mean_std_dn` (of the mean: noise,
 and scatter of repeats); of narrowband light `wavelength_nm`, `bandwidth_nm` (full width at half maximum) and its power by a reference:
-`radiance_w_per_sr_m2`, or `photodiode_a` with `photodiode_a_per_w`; of a colour sensor `channel` (R, G, B).
+`radiance_w_per_sr_m2`, or `photodiode_a` with `photodiode_a_per_w`; of a colour sensor `channel` (R, G, B). A line that was measured stands beside
+the one that was set: its centre and width in `measured_wavelength_nm` and `measured_bandwidth_nm`, or the CSV of its spectrum, relative to the
+table, in `spectrum`. It is used in the other's place, whose cells may be empty. A spectrum without another reading of the power is a radiance.
 
 The power's common factor is unknown or cancels: the curves are relative to their highest value. The method is that of frames (`lab.fit.spectral`).
 """
@@ -21,26 +23,37 @@ from lab.fit.spectral.recordings import FINE_SHARE, OUTPUT_STEP_NM
 from lab.fit.spectral.sensitivity import (
     COVERAGE_FACTOR,
     MIN_SPECTRA,
+    NEGATIVE_LIGHT,
     RADIOMETER_RELATIVE_STD,
     Sensitivity,
     solved_sensitivity,
     trapezoid_weights,
 )
+from lab.formats.foreign_text import read_foreign_csv, remarks_on
 from lab.formats.recording_set import DataSheet
+from lab.formats.recording_set.checks import OFF_NAME_NM
+from lab.formats.recording_set.frame_files import locate
 from lab.formats.results import CameraFit, FitResult, Skipped, SpectralFit
-from sim.spectrum import FloatArray
+from lab.formats.spectrum_csv import parse_spectrum
+from sim.spectrum import FloatArray, Spectrum
 
 NEEDED = ("kind", "exposure_s", "mean_dn", "mean_std_dn", "wavelength_nm", "bandwidth_nm")
 RADIANCE = "radiance_w_per_sr_m2"
 PHOTODIODE, RESPONSIVITY = "photodiode_a", "photodiode_a_per_w"
-KNOWN = (*NEEDED, RADIANCE, PHOTODIODE, RESPONSIVITY, "channel")
+CENTRE, WIDTH, SPECTRUM = "measured_wavelength_nm", "measured_bandwidth_nm", "spectrum"
+KNOWN = (*NEEDED, RADIANCE, PHOTODIODE, RESPONSIVITY, CENTRE, WIDTH, SPECTRUM, "channel")
 GRID_NM = 1.0  # on which lights and curves stand
+FINE_POINTS = 10  # of a measured spectrum in a step of the grid
+LINE_SHARE = 0.1  # of a measured spectrum's maximum: samples above it make the line's centre
 CLIPPED_SHARE = 0.95  # of the range above black: a mean above it may be of a clipped plane
 
 
 @dataclass(frozen=True)
 class _TableLight:
-    """One row of the table: narrowband light of a relative `power`, and a channel's mean in it, `rate` +- `rate_std` (DN/s above dark)."""
+    """One row of the table: narrowband light of a relative `power`, and a channel's mean in it, `rate` +- `rate_std` (DN/s above dark).
+
+    `spectrum`: the light's power per nm, up to a factor, where it was measured; None: a line of `bandwidth_nm` at `wavelength_nm`.
+    """
 
     channel: str
     wavelength_nm: float
@@ -48,6 +61,16 @@ class _TableLight:
     power: float
     rate: float
     rate_std: float
+    spectrum: Spectrum | None = None
+
+
+@dataclass(frozen=True)
+class _Line:
+    """Centre and width of a light (nm), by its measurement where there is one, and its spectrum."""
+
+    wavelength_nm: float
+    bandwidth_nm: float
+    spectrum: Spectrum | None = None
 
 
 def fit_mean_table(file: Path, camera: DataSheet) -> FitResult:
@@ -76,6 +99,9 @@ def fit_mean_table(file: Path, camera: DataSheet) -> FitResult:
         remarks.append(f"{clipped} means near the highest code are left out")
     if not darks:
         remarks.append(f"no means in the dark: the stated black level of {camera.black_level_dn:g} DN is taken off")
+    remarks += _lines_off_their_names(lit)
+    spectra = dict.fromkeys(name for row in lit if (name := row.cells.get(SPECTRUM)))
+    remarks += remarks_on(file.parent, spectra)
     spectral = _fitted(lights, camera.channels, remarks)
     reason = "a table of channel means holds no frames"
     skipped = tuple(Skipped(step=step, reason=reason, side="left") for step in ("noise", "mtf", "psf", "geometry"))
@@ -91,11 +117,66 @@ def _channel(row: TableRow, camera: DataSheet) -> str:
     return channel
 
 
+def _line(row: TableRow) -> _Line:
+    """The light of a row. Raises InputError where neither what was set nor what was measured says its centre and width."""
+    if name := row.cells.get(SPECTRUM):
+        spectrum = _measured_spectrum(row.file, name)
+        wavelength_nm, value = spectrum.arrays
+        high = value > LINE_SHARE * value.max()
+        centre = float(np.average(wavelength_nm[high], weights=value[high]))
+        return _Line(centre, float(np.trapezoid(value, wavelength_nm) / value.max()), spectrum)
+    centre, width = row.known(CENTRE, 1.0), row.known(WIDTH, 0.1)
+    centre = row.known("wavelength_nm", 1.0) if centre is None else centre
+    width = row.known("bandwidth_nm", 0.1) if width is None else width
+    if centre is None or width is None:
+        raise InputError(
+            f"{row.file}: row {row.number}: no {'centre' if centre is None else 'width'} of the line; write wavelength_nm and bandwidth_nm, {CENTRE} "
+            f"and {WIDTH}, or a {SPECTRUM}"
+        )
+    return _Line(centre, width)
+
+
+def _measured_spectrum(table: Path, name: str) -> Spectrum:
+    """The spectrum in the file `name` beside the table, with light in it. Raises InputError."""
+    try:
+        spectrum = parse_spectrum(read_foreign_csv(locate(table.parent, name)).text)
+    except InputError as error:
+        raise InputError(f"{table.parent / name}: {error}") from error
+    wavelength_nm, value = spectrum.arrays
+    if wavelength_nm.size < 2 or np.trapezoid(value, wavelength_nm) <= 0.0:
+        raise InputError(f"{table.parent / name}: no light in it; give the spectrum of the line, or leave the row out")
+    if value.min() < -NEGATIVE_LIGHT * value.max():
+        at = wavelength_nm[np.argmin(value)]
+        raise InputError(
+            f"{table.parent / name}: {value.min():.3g} at {at:g} nm, below the limit of {-NEGATIVE_LIGHT * value.max():.3g} for noise; take "
+            "the dark off"
+        )
+    return spectrum
+
+
+def _lines_off_their_names(lit: Sequence[TableRow]) -> list[str]:
+    """The remark on lights whose measured centre isn't the wavelength set, as `lab.formats.recording_set.checks` tells it of spectra."""
+    off: dict[float, float] = {}
+    for row in lit:
+        line, stated_nm = _line(row), row.known("wavelength_nm")
+        if stated_nm is not None and abs(line.wavelength_nm - stated_nm) > OFF_NAME_NM + 0.25 * line.bandwidth_nm:
+            off[stated_nm] = line.wavelength_nm
+    if not off:
+        return []
+    told, most = next(iter(off.items())), max(abs(measured - stated) for stated, measured in off.items())
+    return [
+        f"{len(off)} lines are centred elsewhere than they are set, by {most:.1f} nm at most ({told[0]:g} nm: {told[1]:.1f} nm): the measured lines are used"
+    ]
+
+
 def _power(row: TableRow) -> float:
     radiance, current = row.known(RADIANCE), row.known(PHOTODIODE)
+    if radiance is None and current is None and (name := row.cells.get(SPECTRUM)):
+        wavelength_nm, value = _measured_spectrum(row.file, name).arrays
+        return float(np.trapezoid(value, wavelength_nm))
     if (radiance is None) == (current is None):
         raise InputError(
-            f"{row.file}: row {row.number}: give the light's power once, as {RADIANCE} or as {PHOTODIODE} with {RESPONSIVITY}"
+            f"{row.file}: row {row.number}: give the light's power once, as {RADIANCE} or as {PHOTODIODE} with {RESPONSIVITY}, or a {SPECTRUM}"
         )
     if radiance is not None:
         return radiance
@@ -122,13 +203,15 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Tabl
         black, black_std = nearest.value("mean_dn"), nearest.value("mean_std_dn")
     if mean > black + CLIPPED_SHARE * (camera.saturation_dn - black):
         return None
+    line = _line(row)
     return _TableLight(
         channel,
-        row.value("wavelength_nm", 1.0),
-        row.value("bandwidth_nm", 0.1),
+        line.wavelength_nm,
+        line.bandwidth_nm,
         power,
         (mean - black) / exposure_s,
         float(np.hypot(row.value("mean_std_dn", 1e-9), black_std)) / exposure_s,
+        line.spectrum,
     )
 
 
@@ -182,8 +265,17 @@ def _fitted(lights: Sequence[_TableLight], channels: Sequence[str], remarks: lis
     )
 
 
+def _measured_photons(light: _TableLight, spectrum: Spectrum, wave: FloatArray) -> FloatArray:
+    """Photons per nm, up to a factor, of a light whose spectrum was measured, averaged over the steps of the grid."""
+    inner = GRID_NM * ((np.arange(FINE_POINTS) + 0.5) / FINE_POINTS - 0.5)
+    shape = np.interp(wave[:, None] + inner, *spectrum.arrays, left=0.0, right=0.0).mean(axis=1)
+    return np.asarray(shape * wave * light.power / np.trapezoid(spectrum.arrays[1], spectrum.arrays[0]))
+
+
 def _photons(light: _TableLight, wave: FloatArray) -> FloatArray:
-    """Photons per nm, up to a factor: a triangle of the light's bandwidth, as a monochromator with equal slits has."""
+    """Photons per nm, up to a factor: a triangle of the light's bandwidth, as a monochromator with equal slits has, or as it was measured."""
+    if light.spectrum is not None:
+        return _measured_photons(light, light.spectrum, wave)
     shape = np.clip(1.0 - np.abs(wave - light.wavelength_nm) / light.bandwidth_nm, 0.0, None)
     area = float(np.sum(shape * trapezoid_weights(wave)))
     if area <= 0.0:  # narrower than the grid, and between its points

@@ -1,6 +1,6 @@
 """Importers: other formats as recording sets. Each turns a path into a `RecordingSet` whose frames are decoded when asked for;
-`lab.formats.recording_set.write` checks it and puts it on disk, completely or not at all. The set's `warnings` and `notes` say what an
-importer left out, assumed or didn't find. What can't be known is asked for: on the command line (`ImportOptions`), or in a descriptor."""
+`lab.formats.recording_set.write` checks it and puts it on disk, completely or not at all. The set's `warnings` say what an importer left out,
+assumed or didn't find; the manifest's `notes` keep them. What can't be known is asked for: on the command line (`ImportOptions`), or in a descriptor."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from lab.errors import InputError
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.importers.fits_folder import read_fits_folder
 from lab.formats.importers.import_options import ImportOptions
-from lab.formats.importers.raw_folder import read_checkerboard_pairs, read_dot_grids, read_raw_folder
+from lab.formats.importers.raw_folder import read_boards, read_checkerboard_pairs, read_dot_grids, read_raw_folder
 from lab.formats.importers.single_picture import read_colour_chart, read_slanted_edge
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import Manifest, RecordingSet
 
 __all__ = [
     "KINDS",
     "ImportOptions",
+    "read_boards",
     "read_checkerboard_pairs",
     "read_colour_chart",
     "read_dot_grids",
@@ -32,11 +33,12 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Importer:
-    """A format: how it is read, which options it takes, and whether it is one file, not a folder."""
+    """A format: how it is read, which options it takes, and whether it is one file, or a folder and nothing else."""
 
     read: Callable[[Path, ImportOptions], RecordingSet]
     takes: frozenset[str] = frozenset()
     of_a_file: bool = False
+    of_a_folder: bool = False
 
 
 def _raw_folder(path: Path, options: ImportOptions) -> RecordingSet:
@@ -55,15 +57,26 @@ def _dot_grids(path: Path, options: ImportOptions) -> RecordingSet:
     return read_dot_grids(path, options.dots, options.square_mm)
 
 
+def _checkerboards(path: Path, options: ImportOptions) -> RecordingSet:
+    if options.checkerboard is None or not options.square_mm:
+        raise InputError(
+            "--from checkerboard: state --checkerboard ROWSxCOLS, its inner corners, and --square-mm, the side of its squares, as in 6x9 and 25"
+        )
+    return read_boards(path, "none", options.checkerboard, options.square_mm)
+
+
 _PICTURE = frozenset({"--camera", "--exposure-s", "--transfer"})
 #: `--from KIND` -> its importer.
 KINDS: dict[str, Importer] = {
     "emva1288": Importer(lambda path, _: read_emva1288(path)),
-    "raw-folder": Importer(_raw_folder, frozenset({"--checkerboard", "--square-mm", "--tap"})),
-    "fits": Importer(lambda path, options: read_fits_folder(path, options.tap or ""), frozenset({"--tap"})),
+    "raw-folder": Importer(_raw_folder, frozenset({"--checkerboard", "--square-mm", "--tap"}), of_a_folder=True),
+    "fits": Importer(
+        lambda path, options: read_fits_folder(path, options.tap or ""), frozenset({"--tap"}), of_a_folder=True
+    ),
     "slanted-edge": Importer(read_slanted_edge, _PICTURE | {"--channel"}, of_a_file=True),
     "colorchecker": Importer(read_colour_chart, _PICTURE | {"--corners", "--light", "--white-patch"}, of_a_file=True),
     "dot-grid": Importer(_dot_grids, frozenset({"--dots", "--square-mm"})),
+    "checkerboard": Importer(_checkerboards, frozenset({"--checkerboard", "--square-mm"})),
 }
 
 
@@ -75,8 +88,23 @@ def read_foreign(kind: str, path: Path, options: ImportOptions | None = None) ->
         raise InputError(f"--from {kind}: no such format; choose {', '.join(KINDS)}")
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give that of the recordings")
-    alien = [name for name in options.stated() if name not in KINDS[kind].takes]
+    importer = KINDS[kind]
+    if path.is_dir() and importer.of_a_file:
+        raise InputError(f"{path}: is a folder; give one picture")
+    if path.is_file() and importer.of_a_folder:
+        raise InputError(f"{path}: is a file; give the folder that it is in")
+    alien = [name for name in options.stated() if name not in importer.takes]
     if alien:
-        takes = ", ".join(sorted(KINDS[kind].takes)) or "none"
+        takes = ", ".join(sorted(importer.takes)) or "none"
         raise InputError(f"--from {kind} doesn't take {', '.join(alien)}; it takes {takes}")
-    return KINDS[kind].read(path, options)
+    if path.is_dir() and not any(path.iterdir()):
+        raise InputError(f"{path}: is empty; give the folder of the recordings")
+    recordings = importer.read(path, options)
+    return recordings.under(_with_notes(recordings, path))
+
+
+def _with_notes(recordings: RecordingSet, path: Path) -> Manifest:
+    """The manifest with the warnings in its notes, one a line, without the folder in which the recordings were."""
+    folder = path if path.is_dir() else path.parent
+    lines = [line.replace(f"{folder}/", "").replace(str(folder), folder.resolve().name) for line in recordings.warnings]
+    return recordings.manifest.model_copy(update={"notes": "\n".join([recordings.manifest.notes, *lines])})

@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 
 from lab.errors import InputError
+from lab.formats.foreign_text import read_foreign_text
 from lab.formats.importers.images import IMAGES, ImageFiles, read_camera_file, read_image
+from lab.formats.importers.stated_settings import contradictions
 from lab.formats.recording_set import Manifest, RecordingSet
 
 NS = 1e-9
@@ -98,14 +100,6 @@ def _numbers(words: list[str], least: int, line: int, what: str) -> list[float]:
     return values
 
 
-def _text(file: Path) -> str:
-    data = file.read_bytes()
-    try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")  # as Windows tools of that time wrote
-
-
 def find_descriptor(path: Path) -> Path:
     """The descriptor: `path` itself, or the only descriptor among the text files in the folder, else one folder deeper."""
     if path.is_file():
@@ -116,10 +110,11 @@ def find_descriptor(path: Path) -> Path:
             return False
         if not 0 < file.stat().st_size <= LARGEST_DESCRIPTOR_BYTES:
             return False
-        text = _text(file)
-        return "\0" not in text and bool(
-            re.search(r"^\s*[bd]\s+[\d.]", text, re.M | re.I) and re.search(r"^\s*i\s+\S", text, re.M | re.I)
-        )
+        try:
+            text = read_foreign_text(file).text
+        except InputError:
+            return False
+        return bool(re.search(r"^\s*[bd]\s+[\d.]", text, re.M | re.I) and re.search(r"^\s*i\s+\S", text, re.M | re.I))
 
     for pattern in ("*", "*/*"):
         found = sorted(file for file in path.glob(pattern) if is_descriptor(file))
@@ -158,11 +153,12 @@ def read_emva1288(path: Path) -> RecordingSet:
     """
     file = find_descriptor(path)
     try:
-        descriptor = parse_descriptor(_text(file))
+        found = read_foreign_text(file)
+        descriptor = parse_descriptor(found.text)
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
     images = _Images(file.parent)
-    warnings = [f"{file}: {remark}" for remark in descriptor.remarks]
+    warnings = [f"{file}: {remark}" for remark in (*found.remarks, *descriptor.remarks)]
     listed = [(level, name, images.find(name)) for level in descriptor.levels for name in level.images]
     there = [(level, name, found) for level, name, found in listed if found is not None]
     missing = [name for _, name, found in listed if found is None]
@@ -204,6 +200,7 @@ def read_emva1288(path: Path) -> RecordingSet:
             "captures": captures,
         }
     )
+    warnings += contradictions(manifest, frames, str(file))
     files = ImageFiles(file.parent, frames, shift)
     return RecordingSet(manifest, source=str(path), warnings=tuple(warnings), files=files)
 

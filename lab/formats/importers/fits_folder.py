@@ -7,11 +7,13 @@ its empty cells of exposure, temperature and time are taken from the header. GAI
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from lab.errors import InputError
-from lab.formats.importers.fits_file import FITS, FitsHeader, fits_header
-from lab.formats.importers.raw_folder import INDEX, index_rows, recordings_of_rows
+from lab.formats.importers.fits_file import FITS, GZIP, FitsHeader, fits_header, is_fits
+from lab.formats.importers.index_file import Index, read_index
+from lab.formats.importers.raw_folder import INDEX, recordings_of_index
 from lab.formats.recording_set import RecordingError, RecordingSet
 
 
@@ -22,10 +24,10 @@ def read_fits_folder(path: Path, tap: str = "") -> RecordingSet:
     dark nor flat need an `index.csv`; without one they are left out with a warning.
     """
     if (path / INDEX).is_file():
-        return recordings_of_rows(path, _with_headers(path), str(path / INDEX), tap)
-    files = sorted(file for file in path.iterdir() if file.suffix.lower() in FITS)
+        return recordings_of_index(path, _with_headers(path), str(path / INDEX), tap)
+    files = sorted(file for file in path.iterdir() if is_fits(file))
     if not files:
-        raise InputError(f"{path}: no FITS frames ({', '.join(FITS)}); give their folder")
+        raise InputError(f"{path}: no FITS frames ({', '.join(FITS)}, also with {GZIP}); give their folder")
     rows: list[tuple[int, dict[str, str]]] = []
     problems: list[str] = []
     left_out: dict[str, list[str]] = {}
@@ -48,7 +50,7 @@ def read_fits_folder(path: Path, tap: str = "") -> RecordingSet:
         raise InputError(
             f"{path}: no frame says that it is dark or flat ({types}); write {INDEX}: frame,kind,exposure_s,..."
         )
-    recordings = recordings_of_rows(path, rows, str(path), tap)
+    recordings = recordings_of_index(path, Index(rows), str(path), tap)
     if left_out:
         recordings.warnings += (f"{path}: neither dark nor flat and left out: {types}; write {INDEX} to use them",)
     return recordings
@@ -64,13 +66,14 @@ def _cells(header: FitsHeader) -> dict[str, str]:
     return {key: cell for key, cell in stated.items() if cell is not None}
 
 
-def _with_headers(path: Path) -> list[tuple[int, dict[str, str]]]:
-    """The rows of the index, with what the headers state in empty cells."""
+def _with_headers(path: Path) -> Index:
+    """The index, with what the headers state in empty cells."""
     rows: list[tuple[int, dict[str, str]]] = []
     problems: list[str] = []
-    for number, row in index_rows(path / INDEX):
+    index = read_index(path / INDEX)
+    for number, row in index.rows:
         file = path / row.get("frame", "")
-        if file.suffix.lower() in FITS and file.is_file():
+        if is_fits(file) and file.is_file():
             try:
                 rows.append((number, _cells(fits_header(file)) | row))
             except InputError as error:
@@ -79,4 +82,4 @@ def _with_headers(path: Path) -> list[tuple[int, dict[str, str]]]:
             rows.append((number, row))
     if problems:
         raise RecordingError(problems)
-    return rows
+    return replace(index, rows=rows)

@@ -1,4 +1,7 @@
-"""Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, FITS, camera raws, .npy. They are decoded on access."""
+"""Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, FITS, camera raws, .npy. They are decoded on access.
+
+A channel of transparency (RGBA) is dropped, and `has_alpha` says so. Spectra beside them may have semicolons and decimal commas.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,13 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from lab.errors import InputError
-from lab.formats.importers.fits_file import FITS, load_fits
+from lab.formats.foreign_text import read_foreign_csv, read_foreign_text
+from lab.formats.importers.fits_file import FITS, GZIP, is_fits, load_fits
 from lab.formats.recording_set import RAWS, DataSheet, FolderFiles, Frame, load_frame
+from lab.formats.recording_set.frame_files import locate
+from lab.formats.spectrum_csv import parse_spectrum
 from sim.camera import Side
+from sim.spectrum import Spectrum
 
 IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
 
@@ -27,11 +34,27 @@ def read_image(file: Path) -> Frame:
     suffix = file.suffix.lower()
     if suffix == ".npy" or suffix in RAWS:
         return load_frame(file)
-    if suffix in FITS:
+    if is_fits(file):
         return load_fits(file)
     if suffix not in IMAGES:
         raise InputError(f"can't be read; give one of {' '.join((*IMAGES, *FITS, *RAWS, '.npy'))}")
-    return _grey(decoded(file))
+    return grey(decoded(file))
+
+
+def is_frame(file: Path) -> bool:
+    """Whether a file is one that can be read as a frame, by its ending."""
+    return file.suffix.lower() in (*IMAGES, *RAWS, ".npy") or is_fits(file)
+
+
+def frame_name(path: str) -> str:
+    """The name of a frame's file without its ending, `.fits.gz` included."""
+    name = path.rpartition("/")[2]
+    return Path(name[: -len(GZIP)] if is_fits(Path(name)) and name.lower().endswith(GZIP) else name).stem
+
+
+def has_alpha(image: NDArray[Any]) -> bool:
+    """Whether an image (rows, cols[, channels]) has a channel of transparency beside its grey values or colours."""
+    return image.shape[2:] in ((2,), (4,))
 
 
 def decoded(file: Path) -> NDArray[Any]:
@@ -68,7 +91,8 @@ def _damage(data: bytes) -> str | None:
     return None
 
 
-def _grey(image: NDArray[Any]) -> Frame:
+def grey(image: NDArray[Any]) -> Frame:
+    """The grey values (rows, cols) of a decoded image; a channel of transparency is dropped. InputError for colours and other numbers."""
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"its values are {image.dtype}; save grey values of 8 or 16 bit")
     if image.ndim == 3:
@@ -82,7 +106,7 @@ def _grey(image: NDArray[Any]) -> Frame:
 class ImageFiles(FolderFiles):
     """A folder whose frames are images. `images`: the file of each frame by its path in the recording set.
 
-    Values are shifted down by `shift` bits. The files are decoded on access and aren't copied byte by byte.
+    Values are shifted down by `shift` bits. The files are decoded on access and, as spectra, aren't copied byte by byte.
     """
 
     def __init__(self, root: Path, images: Mapping[str, Path], shift: int = 0) -> None:
@@ -90,7 +114,10 @@ class ImageFiles(FolderFiles):
         self.images, self.shift = dict(images), shift
 
     def file(self, path: str) -> Path | None:
-        return None if path in self.images else super().file(path)
+        return None if path in self.images or path.lower().endswith(".csv") else super().file(path)
+
+    def spectrum(self, path: str) -> Spectrum:
+        return parse_spectrum(read_foreign_csv(locate(self.root, path)).text)
 
     def frame(self, path: str, camera: DataSheet) -> Frame:
         return np.right_shift(read_image(self.images[path]), self.shift, dtype=np.uint16)
@@ -105,9 +132,11 @@ def described_sides(file: Path) -> dict[Side, dict[str, Any]]:
     written: dict[str, Any] = {}
     if file.is_file():
         try:
-            written = tomllib.loads(file.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            written = tomllib.loads(read_foreign_text(file).text)
+        except tomllib.TOMLDecodeError as error:
             raise InputError(f"{file}: isn't TOML ({error}); correct it") from error
+        except InputError as error:
+            raise InputError(f"{file}: {error}") from error
     sides: dict[Side, dict[str, Any]] = {}
     for side in ("left", "right"):
         if isinstance(written.get(side), dict):

@@ -6,7 +6,8 @@
     overscan = [0, 1024, 1024, 1056]    # what the same tap reads without pixels: its bias
     black_level_dn = 100                # in place of an overscan
 
-The regions tile a rectangle: frames are cropped to it, and `rows`, `cols` and `cfa` of the camera are those of the cropped frame.
+The regions tile a rectangle once the rows and columns that no region has are cut out: what lies between two taps has to be overscan, that around
+them may be anything. `rows`, `cols` and `cfa` of the camera are those of the joined frame.
 Each tap's black level is the mean of its overscan over the frames. Taps are shifted by whole DN to one black level; codes stay codes. What is
 left, and unequal gains, is in the frames: `--tap NAME` imports one tap alone.
 """
@@ -45,13 +46,14 @@ class Tap(Frozen):
 
 @dataclass(frozen=True)
 class Readout:
-    """The taps of a sensor as they are imported: the rectangle of the frame that is kept, and what is added to each tap's codes.
+    """The taps of a sensor as they are imported: the rows and columns of the frame that are kept, and what is added to each tap's codes.
 
     `black_level_dn`: of the frames that come out. `remarks`: what was measured, in sentences.
     """
 
     taps: tuple[Tap, ...]
-    crop: Region
+    rows: tuple[int, ...]
+    cols: tuple[int, ...]
     shift_dn: tuple[int, ...]
     black_level_dn: float
     remarks: tuple[str, ...]
@@ -59,18 +61,19 @@ class Readout:
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of the frames that come out."""
-        return self.crop[2] - self.crop[0], self.crop[3] - self.crop[1]
+        return len(self.rows), len(self.cols)
 
     def applied(self, frame: Frame) -> Frame:
-        """A frame as it is stored, cropped and with its taps at one black level; codes don't fall below 0."""
+        """A frame as it is stored, cropped, joined, and with its taps at one black level; codes don't fall below 0."""
         made = np.zeros(frame.shape, np.int64)
         for tap, shift in zip(self.taps, self.shift_dn, strict=True):
             made[_box(tap.region)] = frame[_box(tap.region)].astype(np.int64) + shift
-        return np.ascontiguousarray(np.clip(made[_box(self.crop)], 0, np.iinfo(np.uint16).max), dtype=np.uint16)
+        joined = made[np.ix_(self.rows, self.cols)]
+        return np.ascontiguousarray(np.clip(joined, 0, np.iinfo(np.uint16).max), dtype=np.uint16)
 
 
 class TapFiles(ImageFiles):
-    """Images whose frames are cropped and levelled as a `Readout` says."""
+    """Images whose frames are cropped, joined and levelled as a `Readout` says."""
 
     def __init__(self, root: Path, images: Mapping[str, Path], readouts: Mapping[str, Readout]) -> None:
         """`readouts`: by the frame's path in the recording set."""
@@ -101,7 +104,7 @@ def readout(taps: Sequence[Tap], files: Sequence[Path], shape: tuple[int, int], 
     don't tile a rectangle, or a black level isn't known."""
     for tap in taps:
         _check_inside(tap, shape, where)
-    crop = _tiled(taps, shape, where)
+    kept_rows, kept_cols, cut = _tiled(taps, shape, where)
     unknown = [tap.name for tap in taps if tap.overscan is None and tap.black_level_dn is None]
     if unknown:
         raise InputError(
@@ -109,7 +112,7 @@ def readout(taps: Sequence[Tap], files: Sequence[Path], shape: tuple[int, int], 
         )
     measured = _overscan_means(taps, files)
     levels = []
-    remarks = []
+    remarks = [f"{where}: overscan between the taps is cut out and the rest joined: {', '.join(cut)}"] if cut else []
     for tap in taps:
         means = measured.get(tap.name)
         if means is None:
@@ -130,7 +133,7 @@ def readout(taps: Sequence[Tap], files: Sequence[Path], shape: tuple[int, int], 
             f"{where}: taps shifted by whole DN to one black level ({said}); they still differ by {np.ptp(left):.2g} DN, and by their "
             "gains: --tap NAME imports one alone"
         )
-    return Readout(tuple(taps), crop, shift, float(np.mean(left)), tuple(remarks))
+    return Readout(tuple(taps), kept_rows, kept_cols, shift, float(np.mean(left)), tuple(remarks))
 
 
 def _box(region: Region) -> tuple[slice, slice]:
@@ -149,23 +152,38 @@ def _check_inside(tap: Tap, shape: tuple[int, int], where: str) -> None:
             )
 
 
-def _tiled(taps: Sequence[Tap], shape: tuple[int, int], where: str) -> Region:
-    """The rectangle that the regions tile."""
-    count = np.zeros(shape, np.uint8)
+def _tiled(
+    taps: Sequence[Tap], shape: tuple[int, int], where: str
+) -> tuple[tuple[int, ...], tuple[int, ...], list[str]]:
+    """The rows and the columns that the regions tile, and the runs between them that are cut out, in words."""
+    count, overscan = np.zeros(shape, np.uint8), np.zeros(shape, bool)
     for tap in taps:
         count[_box(tap.region)] += 1
-    edges = np.array([tap.region for tap in taps])
-    crop = (int(edges[:, 0].min()), int(edges[:, 1].min()), int(edges[:, 2].max()), int(edges[:, 3].max()))
-    if np.any(count[_box(crop)] != 1):
-        raise InputError(
-            f"{where}: the taps' regions leave gaps or overlap; they have to tile {list(crop)}: correct them"
-        )
+        if tap.overscan is not None:
+            overscan[_box(tap.overscan)] = True
+    rows, cols = np.flatnonzero(count.any(axis=1)), np.flatnonzero(count.any(axis=0))
     for tap in taps:
         if tap.overscan is not None and count[_box(tap.overscan)].any():
             raise InputError(
                 f"{where}: tap {tap.name}: overscan {list(tap.overscan)} holds pixels of a tap's region; correct one of them"
             )
-    return crop
+    cut = []
+    for name, kept, blank in (
+        ("row", rows, overscan[:, cols].all(axis=1)),
+        ("column", cols, overscan[rows].all(axis=0)),
+    ):
+        between = np.setdiff1d(np.arange(kept[0], kept[-1] + 1), kept)
+        for run in np.split(between, np.flatnonzero(np.diff(between) > 1) + 1) if between.size else ():
+            if not blank[run].all():
+                raise InputError(
+                    f"{where}: the taps' regions leave gaps: {name} {run[0]}..{run[-1]} belongs to no region, and isn't all overscan; "
+                    "correct the regions, or state the overscan"
+                )
+            cut.append(f"{name} {run[0]}..{run[-1]}")
+    if np.any(count[np.ix_(rows, cols)] != 1):
+        box = [int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1]
+        raise InputError(f"{where}: the taps' regions leave gaps or overlap; they have to tile {box}: correct them")
+    return tuple(rows.tolist()), tuple(cols.tolist()), cut
 
 
 def _overscan_means(taps: Sequence[Tap], files: Sequence[Path]) -> dict[str, list[float]]:

@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from lab.errors import InputError
-from lab.formats.importers.images import IMAGES, decoded, described_sides, read_image
+from lab.formats.foreign_text import read_foreign_csv
+from lab.formats.importers.images import IMAGES, decoded, described_sides, has_alpha, read_image
 from lab.formats.importers.import_options import ImportOptions
+from lab.formats.importers.stated_settings import contradictions
 from lab.formats.recording_set import DataSheet, Frame, Manifest, RecordingSet
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.scene.colorchecker import reflectances
@@ -76,7 +78,8 @@ def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
         notes = (*notes, f"{path}: the chart's corners were found at {said} (row, column): check that")
     _check_grey_row(path, frame, camera, corners)
     capture = {"id": "chart", "kind": "chart", "chart": CHART, "corners": corners, "radiance": "spectra/light.csv"}
-    return _recordings(path, frame, camera, options, capture, notes, {"spectra/light.csv": _light(options)})
+    light, remarks = _light(options)
+    return _recordings(path, frame, camera, options, capture, (*notes, *remarks), {"spectra/light.csv": light})
 
 
 def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
@@ -151,11 +154,13 @@ def _picture(
     if told:
         raise InputError(f"{path}: isn't stated: {'; '.join(told)}; state them")
     notes: tuple[str, ...] = ()
+    if has_alpha(image):
+        notes += (f"{path}: has a channel of transparency, which is dropped",)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: its values are {image.dtype}; save 8 or 16 bit")
     if colours:
         values, keys["cfa"] = plane_of(image[..., 2::-1])
-        notes = (f"{path}: a colour picture: its pixels are no mosaic's, and neighbours share their noise",)
+        notes += (f"{path}: a colour picture: its pixels are no mosaic's, and neighbours share their noise",)
     else:
         values = image[..., 0] if image.ndim == 3 else image
     frame = np.ascontiguousarray(values, dtype=np.uint16)
@@ -255,21 +260,21 @@ def grey_levels(frame: Frame, corners: Corners) -> NDArray[np.floating[Any]]:
     return np.nan_to_num(np.array(levels))
 
 
-def _light(options: ImportOptions) -> Spectrum:
-    """Radiance of a perfect diffuser in the chart's place."""
+def _light(options: ImportOptions) -> tuple[Spectrum, tuple[str, ...]]:
+    """Radiance of a perfect diffuser in the chart's place, and what was found in reading it."""
     file = options.light if options.light is not None else options.white_patch
     assert file is not None
     try:
-        spectrum = parse_spectrum(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: can't be read ({type(error).__name__}); give a CSV wavelength_nm,value") from error
+        found = read_foreign_csv(file)
+        spectrum = parse_spectrum(found.text)
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
+    remarks = tuple(f"{file}: {remark}" for remark in found.remarks)
     if options.light is not None:
-        return spectrum
+        return spectrum, remarks
     white = next(value for name, value in reflectances(CHART).items() if name.startswith("white"))
     wavelength_nm, value = spectrum.arrays
-    return Spectrum.of(wavelength_nm, value / white.at(wavelength_nm))
+    return Spectrum.of(wavelength_nm, value / white.at(wavelength_nm)), remarks
 
 
 def _recordings(
@@ -290,4 +295,5 @@ def _recordings(
             "captures": [capture | {"side": "left", "frame": stored, "exposure_s": options.exposure_s}],
         }
     )
+    notes = (*notes, *contradictions(manifest, {stored: path}, str(path)))
     return RecordingSet(manifest, {stored: frame}, spectra, source=str(path), warnings=notes)

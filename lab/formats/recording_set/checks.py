@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
 from lab.capture_kinds.base import Capture, Names, Open, names_in
+from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import InputError
@@ -21,10 +23,13 @@ from lab.formats.recording_set.clipping import (
     wrong_lights,
 )
 from lab.formats.recording_set.frame_files import Frame
+from lab.formats.recording_set.level_order import FrameLevel, exchanged_kinds, moved_rows
 from lab.formats.recording_set.manifest import DataSheet, Findings
 from lab.formats.recording_set.recordings import RecordingSet
 from sim.camera import Side
 
+#: Share of a channel's pixels at its highest code from which on a flat's mean isn't in proportion to the light.
+ANY_CLIPPED = 0.01
 #: A warning is given where a narrowband light's centre is off the wavelength set by more than this plus a quarter of its bandwidth.
 OFF_NAME_NM = 3.0
 
@@ -60,8 +65,10 @@ def _camera_problems(camera: DataSheet) -> Iterator[str]:
 
 
 def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> None:
-    """Load every frame once and hand it to `loaded`; find damaged frames, saturated flats and clipped captures."""
+    """Load every frame once and hand it to `loaded`; find damaged frames, saturated flats, clipped captures, and darks and flats whose levels
+    contradict their kind or their place."""
     flats: dict[Side, list[ClippedLevel]] = defaultdict(list)
+    levels: dict[Side, list[FrameLevel]] = defaultdict(list)
     clipped_of: dict[tuple[Side, str], list[str]] = defaultdict(list)
     captures = recordings.manifest.captures
     for number, capture in enumerate(captures, start=1):
@@ -72,22 +79,46 @@ def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> 
             found.problems.append(str(error))
             continue
         loaded(capture, frame, number / len(captures))
+        if isinstance(capture, DarkCapture):
+            levels[capture.side].append(_frame_level(recordings, capture, float(frame.mean()), 0.0, None))
         if not capture.clipping_matters:
             continue
         clipped = clipped_share(frame, camera)
         if isinstance(capture, FlatCapture):
             with suppress(InputError):  # a spectrum that can't be used is reported with the spectra
-                flats[capture.side].append(flat_level(recordings, capture, frame, clipped))
+                flat = flat_level(recordings, capture, frame, clipped)
+                flats[capture.side].append(flat)
+                level = _frame_level(recordings, capture, float(frame.mean()), flat.light, flat.scale)
+                levels[capture.side].append(replace(level, is_clipped=max(clipped.values()) > ANY_CLIPPED))
         elif max(clipped.values()) > CLIPPED_LIMIT:
             clipped_of[capture.side, capture.kind].append(capture.id)
-    for side, levels in flats.items():
-        found.problems += saturated_flats(levels, recordings.manifest.cameras[side])
-        found.warnings += wrong_lights(levels, recordings.manifest.cameras[side])
+    for side, of_flats in flats.items():
+        found.problems += saturated_flats(of_flats, recordings.manifest.cameras[side])
+        found.warnings += wrong_lights(of_flats, recordings.manifest.cameras[side])
+    for side, of_frames in levels.items():
+        problems, warnings = exchanged_kinds(of_frames, recordings.manifest.cameras[side])
+        found.problems += problems
+        found.warnings += [*warnings, *([] if problems else moved_rows(of_frames))]
     for (side, kind), ids in clipped_of.items():
         found.warnings.append(
             f"{recordings.source}: {len(ids)} {kind} captures of the {side} camera have a channel clipped ({_some(ids)}); "
             "what a clipped channel saw is not used; expose shorter"
         )
+
+
+def _frame_level(
+    recordings: RecordingSet, capture: Capture, mean_dn: float, light: float, scale: str | None
+) -> FrameLevel:
+    return FrameLevel(
+        capture.id,
+        f"{recordings.where(capture.frame)} (capture {capture.id})",
+        capture.gain_db,
+        capture.exposure_s,
+        capture.temperature_c,
+        mean_dn,
+        light,
+        scale,
+    )
 
 
 def _check_cameras(recordings: RecordingSet, found: Findings) -> None:

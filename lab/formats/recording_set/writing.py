@@ -77,10 +77,14 @@ def contents(recordings: RecordingSet) -> Iterator[tuple[str, bytes]]:
 
 
 def write(
-    recordings: RecordingSet, path: str | os.PathLike[str], *, progress: Callable[[str, float], None] | None = None
+    recordings: RecordingSet,
+    path: str | os.PathLike[str],
+    *,
+    progress: Callable[[str, float], None] | None = None,
+    told: Callable[[list[str]], None] | None = None,
 ) -> Path:
     """Write a recording set as the folder `path`: completely, or not at all. Frames stay bit-exact; each is read once. `progress` is called
-    after each with its capture's id and the share of them.
+    after each with its capture's id and the share of them, `told` with the warnings of the checks, which `read` gives again.
 
     Raises InputError where `path` exists and isn't an empty folder, and RecordingError where the set itself would be
     refused by `read`.
@@ -102,7 +106,7 @@ def write(
             if progress is not None:
                 progress(capture.id, share)
 
-        problems, _ = inspect(recordings, loaded)
+        problems, warnings = inspect(recordings, loaded)
         if problems:
             raise RecordingError(problems)  # noqa: TRY301
         for name, content in _rest(recordings):
@@ -112,6 +116,8 @@ def write(
         if folder.exists():
             folder.rmdir()
         partial.rename(folder)
+        if told is not None:
+            told(warnings)
     except BaseException as error:
         if made is not None:
             shutil.rmtree(made, ignore_errors=True)

@@ -72,6 +72,71 @@ def test_the_relative_sensitivities_of_the_table_s_camera(tmp_path: Path, photod
     assert any("relative" in remark for remark in found.remarks)
 
 
+def _measured(path: Path, *, files: bool) -> Path:
+    """The same lights with nominal wavelengths that are 4 nm too long and widths that are twice too large, and the lines as measured: centre and
+    width, or files whose integral is the power."""
+    lines = _table(path).read_text().splitlines()
+    made = [lines[0] + (",spectrum" if files else ",measured_wavelength_nm,measured_bandwidth_nm")]
+    for line in lines[1:]:
+        cells = line.split(",")
+        if cells[0] == "dark":
+            made.append(line + ("," if files else ",,"))
+            continue
+        nm, power = float(cells[2]), float(cells[-1])
+        cells[2:4] = [f"{nm + 4:g}", "20"]
+        if files:
+            wave = np.arange(nm - 12.0, nm + 12.25, 0.25)
+            # photons are a triangle: power is that over the wavelength
+            value = np.clip(1.0 - np.abs(wave - nm) / 10.0, 0.0, None) / wave
+            value *= power / np.trapezoid(value, wave)
+            rows = "".join(f"{w:g};{v:.8g}\n".replace(".", ",") for w, v in zip(wave, value, strict=True))
+            (path / f"{nm:g}.csv").write_text("wavelength_nm;value\n" + rows)
+            cells = [*cells[:-1], "", f"{nm:g}.csv"]
+        else:
+            cells += [f"{nm:g}", "10"]
+        made.append(",".join(cells))
+    file = path / "measured.csv"
+    file.write_text("\n".join(made) + "\n")
+    return file
+
+
+@pytest.mark.parametrize("files", [False, True])
+def test_measured_lines_stand_for_those_that_were_set(tmp_path: Path, files: bool) -> None:
+    """With the measured lines the curves are those of `test_the_relative_sensitivities_of_the_table_s_camera`; with the stated ones they are moved by
+    4 nm, which is 8 % of the peak on the flanks."""
+    found = _spectral(_measured(tmp_path, files=files))
+    wave = np.array(found.wavelength_nm)
+    peak = max(float(_truth(c, wave).max()) for c in CURVES)
+    for channel in CURVES:
+        value, std = (np.array(getattr(found, f"relative_sensitivity{part}")[channel]) for part in ("", "_std"))
+        assert np.all(np.abs(value - _truth(channel, wave) / peak) < 4.0 * np.hypot(std, 0.002))
+
+
+def test_lines_far_off_their_names_are_told(tmp_path: Path) -> None:
+    file = _measured(tmp_path, files=False)
+    file.write_text(file.read_text().replace(",404,20,", ",414,20,"))
+    assert any(
+        "1 lines are centred elsewhere than they are set, by 14.0 nm at most (414 nm: 400.0 nm)" in r
+        for r in _spectral(file).remarks
+    )
+
+
+def test_spectra_of_lines_that_cannot_be_used(tmp_path: Path) -> None:
+    file = _measured(tmp_path, files=True)
+    for text, words in (
+        ("wavelength_nm,value\n390,0\n410,0\n", "no light in it"),
+        ("wavelength_nm,value\n390,0\n400,1\n410,-0.2\n", "-0.2 at 410 nm, below the limit of -0.05"),
+        ("nm,value\n390,0\n", "its first line is 'nm,value'"),
+    ):
+        name = f"{words[:4].strip()}.csv"
+        (tmp_path / name).write_text(text)
+        changed = tmp_path / "changed.csv"
+        changed.write_text(file.read_text().replace(",400.csv", f",{name}"))
+        with pytest.raises(InputError, match=words) as caught:
+            fit_mean_table(changed, CAMERA)
+        assert "\n" not in str(caught.value)
+
+
 @pytest.mark.slow
 def test_standard_deviations_of_relative_sensitivities_are_true(tmp_path: Path) -> None:
     """20 draws, all values above a tenth of the peak: the mean square pull is within 1 +- 3 sqrt(2 / 20), as neighbours share their noise."""

@@ -106,6 +106,9 @@ def test_dots_that_are_not_there_are_told(tmp_path: Path) -> None:
         dot_grid(np.full(SHAPE, 120, np.uint8), ROWS, COLS)
     with pytest.raises(InputError, match="no images"):
         read_dot_grids(tmp_path, (ROWS, COLS), SPACING_MM)
+    with pytest.raises(InputError, match="is empty; give the folder of the recordings"):
+        read_foreign("dot-grid", tmp_path, ImportOptions(dots=(ROWS, COLS), square_mm=SPACING_MM))
+    (tmp_path / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 12\n')
     with pytest.raises(InputError, match="state --dots ROWSxCOLS and --square-mm"):
         read_foreign("dot-grid", tmp_path, ImportOptions(dots=(ROWS, COLS)))
     with pytest.raises(InputError, match=r"--from fits doesn't take --dots; it takes --tap"):

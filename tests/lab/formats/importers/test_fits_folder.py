@@ -1,5 +1,6 @@
 """FITS frames: what their headers say, what an index adds, and one line for each that can't be used."""
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,26 @@ def test_what_cannot_be_used_is_one_line_each(folder: Path) -> None:
     assert "dark1.fits: damaged FITS" in lines[1]
     assert "x.fits: its header has no EXPTIME" in lines[2]
     assert "EXPTIME = 'long' isn't a number" in lines[3]
+
+
+def test_frames_that_gzip_has_packed(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = read_fits_folder(folder)
+    for file in list(folder.glob("*.fit*")):
+        (folder / f"{file.name}.gz").write_bytes(gzip.compress(file.read_bytes()))
+        file.unlink()
+    recordings = recording.read(recording.write(read_fits_folder(folder), tmp_path / "out"))
+    assert [(c.id, c.kind, c.exposure_s) for c in recordings.captures()] == [
+        (c.id, c.kind, c.exposure_s) for c in plain.captures()
+    ]
+    np.testing.assert_array_equal(recordings.frame(recordings.captures("flat")[1]), load_fits(folder / "flat1.fit.gz"))
+    monkeypatch.setattr("lab.formats.importers.fits_file.LARGEST_BYTES", 2000)
+    with pytest.raises(InputError, match="holds more than the limit of 2000 bytes; save one frame a file"):
+        load_fits(folder / "flat1.fit.gz")
+    packed = (folder / "flat1.fit.gz").read_bytes()
+    for damaged in (packed[:-20], b"\x1f\x8bnothing", b""):
+        (folder / "flat1.fit.gz").write_bytes(damaged)
+        with pytest.raises(InputError, match=r"damaged FITS \(.*\); copy it again"):
+            load_fits(folder / "flat1.fit.gz")
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Folders of images or raws with an index: every kind of capture, and one line for each row that can't be used."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ from lab.errors import InputError
 from lab.fit.geometry.recordings import fit_geometry
 from lab.fit.stereo import fit_stereo
 from lab.formats import recording_set as recording
+from lab.formats.importers import ImportOptions, read_foreign
 from lab.formats.importers.raw_folder import read_checkerboard_pairs, read_raw_folder
 
 DATA = Path(__file__).resolve().parents[5] / "shared" / "data" / "opencv_stereo"
@@ -112,6 +114,109 @@ def test_index_or_camera_file_missing_or_useless(folder: Path) -> None:
     (folder / "index.csv").unlink()
     with pytest.raises(InputError, match=r"index\.csv"):
         read_raw_folder(folder)
+
+
+def test_columns_that_are_meant_to_be_others_are_named(folder: Path) -> None:
+    text = (folder / "index.csv").read_text()
+    for old, new, words in (
+        ("exposure_s", "exposure_ms", "unknown column 'exposure_ms': write exposure_s, in seconds"),
+        ("region", "Region", "unknown column 'Region': write region"),
+        ("screen.pose", "screen_pose", "unknown column 'screen_pose': write screen.pose"),
+        ("target", "kind", "the column kind stands twice"),
+    ):
+        (folder / "index.csv").write_text(text.replace(old, new, 1))
+        with pytest.raises(InputError) as caught:
+            read_raw_folder(folder)
+        assert words in str(caught.value)
+        assert "\n" not in str(caught.value)
+    (folder / "index.csv").write_text(text.replace("target", "target,operator", 1))
+    assert f"{folder}/index.csv: columns that no capture has are left out: operator" in read_raw_folder(folder).warnings
+
+
+def test_rows_of_which_the_same_is_said_share_a_line(folder: Path) -> None:
+    with (folder / "index.csv").open("a") as file:
+        file.write("dark.png,dark,left,-1\nnb.png,dark,left,-1\n")
+    with pytest.raises(InputError) as caught:
+        read_raw_folder(folder)
+    said = "row 8 (dark) and 1 more: exposure_s: input should be greater than or equal to 0 (it is '-1'); correct it"
+    assert str(caught.value) == f"{folder}/index.csv: {said}"
+
+
+def test_an_index_of_another_country_is_read_and_told(folder: Path, tmp_path: Path) -> None:
+    """Semicolons, decimal commas, UTF-16; spectra likewise. The set that is written has the format's own."""
+    plain = recording.write(read_raw_folder(folder), tmp_path / "plain")
+    index, spectrum = (folder / "index.csv").read_text(), (folder / "s.csv").read_text()
+    foreign = index.replace(",", ";").replace("0.1;", "0,1;").replace("0.5;", "0,5;").replace("4.5", "4,5")
+    (folder / "index.csv").write_bytes(foreign.encode("utf-16"))
+    (folder / "s.csv").write_text(spectrum.replace(",", ";").replace(".", ","))
+    read = read_raw_folder(folder)
+    assert f"{folder}/index.csv: read as UTF-16" in read.warnings
+    for name in ("index.csv", "s.csv"):
+        assert f"{folder}/{name}: read with semicolons between cells and decimal commas" in read.warnings
+    written = recording.write(read, tmp_path / "out")
+    assert (written / "manifest.json").read_text() == (plain / "manifest.json").read_text()
+    assert (written / "s.csv").read_text().startswith("wavelength_nm,value\n500.0,0.1")
+
+
+def test_a_channel_of_transparency_is_dropped_and_told(folder: Path) -> None:
+    grey = cv2.imread(str(folder / "dark.png"), cv2.IMREAD_UNCHANGED)
+    assert cv2.imwrite(str(folder / "dark.png"), np.dstack([grey, grey, grey, np.full_like(grey, 255)]))
+    read = read_raw_folder(folder)
+    np.testing.assert_array_equal(read.frame(read.captures("dark")[0]), grey)
+    assert any("dark.png: has a channel of transparency, which is dropped" in line for line in read.warnings)
+
+
+def test_boards_without_markers(folder: Path) -> None:
+    """As a kind of its own, with markers of 0 mm, and as the pictures of a folder."""
+    for name in "abc":
+        cv2.imwrite(str(folder / f"{name}.png"), np.full((12, 16), 90, np.uint8))
+    (folder / "index.csv").write_text(
+        "frame,kind,squares,square_mm,marker_mm,dictionary,pose\na.png,checkerboard,7 10,25,,,p\nb.png,charuco,7 10,25,0,DICT_4X4_50,q\n"
+        "c.png,charuco,8 10,10,0,dots,r\n"
+    )
+    boards = read_raw_folder(folder).captures("charuco")
+    assert [(b.dictionary, b.squares, b.marker_mm, b.has_markers) for b in boards] == [
+        ("none", (7, 10), None, False),
+        ("none", (7, 10), None, False),
+        ("dots", (8, 10), None, False),
+    ]
+    (folder / "index.csv").write_text("frame;wavelength_nm\nb.png;450,5\na.png;650\n")
+    options = ImportOptions(checkerboard=(6, 9), square_mm=25.0)
+    read = read_foreign("checkerboard", folder, options)
+    assert [(b.id, b.wavelength_nm, b.squares, b.pose) for b in read.captures("charuco")] == [
+        ("b", 450.5, (7, 10), "p000"),
+        ("a", 650.0, (7, 10), "p001"),
+    ]
+    (one,) = read_foreign("checkerboard", folder / "a.png", options).captures("charuco")
+    assert (one.id, one.wavelength_nm) == ("a", None)
+    with pytest.raises(InputError, match="state --checkerboard ROWSxCOLS, its inner corners, and --square-mm"):
+        read_foreign("checkerboard", folder)
+
+
+@pytest.mark.parametrize("kind", ["raw-folder", "fits", "emva1288"])
+def test_an_empty_folder(tmp_path: Path, kind: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read_foreign(kind, tmp_path)
+    assert str(caught.value) == f"{tmp_path}: is empty; give the folder of the recordings"
+
+
+def test_a_file_for_a_folder_and_the_other_way(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"dark\.png: is a file; give the folder that it is in"):
+        read_foreign("raw-folder", folder / "dark.png")
+    with pytest.raises(InputError, match="in: is a folder; give one picture"):
+        read_foreign("slanted-edge", folder)
+
+
+def test_real_pictures_of_a_checkerboard_by_one_camera(tmp_path: Path) -> None:
+    """The left pictures alone need no kind and no dictionary."""
+    if not DATA.is_dir():
+        pytest.skip("the shared data are not here")
+    (tmp_path / "in").mkdir()
+    for file in DATA.glob("left*.jpg"):
+        shutil.copy(file, tmp_path / "in")
+    (tmp_path / "in" / "camera.toml").write_text('cfa = "MONO"\n')
+    read = read_foreign("checkerboard", tmp_path / "in", ImportOptions(checkerboard=(6, 9), square_mm=25.0))
+    assert [capture.kind for capture in read.captures()] == ["charuco"] * 13
 
 
 def test_truncated_jpeg_is_named(tmp_path: Path) -> None:

@@ -58,6 +58,55 @@ def test_taps_are_cropped_and_brought_to_one_black_level(tmp_path: Path) -> None
     assert any(re.search(r"they still differ by 0\.[45]", text) for text in read.warnings)
 
 
+BETWEEN = f"""
+[[taps]]
+name = "A"
+region = [0, {WIDE}, {ROWS}, {WIDE + COLS}]
+overscan = [0, {WIDE + COLS}, {ROWS}, {2 * WIDE + COLS}]
+[[taps]]
+name = "B"
+region = [0, {3 * WIDE + COLS}, {ROWS}, {3 * WIDE + 2 * COLS}]
+overscan = [0, {2 * WIDE + COLS}, {ROWS}, {3 * WIDE + COLS}]
+"""
+
+
+def _between(path: Path) -> Path:
+    """The frames of `_folder` with the overscan between the taps, after a margin of no use; their image is its columns, numbered."""
+    path.mkdir()
+    lit = 500 + np.tile(np.arange(2 * COLS), (ROWS, 1))
+    for k in range(2):
+        parts = (
+            np.full((ROWS, WIDE), 7),
+            lit[:, :COLS],
+            np.full((ROWS, WIDE), 100),
+            np.full((ROWS, WIDE), 130),
+            lit[:, COLS:] + 30,
+        )
+        np.save(path / f"f{k}.npy", np.hstack(parts).astype(np.uint16))
+    (path / "index.csv").write_text("frame,kind,exposure_s\nf0.npy,flat,0.1\nf1.npy,flat,0.1\n")
+    (path / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 12\n' + BETWEEN)
+    return path
+
+
+def test_overscan_between_taps_is_cut_out_and_the_rest_joined(tmp_path: Path) -> None:
+    read = read_raw_folder(_between(tmp_path / "in"))
+    recordings = recording.read(recording.write(read, tmp_path / "out"))
+    assert recordings.camera("left").black_level_dn == 100.0
+    frame = recordings.frame(recordings.captures()[0])
+    np.testing.assert_array_equal(frame, 500 + np.tile(np.arange(2 * COLS), (ROWS, 1)))
+    assert any("cut out and the rest joined: column 40..55" in text for text in read.warnings)
+
+
+def test_columns_between_taps_that_are_no_overscan_are_refused(tmp_path: Path) -> None:
+    folder = _between(tmp_path / "in")
+    camera = folder / "camera.toml"
+    camera.write_text(
+        camera.read_text().replace(f"overscan = [0, {2 * WIDE + COLS}, ", f"overscan = [0, {2 * WIDE + COLS + 1}, ")
+    )
+    with pytest.raises(InputError, match=r"column 40\.\.55 belongs to no region, and isn't all overscan"):
+        read_raw_folder(folder)
+
+
 def test_one_tap_alone_keeps_its_codes(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "in")
     recordings = read_raw_folder(folder, tap="B")
@@ -81,7 +130,7 @@ def test_a_stated_black_level_stands_for_an_overscan(tmp_path: Path) -> None:
     ("old", "new", "words"),
     [
         (f"{2 * COLS + 2 * WIDE}]", f"{2 * COLS + 3 * WIDE}]", "tap B: overscan [0, 72, 40, 88] isn't inside the frame of 40 x 80"),
-        (f"region = [0, {COLS}, ", f"region = [0, {COLS + 2}, ", "leave gaps or overlap"),
+        (f"region = [0, {COLS}, ", f"region = [0, {COLS + 2}, ", "leave gaps: column 32..33 belongs to no region, and isn't all overscan"),
         (f"region = [0, {COLS}, ", f"region = [0, {COLS - 2}, ", "leave gaps or overlap"),
         (f"overscan = [0, {2 * COLS}, ", f"overscan = [0, {2 * COLS - 4}, ", "holds pixels of a tap's region"),
         ('name = "B"', 'name = "A"', "two have one name"),
