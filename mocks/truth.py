@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from mocks.conceal import OF_THE_RADIOMETER, SIDES, Concealed, check
-from sim.camera import CameraModel, Geometry, Lens, Side
+from sim.camera import CameraModel, Geometry, Lens, Shutter, Side
 from sim.effects.base import Effect
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
 from sim.effects.infrared_cut_filter import InfraredCutFilter
@@ -29,6 +29,8 @@ from sim.spectrum import FloatArray, Spectrum
 from sim.stages import ComplexArray, Image, image_of
 
 ROWS, COLS, PITCH_UM = 480, 640, 3.0
+#: Rows are exposed one after the other: light that flickers shows as bands.
+SHUTTER: Shutter = "rolling"
 #: Distance of the cameras, and from them to where targets stand (mm). Both look at the same point there.
 BASELINE_MM, DISTANCE_MM = 60.0, 900.0
 #: Every so many degrees the dark current doubles.
@@ -155,6 +157,7 @@ def _datasheet(shape: tuple[int, int]) -> dict[str, Any]:
         "pixel_pitch_um": PITCH_UM,
         "fill_factor": 0.8,
         "cfa": "RGGB",
+        "shutter": SHUTTER,
         "bit_depth": 12,
         "black_level_dn": 64.0,
         "white_level_dn": 4095.0,
@@ -205,6 +208,7 @@ def _camera(
         pixel_pitch_um=PITCH_UM,
         fill_factor=sheet["fill_factor"],
         cfa="RGGB",
+        shutter=SHUTTER,
         bit_depth=12,
         black_level_dn=unit["black_level_dn"],
         white_level_dn=4095.0,

@@ -14,6 +14,8 @@ from sim.spectrum import Spectrum
 
 Cfa = Literal["RGGB", "BGGR", "GRBG", "GBRG", "MONO"]
 Side = Literal["left", "right"]
+#: How the exposure of the rows begins: of all at one time, or one after the other.
+Shutter = Literal["global", "rolling"]
 
 
 #: By how much a lens's stated f-number and focal length may differ from those that its traced table has.
@@ -59,8 +61,8 @@ class CameraModel(Frozen):
     """What calibench knows of one camera. Fits fill it, `sim.frame` predicts with it.
 
     `quantum_efficiency` is the sensor's with its colour filters, electrons a photon, per channel (`R`, `G`, `B`, or `Y` of
-    a MONO sensor), without the lens's transmittance and without any infrared filter that the maker left out. `std` holds
-    one standard uncertainty by field name; `quantum_efficiency_std` the same on the wavelengths of the curve.
+    a MONO sensor), without the lens's transmittance and without any infrared filter that the maker left out. `shutter`: None
+    where nobody says. `std` holds one standard uncertainty by field name; `quantum_efficiency_std` the same on the wavelengths of the curve.
     """
 
     rows: Annotated[int, Quantity("px", "rows of the frame", lower=1)]
@@ -96,6 +98,7 @@ class CameraModel(Frozen):
     column_noise_e: Annotated[
         float, Quantity("e", "spatial standard deviation of the columns' fixed offsets", lower=0.0)
     ] = 0.0
+    shutter: Shutter | None = None
     std: dict[str, float] = {}
     quantum_efficiency_std: dict[str, Spectrum] = {}
 

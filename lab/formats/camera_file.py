@@ -436,6 +436,7 @@ def default_camera() -> CameraFile:
         prnu_percent=0.6,
         row_noise_e=0.2,
         column_noise_e=0.3,
+        shutter="global",
         quantum_efficiency={
             "R": curve(0.48, 605.0, 28.0, 60.0),
             "G": curve(0.58, 530.0, 38.0, 38.0),

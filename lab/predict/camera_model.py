@@ -72,6 +72,7 @@ def camera_model(
             transmittance=camera.lens_transmittance if camera.lens_transmittance is not None else 1.0,
         ),
         geometry=geometry,
+        shutter=camera.shutter,
     )
 
 

@@ -20,7 +20,8 @@ LINE_TIMES_US = tuple(5.0 * 1.2**k for k in range(25))
 
 class LightFlicker(Effect):
     """Light x (1 + m sinc(f T) cos(2 pi f (t + T / 2))), T the exposure and t its begin: the frame's, and a line time later for each
-    row. Bands that vanish where T is a multiple of 1 / f; with a line time of 0 (global shutter) frames flicker as a whole."""
+    row. Bands that vanish where T is a multiple of 1 / f. The line time of a global shutter is 0, whatever is given: frames flicker as
+    a whole."""
 
     name: ClassVar[str] = "light_flicker"
     family: ClassVar[Family] = Family.SOURCE_IN_TIME
@@ -55,18 +56,21 @@ class LightFlicker(Effect):
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        lines = LINE_TIMES_US[:1] if camera.shutter == "global" else LINE_TIMES_US
         return tuple(
             (cls(modulation_percent=depth, frequency_hz=100.0, line_time_us=line),)
             for depth in (1.5, 15.0)
-            for line in LINE_TIMES_US
+            for line in lines
         )
 
     def on_light(self, light: Light) -> Light:
         if self.modulation_percent == 0.0:
             return light
 
+        line_s = 0.0 if light.camera.shutter == "global" else 1e-6 * self.line_time_us
+
         def factors(rows: int, exposure_s: float, elapsed_s: float) -> FloatArray:
-            middle_s = elapsed_s + 0.5 * exposure_s + 1e-6 * self.line_time_us * np.arange(rows)
+            middle_s = elapsed_s + 0.5 * exposure_s + line_s * np.arange(rows)
             depth = 0.01 * self.modulation_percent * np.sinc(self.frequency_hz * exposure_s)
             return np.asarray(1.0 + depth * np.cos(2.0 * np.pi * self.frequency_hz * middle_s))
 

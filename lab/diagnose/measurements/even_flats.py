@@ -13,6 +13,8 @@ from lab.diagnose.measurements.study import Study
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
+LEAST_SIGNAL = 10.0  # of a frame that is a part of the mean image, in standard deviations of the read noise
+
 
 @dataclass(frozen=True)
 class FlatLevel:
@@ -55,7 +57,7 @@ def flats(study: Study) -> tuple[list[FlatLevel], dict[bool, tuple[FloatArray, f
                 if "G1" in own:
                     ratios.append(green_ratio(study, frame))
                 weight = float(np.mean(list(own.values())))
-                if weight < 10.0 * study.noise.read_dn:
+                if weight < LEAST_SIGNAL * study.noise.read_dn:
                     continue
                 for name, plane in mosaic.planes(frame, study.camera.cfa).items():
                     np.multiply(plane, np.float32(weight / own[name]), out=plane)

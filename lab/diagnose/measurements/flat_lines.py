@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.even_flats import flats
+from lab.diagnose.measurements.dark_readout import DarkReadOut, dark_readout
+from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, FlatLevel, flats
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.sensor import mosaic
@@ -22,7 +25,8 @@ def line_block(study: Study) -> Block:
     """Steps in the means of rows and columns at halves and quarters of a side, and the difference of even and odd lines of a plane of the
     mosaic, relative to the mean signal.
 
-    The standard deviation of a step is measured at all other places. No effect predicts a step. Raises NotDetermined without unclipped
+    What dark frames have of both is subtracted. The standard deviation of a step is measured at all other places. No effect predicts a
+    step. Raises NotDetermined without unclipped
     flats, and for frames too small.
     """
     _, images = study.once(flats)
@@ -35,16 +39,18 @@ def line_block(study: Study) -> Block:
             "flat_lines",
             f"frames of {side_px} px: lines are told from the light's slope from {LEAST_LINES * period} px on",
         )
-    levels = study.once(flats)[0]
+    levels, dark = study.once(flats)[0], study.once(dark_readout)
     values: list[float] = []
     labels: list[Label] = []
     whole: list[tuple[float, float]] = []
-    for held_out, (image, noise) in sorted(images.items()):
-        members = tuple(c.id for u in levels if u.held_out == held_out for c in u.captures)
+    for held_out, (whole_image, noise) in sorted(images.items()):
+        part = [u for u in levels if u.held_out == held_out]
+        members = tuple(c.id for u in part for c in u.captures)
+        image, of_dark = (whole_image, 0.0) if dark is None else _without_dark(study, dark, part, whole_image)
         for axis, name in ((0, "column"), (1, "row")):
             line = np.asarray(image.mean(axis=axis, dtype=float))
             shot = noise / image.shape[axis]
-            least = float(np.sqrt(study.noise.prnu**2 / image.shape[axis] + shot))
+            least = float(np.sqrt((study.noise.prnu**2 + of_dark) / image.shape[axis] + shot))
             for share, value, std, size in _steps(line, period, least):
                 values.append(value)
                 whole.append((std**2 + LINE_FLOOR**2, shot * size))
@@ -63,6 +69,22 @@ def line_block(study: Study) -> Block:
         measurement=FLAT_LINES, reach=1.0, value=np.array(values), covariance=covariance, labels=tuple(labels),
         reads=frozenset(), predict=lambda effects: Prediction(np.zeros(len(values)), {}), scale=np.ones(len(values)),
     )  # fmt: skip
+
+
+def _without_dark(
+    study: Study, dark: DarkReadOut, levels: Sequence[FlatLevel], image: FloatArray
+) -> tuple[FloatArray, float]:
+    """The mean image of flat `levels` without the offsets of dark frames, (rows, cols), and the variance that their noise adds to a pixel."""
+    signal = np.array([float(np.mean(list(u.mean.values()))) for u in levels])
+    # each frame of the image counts by its signal, and is divided by that of the plane
+    weight = np.where(signal >= LEAST_SIGNAL * study.noise.read_dn, signal * [len(u.captures) for u in levels], 0.0)
+    if not weight.any():
+        return image, 0.0
+    offsets, size = np.array(dark.offsets_dn), []
+    for name, plane in mosaic.planes(offsets, study.camera.cfa).items():
+        size.append(float(np.average([1.0 / u.mean[name] for u in levels], weights=weight)))
+        np.multiply(plane, np.float32(size[-1]), out=plane)
+    return image - offsets, study.noise.read_dn**2 / dark.frames * float(np.mean(np.square(size)))
 
 
 def _steps(line: FloatArray, period: int, least: float) -> list[tuple[float, float, float, float]]:

@@ -1,5 +1,5 @@
-"""Flicker: light that changes while a rolling shutter exposes row after row, seen in the rows of single flat frames. A fixed pattern of rows
-that doesn't grow with the light shows there, too."""
+"""Flicker: light that changes while a rolling shutter exposes row after row, seen in the rows of single flat frames. Noise of rows and a fixed
+pattern of rows show there, too; what dark frames have of both is predicted."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.dark_readout import RowNoise, dark_readout, row_profile
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.reads import ADDED
 from lab.diagnose.measurements.row_light import PHASES, ROW_LIGHT
@@ -23,14 +23,16 @@ from sim.uniform import Uniform
 MOST_FRAMES, MOST_LEVELS = 6, 8  # frames of a level; levels of a session
 WIDEN = 1.25  # ratio of the lower ends of successive frequency bands
 HIGHEST = 0.45  # cy/row
-#: Relative prior standard deviation of a band's power, common to all levels: row noise that isn't white. Five times as much above
+#: Relative prior standard deviation of a band's power, common to all levels: noise of pixels that isn't white. Five times as much above
 #: 0.15 cy/row.
 COLOUR_STD = 0.1
 #: Prior standard deviation of the relative amplitude by which the fixed pattern of rows changes from level to level.
 PATTERN_STD = 3e-5
-#: Standard deviation of the rows' offsets over the read noise, where there are no repeated dark frames.
-ROW_SHARE = 0.15
+#: Without repeated dark frames, the power of rows beyond that of pixels' noise is anything up to three times the variance of the read noise:
+#: a camera whose rows are noisier than its pixels shows nothing but stripes.
+MOST_ROW_NOISE = 3.0
 LEAST_ROWS = 24  # of a plane of the mosaic
+LEAST_POWER = 0.05  # of a band over that of the pixels' noise, as predicted
 #: Times within a period at which a frame may begin, interpolated between `PHASES`; and how often they are found anew, beside the mean
 #: of all frames that follows from them.
 FINE_PHASES, REFINEMENTS = 240, 3
@@ -41,8 +43,11 @@ class _Level:
     """The frames of one level."""
 
     captures: tuple[Any, ...]
+    held_out: bool
     signal: float  # mean above the dark level, DN
-    variance: float  # relative variance of a row's mean by the noise of pixels
+    pixel_dn2: float  # variance of a pixel without that of whole rows
+    variance: float  # relative variance of a row's mean by the noise of pixels, about the mean of all frames
+    row_share: float  # relative variance of a row's mean, over `variance`, by noise of rows of 1 DN^2
     power: FloatArray  # (bands,): of the rows of single frames, over that of the noise
     freedom: FloatArray  # (bands,): degrees of freedom
     rows: FloatArray  # (frames, rows): of single frames, over the mean of all
@@ -54,10 +59,12 @@ def flicker_block(study: Study) -> Block:
 
     q(r) = row means of a frame / row means of all frames - 1. Power at k cycles a frame: |sum over r of q(r) exp(-2 pi i k r / rows)|^2
     / (rows x variance of a row's mean). The cube root of its mean over a band is nearly normal (Wilson and Hilferty 1931): mean
-    1 - 2 / (9 v), variance 2 / (9 v) for v degrees of freedom. Row noise of the dark frames is expected in light as well. Nuisance
-    parameters: its size, the noise's spectrum, and the fixed pattern of rows. A frame begins at that time within a period of the light
-    for which the predicted rows are most like its own. Raises NotDetermined without
-    unclipped, repeated flats, and for too few rows.
+    1 - 2 / (9 v), variance 2 / (9 v) for v degrees of freedom. The rows' offsets in dark frames are subtracted, and the spectrum of their
+    noise is expected in light as well (`dark_readout`), with its standard deviation as a nuisance parameter of each band. Without repeated
+    dark frames the spectrum is a free parameter of each band up to `MOST_ROW_NOISE`, so that only what grows with the light is seen.
+    Other nuisance parameters: the spectrum of the pixels' noise, and the fixed pattern of rows. A frame begins at that time within a
+    period of the light for which the predicted rows are most like its own. Raises NotDetermined without unclipped, repeated flats, and for
+    too few rows.
     """
     groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
     groups = [g[:MOST_FRAMES] for g in groups if len(g) > 1]
@@ -73,42 +80,54 @@ def flicker_block(study: Study) -> Block:
             "flicker", f"frames of {study.camera.rows} rows: too few to see bands in, which takes {LEAST_ROWS * step}"
         )
     bands = _bands(rows, HIGHEST * step)
-    levels = _measured(study, groups, bands)
-    dark, dark_std = _dark_power(study, bands)
-    out = study.once(held_out_flats)
+    dark = study.once(dark_readout)
+    levels = _measured(study, groups, bands, np.zeros(rows) if dark is None else row_profile(dark.offsets_dn, step))
+    noise = _any_row_noise(study, levels) if dark is None else dark.noise(bands)
     frequency = np.array([np.sqrt(b[0] * b[-1]) for b in bands]) / (rows * step)
     freedom = np.concatenate([level.freedom for level in levels])
     value = np.cbrt(np.concatenate([level.power for level in levels]))
-    # row noise of dark frames, DN^2 -> share of the power of noise in light
-    share = np.repeat([1.0 / (level.signal**2 * level.variance) for level in levels], len(bands))
-    offsets, offsets_std = np.tile(dark, len(levels)) * share, np.tile(dark_std, len(levels)) * share
-    pattern = np.repeat([PATTERN_STD**2 * rows / level.variance for level in levels], len(bands))
+
+    def of_levels(share: Sequence[float], by_band: FloatArray | float) -> FloatArray:
+        """(levels x bands,)"""
+        return np.outer(share, by_band * np.ones(len(bands))).ravel()
+
+    row_share = [level.row_share for level in levels]
+    usual = 1.0 + of_levels(row_share, noise.power_dn2)
+    from_dark = np.zeros(len(value))
+    if dark is not None:
+        # noise that the subtracted offsets have is a larger share of a low level than of the mean of all
+        whole = sum(float(level.weight.sum()) / level.signal for level in levels)
+        more = [(1.0 / level.signal - whole) ** 2 / level.variance for level in levels]
+        from_dark = of_levels(more, dark.pattern_noise_dn2(bands))
+    own = {
+        "offset": of_levels(row_share, noise.std_dn2),
+        "pattern": of_levels([PATTERN_STD**2 * rows / level.variance for level in levels], 1.0),
+        "dark": from_dark / np.sqrt(np.tile([len(band) for band in bands], len(levels))),
+    }
+    colour = np.tile(COLOUR_STD * (1.0 + 4.0 * (frequency > 0.15)), len(levels))
     band = np.tile(np.arange(len(bands)), len(levels))
 
     def predict(effects: Effects) -> Prediction:
         model = Uniform(study.camera, effects)
-        power = 1.0 + offsets
+        power = np.maximum(usual + from_dark, LEAST_POWER)
         if model.varies_by_row:
             power = power + _added_power(model, study.camera.rows, levels, bands, step)
-        if model.adds_signal:
+        if dark is None and model.adds_signal:
             power = power + _pattern_power(study, levels, model, bands, step)
         mean = np.cbrt(power) * (1.0 - 2.0 / (9.0 * freedom))
         slope = mean / (3.0 * power)
         jacobian = {}
         for k in range(len(bands)):
-            jacobian[f"rows:offset:{k}"] = np.where(band == k, slope * offsets_std, 0.0)
-            jacobian[f"rows:colour:{k}"] = np.where(
-                band == k, slope * COLOUR_STD * (1.0 + 4.0 * (frequency[k] > 0.15)), 0.0
-            )
-            jacobian[f"rows:pattern:{k}"] = np.where(band == k, slope * pattern, 0.0)
+            for name, std in (*own.items(), ("colour", colour)):
+                jacobian[f"rows:{name}:{k}"] = np.where(band == k, slope * std, 0.0)
         return Prediction(mean, jacobian)
 
     return Block(
         measurement=FLAT_ROWS, reach=LOG_REACH, along=np.log(np.tile(frequency, len(levels))),
         value=value, covariance=np.diag(2.0 / (9.0 * freedom)),
-        labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s", tuple(c.id for c in level.captures), level.captures[0].id in out)
+        labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s", tuple(c.id for c in level.captures), level.held_out)
                      for level in levels for f in frequency),
-        reads=ROW_LIGHT | ADDED, predict=predict, scale=np.ones(len(value)),
+        reads=ROW_LIGHT if dark is not None else ROW_LIGHT | ADDED, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -126,16 +145,13 @@ def _bands(rows: int, highest_cy_per_row: float) -> list[range]:
     return bands
 
 
-def _profile(frame: NDArray[np.floating], step: int) -> FloatArray:
-    """Means of the rows, over `step` neighbouring ones each, the period of the mosaic."""
-    rows = frame.shape[0] // step
-    return np.asarray(frame.mean(1)[: rows * step].reshape(rows, step).mean(1))
-
-
-def _measured(study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[range]) -> list[_Level]:
-    """The levels of groups of repeated flats."""
-    noise, step = study.noise, mosaic.step(study.camera.cfa)
-    profiles, variances, signals = [], [], []
+def _measured(
+    study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[range], offsets_dn: FloatArray
+) -> list[_Level]:
+    """The levels of groups of repeated flats, without the rows' fixed `offsets_dn` (rows,)."""
+    noise, step, cols = study.noise, mosaic.step(study.camera.cfa), study.camera.cols
+    out = study.once(held_out_flats)
+    profiles, pixels, signals = [], [], []
     for group in groups:
         frames = [np.asarray(study.recordings.frame(c), np.float32) for c in group]
         dark = noise.black + noise.dark_dn_per_s * group[0].exposure_s
@@ -143,68 +159,70 @@ def _measured(study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[ran
         # pixels' noise without that of whole rows
         left = [f - mean for f in frames]
         left = [d - d.mean(1, keepdims=True) for d in left]
-        pixel = float(np.mean([np.mean(np.square(d, dtype=float)) for d in left])) * len(frames) / (len(frames) - 1)
-        own = np.array([_profile(f, step) for f in frames]) - dark
+        pixel = float(np.mean([np.mean(np.square(d, dtype=float)) for d in left])) / (1.0 - 1.0 / cols)
+        own = np.array([row_profile(f, step) for f in frames]) - dark - offsets_dn
         profiles.append(own / own.mean(1, keepdims=True))
         signals.append(float(own.mean()))
-        variances.append(pixel / (step * study.camera.cols) / signals[-1] ** 2)
+        pixels.append(pixel * len(frames) / (len(frames) - 1))
     # the reference: frames are weighted by signal and exposure, as flicker averages out in long ones
     weight = np.concatenate([np.full(len(g), s * g[0].exposure_s) for g, s in zip(groups, signals, strict=True)])
     weight /= weight.sum()
     every = np.concatenate(profiles)
     reference = weight @ every
-    variance = np.concatenate([np.full(len(g), v) for g, v in zip(groups, variances, strict=True)])
+    count = [len(group) for group in groups]
+    of_pixels = np.array(pixels) / (step * cols) / np.square(signals)
+    of_rows = 1.0 / np.square(signals)
+    common_pixels, common_rows = (float(weight**2 @ np.repeat(of, count)) for of in (of_pixels, of_rows))
     found, first = [], 0
-    for group, signal, level in zip(groups, signals, variances, strict=True):
+    for k, group in enumerate(groups):
         at = slice(first, first + len(group))
         first += len(group)
         # variance of q: the frame's own noise, less its covariance with the reference, and the reference's
-        own = level * (1.0 - 2.0 * weight[at].mean()) + float(weight**2 @ variance)
+        apart = 1.0 - 2.0 * float(weight[at].mean())
+        variance = float(of_pixels[k]) * apart + common_pixels
+        # frames share the noise of the reference: their mean has this variance over that of their differences
+        together = max(1.0 + len(group) * (variance / float(of_pixels[k]) - 1.0), 0.0)
+        free = (len(group) - 1.0 + together) ** 2 / (len(group) - 1.0 + together**2)
         found.append(
             _Level(
-                tuple(group),
-                signal,
-                own,
-                _power(every[at] / reference, bands) / own,
-                np.array([2.0 * len(group) * len(band) for band in bands]),
-                every[at] / reference,
-                weight[at],
+                captures=tuple(group),
+                held_out=group[0].id in out,
+                signal=signals[k],
+                pixel_dn2=pixels[k],
+                variance=variance,
+                row_share=(float(of_rows[k]) * apart + common_rows) / variance,
+                power=_power(every[at] / reference, bands) / variance,
+                freedom=np.array([2.0 * free * len(band) for band in bands]),
+                rows=every[at] / reference,
+                weight=weight[at],
             )
         )
     return found
 
 
-def _dark_power(study: Study, bands: Sequence[range]) -> tuple[FloatArray, FloatArray]:
-    """Power of the rows of dark frames beyond that of pixels' noise, by band, DN^2, and its standard deviation.
+def _any_row_noise(study: Study, levels: Sequence[_Level]) -> RowNoise:
+    """The noise of rows where no dark frames tell it: what is most like the seen flats beside light that varies from row to row, and so
+    wide a standard deviation that any other is as good.
 
-    Without repeated dark frames: 0, and that of the prior `ROW_SHARE`. What is within two standard deviations of 0 is taken as 0.
+    A prediction is linear in this power, and so it is taken about the likeliest: of the seen levels' power P = 1 + x `row_share` +
+    y / `variance` by least squares with x, y >= 0, x up to `MOST_ROW_NOISE` times the read noise's variance.
     """
-    noise, step = study.noise, mosaic.step(study.camera.cfa)
-    rows = study.camera.rows // step
-    total, expected, freedom = np.zeros(len(bands)), 0.0, np.zeros(len(bands))
-    for group in study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db)):
-        part = group[:MOST_FRAMES]
-        if len(part) < 2:
-            continue
-        frames = [np.asarray(study.recordings.frame(c), np.float32) for c in part]
-        mean = sum(frames[1:], frames[0]) / len(frames)
-        count = len(frames) - 1
-        left = [f - mean for f in frames]
-        lines = (
-            np.mean([np.abs(np.fft.rfft(_profile(d, step))) ** 2 for d in left], axis=0) * len(frames) / count / rows
-        )
-        total += count * np.array([lines[list(band)].mean() for band in bands])
-        inner = np.mean([np.mean(np.square(d - d.mean(1, keepdims=True), dtype=float)) for d in left])
-        expected += count * float(inner) * len(frames) / count / (step * study.camera.cols)
-        freedom += count
-    if not freedom.any():
-        return np.zeros(len(bands)), np.full(len(bands), (ROW_SHARE * noise.read_dn) ** 2 / step)
-    frames_seen = freedom[0]
-    mean_power = total / frames_seen
-    uncertain = mean_power * np.sqrt(2.0 / (2.0 * frames_seen * np.array([len(b) for b in bands])))
-    excess = mean_power - expected / frames_seen
+    from scipy.optimize import nnls  # here: the library takes a while to load
 
-    return np.where(excess > 2.0 * uncertain, excess, 0.0), uncertain
+    stated_e = study.stated.read_noise_e
+    read_dn2 = min(level.pixel_dn2 for level in levels)  # the darkest level's at most
+    if stated_e is not None and study.noise.gain_is_known:
+        read_dn2 = min(read_dn2, (study.noise.gain * stated_e) ** 2 + 1.0 / 12.0)
+    seen = [level for level in levels if not level.held_out]
+    power = np.array([level.power for level in seen])  # (levels, bands)
+    design = np.array([[level.row_share, 1.0 / level.variance] for level in seen])
+    size = design.max(0)
+    likely = []
+    for k in range(power.shape[1]):
+        std = np.array([max(level.power[k], 1.0) * np.sqrt(2.0 / level.freedom[k]) for level in seen])
+        found, _ = nnls(design / size / std[:, None], (power[:, k] - 1.0) / std)
+        likely.append(min(float(found[0]) / size[0], MOST_ROW_NOISE * read_dn2))
+    return RowNoise(np.array(likely), np.array(likely) + read_dn2)
 
 
 def _power(rows: FloatArray, bands: Sequence[range]) -> FloatArray:
@@ -250,7 +268,7 @@ def _pattern_power(
     study: Study, levels: Sequence[_Level], model: Uniform, bands: Sequence[range], step: int
 ) -> FloatArray:
     """Power (levels x bands,) that a fixed pattern of rows adds: it is a larger share of a low level than of the mean of all."""
-    added = study.noise.gain * _profile(model.added_e - model.added_e.mean(), step)
+    added = study.noise.gain * row_profile(model.added_e - model.added_e.mean(), step)
     share = np.array([added / level.signal for level in levels])
     weight = np.array([float(level.weight.sum()) for level in levels])
     relative = (1.0 + share) / (1.0 + weight @ share)

@@ -25,10 +25,11 @@ def level_repeats_block(study: Study) -> Block:
 
     S is the variance of a setting's relative levels, with f = n - 1 degrees of freedom; noise its expectation by the noise of pixels. The
     cube root of chi2_f / f is all but normal, of mean 1 - 2 / (9 f) and variance 2 / (9 f), also for few degrees of freedom, where a
-    logarithm would hide much of a large variance (Wilson and Hilferty, PNAS 17, 684, 1931). Nuisance parameters: a lamp's usual
-    unsteadiness, whose variance is uncertain by s0^2, s0 = `STEADY_LAMP`; and how much wider S scatters the larger it is. Image lag adds
-    to S what each repeat's predecessor leaves in it. Settings out of line with the others are left out (`steady`): other measurements
-    find those. Raises NotDetermined for fewer than `LEAST_FREEDOM` degrees of freedom.
+    logarithm would hide much of a large variance (Wilson and Hilferty, PNAS 17, 684, 1931). The means of dark frames scatter, as rows of
+    one frame share noise of low frequencies and black levels jump; by the same DN^2 do those of flats. Nuisance parameters: that
+    variance (`_dark_scatter`); a lamp's usual unsteadiness, whose variance is uncertain by s0^2, s0 = `STEADY_LAMP`; and how much wider S
+    scatters the larger it is. Image lag adds to S what each repeat's predecessor leaves in it. Settings out of line with the others are
+    left out (`steady`): other measurements find those. Raises NotDetermined for fewer than `LEAST_FREEDOM` degrees of freedom.
     """
     groups = _by_exposure(_seen(study))
     if not groups:
@@ -43,18 +44,23 @@ def level_repeats_block(study: Study) -> Block:
     variance = 2.0 / (9.0 * freedom)
     exposure_s = np.array([_weighted(group, [r.captures[0].exposure_s for r in group]) for group in groups])
 
+    per_dn2 = np.array([_weighted(group, [r.signal_dn**-2 for r in group]) for group in groups])
+    dark_dn2, dark_std_dn2 = _dark_scatter(study)
+
     def predict(effects: Effects) -> Prediction:
         model = Uniform(study.camera, effects)
-        more = np.array(
+        more = dark_dn2 * per_dn2 + np.array(
             [model.unsteadiness**2 + row_light_variance(model, study.camera.rows, float(t)) for t in exposure_s]
         )
         if acting(effects, LAG):
             more = more + np.array([_of_lag(study, effects, group) for group in groups])
         root = np.cbrt(1.0 + more / noise)
         usual = np.cbrt(1.0 + (more + STEADY_LAMP**2) / noise) - root
+        darker = np.cbrt(1.0 + (more + dark_std_dn2 * per_dn2) / noise) - root
         wider = np.diag(np.sqrt(variance * (np.square(root) - 1.0)))
         scatter = {f"scatter of repeats {number}": column for number, column in enumerate(wider)}
-        return Prediction(root * (1.0 - variance), {"usual unsteadiness of the lamp": usual} | scatter)
+        usually = {"usual unsteadiness of the lamp": usual, "scatter of dark frames": darker}
+        return Prediction(root * (1.0 - variance), usually | scatter)
 
     labels = tuple(
         Label(float(np.log(t)), "all", f"{t:.4g} s", tuple(c.id for r in group for c in r.captures), held_out=False)
@@ -74,8 +80,23 @@ def _seen(study: Study) -> list[RepeatedMeans]:
         kept = [i for i, c in enumerate(one.captures) if c.id not in out]
         if len(kept) > 1:
             captures, elapsed = tuple(one.captures[i] for i in kept), one.elapsed_s[kept]
-            found.append(RepeatedMeans(captures, one.away[kept] - one.away[kept].mean(), elapsed, one.noise))
+            away = one.away[kept] - one.away[kept].mean()
+            found.append(RepeatedMeans(captures, away, elapsed, one.noise, one.signal_dn))
     return steady(found)
+
+
+def _dark_scatter(study: Study) -> tuple[float, float]:
+    """Variance of a dark frame's mean beside that by the noise of independent pixels, DN^2, and its standard deviation.
+
+    A variance v of f degrees of freedom has the standard deviation v sqrt(2 / f). Without repeated dark frames it may be as large as
+    rows leave whose noise is that of their pixels.
+    """
+    noise, camera = study.noise, study.camera
+    whole = noise.jitter_dn**2
+    if noise.jitter_freedom == 0.0:
+        return 0.0, max(whole, noise.read_dn**2 / camera.rows)
+    pixels = noise.read_dn**2 / (camera.rows * camera.cols)
+    return max(whole - pixels, 0.0), whole * float(np.sqrt(2.0 / noise.jitter_freedom))
 
 
 def _by_exposure(repeats: list[RepeatedMeans]) -> list[list[RepeatedMeans]]:

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 STATED_BLACK_SHARE, STATED_BLACK_DN = 0.03, 2.0  # standard deviation of a stated black level, relative and absolute
 BLACK_FLOOR_DN = 0.01  # standard deviation of a frame's mean beside noise
 USUAL_JITTER_DN = 0.02  # usual standard deviation of a dark frame's mean, from repeat to repeat
+USUAL_JITTER_FREEDOM = 2.0  # degrees of freedom that count for the usual one
+UNKNOWN_JITTER_DN = 0.05  # where no dark frames are repeated
 USUAL_PRNU = 0.008  # where no flats tell
 #: Local mean of a plane of the mosaic: side of the box and width of the border that is left out, px. The wide one is used in planes of
 #: at least `WIDE_PLANE_PX` a side. In planes below `LEAST_PLANE_PX` PRNU isn't measured.
@@ -50,6 +52,7 @@ class NoiseGuess:
     read_dn: float
     prnu: float  # relative
     jitter_dn: float  # standard deviation of a dark frame's mean, from repeat to repeat
+    jitter_freedom: float  # its degrees of freedom, the usual one's included; 0: no dark frames are repeated
     jitter_lamp: float  # relative standard deviation of a flat frame's mean, from repeat to repeat
     black_std: float  # standard deviation of `black`
     dark_std: float  # standard deviation of `dark_dn_per_s`
@@ -66,7 +69,7 @@ def noise_guess(study: Study) -> NoiseGuess:
     """
     recordings, stated = study.recordings, study.stated
     black = stated.black_level_dn if stated.black_level_dn is not None else 0.0
-    dark, read, jitter = 0.0, 1.0, BLACK_FLOOR_DN
+    dark, read, jitter, jitter_freedom = 0.0, 1.0, BLACK_FLOOR_DN, 0.0
     dark_c = study.temperature_c
     # without dark frames: a dark current as stated, or of some tens of electrons
     expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
@@ -98,7 +101,8 @@ def noise_guess(study: Study) -> NoiseGuess:
         if len(first) > 1:
             read = float(np.sqrt(pair_variance([recordings.frame(c) for c in first[:4]])))
         own_dn2 = read**2 / recordings.frame(first[0]).size if len(first) > 1 else 0.0
-        jitter = max(_jitter(study, darks, frames_mean, own_dn2), BLACK_FLOOR_DN)
+        jitter, jitter_freedom = _jitter(study, darks, frames_mean, own_dn2)
+        jitter = max(jitter, BLACK_FLOOR_DN)
     gain, lamp = stated.conversion_gain_dn_per_e, 3e-4
     signal, variance, prnu = _transfer_points(study, black)
     if len(signal) > 1:
@@ -111,7 +115,9 @@ def noise_guess(study: Study) -> NoiseGuess:
         gain = _scene_gain(study, black, read)
     known = gain is not None and gain > 0
     gain = gain if gain is not None and known else 1.0
-    return NoiseGuess(black, dark, dark_c, gain, known, read, prnu, jitter, max(lamp, LAMP_FLOOR), black_std, dark_std)
+    return NoiseGuess(
+        black, dark, dark_c, gain, known, read, prnu, jitter, jitter_freedom, max(lamp, LAMP_FLOOR), black_std, dark_std
+    )
 
 
 def _transfer_points(study: Study, black: float) -> tuple[list[float], list[float], float]:
@@ -188,11 +194,14 @@ def _even_rows(frame: Any, step: int) -> FloatArray:
     return even
 
 
-def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float) -> float:
-    """Standard deviation of the repeats' means (DN) about a linear drift with time that all groups have in common.
+def _jitter(
+    study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float
+) -> tuple[float, float]:
+    """Standard deviation of the repeats' means (DN) about a linear drift with time that all groups have in common, and its degrees of
+    freedom.
 
     Settings out of line are left out (`steady`). With few repeats it is shrunk towards the usual: the variance `USUAL_JITTER_DN`^2 +
-    `own_dn2`, that of a frame's mean by its pixels' noise, counts as two degrees of freedom.
+    `own_dn2`, that of a frame's mean by its pixels' noise, counts as `USUAL_JITTER_FREEDOM` degrees of freedom.
     """
     repeats = []
     for group, mean in zip(groups, means, strict=True):
@@ -204,12 +213,14 @@ def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[F
     repeats = steady(repeats)
     freedom = sum(len(r.away) - 1 for r in repeats)
     if freedom == 0:
-        return 0.05
+        return UNKNOWN_JITTER_DN, 0.0
     rest, elapsed = np.concatenate([r.away for r in repeats]), np.concatenate([r.elapsed_s for r in repeats])
     if freedom > 2 and np.any(elapsed):
         rest = rest - elapsed * float(elapsed @ rest) / float(elapsed @ elapsed)
         freedom -= 1
-    return float(np.sqrt((rest @ rest + 2.0 * (USUAL_JITTER_DN**2 + own_dn2)) / (freedom + 2.0)))
+    total = freedom + USUAL_JITTER_FREEDOM
+    usual = USUAL_JITTER_FREEDOM * (USUAL_JITTER_DN**2 + own_dn2)
+    return float(np.sqrt((rest @ rest + usual) / total)), total
 
 
 def pair_variance(frames: Sequence[Any]) -> float:

@@ -38,6 +38,7 @@ class RepeatedMeans:
     away: FloatArray  # (n,): levels less their mean
     elapsed_s: FloatArray  # (n,): times less their mean
     noise: float  # variance of a level by the noise of pixels
+    signal_dn: float = 0.0  # mean level where these are relative to it; 0: they are in DN
 
 
 def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[RepeatedMeans]:
@@ -55,7 +56,10 @@ def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> 
             continue
         noise = float(((gain * np.maximum(levels.mean(0), 0.0) + read_dn**2) * size).sum()) / total.mean() ** 2
         elapsed = np.array([study.elapsed_s(k) for k in group])
-        found.append(RepeatedMeans(tuple(group), total / total.mean() - 1.0, elapsed - elapsed.mean(), noise))
+        signal_dn = float(total.mean() / size.sum())
+        found.append(
+            RepeatedMeans(tuple(group), total / total.mean() - 1.0, elapsed - elapsed.mean(), noise, signal_dn)
+        )
     return found
 
 

@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError, field_validator
 
 from lab.capture_kinds.base import CAPTURES, AnyCapture, Capture, Open
 from lab.errors import InputError, one_line
-from sim.camera import Cfa, Side
+from sim.camera import Cfa, Shutter, Side
 
 #: Rows and columns of a frame, at most: no sensor has more, and a manifest can't ask for any amount of memory.
 MOST_PX = 1 << 15
@@ -29,6 +29,7 @@ class DataSheet(Open):
     pixel_pitch_um: float | None = Field(default=None, gt=0)
     fill_factor: float | None = Field(default=None, gt=0, le=1)
     cfa: Cfa
+    shutter: Shutter | None = None
     bit_depth: int = Field(ge=1, le=16)
     black_level_dn: float | None = Field(default=None, ge=0)
     white_level_dn: float | None = Field(default=None, gt=0)

@@ -27,16 +27,32 @@ def recorded() -> RecordingSet:
     return rendered(5, (RAMP,))
 
 
+def without_darks(recordings: RecordingSet) -> RecordingSet:
+    return recordings.without({c.id for c in recordings.captures("dark", "left")})
+
+
 @pytest.mark.parametrize(
-    "make",
-    [dark_field_block, partial(fixed_line_block, "rows"), shading_block, flicker_block],
+    ("make", "recordings"),
+    [
+        (dark_field_block, recorded),
+        (partial(fixed_line_block, "rows"), recorded),
+        (shading_block, recorded),
+        (flicker_block, lambda: without_darks(recorded())),
+    ],
     ids=["dark_field", "dark_row_pattern", "flat_field", "flat_rows"],
 )
-def test_what_read_out_adds_is_predicted(make: Callable[[Study], Block]) -> None:
+def test_what_read_out_adds_is_predicted(
+    make: Callable[[Study], Block], recordings: Callable[[], RecordingSet]
+) -> None:
     """Without the effect the numbers lie far off, with it chi-squared is within 4 of its standard deviations."""
-    model = measured_model(recorded(), make)
+    model = measured_model(recordings(), make)
     assert sigmas(model) > 20.0
     assert abs(sigmas(model, (RAMP,))) < 4.0
+
+
+def test_the_rows_of_flats_have_the_offsets_of_dark_rows() -> None:
+    """The dark frames' mean rows are subtracted: no effect has to tell them once more."""
+    assert abs(sigmas(measured_model(recorded(), flicker_block))) < 4.0
 
 
 def test_its_mean_is_a_part_of_the_black_level() -> None:
