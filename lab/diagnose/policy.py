@@ -188,6 +188,15 @@ class DecisionPolicy(Frozen):
             "odds of 9 to 1; with `parameter_log_odds`, one parameter has to gain 17 in chi2, which noise reaches in one of 27 000 effects that are tried",
         ),
     ] = 0.9
+    least_means_log_odds: Annotated[
+        float,
+        Rule(
+            "name",
+            "log odds",
+            "least gain in log-likelihood, in the numbers that aren't variances, of an effect that changes variances by changing the mean response",
+            "ln(1 / `false_alarm_rate`): without the effect, a likelihood ratio exceeds 1 / p with a probability of p at most (Markov)",
+        ),
+    ] = 4.6
     family_probability: Annotated[
         float,
         Rule(

@@ -8,6 +8,7 @@ from dataclasses import replace
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.refit import Fit
 from lab.diagnose.inference.search import Search
+from lab.diagnose.inference.shown_in_means import shown_in_means
 from lab.diagnose.inference.weigh import Candidate, explained, weigh
 from lab.diagnose.policy import DecisionPolicy
 
@@ -74,10 +75,15 @@ def holds(candidate: Candidate, policy: DecisionPolicy) -> bool:
 
 
 def _too_weak(search: Search, fit: Fit) -> int | None:
-    """The weakest member that can't be named whatever its rivals. Tested before anything is weighed, as that fits every rival of every
+    """The weakest member that can't be named whatever its rivals: too small a gain, or none in the means that it must show in. Tested before anything is weighed, as that fits every rival of every
     member."""
-    log_odds = [fit.log_posterior - search.without(fit, i).log_posterior for i in range(len(fit.effects))]
-    weak = [odds for odds in log_odds if odds < search.needed_log_odds]
+    without = [search.without(fit, i) for i in range(len(fit.effects))]
+    log_odds = [fit.log_posterior - one.log_posterior for one in without]
+    weak = [
+        odds
+        for odds, e, one in zip(log_odds, fit.effects, without, strict=True)
+        if odds < search.needed_log_odds or not shown_in_means(search.model, e, fit.effects, one.effects, search.policy)
+    ]
     return log_odds.index(min(weak)) if weak else None
 
 
