@@ -38,11 +38,12 @@ class CopiedFrames:
                 for copy, twin in self.pairs
             )
         named = ", ".join(f"{copy.id} is {twin.id}" for copy, twin in self.pairs[:LISTED])
-        return (
+        line = (
             f"the frames of {len(self.pairs)} captures of the {self.side} camera are copies of others, bit for bit, noise and all ({named} ..): they "
             "weren't taken anew and are left out, so that temporal noise is unknown where no other repeat is left; give frames that were captured "
-            "one by one",
+            "one by one"
         )
+        return (line,)
 
 
 def copied_frames(recordings: RecordingSet, side: Side, captures: Sequence[Capture] | None = None) -> CopiedFrames:

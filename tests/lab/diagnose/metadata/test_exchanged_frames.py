@@ -21,7 +21,7 @@ def test_exchanged_frames_of_two_levels_are_told_and_nothing_else() -> None:
     """A converter whose codes are unequal explains such means, too."""
     recordings = _recorded()
     flats = recordings.captures("flat")
-    one, other = ([c.id for c in flats if c.exposure_s == t][0] for t in sorted({c.exposure_s for c in flats})[2:6:3])
+    one, other = (next(c.id for c in flats if c.exposure_s == t) for t in sorted({c.exposure_s for c in flats})[2:6:3])
     wrong = swapped(recordings, [one], [other])
     corrected, (found,) = misstatements(wrong, "left")
     assert set(found.captures) == {one, other}
