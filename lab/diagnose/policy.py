@@ -206,6 +206,15 @@ class DecisionPolicy(Frozen):
             "95 % of a normal distribution: what is within it isn't told as a size",
         ),
     ] = 2.0
+    least_means_log_odds: Annotated[
+        float,
+        Rule(
+            "name",
+            "log odds",
+            "least gain in log-likelihood, in the numbers that aren't variances, of an effect that changes variances by changing the mean response",
+            "ln(1 / `false_alarm_rate`): without the effect, a likelihood ratio exceeds 1 / p with a probability of p at most (Markov)",
+        ),
+    ] = 4.6
     family_probability: Annotated[
         float,
         Rule(

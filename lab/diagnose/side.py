@@ -14,6 +14,7 @@ from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.outcome.detectability import detectability
 from lab.diagnose.outcome.effect_sets import side_models
@@ -131,7 +132,11 @@ def diagnose_side(
     left = (
         *wrong,
         *unexplained(recordings, side, verdict, corrections, policy),
-        *misstated_light(side, fit.cameras.get(side) if fit is not None else None),
+        *misstated_light(
+            side,
+            fit.cameras.get(side) if fit is not None else None,
+            levels_are_judged=any(b.measurement is PHOTON_TRANSFER for b in model.blocks),
+        ),
     )
     return SideFindings(
         side=side,

@@ -8,6 +8,7 @@ from dataclasses import replace
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.refit import Fit
 from lab.diagnose.inference.search import Search
+from lab.diagnose.inference.shown_in_means import shown_in_means
 from lab.diagnose.inference.weigh import Candidate, closes_somewhere, explained, weigh
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
@@ -41,7 +42,8 @@ def named_members(
                 current = search.fitted(better.effects, converged=True)
                 continue
             without = search.without(current, index)
-            if current.log_posterior - without.log_posterior < search.needed_log_odds:
+            gain, needed = current.log_posterior - without.log_posterior, search.needed_log_odds
+            if gain < needed or search.member_log_odds(current, index) >= needed:
                 given_up.append(replace(candidate, among_listed=()))  # no claim, of its family neither
             # else it explains no more than what the other members' laws may lack: a mismatch beyond that is located without it
             current = without
@@ -121,10 +123,15 @@ def excludes_rivals(candidate: Candidate, policy: DecisionPolicy) -> bool:
 
 
 def _too_weak(search: Search, fit: Fit) -> int | None:
-    """The weakest member that can't be named whatever its rivals. Tested before anything is weighed, as that fits every rival of every
-    member."""
+    """The weakest member that can't be named whatever its rivals: too small a gain, or none in the means that it must show in. Tested before
+    anything is weighed, as that fits every rival of every member."""
     log_odds = [search.member_log_odds(fit, i) for i in range(len(fit.effects))]
-    weak = [odds for odds in log_odds if odds < search.needed_log_odds]
+    weak = [
+        odds
+        for i, (odds, e) in enumerate(zip(log_odds, fit.effects, strict=True))
+        if odds < search.needed_log_odds
+        or not shown_in_means(search.model, e, fit.effects, search.without(fit, i).effects, search.policy)
+    ]
     return log_odds.index(min(weak)) if weak else None
 
 

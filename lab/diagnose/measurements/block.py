@@ -41,6 +41,8 @@ class Measurement:
     quantity: str  # what the numbers are, with their unit: the ordinate of the report's curves
     #: Whether the numbers are levels of frames, which lie between 0 and the white level.
     is_level: bool = False
+    #: Whether the numbers are variances, or correlations, of noise.
+    of_variances: bool = False
     #: The quantity of `Label.condition` ("orientation"). Mismatches are located, and curves drawn, by its values. "": it has none.
     conditions: str = ""
     #: Words before the conditions where the report lists them ("edges at"); "": `conditions`.

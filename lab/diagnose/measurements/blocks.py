@@ -48,7 +48,7 @@ def measurement_model(
     ]
     misstated = frozenset(name for level in misstated_levels(camera_fit) for name in level.captures)
     study = Study(recordings, side, camera, _saturation_dn(camera_fit), misstated)
-    skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for _, reason in study.stale]
+    skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for reason in study.copies.told]
     blocks = []
     for measurement in measurements():
         try:

@@ -117,5 +117,6 @@ DARK_NOISE = Measurement(
     unit="s",
     make=dark_noise_block,
     quantity="temporal variance, DN²",
+    of_variances=True,
     conditions="exposure and temperature",
 )

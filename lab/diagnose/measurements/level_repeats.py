@@ -147,4 +147,5 @@ LEVEL_REPEATS = Measurement(
     unit="log s",
     make=level_repeats_block,
     quantity="variance over noise, cube root",
+    of_variances=True,
 )

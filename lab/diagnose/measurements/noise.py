@@ -110,4 +110,5 @@ NOISE = Measurement(
     unit="DN",
     make=variance_block,
     quantity="temporal variance, DN²",
+    of_variances=True,
 )

@@ -144,4 +144,5 @@ NOISE_NEIGHBOURS = Measurement(
     unit="DN",
     make=neighbour_block,
     quantity="correlation",
+    of_variances=True,
 )

@@ -16,8 +16,8 @@ from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.noise_guess import NoiseGuess, noise_guess
 from lab.diagnose.measurements.reads import LAG, acting
 from lab.diagnose.measurements.saturation import CLIPPED_SHARE, clipping_level_dn
-from lab.diagnose.measurements.stale_frames import stale
 from lab.errors import NotDetermined
+from lab.fit.noise.copied_frames import CopiedFrames, copied_frames
 from lab.formats.recording_set import DataSheet, RecordingSet
 from sim.camera import CameraModel, Side
 from sim.sensor import mosaic
@@ -56,10 +56,9 @@ class Study:
         misstated: frozenset[str] = frozenset(),
     ) -> None:
         self.misstated = misstated
-        #: Captures that are left out, as their frames weren't taken anew: (id, reason in one line).
-        self.stale: tuple[tuple[str, str], ...] = stale(recordings, side)
-        left_out = {name for name, _ in self.stale}
-        self.recordings = recordings.without(left_out) if left_out else recordings
+        #: Captures that are left out, as their frames weren't taken anew.
+        self.copies: CopiedFrames = copied_frames(recordings, side)
+        self.recordings = recordings.without(self.copies.ids) if self.copies.ids else recordings
         self.side, self.camera = side, camera
         #: Clipping level: the converter's highest code, or the full well where that is lower.
         self.saturation_dn = min(camera.white_level_dn, saturation_dn or camera.white_level_dn)

@@ -11,6 +11,7 @@ from lab.diagnose.metadata.black_level import misstated_black_level
 from lab.diagnose.metadata.board_squares import misstated_board
 from lab.diagnose.metadata.cell_size import misstated_cell_size
 from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
+from lab.diagnose.metadata.exchanged_frames import exchanged_kinds, misplaced_frames
 from lab.diagnose.metadata.exchanged_lights import exchanged_lights
 from lab.diagnose.metadata.misstatement import Misstatement
 from lab.diagnose.metadata.mosaic_phase import misstated_mosaic_phase
@@ -22,6 +23,8 @@ __all__ = ["Misstatement", "misstatements", "unchecked"]
 
 #: Each check gets the recordings as corrected by those before it.
 _CHECKS = (
+    exchanged_kinds,
+    misplaced_frames,
     misstated_bit_depth,
     misstated_dark_exposure,
     misstated_black_level,

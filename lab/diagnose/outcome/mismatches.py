@@ -13,6 +13,7 @@ from lab.diagnose.inference.gaussian import Gaussian, chi2
 from lab.diagnose.inference.locate import Slice, describe
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.outlying import OutlyingLevel
+from lab.diagnose.inference.shown_in_means import is_judged_in_means, shown_in_means
 from lab.diagnose.inference.weigh import UNKNOWN, Candidate
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.outcome.improved_model import Correction
@@ -243,6 +244,13 @@ def _nearest(
     name = nearest.effect.name
     index = np.arange(at.start, at.stop)[model.seen[at]]
     others = tuple(e for e in verdict.effects if e.name != name)
+    if not shown_in_means(model, nearest.effect, (*others, nearest.effect), others, policy):
+        why = (
+            "and these don't show it"
+            if is_judged_in_means(model, type(nearest.effect))
+            else "and no light of theirs is stated: state the flats' radiance or photons"
+        )
+        return f"the nearest law is {name}, which has to show in mean levels, {why}"
     left = _seen_chi2(model, model.gaussian((*others, nearest.effect)), index)
     if chi2_without - left < policy.near_share * (chi2_without - len(index)):
         return ""

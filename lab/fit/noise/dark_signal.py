@@ -109,5 +109,6 @@ def refuse_light_darks(recorded: RecordedLevels, dark: DarkSignal) -> None:
                 raise NotDetermined(
                     "noise",
                     f"a flat of {level.exposure_s:g} s has {level.plane[name].mean:.0f} DN and is darker than darks of as long, {expected:.0f} DN: "
-                    "capture the darks again, with the cap on and at the flats' settings",
+                    "darks and flats may be stated for each other: exchange them, or capture the darks again, with the cap on and at the flats' "
+                    "settings",
                 )

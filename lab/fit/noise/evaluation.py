@@ -19,6 +19,9 @@ from lab.fit.noise.saturation import CLIPPED_LIMIT, Saturation, saturation_of
 from lab.formats.recording_set import DataSheet
 
 MIN_LEVELS = 3
+#: Share of saturation that the levels of a figure at saturation have to reach: a parabola through less says nothing of what it does beyond twice
+#: their range.
+LEAST_REACH = 0.5
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,23 @@ class Evaluation:
         ]
         freedom = sum(rest.size - 1 for rest in rests)
         return float(np.sqrt(sum(float(rest @ rest) for rest in rests) / freedom)) if freedom else 0.0
+
+    @cached_property
+    def reach(self) -> float:
+        """Highest level of the photon transfer, as a share of saturation."""
+        return max(
+            (
+                (level.plane[name].mean - self.dark.lines[name].black) / self.saturation.signal_dn[name]
+                for (level, name), used in zip(self.points, self.transfer.used, strict=True)
+                if used and level.lamp != "dark"
+            ),
+            default=0.0,
+        )
+
+    @property
+    def reaches_saturation(self) -> bool:
+        """Whether figures at saturation can be given (`LEAST_REACH`)."""
+        return self.reach >= LEAST_REACH
 
     @property
     def light_scatter(self) -> float:
@@ -152,15 +172,23 @@ def _remark_on_transfer(e: Evaluation) -> None:
             f"the variances of the flats depart from their curve by {100 * t.model_error:.2g} % (rms) beyond what sampling explains "
             "(an uneven converter does that): it is in the uncertainties"
         )
+    share = 1.0 if e.reaches_saturation else e.reach
+    at = "at saturation" if e.reaches_saturation else f"at the highest level, {100 * e.reach:.2g} % of saturation"
+    bend, bend_std = 100 * share * t.relative_curvature, 100 * share * t.relative_curvature_std
+    if not e.reaches_saturation:
+        e.remarks.add(
+            f"the highest level of the photon transfer is {100 * e.reach:.2g} % of saturation, {100 * LEAST_REACH:.0f} % are needed: curvatures at "
+            "saturation aren't given; expose longer, or correct bit_depth or white_level_dn"
+        )
     if t.by_line:
         e.remarks.add(
-            f"the bend of the variances ({100 * t.relative_curvature:+.1f} +- {100 * t.relative_curvature_std:.1f} % at saturation) isn't "
+            f"the bend of the variances ({bend:+.1f} +- {bend_std:.1f} % {at}) isn't "
             "significant against that: the conversion gain is EMVA's straight line to 70 % of saturation; at zero signal "
             f"the curve has {t.curve_gain:.4g} +- {t.curve_gain_std:.2g} DN/e"
         )
     elif abs(t.relative_curvature) > 4.0 * t.relative_curvature_std:
         e.remarks.add(
-            f"the variance bends by {100 * t.relative_curvature:+.1f} +- {100 * t.relative_curvature_std:.1f} % of its line at saturation "
+            f"the variance bends by {bend:+.1f} +- {bend_std:.1f} % of its line {at} "
             "(nonlinear response or brighter-fatter); the conversion gain is that at zero signal"
         )
 

@@ -16,6 +16,10 @@ LINE_LIMIT = 0.7  # of saturation: range of the straight line of EMVA 1288
 CURVE_LIMIT = 0.9  # of saturation: range of the curve, whose top levels determine the curvature
 CURVATURE_PRIOR = 0.1  # standard deviation of c x_saturation / K; three levels are solvable, twenty don't see it
 EXCESS_CHANCE = 1e-3  # probability below which residuals of variances aren't sampling noise
+#: Degrees of freedom of the flats below which the test of their scatter misses an error of the model of three times the sampling's (with six it
+#: sees that in nine of ten series): the error is then taken as the usual one of real converters, a share of the variance beside the unevenness of
+#: the codes over the noise, DN.
+LEAST_FREEDOM, USUAL_ERROR, USUAL_CODE_ERROR_DN = 6.0, 0.01, 0.04
 SIGNIFICANT_SIGMA = 2.0  # standard deviations, with the error of the model, above which a curvature is used
 SECOND_DIFFERENCE_RMS = 12.0**-0.5  # rms of x about its mean over 0..1
 
@@ -115,9 +119,10 @@ def fit_transfer(
             v = (variance - floor[plane])[on_line]
             line = float(np.sum(x * v) / np.sum(x * x))
         line_std = float(np.sqrt(np.sum((x * (v - line * x)) ** 2)) / np.sum(x * x))
-        # The gain at zero signal is anywhere between those of the line and of the curve
+        # The gain at zero signal is anywhere between those of the line and of the curve, which is uncertain by itself:
+        # the mean square of u (curve - line + error) with u uniform in 0..1
         covariance = np.zeros_like(covariance)
-        covariance[0, 0] = line_std**2 + (line - gain) ** 2 / 3.0
+        covariance[0, 0] = line_std**2 + ((line - gain) ** 2 + curve_gain_std**2) / 3.0
         covariance[2:, 2:] = np.diag(floor_std**2) + covariance[0, 0] * np.outer(dark_signal, dark_signal)
         covariance[0, 2:] = covariance[2:, 0] = -covariance[0, 0] * dark_signal
         gain, curvature = line, 0.0
@@ -200,17 +205,21 @@ class TransferPoints:
 
     def model_errors(self, used: NDArray[np.bool_], curve: TransferCurve) -> tuple[float, float]:
         """Relative errors of the model in darks and in flats: those for which chi2 has its expected value; 0 where
-        sampling explains the residuals.
+        sampling explains the residuals, for the flats the usual error where these are too few to tell (`LEAST_FREEDOM`).
 
         Source: Paule and Mandel, J. Res. Natl. Bur. Stand. 87, 377 (1982).
         """
         light = self.light[used]
         squares = [0.0, 0.0]
+        least = 0.0
         active = [False, False]
         for index, group in enumerate((~light, light)):
             freedom = float(np.sum(1.0 - curve.leverage[group])) if group.any() else 0.0
             chi2 = float(np.sum((curve.residual[group] / curve.std[group]) ** 2))
             active[index] = freedom >= 1.0 and bool(special.chdtrc(freedom, chi2) < EXCESS_CHANCE)
+            if index == 1 and freedom < LEAST_FREEDOM and not active[1] and group.any():
+                noise_dn2 = float(np.median(self.variance[used][group]))
+                least = USUAL_ERROR**2 + USUAL_CODE_ERROR_DN**2 / noise_dn2
         for _ in range(40):
             before = list(squares)
             for index, group in enumerate((~light, light)):
@@ -223,7 +232,7 @@ class TransferPoints:
             if np.allclose(squares, before, rtol=1e-3, atol=0.0):
                 break
             curve = self.curve(used, (np.sqrt(squares[0]), np.sqrt(squares[1])))
-        return float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
+        return float(np.sqrt(squares[0])), float(np.sqrt(max(squares[1], least)))
 
     def dark_variances(self, error: float, gain: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """By plane: variance of the darks less the shot noise of their own signal (`gain` times it), its standard

@@ -11,8 +11,10 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
+from lab.fit.noise.copied_frames import copied_frames
 from lab.fit.noise.dark_pixels import DarkPixels, stack_of
 from lab.fit.noise.defective_pixels import defective_pixels
+from lab.fit.noise.exchanged_frames import exchanged_frames
 from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.noise_fit import noise_fit
 from lab.fit.noise.photon_numbers import light_of, why_not
@@ -44,6 +46,13 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
             "noise",
             f"{camera.rows} x {camera.cols} px are too few for a variance: give frames of {MIN_SIZE_PX} x {MIN_SIZE_PX} or more",
         )
+    copies = copied_frames(recordings, side, [*recordings.captures(DarkCapture, side), *flats])
+    if copies.ids:
+        recordings = recordings.without(copies.ids)
+    exchanged = exchanged_frames(recordings, side)
+    if exchanged is not None:
+        recordings = exchanged.corrected
+    flats = recordings.captures(FlatCapture, side)
     gains = [flat.gain_db or 0.0 for flat in flats]
     gain_db = max(sorted(set(gains)), key=gains.count)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
@@ -64,9 +73,14 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
         )
         for group in _grouped(flats, lambda flat: (flat.exposure_s, light[flat.id].amount, lamps[flat.id]))
     ]
-    fitted = noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
+    mishaps = (*copies.told, *((exchanged.told(side),) if exchanged is not None else ()))
+    try:
+        fitted = noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
+    except NotDetermined as refused:
+        raise NotDetermined("noise", "; ".join((*mishaps, refused.reason))) from refused
     reason = why_not(flats, camera)
-    return fitted if reason is None else fitted.model_copy(update={"remarks": (*fitted.remarks, reason)})
+    remarks = (*mishaps, *fitted.remarks, *(() if reason is None else (reason,)))
+    return fitted.model_copy(update={"remarks": remarks})
 
 
 def _mean_c(captures: Sequence[Capture]) -> float | None:

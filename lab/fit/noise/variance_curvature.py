@@ -20,8 +20,11 @@ ADJACENT = {"Y": ("Y",), "R": ("G1", "G2"), "B": ("G1", "G2"), "G1": ("R", "B"),
 def variance_curvature_figures(e: Evaluation) -> dict[str, float]:
     """Percent at saturation, with standard deviations: curvature of the response, of the variance, what the variance
     lacks beyond three times that of the response, and the covariance of neighbours. Reports what bends the variance.
+    Empty where no level is near saturation (`LEAST_REACH`).
     """
     t = e.transfer
+    if not e.reaches_saturation:
+        return {}
     found = {
         "variance_bend_percent": 100.0 * t.relative_curvature,
         "variance_bend_percent_std": 100.0 * t.relative_curvature_std,

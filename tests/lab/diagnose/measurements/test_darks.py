@@ -315,7 +315,7 @@ def test_a_frame_that_was_not_taken_anew_is_left_out_and_told() -> None:
     frames[captures[5].frame] = frames[captures[4].frame].copy()
     stale = RecordingSet(recordings.manifest, frames, {}, {})
     study = Study(stale, "left", camera_model(stale, "left"))
-    assert [name for name, _ in study.stale] == ["d5"]
+    assert study.copies.ids == {"d5"}
     assert "d5" not in {c.id for c in study.recordings.captures("dark")}
     _, skipped = measurement_model(stale, "left")
     lines = [s.reason for s in skipped if "bit for bit" in s.reason]
@@ -324,13 +324,22 @@ def test_a_frame_that_was_not_taken_anew_is_left_out_and_told() -> None:
     assert "\n" not in lines[0]
 
 
-def test_recordings_without_noise_are_not_stale() -> None:
-    """Mean frames, as a simulator leaves them without noise: every repeat is the same."""
+def test_repeats_that_are_all_copies_are_told_in_one_line() -> None:
+    """Every repeat is the first frame: temporal noise is unknown, and the levels are judged all the same."""
     recordings = _sim_darks(10)
     captures = list(recordings.manifest.captures)
     first = {c.exposure_s: np.array(recordings.frame(c)) for c in reversed(captures)}
     still = RecordingSet(recordings.manifest, {c.frame: first[c.exposure_s] for c in captures}, {}, {})
-    assert Study(still, "left", camera_model(still, "left")).stale == ()
+    copies = Study(still, "left", camera_model(still, "left")).copies
+    assert copies.ids == {c.id for c in captures if not np.shares_memory(still.frame(c), still.frame(captures[0]))} - {
+        next(c.id for c in captures if c.exposure_s == exposure_s) for exposure_s in first
+    }
+    model, skipped = measurement_model(still, "left")
+    assert model is not None
+    assert "dark" in {b.measurement.name for b in model.blocks}
+    (line,) = [s.reason for s in skipped if "bit for bit" in s.reason]
+    assert f"{len(copies.ids)} captures" in line
+    assert "temporal noise is unknown" in line
 
 
 @pytest.mark.parametrize("seed", [9, 10])
