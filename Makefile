@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium names soak kills setup run test serve bench proof proof-live slow lint clean
+.PHONY: aravis chromium names soak kills setup run test serve bench proof proof-live real slow lint clean
 
 setup: $(STAMP)
 
@@ -70,6 +70,12 @@ proof-live: $(STAMP)
 NAMES ?= calibench-data/names
 names: $(STAMP)
 	$(BIN)/python -m lab.challenge.names --out $(NAMES) $(ARGS)
+
+# Real recordings through import, fit and diagnose, beside what is known of them by other means: docs/real-recordings.md, compared with
+# its last state. Goes on where it stopped; ARGS="--only SET" runs one, ARGS="--more DIR" takes the sets of another folder.
+REAL ?= ../shared/data
+real: $(STAMP)
+	$(BIN)/python -m benchmarks.real --data $(REAL) --out calibench-data/real $(ARGS)
 
 # The tests that the everyday suite leaves out: recovery and coverage over many draws.
 slow: $(STAMP)

@@ -3,11 +3,12 @@ given."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from lab.diagnose.inference.discrepancy import predictive_discrepancy
 from lab.diagnose.inference.gaussian import ROUNDING, chi2, conditional
 from lab.diagnose.inference.locate import Slice, log_tail
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -79,6 +80,15 @@ def predicts_held_out(model: MeasurementModel, effects: Effects, index: int, ker
     return n == 0 or after < before
 
 
+def _kernels(
+    model: MeasurementModel, effects: Effects, blocks: Sequence[int], policy: DecisionPolicy
+) -> dict[int, FloatArray]:
+    """Kernels of the discrepancies that predict held-out captures beside the effects, by block."""
+    gaussian = model.seen_gaussian(effects)
+    found = {i: predictive_discrepancy(model, gaussian, i, policy) for i in blocks}
+    return {i: d.kernel for i, d in found.items() if d.log_odds > 0 and predicts_held_out(model, effects, i, d.kernel)}
+
+
 def vetoed(
     model: MeasurementModel, candidate: Candidate, effects: Effects, without: Effects, policy: DecisionPolicy
 ) -> VetoedCandidate | None:
@@ -88,15 +98,23 @@ def vetoed(
     right, chi2 rises by it by 2 w.e - lambda, with e normal of variance 1 + lambda / G along w, where G = 2 `log_odds` is what the
     parameters' uncertainty follows from. For a quantile z of that, the rise is z^2 (1 + lambda / G) at most, whatever lambda. Where
     neither set describes the held-out numbers, the noise is as much larger as they show: the lesser chi2 over their number.
+
+    The nearest law of a family stands in the improved model with a discrepancy beside it, and without the name a discrepancy stands alone:
+    these are compared.
     """
     where = model.affected(type(candidate.effect))
-    before, n = model.held_out(without, where)
-    after, _ = model.held_out(effects, where)
+    beside: dict[int, FloatArray] = {}
+    alone: dict[int, FloatArray] = {}
+    if candidate.holds_a_remainder:
+        blocks = model.affected_blocks(candidate.effect)
+        beside, alone = (_kernels(model, each, blocks, policy) for each in (effects, without))
+    before, n = model.held_out(without, where, alone)
+    after, _ = model.held_out(effects, where, beside)
     if n == 0 or after <= before:
         return None
     chosen = where[~model.seen]
-    one, covariance = held_out_residual(model, effects)
-    other, _ = held_out_residual(model, without)
+    one, covariance = held_out_residual(model, effects, beside)
+    other, _ = held_out_residual(model, without, alone)
     difference = (one - other)[chosen]
     size = chi2(difference, covariance[np.ix_(chosen, chosen)])
     uncertain = 1.0 + size / max(2.0 * candidate.log_odds, 1.0)

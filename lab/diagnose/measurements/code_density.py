@@ -79,7 +79,7 @@ def code_block(study: Study) -> Block:
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
     sets: list[tuple[_Codes, sparse.csr_array, list[_Part]]] = []
-    values, covariances = [], []
+    values, covariances, scales = [], [], []
     for held_out in (False, True):
         codes = _prepared(study, counts[held_out])
         if codes is None:
@@ -92,6 +92,8 @@ def code_block(study: Study) -> Block:
             combs @ codes.count,
             np.array([p.excess(residual) - p.number / p.chi2_std for p in parts]),
         ]
+        # unequal codes show in proportion to the number of pixels counted: seen and held-out frames have different ones
+        scales += [np.ones(len(steps) + len(combs)), np.array([p.of_widths for p in parts])]
         linear = np.vstack([steps, combs])
         floor = np.concatenate([np.full(len(steps), STEP_FLOOR * _spacing(study)), np.full(len(combs), COMB_FLOOR)])
         covariances += [
@@ -127,7 +129,7 @@ def code_block(study: Study) -> Block:
 
     return Block(
         measurement=CODE_DENSITY, reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
-        covariance=block_diag(*covariances), labels=tuple(labels), reads=frozenset({"codes.codes"}), predict=predict, scale=np.ones(len(labels)),
+        covariance=block_diag(*covariances), labels=tuple(labels), reads=frozenset({"codes.codes"}), predict=predict, scale=np.concatenate(scales),
         along=np.array(places),
     )  # fmt: skip
 
@@ -312,6 +314,7 @@ class _Part:
     number: int  # of codes used
     variance: FloatArray  # of the residuals; infinite at codes that aren't used
     chi2_std: float  # standard deviation of the residuals' chi2
+    of_widths: float  # excess where the codes' widths have a relative variance of 1, independent of each other
 
     def excess(self, residual: FloatArray) -> float:
         """chi2 of the residuals (codes,) over its standard deviation."""
@@ -320,7 +323,9 @@ class _Part:
 
 def _parts(codes: _Codes) -> list[_Part]:
     """The parts with codes enough. Var(chi2) = 2 n sum_k r_k^2 with the residuals' autocorrelation r of the smoothing filter."""
-    variance = np.asarray(codes.rough.power(2) @ np.maximum(codes.smooth, 1.0))
+    square = codes.rough.power(2)
+    variance = np.asarray(square @ np.maximum(codes.smooth, 1.0))
+    unequal = np.asarray(square @ np.square(codes.smooth))
     found = []
     for part in np.array_split(np.flatnonzero(codes.used), PARTS):
         if len(part) < LEAST_CODES:
@@ -331,9 +336,9 @@ def _parts(codes: _Codes) -> list[_Part]:
         row = row[np.flatnonzero(row)]
         shared = np.correlate(row, row, mode="full") / float(row @ row)
         number = int(kept.sum())
-        found.append(
-            _Part(at, number, np.where(kept, variance[at], np.inf), float(np.sqrt(2.0 * number * np.sum(shared**2))))
-        )
+        chi2_std = float(np.sqrt(2.0 * number * np.sum(shared**2)))
+        of_widths = float(np.sum(unequal[at][kept] / variance[at][kept])) / chi2_std
+        found.append(_Part(at, number, np.where(kept, variance[at], np.inf), chi2_std, of_widths))
     return found
 
 

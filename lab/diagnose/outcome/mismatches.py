@@ -84,7 +84,8 @@ def vetoed_names(side: Side, verdict: Verdict) -> list[VetoedName]:
             chi2_after=one.chi2_with,
             n=one.n,
             statement=f"{one.candidate.told_name} is not named for the {side} camera: the captures that the choice used suggest it, but on "
-            f"held-out captures chi2 rises by it from {one.chi2_without:.0f} to {one.chi2_with:.0f} for {one.n} numbers, more than chance allows.",
+            f"held-out captures chi2 rises by it from {one.chi2_without:.0f} to {one.chi2_with:.0f} for {one.n} numbers, more than chance allows"
+            f"{', with a discrepancy beside its nearest law or in its place' if one.candidate.members else ''}.",
         )
         for one in verdict.vetoed
     ]

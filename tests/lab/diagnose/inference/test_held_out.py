@@ -13,6 +13,7 @@ from lab.diagnose.inference.held_out import held_out_mismatches, predicts_held_o
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
 from lab.diagnose.inference.weigh import Candidate
+from lab.diagnose.measurements.block import Effects, Prediction
 from lab.diagnose.outcome.mismatches import located, vetoed_names
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.charge_diffusion import ChargeDiffusion
@@ -68,6 +69,29 @@ def test_a_right_name_is_seldom_vetoed() -> None:
         candidate = Candidate(fit.effects[0], fit.std[0], 1.0, (), log_odds)
         vetoes += vetoed(model, candidate, fit.effects, (), policy) is not None
     assert vetoes < 4
+
+
+@pytest.mark.parametrize(("over", "is_vetoed"), [(1.0, False), (1.8, True)])
+def test_a_familys_nearest_law_has_to_predict_as_well_as_a_discrepancy(over: float, is_vetoed: bool) -> None:
+    """A law that fits the seen edges, and changes the held-out ones `over` times as much as they do: by 1.8, chi2 still falls to
+    (1.8 - 1)^2 = 64 % of what it is without, but a discrepancy alone predicts them within their noise."""
+    policy, law = DecisionPolicy(), ChargeDiffusion(length_um=0.8)
+    model = contrast_model(np.random.default_rng(8), (law,))
+    block = model.blocks[0]
+
+    def predict(acting: Effects) -> Prediction:
+        mean = block.predict(()).mean
+        return Prediction(mean + np.where(model.seen, 1.0, over) * (block.predict(acting).mean - mean), {})
+
+    model = MeasurementModel((replace(block, predict=predict),), CAMERA)
+    gain = 0.5 * (model.seen_gaussian().chi2(model.seen_value) - model.seen_gaussian((law,)).chi2(model.seen_value))
+    members = ((law.name, 1.0),)
+    candidate = Candidate(law, {}, 1.0, (), gain, is_closed=False, members=members)
+    before, after = model.held_out(())[0], model.held_out((law,))[0]
+    assert after < before
+    found = vetoed(model, candidate, (law,), (), policy)
+    assert (found is not None) == is_vetoed
+    assert vetoed(model, replace(candidate, members=()), (law,), (), policy) is None
 
 
 def test_a_discrepancy_that_held_out_captures_lack_is_dropped() -> None:

@@ -101,6 +101,17 @@ def test_other_combs_are_located_and_at_most_their_family_is_named(law: Law) -> 
     assert {c.told_name for c in verdict.named} <= {"converter"}
 
 
+def test_unequal_codes_show_alike_in_seen_and_in_held_out_frames() -> None:
+    """Over the block's scale, which holds the number of counted pixels, the counts' excess variance is the variance of the codes' widths. A
+    gain of 1.1 leaves one code of eleven out and makes the others 1.1 wide: 1.1^2 10 / 11 - 1 = 0.1. Filters and unequal counts add some
+    per cent, which a part of a few hundred codes knows to 3 sqrt(2 / 300) = 25 %."""
+    block = code_block(_study(772302, (DigitalGainLaw(10.0),)))
+    at = [i for i, label in enumerate(block.labels) if label.channel == "variance"]
+    held_out = np.array([block.labels[i].held_out for i in at])
+    assert block.value[at][~held_out].mean() > 1.5 * block.value[at][held_out].mean()
+    assert block.value[at] / block.scale[at] == pytest.approx(np.full(len(at), 0.1), rel=0.25)
+
+
 @pytest.mark.parametrize("variant", [2, 3])
 def test_a_ripple_is_named_and_a_saw_tooth_is_the_converter(variant: int) -> None:
     """2.5 DN sin(2 pi code / 512 + phase): amplitude and period within three standard deviations. A saw tooth over 1024 codes is off by
