@@ -32,9 +32,7 @@ from lab.challenge.truth import load, store
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws.charge import ChargeDiffusionLaw
-from mocks.former.laws.imaging import OpticalLowPassFilterLaw, PixelApertureLaw
+from mocks.former import LISTED, ConcealedCamera, Law, Plan
 from sim.effects.library import effects as library
 from sim.parameters import Frozen
 
@@ -131,15 +129,16 @@ def _strong(number: int) -> Made:
 
 def blur_law(number: int, pitch_um: float, side_um: float) -> Law:
     """Return the blur of a case: filters, diffusions and apertures in turn, of drawn size and form."""
-    rng = np.random.default_rng([SEED, number, 3])
+    rng, laws = np.random.default_rng([SEED, number, 3]), {law.name: law for law in LISTED}
     if number % 3 == 1:
-        return OpticalLowPassFilterLaw(pitch_um * rng.uniform(*FILTER_PX), int(rng.integers(2)))
+        return laws["optical_low_pass_filter"](pitch_um * rng.uniform(*FILTER_PX), int(rng.integers(2)))
     if number % 3 == 2:
-        return ChargeDiffusionLaw(pitch_um * rng.uniform(*DRIFT_PX), int(rng.integers(3)))
-    seed = next(
-        s for s in range(100) if PixelApertureLaw(1.0, 0, s).sign < 0.0
-    )  # an aperture that is smaller than stated
-    return PixelApertureLaw(side_um * rng.uniform(*SIDE_CHANGE), int(rng.integers(3)), seed)
+        return laws["charge_diffusion"](pitch_um * rng.uniform(*DRIFT_PX), int(rng.integers(3)))
+    aperture = laws["pixel_aperture"]
+    smaller = next(
+        s for s in range(100) if aperture(1.0, 0, s).sign < 0.0
+    )  # seed of an aperture that is smaller than stated
+    return aperture(side_um * rng.uniform(*SIDE_CHANGE), int(rng.integers(3)), smaller)
 
 
 def _blur(number: int) -> Made:
