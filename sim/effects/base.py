@@ -1,7 +1,7 @@
 """What a physical effect declares and where it acts. One effect, one file; `sim.effects.library` lists them.
 
 A first-order camera model leaves physics out. Each effect is one such piece: a change to a stage of the chain of light
-(`sim.stages`). An effect writes those of the seven methods below that it needs, and its parameters as fields.
+(`sim.stages`). An effect writes those of the nine methods below that it needs, and its parameters as fields.
 """
 
 from __future__ import annotations
