@@ -97,7 +97,7 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
     `false_alarm_rate`: probability of any `changed` between two calibrations of an unchanged rig. It is shared among the n
     rows of the comparison (Sidak): each is `changed` beyond z sigma with 2 (1 - Phi(z)) = 1 - (1 - rate)^(1/n), 4.1 for
     the 239 rows of a session with eight edges, 4.4 for 1000. Rows are taken as independent. They are not; the true rate is
-    lower. `tests/recovery/test_compare_coverage.py` measures it on 105 comparisons of an unchanged pair.
+    lower. `tests/recovery/test_compare_coverage.py` measures it on 105 comparisons of an unchanged camera.
     """
     skipped: list[Skipped] = []
     rows: list[Change] = []
@@ -399,6 +399,8 @@ def _rotation_changes(a: StereoFit, b: StereoFit) -> Iterator[Change]:
             continue
         yield Change(
             name="stereo rotation_mrad",
+            title=plain_name("stereo rotation_mrad", f"about {axis}"),
+            unit=unit_of("stereo rotation_mrad"),
             where=f"about {axis}, from A's",
             a=0.0,
             a_std=std_a,

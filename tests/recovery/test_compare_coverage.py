@@ -5,7 +5,7 @@ noise is new, the sensor is warmer or cooler, the lamp swings and the radiometer
 (`mocks.bench`: 0.15 % and 2e-9 W sr^-1 m^-2 nm^-1 a sample of 2 nm, a swing of 0.04 % in 2400 s). What changed is told:
 `tests/lab/fit/test_compare.py`.
 
-`pytest -m slow -s tests/recovery/test_compare_coverage.py` prints the number of alarms; about six minutes of one core.
+`pytest -m slow -s tests/recovery/test_compare_coverage.py` prints the number of alarms; some three minutes of one core.
 """
 
 from __future__ import annotations

@@ -17,9 +17,7 @@ from lab.formats.results import ChannelGeometry
 
 Array = NDArray[np.floating[Any]]
 
-HUBER_STD = (
-    1.5  # standard deviations of a coordinate from which residuals lose weight: 95 % efficient where they are normal
-)
+HUBER_STD = 1.5  # standard deviations of a coordinate from which residuals lose weight
 MOST_ITERATIONS = 50
 
 
@@ -101,18 +99,14 @@ def _fitted_shift(shift: Array, jacobian: Array, trusted: NDArray[np.bool_]) -> 
     weight = np.ones(len(shift))
     values = np.zeros(len(scale))
     for _ in range(MOST_ITERATIONS):
-        root = np.sqrt(weight)[:, None]
-        before, values = (
-            values,
-            np.linalg.lstsq((design * root[..., None]).reshape(-1, len(scale)), (shift * root).ravel(), rcond=1e-12)[0],
-        )
+        root, before = np.sqrt(weight)[:, None], values
+        weighted = (design * root[..., None]).reshape(-1, len(scale))
+        values = np.linalg.lstsq(weighted, (shift * root).ravel(), rcond=1e-12)[0]
         rest = shift - design @ values
         away = np.linalg.norm(rest, axis=1)
         std = max(1.4826 * float(np.median(np.abs(rest))), 1e-6)
         weight = np.minimum(1.0, HUBER_STD * std / np.maximum(away, 1e-12))
-        if (
-            np.max(np.abs(values - before)) < 1e-3 * std
-        ):  # the design's columns have norm 1: a share of the error of a value
+        if np.max(np.abs(values - before)) < 1e-3 * std:  # the design's columns have norm 1: `std` is that of a value
             break
     # Beyond the bend, Huber's influence has no slope along the residual and that of its weight across
     slope = np.where(weight < 1.0, 0.5 * weight, 1.0)

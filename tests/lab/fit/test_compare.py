@@ -197,6 +197,12 @@ def test_each_number_has_a_name_of_its_own():
     assert names == ["psf b G psf", "psf_field b G part 1 psf", "psf_field b G part 2 psf"]
 
 
+def test_every_row_has_a_plain_name():
+    found = compare(made(1), made(2))
+    assert all(row.title for row in found.changes)
+    assert {row.title: row.unit for row in found.changes}["stereo rotation about x"] == "mrad"
+
+
 def test_one_point_of_a_curve_is_found_with_its_place():
     other = made(2)
     curve = list(other.cameras["left"].spectral.quantum_efficiency["G"])

@@ -7,7 +7,7 @@ import pytest
 
 from lab.fit.geometry.calibration import calibrate_robustly
 from lab.fit.geometry.corners import CornerFits
-from lab.fit.geometry.lateral_colour import channel_geometry
+from lab.fit.geometry.lateral_colour import _fitted_shift, channel_geometry
 from tests.lab.fit.projected import SHAPE, poses, seen
 
 
@@ -41,3 +41,19 @@ def test_colours_of_a_camera_without_lateral_colour_agree(charuco_fits):
             assert np.all(np.abs(channel.centre_shift_px) < 5 * np.array(channel.centre_shift_px_std))
             assert np.abs(channel.centre_shift_px).max() < 0.02
             assert abs(channel.radial_shift_px[-1]) < 5 * channel.radial_shift_px_std[-1]
+
+
+def test_corners_with_large_errors_move_the_shift_by_no_more_than_its_uncertainty():
+    """A quarter of the corners has errors of 0.05 +- 0.02 px to the right, the same in every session, as demosaicing makes them.
+
+    From session to session only noise of 0.007 px is new. Over 60 sessions, a standard deviation is known to 1 / sqrt(120) = 9 %: 3 sigma is 28 %.
+    """
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(-1, 1, (2, 300))
+    jacobian = np.zeros((300, 2, 3))
+    jacobian[:, 0, 0], jacobian[:, 1, 0], jacobian[:, 0, 1], jacobian[:, 1, 2] = x, y, 1.0, 1.0
+    same = np.zeros((300, 2))
+    same[:75, 0] = rng.normal(0.05, 0.02, 75)
+    fits = [_fitted_shift(same + rng.normal(0, 0.007, (300, 2)), jacobian, np.ones(300, bool)) for _ in range(60)]
+    spread = np.std([fit[0] for fit in fits], axis=0, ddof=1)
+    assert np.all(spread < 1.28 * np.mean([np.sqrt(np.diag(fit[1])) for fit in fits], axis=0))
