@@ -32,6 +32,8 @@ from sim.scene.scenes import Scene
 from sim.spectrum import Spectrum
 
 Cells = NDArray[np.uint8]
+#: Longest exposure of a plan, and of a capture that was exposed in seconds.
+LONGEST_EXPOSURE_S = 3600.0
 
 # --- the manifest's entry ----------------------------------------------------------------------------------------------
 
@@ -101,7 +103,8 @@ class Capture(Open):
 
     def remarks(self) -> Iterator[str]:
         """Warnings about the keys, with a remedy. The capture is used nevertheless."""
-        return iter(())
+        if self.exposure_s > LONGEST_EXPOSURE_S:
+            yield f"exposure_s is above {LONGEST_EXPOSURE_S:g} s: state it in seconds, not in milliseconds or microseconds"
 
     def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
         """The scene for the forward model; None where the manifest doesn't determine it.

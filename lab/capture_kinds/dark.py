@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from lab.capture_kinds.base import (
+    LONGEST_EXPOSURE_S,
     Capture,
     Equipment,
     FixedExposure,
@@ -46,9 +47,9 @@ class DarkSequence(Sequence):
     purpose: ClassVar[str] = "black level, read noise, DSNU, dark current"
     targets: ClassVar[tuple[type[Target], ...]] = (CapTarget,)
 
-    exposures_s: Annotated[tuple[float, ...], Quantity("s", "exposures of the series", lower=1e-6, upper=3600.0)] = (
-        Field(min_length=1, max_length=200)
-    )
+    exposures_s: Annotated[
+        tuple[float, ...], Quantity("s", "exposures of the series", lower=1e-6, upper=LONGEST_EXPOSURE_S)
+    ] = Field(min_length=1, max_length=200)
     frames: Annotated[int, Quantity("1", "frames at each exposure", lower=1, upper=20_000)]
 
     @model_validator(mode="after")

@@ -121,6 +121,7 @@ class FlatCapture(IrradianceCapture):
     photons_per_pixel: float | None = Field(default=None, ge=0)
 
     def remarks(self) -> Iterator[str]:
+        yield from super().remarks()
         if self.irradiance_w_m2 is not None and self.wavelength_nm is None:
             yield "irradiance_w_m2 without wavelength_nm: the number of photons isn't known; add the wavelength"
         if self.radiance is None and self.photons_per_pixel is None and self.irradiance_w_m2 is None:

@@ -97,18 +97,19 @@ def _judged(
     """Judge a diagnosis. `wanted`: (name, side) of what is concealed; `right_besides`: by such a name, others that are right in its place:
     families, and effects that describe it as well."""
     named = {(e.name, side) for e in found.effects for side in e.sides}
-    stand_ins = {(other, side): name for name, side in wanted for other in right_besides.get(name, frozenset())}
-    for others in right_besides.values():
-        stand_ins |= {(other, "left"): "" for other in others if (other, "left") not in stand_ins}
-    false = {one for one in named if one not in wanted and one not in stand_ins}
-    told = {name for name, _ in named} | {stand_ins[one] for one in named if one in stand_ins}
+    sides = {side for _, side in wanted} or {"left"}
+    stands_for = {
+        (other, side): (name, side) for name, others in right_besides.items() for other in others for side in sides
+    }
+    told = named | {stands_for[one] for one in named if one in stands_for}
+    false = {one for one in named if one not in wanted and one not in stands_for}
     return NameRun(
         case="",
         concealed=tuple(sorted(f"{name} ({side})" for name, side in wanted)),
         verdict=found.verdict,
         named=tuple(sorted(f"{name} ({side})" for name, side in named)),
         false=tuple(sorted(f"{name} ({side})" for name, side in false)),
-        missing=tuple(sorted(f"{n} ({s})" for n, s in wanted if (n, s) not in named and n not in told)),
+        missing=tuple(sorted(f"{name} ({side})" for name, side in wanted - told)),
     )
 
 

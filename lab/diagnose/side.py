@@ -65,6 +65,7 @@ class SideFindings:
     """The findings on one side.
 
     is_judged  whether any measurement is determined
+    gain_is_known  whether a conversion gain is stated or measured; else electrons are those of 1 DN/e
     threshold  of an effect's score; None where no effect acts on the measurements
     improved   the improved model
     settling   what to capture for a mismatch without a name, as a sentence
@@ -73,6 +74,7 @@ class SideFindings:
     side: Side
     skipped: tuple[Skipped, ...]
     is_judged: bool = False
+    gain_is_known: bool = True
     threshold: float | None = None
     mismatches: tuple[Mismatch, ...] = ()
     named: tuple[NamedCandidate, ...] = ()
@@ -142,6 +144,7 @@ def diagnose_side(
         side=side,
         skipped=skipped,
         is_judged=True,
+        gain_is_known=model.gain_is_known,
         threshold=verdict.threshold if np.isfinite(verdict.threshold) else None,
         mismatches=tuple(located(side, verdict)),
         named=tuple(

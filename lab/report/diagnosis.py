@@ -11,6 +11,7 @@ from scipy import special
 
 from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.outcome.detectability import detectable
+from lab.diagnose.outcome.in_dn import told_as
 from lab.formats.results import DiagnosisResult, ExaminedPlace, ResidualCurve, ResidualPicture, Visibility
 from lab.report.charts import Figure, axis, layout
 from lab.report.figures import SHOWN_UNITS
@@ -181,9 +182,13 @@ def _visibility(items: Sequence[Visibility]) -> dict[str, dict[Side, _Detectable
     """Effect -> side -> cells of the table, in the order of the names."""
     table: dict[str, dict[Side, _Detectable]] = {}
     for item in sorted(items, key=lambda item: item.effect):
-        units = {name: quantity.unit for name, quantity in library()[item.effect].quantities().items()}
+        units = dict(
+            told_as(name, quantity, gain_is_known=known)
+            for name, quantity in library()[item.effect].quantities().items()
+            for known in (True, False)
+        )
         sizes = [
-            f"{name.removesuffix('_' + ('percent' if units[name] == '%' else units[name])).replace('_', ' ')} {value:.2g} "
+            f"{name.removesuffix('_' + ('percent' if units[name] == '%' else units[name].lower())).replace('_', ' ')} {value:.2g} "
             f"{SHOWN_UNITS.get(units[name], '' if units[name] == '1' else units[name])}".strip()
             for name, value in item.smallest.items()
         ]

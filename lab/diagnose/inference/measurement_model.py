@@ -53,13 +53,14 @@ class MeasurementModel:
 
     `always` are effects that the baseline has: they act first, and their laws have tolerances like those of others.
     `unstated_jacobian` has columns (n,) by nuisance parameters that stand for what nobody states, per prior standard
-    deviation. Predictions are cached by block, as most effects act on few blocks.
+    deviation. `gain_is_known`: whether the camera's conversion gain is stated or measured, and not 1 for want of both. Predictions are cached by block, as most effects act on few blocks.
     """
 
     blocks: tuple[Block, ...]
     camera: CameraModel
     always: tuple[Effect, ...] = ()
     unstated_jacobian: Mapping[str, FloatArray] = field(default_factory=dict)
+    gain_is_known: bool = True
     _predictions: dict[tuple[int, ...], Prediction] = field(default_factory=dict)
     _covariances: dict[tuple[bytes, tuple[int, ...], tuple[float, float]], BlockCovariance] = field(
         default_factory=dict

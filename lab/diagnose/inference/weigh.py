@@ -16,7 +16,6 @@ from lab.diagnose.inference.search import Search
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
 from sim.effects.library import changed_by
-from sim.effects.library import effects as library
 from sim.effects.other_f_number import OtherFNumber
 from sim.point import TRANSFER
 
@@ -113,7 +112,8 @@ def weigh(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | None]:
     for name, tried in fits.items():
         weights[name] = tried.log_posterior
         if tried.log_posterior > fit.log_posterior - policy.hopeless_log_odds:
-            common = [i for i in affected if model.blocks[i].touched_by(library()[name])]
+            kind = next(type(e) for e in tried.effects if e.name == name)
+            common = [i for i in affected if model.blocks[i].touched_by(kind)]
             weights[name] += with_discrepancies(model.seen_gaussian(tried.effects), common)
     log_prior = fit.log_posterior - fit.log_likelihood
     as_they_are = (

@@ -24,6 +24,11 @@ from sim.spectrum import FloatArray
 LEAST_SIDE, APERTURES, APERTURE_DIRECTIONS = 0.5, 10, 4
 #: Remark on an assumed quantity that has nuisance parameters.
 FREE_BESIDE = {"fill_factor": ", but contrast may be that of any aperture"}
+#: Remark where nothing tells the conversion gain.
+NO_GAIN = (
+    "neither stated nor measured: what is told in electrons elsewhere is told in DN, and the improved model takes 1 DN/e; capture repeated flats at "
+    "three levels, or state it"
+)
 #: Share of the fitted full well from which on a pixel counts as clipped, as noise takes some pixels of that level to the full well.
 _NEAR_FULL = 0.985
 
@@ -49,6 +54,8 @@ def measurement_model(
     misstated = frozenset(name for level in misstated_levels(camera_fit) for name in level.captures)
     study = Study(recordings, side, camera, _saturation_dn(camera_fit), misstated)
     skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for reason in study.copies.told]
+    if not study.noise.gain_is_known:
+        skipped.append(Skipped(step="diagnose conversion_gain_dn_per_e", reason=NO_GAIN, side=side))
     blocks = []
     for measurement in measurements():
         try:
@@ -59,7 +66,7 @@ def measurement_model(
     always = baseline.effects if baseline is not None else ()
     if not blocks:
         return None, tuple(skipped)
-    model = MeasurementModel(tuple(blocks), study.camera, always)
+    model = MeasurementModel(tuple(blocks), study.camera, always, gain_is_known=study.noise.gain_is_known)
     if study.stated.fill_factor is None and baseline is None:
         model = replace(model, unstated_jacobian=_any_aperture(model))
     return model, tuple(skipped)

@@ -13,7 +13,9 @@ from lab.diagnose.metadata.cell_size import misstated_cell_size
 from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
 from lab.diagnose.metadata.exchanged_frames import exchanged_kinds, misplaced_frames
 from lab.diagnose.metadata.exchanged_lights import exchanged_lights
+from lab.diagnose.metadata.exposure_unit import misstated_exposure_unit
 from lab.diagnose.metadata.misstatement import Misstatement
+from lab.diagnose.metadata.mono_sensor import misstated_mosaic
 from lab.diagnose.metadata.mosaic_phase import misstated_mosaic_phase
 from lab.diagnose.metadata.unchecked import unchecked
 from lab.formats.recording_set import RecordingSet
@@ -23,11 +25,13 @@ __all__ = ["Misstatement", "misstatements", "unchecked"]
 
 #: Each check gets the recordings as corrected by those before it.
 _CHECKS = (
+    misstated_exposure_unit,
     exchanged_kinds,
     misplaced_frames,
     misstated_bit_depth,
     misstated_dark_exposure,
     misstated_black_level,
+    misstated_mosaic,
     misstated_mosaic_phase,
     exchanged_lights,
     misstated_cell_size,

@@ -9,6 +9,7 @@ from scipy import optimize, special
 
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.score import signatures
+from lab.diagnose.outcome.in_dn import told_as
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import Visibility
 from sim.camera import Side
@@ -50,7 +51,10 @@ def detectability(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Itera
         yield Visibility(
             side=side,
             effect=name,
-            smallest=_smallest(library()[name], members, needed),
+            smallest={
+                told_as(field, library()[name].quantities()[field], gain_is_known=model.gain_is_known)[0]: size
+                for field, size in _smallest(library()[name], members, needed).items()
+            },
             nearest=nearest,
             cosine=cosine,
             told_apart=float(special.ndtr(0.5 * np.sqrt(needed * (1.0 - cosine**2)))),

@@ -99,7 +99,9 @@ def improved_model(
             said = f"{name}: a factor on the {kind}" + ("" if is_shared else f"; the mean of what goes {one.grouping}")
         corrections.append(Correction(block.measurement.name, kind, said))
     improved = camera.model_copy(update={"quantum_efficiency": curves})
-    return CameraFile(f"{recordings.manifest.name} {side}".strip(), improved, tuple(acting)), tuple(corrections)
+    unknown = "" if model.gain_is_known else ", conversion gain unknown: electrons of 1 DN/e are DN"
+    name = f"{recordings.manifest.name} {side}{unknown}".strip()
+    return CameraFile(name, improved, tuple(acting)), tuple(corrections)
 
 
 def _applied(

@@ -10,6 +10,7 @@ from lab.diagnose.effect_list import choice_values
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.outcome.effect_sets import set_sentences
+from lab.diagnose.outcome.in_dn import told_as
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
@@ -86,6 +87,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
 def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedEffect]:
     """The named effects of all sides, one item a name."""
     by_name: dict[str, list[tuple[Side, NamedCandidate]]] = {}
+    with_gain = {findings.side for findings in found if findings.gain_is_known}
     for findings in found:
         for one in findings.named:
             by_name.setdefault(one.candidate.told_name, []).append((findings.side, one))
@@ -95,6 +97,8 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
         # of sides whose nearest laws differ, the parameters are those of the likelier one
         kind = library()[held[0].name if held else name]
         alike = [one.candidate for _, one in members if one.candidate.effect.name == kind.name]
+        in_electrons = [one.candidate for side, one in members if side in with_gain and one.candidate in alike]
+        alike = in_electrons or alike
         candidates = alike or [max((one.candidate for _, one in members), key=lambda c: c.log_odds)]
         kind = type(candidates[0].effect)
         rivals: dict[str, float] = {}
@@ -108,8 +112,9 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 continue
             values_of_sides = [(float(getattr(c.effect, field)), c.std.get(field)) for c in candidates]
             value, std = _mean(values_of_sides, is_shared="light" in kind.stages())
+            told, unit = told_as(field, quantity, gain_is_known=bool(in_electrons))
             is_signed = all(field not in c.unsigned for c in candidates)
-            parameters[field] = ParameterValue(value=value, std=std, unit=quantity.unit, sign_known=is_signed)
+            parameters[told] = ParameterValue(value=value, std=std, unit=unit, sign_known=is_signed)
         chosen = [_choices(c.effect) for c in candidates]
         choices = {
             field: " and ".join(dict.fromkeys(one[field] for one in chosen if field in one)) for field in chosen[0]
@@ -195,7 +200,7 @@ def _family_statement(
 
 def _plain_name(field: str, unit: str) -> str:
     """Return a parameter's name in words, without its unit."""
-    return field.removesuffix("_" + unit).replace("_", " ")
+    return field.removesuffix("_" + unit.lower()).replace("_", " ")
 
 
 def _number(parameter: ParameterValue) -> str:

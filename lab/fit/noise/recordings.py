@@ -11,6 +11,7 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
+from lab.fit.noise.alike_planes import alike_planes
 from lab.fit.noise.copied_frames import copied_frames
 from lab.fit.noise.dark_pixels import DarkPixels, stack_of
 from lab.fit.noise.defective_pixels import defective_pixels
@@ -73,7 +74,8 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
         )
         for group in _grouped(flats, lambda flat: (flat.exposure_s, light[flat.id].amount, lamps[flat.id]))
     ]
-    mishaps = (*copies.told, *((exchanged.told(side),) if exchanged is not None else ()))
+    alike = alike_planes(recordings, side)
+    mishaps = (*copies.told, *(one.told(side) for one in (exchanged, alike) if one is not None))
     try:
         fitted = noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
     except NotDetermined as refused:

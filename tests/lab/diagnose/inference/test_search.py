@@ -13,6 +13,7 @@ import pytest
 from lab.diagnose.inference.decide import _with_every_mode, decide
 from lab.diagnose.inference.gaussian import BlockCovariance
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.naming import _still_certain, named_members
 from lab.diagnose.inference.score import prototype_changes, signatures_of
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate
@@ -158,6 +159,38 @@ def test_scores_beside_a_law_that_holds_are_by_the_tolerance_that_it_needs() -> 
     whole = signatures_of(search.model, fit.effects, [c for c in search.changes if c[0] is _Bend], fit.jacobian)
     needed = {score.effect: score.value for score in search.signatures(fit).scores()}
     assert needed[_Bend] > 1.0 > 10.0 * whole.scores()[0].value
+
+
+def test_what_a_strong_law_may_lack_is_no_second_effect() -> None:
+    """A line of 5 DN and an arch of 0.1 DN, where a law may lack 5 % of its own change: the arch fits, and isn't told. Without the strong line
+    beside it, the same arch is."""
+    truth, policy = (_Up(size_dn=5.0), _Arch(size_dn=0.1)), DecisionPolicy(beside_tolerance=0.05)
+    search = _search(truth, 60, policy)
+    fit = search.fitted(truth, converged=True)
+    gain = fit.log_posterior - search.without(fit, 1).log_posterior
+    assert gain > search.needed_log_odds > search.member_log_odds(fit, 1)
+    named, given_up = named_members(search, fit, lambda _: None)
+    assert "arch" not in [c.effect.name for c in (*named, *given_up)]
+    alone = _search(truth[1:], 60, policy)
+    named, _ = named_members(alone, alone.fitted(truth[1:], converged=True), lambda _: None)
+    assert [c.effect.name for c in named] == ["arch"]
+
+
+def test_what_was_certain_beside_another_effect_is_weighed_again_without_it() -> None:
+    """Both show in the one measurement there is: when the wave leaves, the arch isn't certain any more."""
+    search = _search((_Arch(size_dn=0.3), _Wave(size_dn=0.1)), 1)
+    fit = search.fitted((_Arch(size_dn=0.3), _Wave(size_dn=0.1)), converged=True)
+    certain = {"arch": Candidate(fit.effects[0], fit.std[0], 1.0, (), 500.0)}
+    assert _still_certain(search, certain, fit, fit) == certain
+    assert _still_certain(search, certain, fit, search.without(fit, 1)) == {}
+
+
+def test_a_set_that_was_vetoed_is_not_returned_to() -> None:
+    search = _search((_Up(size_dn=0.1), _Wave(size_dn=0.05)), 5)
+    best = search.best()
+    rest = search.fitted((best.effects[best.names.index("up")],), converged=True)
+    named, _ = named_members(search, rest, lambda _: None, barred={frozenset(best.names)})
+    assert [c.effect.name for c in named] in (["up"], [])
 
 
 def test_sets_that_the_numbers_cannot_tell_apart_share_the_probability() -> None:
