@@ -128,8 +128,8 @@ def test_a_named_folder_is_taken_through_once_and_compared(tmp_path: Path, capsy
     (one / "means.csv").write_text(SWEEP + "\n".join(rows) + "\n", encoding="utf-8")
     (one / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 12\n', encoding="utf-8")
     (one / "independent.toml").write_text(INDEPENDENT.replace("VALUE", "1.0"), encoding="utf-8")
-    out = tmp_path / "out"
-    main(data=tmp_path, out=out, more=tmp_path / "sets")
+    out = tmp_path / "out" / "sets"
+    main(data=tmp_path, out=tmp_path / "out", more=tmp_path / "sets")
     assert "mine: fitted" in capsys.readouterr().out
     kept = kept_in(out / "kept.json").sets["mine"]
     assert kept.cpu_s > 0.1
@@ -141,7 +141,7 @@ def test_a_named_folder_is_taken_through_once_and_compared(tmp_path: Path, capsy
     (one / "independent.toml").write_text(INDEPENDENT.replace("VALUE", "0.5"), encoding="utf-8")
     before = (out / "mine" / "cost.json").stat().st_mtime_ns
     with pytest.raises(SystemExit, match="green at 500 nm: pull"):
-        main(data=tmp_path, out=out, more=tmp_path / "sets")
+        main(data=tmp_path, out=tmp_path / "out", more=tmp_path / "sets")
     assert (out / "mine" / "cost.json").stat().st_mtime_ns == before
     assert kept_in(out / "kept.json").sets["mine"] == kept  # nothing is written
 

@@ -26,13 +26,19 @@ def main(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="where results are kept, set by set")],
     more: Annotated[
         Path | None,
-        typer.Option("--more", metavar="DIR", help="take the sets in this folder instead; page and JSON go to --out"),
+        typer.Option(
+            "--more", metavar="DIR", help="take the sets in this folder instead; page and JSON go to --out/DIR"
+        ),
     ] = None,
     only: Annotated[list[str] | None, typer.Option("--only", metavar="SET", help="this set; may be repeated")] = None,
     accept: Annotated[bool, typer.Option("--accept", help="keep results that got worse")] = False,
 ) -> None:
     """Take real recordings through import, fit and diagnose, and compare with the results that were kept. Goes on where it stopped."""
-    page, json, folder = (PAGE, JSON, data) if more is None else (out / "page.md", out / "kept.json", more)
+    page, json, folder, out = PAGE, JSON, data.resolve(), out.resolve()
+    if more is not None:
+        folder = more.resolve()
+        out /= folder.name
+        page, json = out / "page.md", out / "kept.json"
     declared = declared_sets() if more is None else sets_in(more)
     unknown = sorted(set(only or ()) - set(declared))
     if unknown:

@@ -96,7 +96,7 @@ def run_set(one: DeclaredSet, folder: Path, out: Path) -> Cost:
         state=state,
         cpu_s=usage.ru_utime + usage.ru_stime,
         memory_mb=usage.ru_maxrss / 1024.0,
-        failed=said[-1] if status else "",
+        failed=said[-1].replace(str(folder), folder.name) if status else "",
     )
     store(cost, out / COST)
     return cost
