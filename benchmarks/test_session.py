@@ -1,7 +1,8 @@
 """All fits of a whole session and its diagnosis, as a user runs them: wall clock, CPU time and memory of `calibench fit` and `diagnose`.
 
 Two cameras of 1280 x 960, some 190 frames of each (`benchmarks.big_session`, 1 GB, in a temporary folder), of which all are read and
-looked through. Wanted on two cores: 90 s for the fits, 240 s for the diagnosis with them.
+looked through. Wanted on two cores: 90 s for the fits, 240 s for the diagnosis with them. And the diagnosis of one camera of 600 frames of
+a megapixel (`benchmarks.many_frames`, 1.2 GB): 90 s.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import contextlib
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -30,6 +32,7 @@ from lab.formats import recording_set as recording
 
 T = TypeVar("T")
 WANTED_S, WANTED_BYTES = {"fit": 90.0, "diagnose": 240.0}, 3 << 30
+MANY_FRAMES_S, MANY_FRAMES_BYTES = 90.0, 3 << 29
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(7200)]
 
 
@@ -83,6 +86,31 @@ def test_the_command(session: Path, tmp_path: Path, name: str) -> None:
     found = json.loads((tmp_path / "found.json").read_text())
     assert found["skipped"] == [] if name == "fit" else found["verdict"] == "explained"
     assert memory < WANTED_BYTES
+
+
+def test_many_frames(tmp_path: Path) -> None:
+    """Every frame is read a few times and not kept: memory is that of single frames, and of the 256 MB that a set keeps."""
+    folder = tmp_path / "set"
+    command = [sys.executable, "-m", "benchmarks.many_frames"]
+    try:
+        subprocess.run([*command, "write", str(folder)], check=True)
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        begun = time.perf_counter()
+        memory = _most_held_bytes([*command, "diagnose", str(folder)])
+        wall = time.perf_counter() - begun
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    show(
+        "diagnosis of one camera of 1024 x 1024: 300 darks and 300 flats",
+        [
+            Row("wall clock, as busy as this machine is", wall, MANY_FRAMES_S, "s", "wanted on free cores"),
+            Row("CPU", cpu, MANY_FRAMES_S, "s", "one core for as long"),
+            Row("memory", memory / 2**30, MANY_FRAMES_BYTES / 2**30, "GiB", "wanted"),
+        ],
+    )
+    assert memory < MANY_FRAMES_BYTES
 
 
 def test_the_steps(session: Path) -> None:

@@ -1,0 +1,106 @@
+"""Memory of the diagnosis: it doesn't grow with the number of repeats, as frames are summed one by one."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lab.diagnose.measurements.dark_frames import dark_frames
+from lab.diagnose.measurements.noise_guess import TemporalVariance
+from lab.diagnose.measurements.study import Study, mean_frame
+from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
+from lab.fit.noise.exchanged_frames import exchanged_frames
+from lab.formats.recording_set import Manifest, RecordingSet
+from lab.predict.camera_model import camera_model
+
+SIDE_PX = 128
+BLACK_DN, READ_DN, GAIN = 64.0, 3.0, 0.4
+#: Kind, exposure (s) and signal (DN) of the settings.
+SETTINGS = [("dark", 0.01, 0.1), ("dark", 0.1, 1.0), ("dark", 1.0, 10.0)]
+SETTINGS += [("flat", 0.01 * level, 10.0 * level) for level in (30, 100, 200)]
+
+
+class _DrawnFrames(Mapping[str, NDArray[np.uint16]]):
+    """Frames by `setting-repeat`, drawn whenever they are asked for: a set that takes no memory itself."""
+
+    def __init__(self, repeats: int) -> None:
+        self._names = [f"{setting}-{repeat}" for setting in range(len(SETTINGS)) for repeat in range(repeats)]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __getitem__(self, name: str) -> NDArray[np.uint16]:
+        setting, repeat = (int(part) for part in name.split("-"))
+        signal = SETTINGS[setting][2]
+        noise = np.random.default_rng([setting, repeat]).standard_normal((SIDE_PX, SIDE_PX), np.float32)
+        std = np.float32(np.sqrt(READ_DN**2 + GAIN * signal))
+        return np.rint(np.float32(BLACK_DN + signal) + std * noise).astype(np.uint16)
+
+
+def _recordings(repeats: int) -> RecordingSet:
+    frames = _DrawnFrames(repeats)
+    captures = []
+    for name in frames:
+        kind, exposure_s, _ = SETTINGS[int(name.split("-")[0])]
+        captures.append({"id": name, "kind": kind, "side": "left", "frame": name, "exposure_s": exposure_s})
+    stated = {"rows": SIDE_PX, "cols": SIDE_PX, "cfa": "MONO", "bit_depth": 12, "black_level_dn": BLACK_DN}
+    manifest = Manifest.model_validate({"cameras": {"left": stated}, "captures": captures})
+    return RecordingSet(manifest, frames, cache_bytes=0)
+
+
+def _study(recordings: RecordingSet) -> Study:
+    return Study(recordings, "left", camera_model(recordings, "left"))
+
+
+STEPS: dict[str, Callable[[RecordingSet], Any]] = {
+    "exposures of darks": lambda recordings: misstated_dark_exposure(recordings, "left"),
+    "exchanged frames": lambda recordings: exchanged_frames(recordings, "left"),
+    "first estimates": _study,
+    "dark frames": lambda recordings: dark_frames(_study(recordings)),
+    "mean frame": lambda recordings: mean_frame(recordings, recordings.captures("flat")),
+}
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_repeats_take_no_memory(step: str) -> None:
+    """Three times the repeats of every setting take less memory more than half of the frames that one setting has more, as they are
+    stored: 2 bytes a pixel. 16 repeats are enough for the few frames that are kept for medians."""
+
+    def peak_bytes(repeats: int) -> int:
+        recordings = _recordings(repeats)
+        tracemalloc.start()
+        try:
+            STEPS[step](recordings)
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    STEPS[step](_recordings(2))  # loads what is loaded once
+    few, many = 16, 48
+    assert peak_bytes(many) - peak_bytes(few) < 0.5 * (many - few) * 2 * SIDE_PX**2
+
+
+def test_a_temporal_variance_is_that_of_the_whole_stack() -> None:
+    """Up to rounding, beside a fixed pattern a hundred times the noise and levels that differ."""
+    rng = np.random.default_rng(1)
+    stack = 3000.0 + 300.0 * rng.standard_normal((12, 16)) + 3.0 * rng.standard_normal((9, 12, 16))
+    stack += rng.standard_normal((9, 1, 1))
+    repeats = TemporalVariance()
+    assert repeats.variance_dn2 == 0.0
+    for frame in stack:
+        repeats.add(frame)
+    away = stack - stack.mean((1, 2), keepdims=True)
+    # the mean of each frame takes one of its pixels' degrees of freedom, to first order
+    expected = away.var(axis=0, ddof=1).mean() * (1.0 + 1.0 / stack[0].size)
+    assert repeats.variance_dn2 == pytest.approx(expected, rel=1e-10)
