@@ -1,8 +1,9 @@
 """A recording set of many frames: what the memory and the time of a diagnosis are measured on.
 
-`python -m benchmarks.many_frames write FOLDER [SIDE_PX [REPEATS]]` writes it: one camera without a mosaic, darks of three exposures with
-`DARK_REPEATS` frames each and flats of ten levels with `FLAT_REPEATS` frames each (REPEATS: this share of them). `python -m
-benchmarks.many_frames diagnose FOLDER` diagnoses it in this process and prints CPU time and peak memory by step.
+`python -m benchmarks.many_frames write FOLDER [SIDE_PX [REPEATS]]` writes it: one camera without a mosaic, darks of three
+exposures with `DARK_REPEATS` frames each and flats of ten levels with `FLAT_REPEATS` frames each (REPEATS: this share of
+them). `python -m benchmarks.many_frames diagnose FOLDER` diagnoses it in this process and prints CPU time and peak memory
+by step.
 """
 
 from __future__ import annotations
@@ -33,8 +34,10 @@ def camera(side_px: int = SIDE_PX) -> CameraModel:
     """A camera of 12 bits without a mosaic, `side_px` rows and columns."""
     return CameraModel(
         rows=side_px, cols=side_px, pixel_pitch_um=3.45, fill_factor=0.9, cfa="MONO", bit_depth=12, black_level_dn=64.0,
-        white_level_dn=4095.0, conversion_gain_dn_per_e=0.4, full_well_e=10500.0, read_noise_e=4.0, dark_current_e_per_s=8.0, dsnu_e=1.0,
-        prnu_percent=0.7, quantum_efficiency={"Y": Spectrum.of([400.0, 700.0], [0.5, 0.5])}, lens=Lens(f_number=4.0, focal_length_mm=25.0),
+        white_level_dn=4095.0, conversion_gain_dn_per_e=0.4, full_well_e=10500.0, read_noise_e=4.0,
+        dark_current_e_per_s=8.0, dsnu_e=1.0, prnu_percent=0.7,
+        quantum_efficiency={"Y": Spectrum.of([400.0, 700.0], [0.5, 0.5])},
+        lens=Lens(f_number=4.0, focal_length_mm=25.0),
     )  # fmt: skip
 
 
@@ -71,8 +74,8 @@ def write(folder: Path, side_px: int = SIDE_PX, repeats: float = 1.0) -> None:
         rows = zip(curve.wavelength_nm, curve.value, strict=True)
         (folder / path).write_text("wavelength_nm,value\n" + "".join(f"{w:g},{v:g}\n" for w, v in rows))
     stated = model.model_dump(include={
-        "rows", "cols", "pixel_pitch_um", "fill_factor", "cfa", "bit_depth", "black_level_dn", "white_level_dn", "full_well_e",
-        "conversion_gain_dn_per_e", "read_noise_e",
+        "rows", "cols", "pixel_pitch_um", "fill_factor", "cfa", "bit_depth", "black_level_dn", "white_level_dn",
+        "full_well_e", "conversion_gain_dn_per_e", "read_noise_e",
     })  # fmt: skip
     stated |= {"f_number": 4.0, "focal_length_mm": 25.0, "quantum_efficiency": {"Y": "efficiency.csv"}}
     manifest = Manifest.model_validate({"cameras": {"left": stated}, "captures": captures})

@@ -1,8 +1,8 @@
 """All fits of a whole session and its diagnosis, as a user runs them: wall clock, CPU time and memory of `calibench fit` and `diagnose`.
 
 Two cameras of 1280 x 960, some 190 frames of each (`benchmarks.big_session`, 1 GB, in a temporary folder), of which all are read and
-looked through. Wanted on two cores: 90 s for the fits, 240 s for the diagnosis with them. And the diagnosis of one camera of 600 frames of
-a megapixel (`benchmarks.many_frames`, 1.2 GB): 90 s.
+looked through. Wanted on two cores: 90 s for the fits, 240 s for the diagnosis with them. And the diagnosis of one
+camera of 600 frames of a megapixel (`benchmarks.many_frames`, 1.2 GB): 90 s.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def test_the_command(session: Path, tmp_path: Path, name: str) -> None:
 
 
 def test_many_frames(tmp_path: Path) -> None:
-    """Every frame is read a few times and not kept: memory is that of single frames, and of the 256 MB that a set keeps."""
+    """Every frame is read a few times: memory is that of single frames, and of the 256 MB that a set keeps."""
     folder = tmp_path / "set"
     command = [sys.executable, "-m", "benchmarks.many_frames"]
     try:

@@ -185,10 +185,12 @@ def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDA
         held_out = k >= len(condition.seen)
         frame -= np.float32(level)
         if k:
-            changing.setdefault(held_out, _Contrasts()).add((frame - mean) * np.float32(np.sqrt(k / (k + 1.0))))
+            changing.setdefault(held_out, _Contrasts(mean.shape)).add(
+                (frame - mean) * np.float32(np.sqrt(k / (k + 1.0)))
+            )
         mean += (frame - mean) / np.float32(k + 1)
         if with_pattern:
-            fixed.setdefault(held_out, _Mean()).add(frame, capture.id)
+            fixed.setdefault(held_out, _Mean(mean.shape)).add(frame, capture.id)
     return DarkStatistics(
         condition,
         means,
@@ -200,8 +202,8 @@ def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDA
 class _Contrasts:
     """What contrasts tell of the temporal noise. They are added one by one and not kept: a condition may have hundreds of frames."""
 
-    def __init__(self) -> None:
-        self._squares: Image | float = 0.0  # sum of squared contrasts without row and column noise
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self._squares: Image = np.zeros(shape, np.float32)  # sum of squared contrasts without row and column noise
         self._variance: list[float] = []
         self._pixel: list[float] = []
         self._cells: list[float] = []
@@ -219,7 +221,7 @@ class _Contrasts:
         self._variance.append(float(np.mean(np.square(cut), dtype=np.float64)))
         own = robust_std(rest)
         self._pixel.append(float(np.mean(np.square(np.clip(rest, -CLIP * own, CLIP * own)), dtype=np.float64)))
-        self._squares = self._squares + np.square(rest)
+        self._squares += np.square(rest)
         self._cells.append(float(np.mean(np.square(cell_means(cut)))))
         if len(self._white) < 6:  # more spectra add little
             power = periodogram(cut)
@@ -229,13 +231,12 @@ class _Contrasts:
                 self._along[lines].append(power.along(lines))
 
     def noise(self) -> DarkNoise:
-        squares = np.asarray(self._squares, np.float32)
-        local = local_variance(squares, len(self._variance))
+        local = local_variance(self._squares, len(self._variance))
         return DarkNoise(
             contrasts=len(self._variance),
             variance_dn2=float(np.mean(self._variance)),
             pixel_dn2=float(np.mean(self._pixel)),
-            squares=(squares / local).astype(np.float32),
+            squares=(self._squares / local).astype(np.float32),
             lines={lines: pooled(parts) for lines, parts in self._lines.items()},
             along={lines: pooled_along(parts) for lines, parts in self._along.items()},
             white_dn2=float(np.mean(self._white)),
@@ -247,19 +248,19 @@ class _Contrasts:
 class _Mean:
     """The mean of frames that are added one by one. Only the first `MEDIAN_OF` are kept, for their median."""
 
-    def __init__(self) -> None:
-        self._total: Image | float = 0.0
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self._total: Image = np.zeros(shape, np.float32)
         self._first: list[Image] = []
         self._captures: list[str] = []
 
     def add(self, frame: Image, capture: str) -> None:
-        self._total = self._total + frame
+        self._total += frame
         self._captures.append(capture)
         if len(self._first) < MEDIAN_OF:
             self._first.append(frame)
 
     def pattern(self) -> DarkPattern:
-        mean: Image = np.asarray(self._total / np.float32(len(self._captures)), np.float32)
+        mean = self._total / np.float32(len(self._captures))
         return _pattern(mean, self._first, tuple(self._captures))
 
 

@@ -74,8 +74,8 @@ STEPS: dict[str, Callable[[RecordingSet], Any]] = {
 
 @pytest.mark.parametrize("step", STEPS)
 def test_repeats_take_no_memory(step: str) -> None:
-    """Three times the repeats of every setting take less memory more than half of the frames that one setting has more, as they are
-    stored: 2 bytes a pixel. 16 repeats are enough for the few frames that are kept for medians."""
+    """Three times the repeats of every setting take less additional memory than half of the frames that one setting has
+    more, as they are stored: 2 bytes a pixel. 16 repeats are enough for the few frames that are kept for medians."""
 
     def peak_bytes(repeats: int) -> int:
         recordings = _recordings(repeats)
