@@ -6,7 +6,7 @@ has, one that is off by a unit, and rows that fit their frames when all are move
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import log10
@@ -59,21 +59,18 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
             f"{off[0].header.source} says {off[0].header.exposure_s:g} s), and fit those of the frames of {moved}: move the column of the "
             "frames by one row"
         )
-    lines = [_said(off, "exposure_s", "s", lambda one: one.capture.exposure_s, lambda one: one.header.exposure_s)]
-    warm = [one for one in seen if _differ(one.capture.temperature_c, one.header.temperature_c, TEMPERATURE_C)]
-    lines.append(
-        _said(warm, "temperature_c", "degree C", lambda one: one.capture.temperature_c, lambda one: one.header.temperature_c)
-    )  # fmt: skip
-    gains = [one for one in seen if _differ(one.capture.gain_db, one.header.gain_db, GAIN_DB)]
-    lines.append(_said(gains, "gain_db", "dB", lambda one: one.capture.gain_db, lambda one: one.header.gain_db))
+    lines = [_said("exposure_s", "s", [(one, one.capture.exposure_s, one.header.exposure_s) for one in off])]
+    warm = [(one, one.capture.temperature_c, one.header.temperature_c) for one in seen]
+    lines.append(_said("temperature_c", "degree C", [one for one in warm if _differ(*one[1:], TEMPERATURE_C)]))
+    gains = [(one, one.capture.gain_db, one.header.gain_db) for one in seen]
+    lines.append(_said("gain_db", "dB", [one for one in gains if _differ(*one[1:], GAIN_DB)]))
     for side, camera in manifest.cameras.items():
         own = [one for one in seen if one.capture.side == side]
         f_number, key = camera.f_number, "f_number"
         if f_number is None and (opened := [one for one in own if one.header.f_number is not None]):
             f_number, key = opened[0].header.f_number, f"f_number (of {opened[0].file.name})"
-        wide = [one for one in own if not same_f_number(f_number, one.header.f_number)]
-        lines.append(_said(wide, key, "", lambda _, said=f_number: said, lambda one: one.header.f_number))
-        lines.append(_uneven_gain(own))
+        wide = [(one, f_number, one.header.f_number) for one in own]
+        lines += [_said(key, "", [one for one in wide if not same_f_number(*one[1:])]), _uneven_gain(own)]
     return [line for line in lines if line] + _long_or_overlapping(manifest.captures, images)
 
 
@@ -137,22 +134,16 @@ def _moved(timed: Sequence[_Seen], off: Sequence[_Seen]) -> str | None:
     return None
 
 
-def _and(off: Sequence[_Seen]) -> str:
+def _and(off: Sequence[object]) -> str:
     return f" (so do {len(off) - 1} more)" if len(off) > 1 else ""
 
 
-def _said(
-    off: Sequence[_Seen],
-    key: str,
-    unit: str,
-    stated: Callable[[_Seen], float | None],
-    header: Callable[[_Seen], float | None],
-) -> str:
-    """The line for a quantity whose statement the frames' files contradict; empty where none does."""
+def _said(key: str, unit: str, off: Sequence[tuple[_Seen, float | None, float | None]]) -> str:
+    """The line for a quantity of which frames, what is stated and what their files say differ; empty where none does."""
     if not off:
         return ""
-    one, of = off[0], f" {unit}" if unit else ""
-    return f"{one.file}: {key} = {stated(one):g}{of}, its {one.header.source} says {header(one):g}{of}{_and(off)}; the former is used: correct what is wrong"
+    (one, stated, header), of = off[0], f" {unit}" if unit else ""
+    return f"{one.file}: {key} = {stated:g}{of}, its {one.header.source} says {header:g}{of}{_and(off)}; the former is used: correct what is wrong"
 
 
 def _uneven_gain(own: Sequence[_Seen]) -> str:
