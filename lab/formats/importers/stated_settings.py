@@ -17,7 +17,7 @@ from lab.errors import InputError
 from lab.formats.importers.frame_header import FrameHeader, frame_header
 from lab.formats.recording_set import Manifest
 
-#: Longest exposure of a frame (that of a sequence's darks), and of one with light beyond which a unit is suspected, s.
+#: Longest exposure that is taken without a header that says it (that of a sequence's darks), and of one with light that isn't told, s.
 LONGEST_S, LONGEST_LIT_S = 3600.0, 60.0
 #: Factor within which a shutter that is marked in thirds of a stop is meant, half of a third: 1/60 s is 1/64 s. Others are measured: relative.
 MARKED_FACTOR, MEASURED_SHARE = 2.0 ** (1.0 / 6.0), 0.02
@@ -38,7 +38,6 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
 
     `images`: the file of each frame by its path. Raises InputError where the exposures can't be right: `where` names what lists them.
     """
-    check_exposures([(str(images[c.frame]), c.exposure_s) for c in manifest.captures])
     headers = {path: frame_header(file) for path, file in images.items()}
     seen = [
         _Seen(capture, images[capture.frame], header)
@@ -53,6 +52,9 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
             f"{one.file}: exposure_s = {one.capture.exposure_s:g} s, its {one.header.source} says {one.header.exposure_s:g} s{_and(off)}: "
             f"it seems to be in {unit}; write seconds"
         )
+    confirmed = {one.capture.id for one in timed} - {one.capture.id for one in off}
+    doubted = [c for c in manifest.captures if c.exposure_s is not None and c.id not in confirmed]
+    _check_limit([c for c in doubted if c.exposure_s > LONGEST_S], images)
     if moved := _moved(timed, off):
         raise InputError(
             f"{where}: {len(off)} of {len(timed)} exposures contradict their frames ({off[0].file.name}: {off[0].capture.exposure_s:g} s, its "
@@ -71,7 +73,7 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
             f_number, key = opened[0].header.f_number, f"f_number (of {opened[0].file.name})"
         wide = [(one, f_number, one.header.f_number) for one in own]
         lines += [_said(key, "", [one for one in wide if not same_f_number(*one[1:])]), _uneven_gain(own)]
-    return [line for line in lines if line] + _long_or_overlapping(manifest.captures, images)
+    return [line for line in (*lines, _long(doubted, images)) if line] + _overlapping(manifest.captures, images)
 
 
 @dataclass(frozen=True)
@@ -83,14 +85,13 @@ class _Seen:
     header: FrameHeader
 
 
-def check_exposures(stated: Sequence[tuple[str, float | None]]) -> None:
-    """Refuse exposures (what has it, s) beyond `LONGEST_S`: InputError with one line."""
-    too_long = [(name, exposure_s) for name, exposure_s in stated if exposure_s is not None and exposure_s > LONGEST_S]
+def _check_limit(too_long: Sequence[Capture], images: Mapping[str, Path]) -> None:
+    """Refuse exposures beyond the limit that no file confirms: InputError with one line."""
     if too_long:
-        name, exposure_s = too_long[0]
         more = f", and {len(too_long) - 1} more" if len(too_long) > 1 else ""
         raise InputError(
-            f"{name}: exposure_s = {exposure_s:g} is beyond the limit of {LONGEST_S:g} s{more}; write seconds (microseconds over 1e6)"
+            f"{images[too_long[0].frame]}: exposure_s = {too_long[0].exposure_s:g} is beyond the limit of {LONGEST_S:g} s{more}, and no header says "
+            "so; write seconds (microseconds over 1e6)"
         )
 
 
@@ -168,16 +169,21 @@ def _uneven_gain(own: Sequence[_Seen]) -> str:
     )
 
 
-def _long_or_overlapping(captures: Sequence[Capture], images: Mapping[str, Path]) -> list[str]:
-    """The lines for exposures with light that are longer than usual, and for those that are longer than the time to the next frame."""
+def _long(doubted: Sequence[Capture], images: Mapping[str, Path]) -> str:
+    """The line for exposures with light that are longer than usual; empty where there is none."""
+    long = [c for c in doubted if c.kind != "dark" and c.exposure_s > LONGEST_LIT_S]
+    if not long:
+        return ""
+    more = f", and {len(long) - 1} more" if len(long) > 1 else ""
+    return (
+        f"{images[long[0].frame]}: exposure_s = {long[0].exposure_s:g} of a {long[0].kind}{more}, beyond {LONGEST_LIT_S:g} s of light: "
+        "check that it is in seconds, not in milliseconds or microseconds"
+    )
+
+
+def _overlapping(captures: Sequence[Capture], images: Mapping[str, Path]) -> list[str]:
+    """The line for the first exposure of each side that is longer than the time to the next frame."""
     lines = []
-    long = [c for c in captures if c.kind != "dark" and c.exposure_s is not None and c.exposure_s > LONGEST_LIT_S]
-    if long:
-        more = f", and {len(long) - 1} more" if len(long) > 1 else ""
-        lines.append(
-            f"{images[long[0].frame]}: exposure_s = {long[0].exposure_s:g} of a {long[0].kind}{more}, beyond {LONGEST_LIT_S:g} s of light: "
-            "check that it is in seconds, not in milliseconds or microseconds"
-        )
     timed = [(c.time.timestamp(), c) for c in captures if c.time is not None and c.exposure_s is not None]
     for side in dict.fromkeys(c.side for _, c in timed):
         own = sorted((one for one in timed if one[1].side == side), key=lambda one: one[0])
