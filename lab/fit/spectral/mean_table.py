@@ -123,8 +123,8 @@ def _line(row: TableRow) -> _Line:
         spectrum = _measured_spectrum(row.file, name)
         wavelength_nm, value = spectrum.arrays
         high = value > LINE_SHARE * value.max()
-        centre = float(np.average(wavelength_nm[high], weights=value[high]))
-        return _Line(centre, float(np.trapezoid(value, wavelength_nm) / value.max()), spectrum)
+        middle_nm = float(np.average(wavelength_nm[high], weights=value[high]))
+        return _Line(middle_nm, float(np.trapezoid(value, wavelength_nm) / value.max()), spectrum)
     centre, width = row.known(CENTRE, 1.0), row.known(WIDTH, 0.1)
     centre = row.known("wavelength_nm", 1.0) if centre is None else centre
     width = row.known("bandwidth_nm", 0.1) if width is None else width
