@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from benchmarks.real.compare import PULL
 from benchmarks.real.judge import EXPLAINED, QUANTILE, JudgedFigure, SetResult
 from benchmarks.real.kept import Kept
 from benchmarks.real.sets import DeclaredSet
@@ -78,6 +79,9 @@ def _wrong(sets: Mapping[str, tuple[DeclaredSet, SetResult]]) -> str:
     for name, (_, result) in sets.items():
         said = [f"fails: {result.failed}"] if result.failed else []
         said += [f"{f.name} {_number(f)}, independently {f.independent:g}: pull {f.pull:+.1f}" for f in _off(result)]
+        said += [
+            f"{f.name} isn't determined; independently {f.independent:g}" for f in result.figures if f.value is None
+        ]
         said += [f"{at} is given, which these recordings can't determine" for at in result.made_up]
         said += [f"the name `{name.name}` is contradicted: {name.why or 'it isn’t in the truth'}" for name in result.names if name.is_right == "contradicted"]  # fmt: skip
         said += [f"the name `{name}` isn't given" for name in result.missing]
@@ -119,7 +123,7 @@ def _section(name: str, one: DeclaredSet, result: SetResult) -> str:
     if result.figures:
         parts += ["| figure | here | independent | pull |", "| --- | --- | --- | --- |"]
         for f in result.figures:
-            pull = "-" if f.pull is None else f"**{f.pull:+.1f}**" if abs(f.pull) > 2.0 else f"{f.pull:+.1f}"
+            pull = "-" if f.pull is None else f"**{f.pull:+.1f}**" if abs(f.pull) > PULL else f"{f.pull:+.1f}"
             beside = f"{f.independent:g}" + (f" ± {f.independent_std:.2g}" if f.independent_std else "")
             unit = "" if f.unit == "1" else f", {f.unit}"
             parts.append(f"| {f.name}{unit} | {_number(f)} | {beside} | {pull} |")
@@ -151,12 +155,18 @@ def _held_out(result: SetResult, most: int) -> str:
     ranked = sorted(result.measurements, key=lambda m: -max(m.before, m.after) / m.n)
     rows = [(measurement_title(m.measurement) + (f", {m.side}" if len({o.side for o in ranked}) > 1 else ""), m.n, m.before, m.after) for m in ranked[:most]]  # fmt: skip
     rows.append(("all", result.n, result.before, result.after))
-    lines += [f"| {what} | {n} | {before:.0f} | {after:.0f} | {after / n:.3g} |" for what, n, before, after in rows]
+    lines += [
+        f"| {what} | {n} | {_chi2(before)} | {_chi2(after)} | {after / n:.3g} |" for what, n, before, after in rows
+    ]
     return "\n".join([*lines, ""])
 
 
+def _chi2(value: float) -> str:
+    return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"
+
+
 def _off(result: SetResult) -> list[JudgedFigure]:
-    return [f for f in result.figures if f.pull is not None and abs(f.pull) > 2.0]
+    return [f for f in result.figures if f.pull is not None and abs(f.pull) > PULL]
 
 
 def _number(figure: JudgedFigure) -> str:
