@@ -85,7 +85,7 @@ def test_damaged_headers_are_unknown(tmp_path: Path) -> None:
     for name, write in (("a.jpg", _jpeg), ("a.png", _png)):
         write(tmp_path / name, _exif((1, 60)))
         whole = (tmp_path / name).read_bytes()
-        for _ in range(60):
+        for _ in range(25):
             changed = bytearray(whole[: rng.integers(2, 200)])
             changed[rng.integers(len(changed))] = rng.integers(256)
             (tmp_path / name).write_bytes(changed)
