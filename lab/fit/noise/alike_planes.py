@@ -16,10 +16,8 @@ from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
-ALIKE, ALIKE_DN = (
-    0.005,
-    0.1,
-)  # of the signal, and in DN, within which planes are alike: colours differ by tens of percent
+#: Share of the signal, and DN, within which planes are alike: colours differ by tens of percent.
+ALIKE, ALIKE_DN = 0.005, 0.1
 BRIGHT_SHARE = 0.1  # of the range: signal from which on a light counts
 #: Of one light, analogue gains may make colours alike; then the variances over the signals differ by as much. Relative, and standard deviations of
 #: a variance, within which they are alike.
