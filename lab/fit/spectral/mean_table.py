@@ -243,7 +243,8 @@ def _fitted(lights: Sequence[_TableLight], channels: Sequence[str], remarks: lis
         return curves, joint_covariance(at, solved), scatter
 
     value, joint, scatter = solved_on(1.0)
-    widths = likely_widths(signals_of, scatter, FINE_SHARE)
+    is_stated = all(one.spectrum is None for one in lights)  # measured spectra are used as they are
+    widths = likely_widths(signals_of, scatter, FINE_SHARE) if is_stated else None
     if widths is not None:
         stated = float(np.median([one.bandwidth_nm for one in lights]))
         remarks.append(
@@ -275,6 +276,13 @@ def _fitted(lights: Sequence[_TableLight], channels: Sequence[str], remarks: lis
     )
 
 
+def _measured_photons(light: _TableLight, spectrum: Spectrum, wave: FloatArray) -> FloatArray:
+    """Photons per nm, up to a factor, of a light whose spectrum was measured, averaged over the steps of the grid."""
+    inner = GRID_NM * ((np.arange(FINE_POINTS) + 0.5) / FINE_POINTS - 0.5)
+    shape = np.interp(wave[:, None] + inner, *spectrum.arrays, left=0.0, right=0.0).mean(axis=1)
+    return np.asarray(shape * wave * light.power / np.trapezoid(spectrum.arrays[1], spectrum.arrays[0]))
+
+
 def _signals(
     by_channel: Mapping[str, Sequence[_TableLight]], factor: float
 ) -> tuple[FloatArray, dict[str, ChannelSignals]]:
@@ -300,16 +308,10 @@ def _signals(
     return wave, found
 
 
-def _measured_photons(light: _TableLight, spectrum: Spectrum, wave: FloatArray) -> FloatArray:
-    """Photons per nm, up to a factor, of a light whose spectrum was measured, averaged over the steps of the grid."""
-    inner = GRID_NM * ((np.arange(FINE_POINTS) + 0.5) / FINE_POINTS - 0.5)
-    shape = np.interp(wave[:, None] + inner, *spectrum.arrays, left=0.0, right=0.0).mean(axis=1)
-    return np.asarray(shape * wave * light.power / np.trapezoid(spectrum.arrays[1], spectrum.arrays[0]))
-
-
 def _photons(light: _TableLight, wave: FloatArray, factor: float) -> FloatArray:
     """Photons per nm, up to a factor: a triangle of `factor` times the light's bandwidth, as a monochromator with equal slits has, or as it was
-    measured."""
+    measured.
+    """
     if light.spectrum is not None:
         return _measured_photons(light, light.spectrum, wave)
     shape = np.clip(1.0 - np.abs(wave - light.wavelength_nm) / (factor * light.bandwidth_nm), 0.0, None)
