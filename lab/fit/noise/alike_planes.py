@@ -59,7 +59,7 @@ def alike_planes(recordings: RecordingSet, side: Side) -> AlikePlanes | None:
             continue
         if float(np.mean(frame >= camera.saturation_dn)) > CLIPPED_LIMIT:
             continue
-        means = np.array([plane.mean() for plane in _planes(frame.astype(float))])
+        means = np.array([plane.mean() for plane in _planes(np.asarray(frame, float))])
         brightest[light] = signal, float(np.abs(means - means.mean()).max()), capture
     if not brightest or any(away > ALIKE * signal + ALIKE_DN for signal, away, _ in brightest.values()):
         return None

@@ -143,7 +143,7 @@ def _judged(
         if law is None:
             continue
         share = max(SAME_SCATTER * law.scatter, LEAST_SAME)
-        for number, at in enumerate(np.flatnonzero(mine)):
+        for number, at in enumerate(np.flatnonzero(mine).tolist()):
             expected = float(law.expected_signal[number])
             found.append(
                 JudgedFrame(
