@@ -65,11 +65,11 @@ def example_of(text: str, kept: Kept) -> str:
 
 
 def findings(result: SetResult) -> str:
-    """What a diagnosis says, and held-out chi2 by measurement, as Markdown."""
+    """What a diagnosis says, and held-out chi2 of the measurements in which it is or was largest, as Markdown."""
     lines = [f"> **{result.verdict}**"]
     lines += [f"> {sentence}" for sentence in result.summary]
     text = "  \n".join(lines)
-    held = _held_out(result, len(result.measurements))
+    held = _held_out(result, 8)
     return f"{text}\n\n{held}" if held else text
 
 
