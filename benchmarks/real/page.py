@@ -46,6 +46,9 @@ def page_of(kept: Kept, declared: Mapping[str, DeclaredSet]) -> str:
     """The page as Markdown."""
     sets = {name: (one, kept.sets[name]) for name, one in declared.items() if name in kept.sets}
     parts = [HEAD, _wrong(sets), _overview(sets)]
+    without = [name for name in declared if name not in kept.sets]
+    if without:
+        parts.append(f"Not run yet: {', '.join(without)}.\n")
     parts += [_section(name, one, result) for name, (one, result) in sets.items()]
     return "\n".join([*parts, TAIL])
 
