@@ -46,6 +46,9 @@ def page_of(kept: Kept, declared: Mapping[str, DeclaredSet]) -> str:
     """The page as Markdown."""
     sets = {name: (one, kept.sets[name]) for name, one in declared.items() if name in kept.sets}
     parts = [HEAD, _wrong(sets), _overview(sets)]
+    without = [name for name in declared if name not in kept.sets]
+    if without:
+        parts.append(f"Not run yet: {', '.join(without)}.\n")
     parts += [_section(name, one, result) for name, (one, result) in sets.items()]
     return "\n".join([*parts, TAIL])
 
@@ -65,11 +68,11 @@ def example_of(text: str, kept: Kept) -> str:
 
 
 def findings(result: SetResult) -> str:
-    """What a diagnosis says, and held-out chi2 by measurement, as Markdown."""
+    """What a diagnosis says, and held-out chi2 of the measurements in which it is or was largest, as Markdown."""
     lines = [f"> **{result.verdict}**"]
     lines += [f"> {sentence}" for sentence in result.summary]
     text = "  \n".join(lines)
-    held = _held_out(result, len(result.measurements))
+    held = _held_out(result, 8)
     return f"{text}\n\n{held}" if held else text
 
 
