@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from lab.errors import NotDetermined
@@ -82,10 +82,8 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
                 break
             # across the edge, only so much that the next side of a square stays outside the region
             room = np.maximum(half, np.minimum(LEAST_ROOM_PX + half.min(), 0.47 * lengths[index] * np.abs(along).max()))
-            start = np.maximum(np.ceil(np.array(middle) - room), 0).astype(int)
-            stop = np.minimum(np.floor(np.array(middle) + room) + 1, values.shape).astype(int)
-            region = (int(start[0]), int(start[1]), int(stop[0]), int(stop[1]))
-            part = values[start[0] : stop[0], start[1] : stop[1]]
+            region = _region_about(middle, room, values.shape)
+            part = values[region[0] : region[2], region[1] : region[3]]
             if saturation_dn is not None and np.mean(part >= saturation_dn) > 0.002:
                 reason = f"the edge at row {middle[0]:.0f}, column {middle[1]:.0f} is saturated; expose it shorter"
                 continue
@@ -102,14 +100,28 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
                     f"what lies at row {middle[0]:.0f}, column {middle[1]:.0f} isn't one edge between two even fields"
                 )
                 continue
-            refused = ""
-            try:
-                check_phases("mtf", cfa, channel, region, edge.angle_deg)
-            except NotDetermined as too_straight:
-                reason = refused = f"at row {middle[0]:.0f}, column {middle[1]:.0f}: {too_straight.reason}"
-            found.append(FoundEdge(region, edge.angle_deg, float(share * lengths[index]), refused))
+            reason = _refusal(cfa, channel, region, edge.angle_deg)
+            found.append(FoundEdge(region, edge.angle_deg, float(share * lengths[index]), reason))
             break
     found.sort(key=lambda f: bool(f.refused))
     if not found or found[0].refused:
         raise NotDetermined("mtf", f"no edge found in the frame: {reason}")
     return tuple(found)
+
+
+def _region_about(middle: tuple[float, float], room: NDArray[np.float64], shape: tuple[int, ...]) -> Region:
+    """The region that reaches `room` (rows, columns), px, to both sides of a place, within a frame of that shape."""
+    start = np.maximum(np.ceil(np.array(middle) - room), 0).astype(int)
+    stop = np.minimum(np.floor(np.array(middle) + room) + 1, shape).astype(int)
+    return int(start[0]), int(start[1]), int(stop[0]), int(stop[1])
+
+
+def _refusal(cfa: Cfa, channel: str, region: Region, angle_deg: float) -> str:
+    """Why an edge crosses too few phases of the samples; empty where it crosses enough."""
+    try:
+        check_phases("mtf", cfa, channel, region, angle_deg)
+    except NotDetermined as refused:
+        return (
+            f"at row {0.5 * (region[0] + region[2]):.0f}, column {0.5 * (region[1] + region[3]):.0f}: {refused.reason}"
+        )
+    return ""
