@@ -176,8 +176,8 @@ def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDA
     """The statistics of one condition. `sound` (rows, cols): mask of the pixels that count in the frames' means."""
     means: dict[str, float] = {}
     mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
-    contrasts: dict[bool, list[Image]] = {False: [], True: []}
-    stacks: dict[bool, list[Image]] = {False: [], True: []}
+    changing: dict[bool, _Contrasts] = {}
+    fixed: dict[bool, _Mean] = {}
     for k, capture in enumerate(condition.captures):
         frame = study.recordings.frame(capture).astype(np.float32)
         means[capture.id] = float(frame.mean(dtype=np.float64, where=sound))
@@ -185,59 +185,86 @@ def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDA
         held_out = k >= len(condition.seen)
         frame -= np.float32(level)
         if k:
-            contrasts[held_out].append((frame - mean) * np.float32(np.sqrt(k / (k + 1.0))))
+            changing.setdefault(held_out, _Contrasts()).add((frame - mean) * np.float32(np.sqrt(k / (k + 1.0))))
         mean += (frame - mean) / np.float32(k + 1)
         if with_pattern:
-            stacks[held_out].append(frame)
-    changing = {out: _changing(part) for out, part in contrasts.items() if part}
-    ids = {False: [c.id for c in condition.seen], True: [c.id for c in condition.held_out]}
-    fixed = {out: _fixed(part, tuple(ids[out])) for out, part in stacks.items() if part}
-    return DarkStatistics(condition, means, fixed, changing)
+            fixed.setdefault(held_out, _Mean()).add(frame, capture.id)
+    return DarkStatistics(
+        condition,
+        means,
+        {out: part.pattern() for out, part in fixed.items()},
+        {out: part.noise() for out, part in changing.items()},
+    )
 
 
-def _changing(contrasts: list[Image]) -> DarkNoise:
-    total = np.zeros_like(contrasts[0])
-    variance: list[float] = []
-    pixel: list[float] = []
-    white: list[float] = []
-    cells: list[float] = []
-    rows, cols, along_rows, along_cols = [], [], [], []
-    excess: dict[Lines, list[float]] = {"rows": [], "columns": []}
-    for contrast in contrasts:
+class _Contrasts:
+    """What contrasts tell of the temporal noise. They are added one by one and not kept: a condition may have hundreds of frames."""
+
+    def __init__(self) -> None:
+        self._squares: Image | float = 0.0  # sum of squared contrasts without row and column noise
+        self._variance: list[float] = []
+        self._pixel: list[float] = []
+        self._cells: list[float] = []
+        self._excess: dict[Lines, list[float]] = {"rows": [], "columns": []}
+        self._white: list[float] = []
+        self._lines: dict[Lines, list[tuple[FloatArray, FloatArray, float]]] = {"rows": [], "columns": []}
+        self._along: dict[Lines, list[tuple[FloatArray, FloatArray, FloatArray]]] = {"rows": [], "columns": []}
+
+    def add(self, contrast: Image) -> None:
         std = robust_std(contrast)
         cut = np.clip(contrast, -CLIP * std, CLIP * std)
         rest, spare = without_lines(contrast, cut)
         for lines, value in spare.items():
-            excess[lines].append(value)
-        variance.append(float(np.mean(np.square(cut), dtype=np.float64)))
+            self._excess[lines].append(value)
+        self._variance.append(float(np.mean(np.square(cut), dtype=np.float64)))
         own = robust_std(rest)
-        pixel.append(float(np.mean(np.square(np.clip(rest, -CLIP * own, CLIP * own)), dtype=np.float64)))
-        total += np.square(rest)
-        cells.append(float(np.mean(np.square(cell_means(cut)))))
-        if len(white) < 6:  # more spectra add little
+        self._pixel.append(float(np.mean(np.square(np.clip(rest, -CLIP * own, CLIP * own)), dtype=np.float64)))
+        self._squares = self._squares + np.square(rest)
+        self._cells.append(float(np.mean(np.square(cell_means(cut)))))
+        if len(self._white) < 6:  # more spectra add little
             power = periodogram(cut)
-            white.append(power.level)
-            rows.append(power.line("rows"))
-            cols.append(power.line("columns"))
-            along_rows.append(power.along("rows"))
-            along_cols.append(power.along("columns"))
-    local = local_variance(total, len(contrasts))
-    return DarkNoise(
-        contrasts=len(contrasts),
-        variance_dn2=float(np.mean(variance)),
-        pixel_dn2=float(np.mean(pixel)),
-        squares=(total / local).astype(np.float32),
-        lines={"rows": pooled(rows), "columns": pooled(cols)},
-        along={"rows": pooled_along(along_rows), "columns": pooled_along(along_cols)},
-        white_dn2=float(np.mean(white)),
-        line_dn2={lines: max(float(np.mean(values)), 0.0) for lines, values in excess.items()},
-        cells_dn2=float(np.mean(cells)),
-    )
+            self._white.append(power.level)
+            for lines in self._excess:
+                self._lines[lines].append(power.line(lines))
+                self._along[lines].append(power.along(lines))
+
+    def noise(self) -> DarkNoise:
+        squares = np.asarray(self._squares, np.float32)
+        local = local_variance(squares, len(self._variance))
+        return DarkNoise(
+            contrasts=len(self._variance),
+            variance_dn2=float(np.mean(self._variance)),
+            pixel_dn2=float(np.mean(self._pixel)),
+            squares=(squares / local).astype(np.float32),
+            lines={lines: pooled(parts) for lines, parts in self._lines.items()},
+            along={lines: pooled_along(parts) for lines, parts in self._along.items()},
+            white_dn2=float(np.mean(self._white)),
+            line_dn2={lines: max(float(np.mean(values)), 0.0) for lines, values in self._excess.items()},
+            cells_dn2=float(np.mean(self._cells)),
+        )
 
 
-def _fixed(frames: list[Image], captures: tuple[str, ...]) -> DarkPattern:
-    mean: Image = np.asarray(np.mean(frames, axis=0, dtype=np.float32))
-    part = frames[:MEDIAN_OF]
+class _Mean:
+    """The mean of frames that are added one by one. Only the first `MEDIAN_OF` are kept, for their median."""
+
+    def __init__(self) -> None:
+        self._total: Image | float = 0.0
+        self._first: list[Image] = []
+        self._captures: list[str] = []
+
+    def add(self, frame: Image, capture: str) -> None:
+        self._total = self._total + frame
+        self._captures.append(capture)
+        if len(self._first) < MEDIAN_OF:
+            self._first.append(frame)
+
+    def pattern(self) -> DarkPattern:
+        mean: Image = np.asarray(self._total / np.float32(len(self._captures)), np.float32)
+        return _pattern(mean, self._first, tuple(self._captures))
+
+
+def _pattern(mean: Image, part: list[Image], captures: tuple[str, ...]) -> DarkPattern:
+    """The fixed pattern of the mean of the frames of `captures`, and of the median of `part`, the first of them."""
     away, local = from_surroundings(part)
     z = away / local
     edges = np.array([-np.inf, -TAIL_EDGES[1], -TAIL_EDGES[0], *TAIL_EDGES, np.inf])
@@ -251,7 +278,7 @@ def _fixed(frames: list[Image], captures: tuple[str, ...]) -> DarkPattern:
     power = periodogram(mean)
     _, excess = without_lines(mean, mean)
     return DarkPattern(
-        frames=len(frames),
+        frames=len(captures),
         of_median=len(part),
         captures=captures,
         cells=cell_means(mean),

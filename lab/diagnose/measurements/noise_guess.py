@@ -19,7 +19,6 @@ from lab.diagnose.measurements.repeatability import (
     repeated_levels,
     steady,
 )
-from lab.diagnose.measurements.saturation import CLIPPED_SHARE
 from lab.fit.rounding import unrounded
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -99,7 +98,10 @@ def noise_guess(study: Study) -> NoiseGuess:
             black_std += dark_std * float(t[0])
         first = min((darks[i] for i in near), key=lambda g: g[0].exposure_s)
         if len(first) > 1:
-            read = float(np.sqrt(pair_variance([recordings.frame(c) for c in first[:4]])))
+            repeats = TemporalVariance()
+            for capture in first[:4]:
+                repeats.add(recordings.frame(capture))
+            read = float(np.sqrt(repeats.variance_dn2))
         own_dn2 = read**2 / recordings.frame(first[0]).size if len(first) > 1 else 0.0
         jitter, jitter_freedom = _jitter(study, darks, frames_mean, own_dn2)
         jitter = max(jitter, BLACK_FLOOR_DN)
@@ -128,20 +130,28 @@ def _transfer_points(study: Study, black: float) -> tuple[list[float], list[floa
     for group in study.flat_levels():
         if len(group) < 2:
             continue
-        frames = [study.recordings.frame(c) for c in group]
-        evened = [_even_rows(f, step) for f in frames]  # without flicker of the light
-        freedom = 1.0 - step / frames[0].shape[1]
-        for channel in study.channels:
-            planes = [study.pixels_of(f, channel) for f in frames]
-            if any(np.mean(p >= study.saturation_dn) >= CLIPPED_SHARE for p in planes):
-                continue
-            signal.append(float(np.mean([p.mean() for p in planes])) - black)
-            variance.append(pair_variance([study.pixels_of(f, channel) for f in evened]) / freedom)
+        evened = {
+            channel: TemporalVariance()
+            for channel in study.channels
+            if all(study.levels(c).mean[channel] is not None for c in group)
+        }
+        if not evened:
+            continue
+        total = np.zeros((study.camera.rows, study.camera.cols))
+        for capture in group:
+            frame = study.recordings.frame(capture)
+            total += frame
+            even = _even_rows(frame, step)  # without flicker of the light
+            for channel, repeats in evened.items():
+                repeats.add(study.pixels_of(even, channel))
+        for channel, repeats in evened.items():
+            signal.append(float(np.mean([study.levels(c).whole[channel] for c in group])) - black)
+            variance.append(repeats.variance_dn2 / (1.0 - step / study.camera.cols))
             if 0.3 < signal[-1] / (study.saturation_dn - black) < 0.8:
                 row, col = mosaic.phases(study.camera.cfa)[channel][0]
-                plane = np.mean(frames, axis=0)[row::step, col::step]
+                plane = total[row::step, col::step] / len(group)
                 if min(plane.shape) >= LEAST_PLANE_PX:
-                    fixed = max(variance_between_pixels(plane) - variance[-1] / len(frames), 0.0)
+                    fixed = max(variance_between_pixels(plane) - variance[-1] / len(group), 0.0)
                     prnu = float(np.sqrt(fixed) / signal[-1])
     return signal, variance, prnu
 
@@ -223,13 +233,30 @@ def _jitter(
     return float(np.sqrt((rest @ rest + usual) / total)), total
 
 
-def pair_variance(frames: Sequence[Any]) -> float:
-    """Temporal variance of a pixel (DN^2) from repeats: mean over pixels of the sample variance, after each frame's mean is subtracted.
-    0 for a single frame."""
-    stack = np.stack([np.asarray(f, np.float32) - np.float32(np.mean(f, dtype=float)) for f in frames])
-    n = len(frames)
-    return (
-        float(np.mean(stack.var(axis=0, ddof=1, dtype=np.float64))) * (1.0 + 1.0 / max(stack[0].size, 1))
-        if n > 1
-        else 0.0
-    )
+class TemporalVariance:
+    """Temporal variance of a pixel from repeats, which are added one by one and not kept: mean over pixels of the sample variance, after each
+    frame's mean is subtracted.
+
+    The squares about the repeats' mean are summed by Welford's recursion (Technometrics 4, 419, 1962).
+    """
+
+    def __init__(self) -> None:
+        self._mean: FloatArray = np.zeros(0)
+        self._count, self._squares = 0, 0.0  # DN^2, mean over pixels
+
+    def add(self, frame: Any) -> None:
+        """Add a repeat, DN, of the shape of those before it."""
+        away = np.array(frame, float)
+        away -= away.mean()
+        self._count += 1
+        if self._count == 1:
+            self._mean = away
+            return
+        away -= self._mean
+        self._squares += float(np.mean(np.square(away))) * (self._count - 1) / self._count
+        self._mean += away / self._count
+
+    @property
+    def variance_dn2(self) -> float:
+        """The variance, DN^2; 0 for a single frame."""
+        return self._squares / (self._count - 1) * (1.0 + 1.0 / max(self._mean.size, 1)) if self._count > 1 else 0.0

@@ -14,7 +14,7 @@ from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.pattern_fit import mean_rate
 from lab.diagnose.measurements.reads import SHOWN
-from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.study import Study, mean_frame
 from lab.errors import NotDetermined
 from sim.frame import screen_light
 from sim.sensor import mosaic
@@ -100,8 +100,8 @@ def _line(study: Study, group: Sequence[Any], channel: str) -> _Line:
     count = (fx > 2.5 / window.shape[1]) & (np.abs(fy) > 2.5 / window.shape[0]) & (np.hypot(fx, fy) > GRID_LOWEST)
     flats = study.flat_levels()
     if flats:
-        lit = [study.recordings.frame(c)[row::step, col::step] - study.noise.black for c in flats[len(flats) // 2]]
-        of_flats, level, _ = _power(np.mean(lit, axis=0)[box], step)
+        lit = mean_frame(study.recordings, flats[len(flats) // 2])[row::step, col::step] - study.noise.black
+        of_flats, level, _ = _power(lit[box], step)
         count &= ndimage.maximum_filter(of_flats / level, 3) < GRID_OF_CAMERA
     relative = np.where(count, power / noise, 0.0)
     i, j = np.unravel_index(int(np.argmax(relative)), relative.shape)

@@ -256,4 +256,7 @@ class Study:
 
 def mean_frame(recordings: RecordingSet, captures: Sequence[Capture]) -> FloatArray:
     """Mean (rows, cols) of the captures' frames, DN."""
-    return np.asarray(np.mean([recordings.frame(c).astype(float) for c in captures], axis=0))
+    total = recordings.frame(captures[0]).astype(float)
+    for capture in captures[1:]:
+        total += recordings.frame(capture)
+    return total / len(captures)

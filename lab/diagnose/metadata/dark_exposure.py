@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from lab.diagnose.measurements.dark_level import DARK
 from lab.diagnose.metadata.misstatement import Misstatement
 from lab.fit.rounding import rounding_std_dn
 from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set.frame_files import Frame
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
@@ -55,11 +57,9 @@ def misstated_dark_exposure(recordings: RecordingSet, side: Side) -> Misstatemen
     levels, count = np.unique(exposure, return_counts=True)
     if len(levels) < LEAST_EXPOSURES or count.min() < LEAST_REPEATS:
         return None
-    frames = [np.asarray(recordings.frame(c), float) for c in alike]
-    mean = np.array([float(f.mean()) for f in frames])
-    noise = np.array([max(float(f.var()), ROUNDED_DN2) / f.size for f in frames])
+    mean, noise = np.array([_mean_and_variance(recordings.frame(c)) for c in alike]).T
     table = _drifts(exposure, [c.time.timestamp() if c.time is not None else None for c in alike])
-    found = _candidates(exposure, mean, noise, table, _floor_dn(exposure, frames))
+    found = _candidates(exposure, mean, noise, table, _floor_dn(recordings, alike))
     if not found:
         return None
     nearest = min(found, key=lambda one: abs(np.log(one.factor)))
@@ -91,11 +91,19 @@ def _near(temperature_c: float | None, usual_c: float) -> bool:
     return temperature_c is not None and abs(temperature_c - usual_c) <= TEMPERATURE_STEP_C
 
 
-def _floor_dn(exposure: FloatArray, frames: list[FloatArray]) -> FloatArray:
+def _mean_and_variance(frame: Frame) -> tuple[float, float]:
+    """Mean of a frame, DN, and the variance of that mean by the spread of its pixels, DN^2."""
+    return float(frame.mean()), max(float(frame.var()), ROUNDED_DN2) / frame.size
+
+
+def _floor_dn(recordings: RecordingSet, darks: Sequence[DarkCapture]) -> FloatArray:
     """Standard deviation (exposures,) of a mean level beside the scatter of its repeats: rounding, where the temporal noise of two repeats
     is too small to dither, and `FLOOR_DN`."""
-    pairs = [[f for f, t in zip(frames, exposure, strict=True) if t == level][:2] for level in np.unique(exposure)]
-    before_rounding = [max(0.5 * float((a - b).var()) - ROUNDED_DN2, 0.0) for a, b in pairs]
+    before_rounding = []
+    for exposure_s in sorted({c.exposure_s for c in darks}):
+        one, other = [recordings.frame(c) for c in [c for c in darks if c.exposure_s == exposure_s][:2]]
+        between = np.subtract(one, other, dtype=float)
+        before_rounding.append(max(0.5 * float(between.var()) - ROUNDED_DN2, 0.0))
     return np.asarray(np.hypot(FLOOR_DN, rounding_std_dn(np.array(before_rounding))))
 
 

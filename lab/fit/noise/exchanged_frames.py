@@ -108,9 +108,11 @@ def _judged(
 ) -> list[JudgedFrame]:
     """Every dark, and every flat of a lamp whose response the others tell."""
     camera = recordings.camera(side)
-    frames = [recordings.frame(capture) for capture in (*darks, *flats)]
-    mean = np.array([float(frame.mean()) for frame in frames])
-    clipped = np.array([float(np.mean(frame >= camera.saturation_dn)) > CLIPPED_SHARE for frame in frames])
+    looked_at = []
+    for capture in (*darks, *flats):
+        frame = recordings.frame(capture)
+        looked_at.append((float(frame.mean()), float(np.mean(frame >= camera.saturation_dn)) > CLIPPED_SHARE))
+    mean, clipped = (np.array(values) for values in zip(*looked_at, strict=True))
     dark_mean, flat_mean = mean[: len(darks)], mean[len(darks) :]
     exposure = np.array([dark.exposure_s for dark in darks])
     slope, black = 0.0, float(np.median(dark_mean))
