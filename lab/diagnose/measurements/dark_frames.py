@@ -201,7 +201,7 @@ class _Contrasts:
     """What contrasts tell of the temporal noise. They are added one by one and not kept: a condition may have hundreds of frames."""
 
     def __init__(self) -> None:
-        self._squares: Image | float = 0.0  # sum of squared contrasts without row and column noise
+        self._squares: Image | FloatArray | float = 0.0  # sum of squared contrasts without row and column noise
         self._variance: list[float] = []
         self._pixel: list[float] = []
         self._cells: list[float] = []

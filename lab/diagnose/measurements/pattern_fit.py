@@ -324,8 +324,8 @@ def _refined(
     )
     terms = warp.basis(mask_points(mask, window))
     # a smooth change of the OTF is fitted as well: with the phase of the cells on the pixels, aliases look like a displacement
-    ends = (np.clip(f, -REGISTERED_CY_PER_PX, REGISTERED_CY_PER_PX) for f in (whole.fx, whole.fy))
-    powers = even_powers(*ends, REGISTERED_ORDER, REGISTERED_CY_PER_PX)
+    fx, fy = (np.clip(f, -REGISTERED_CY_PER_PX, REGISTERED_CY_PER_PX) for f in (whole.fx, whole.fy))
+    powers = even_powers(fx, fy, REGISTERED_ORDER, REGISTERED_CY_PER_PX)
     smooth = [canvas.sampled(term * lens)[mask] for term in powers]
     columns = np.concatenate([across * terms, down * terms, smooth, [np.ones_like(picture)]])
     scale = np.sqrt(np.mean(columns**2, axis=1))[:, None]
