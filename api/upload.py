@@ -138,6 +138,8 @@ class Inbox:
                 recordings = recording.read(_top(sent))
             else:
                 recordings = foreign.read(_top(sent, None))
+                notes = as_in_archive(recordings.manifest.notes, place)
+                recordings = recordings.under(recordings.manifest.model_copy(update={"notes": notes}))
                 found: list[str] = []
                 recording.write(recordings, unpacked, told=found.extend)
                 recordings.warnings += tuple(found)

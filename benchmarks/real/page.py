@@ -6,7 +6,8 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.real.judge import EXPLAINED, JudgedFigure, SetResult
+from benchmarks.real.compare import PULL
+from benchmarks.real.judge import EXPLAINED, QUANTILE, JudgedFigure, SetResult
 from benchmarks.real.kept import Kept
 from benchmarks.real.sets import DeclaredSet
 from lab.challenge.proof import placed
@@ -28,6 +29,12 @@ TAIL = """## What isn't taken through
 
 A photograph of a printed noise target (`delbracio_noise_target`) has no importer: `make bench` fits its kernel. Measured sensitivities,
 radiances of a chart and lens prescriptions hold no recordings: tests of the fits and of the lens read them.
+
+## Sets of your own
+
+`make real ARGS="--more DIR"` takes the sets in the folders of DIR: recording sets, folders of frames with an index, and EMVA 1288 sessions. A
+file `independent.toml` beside the recordings states how else a set is brought in, and the independent figures, with the keys of
+`benchmarks/real/sets.toml`. Page and results go to `calibench-data/real/DIR`; the next run is compared with them.
 """
 
 #: Pages with findings of sets, each between marks that have the set's name.
@@ -39,6 +46,9 @@ def page_of(kept: Kept, declared: Mapping[str, DeclaredSet]) -> str:
     """The page as Markdown."""
     sets = {name: (one, kept.sets[name]) for name, one in declared.items() if name in kept.sets}
     parts = [HEAD, _wrong(sets), _overview(sets)]
+    without = [name for name in declared if name not in kept.sets]
+    if without:
+        parts.append(f"Not run yet: {', '.join(without)}.\n")
     parts += [_section(name, one, result) for name, (one, result) in sets.items()]
     return "\n".join([*parts, TAIL])
 
@@ -58,11 +68,11 @@ def example_of(text: str, kept: Kept) -> str:
 
 
 def findings(result: SetResult) -> str:
-    """What a diagnosis says, and held-out chi2 by measurement, as Markdown."""
+    """What a diagnosis says, and held-out chi2 of the measurements in which it is or was largest, as Markdown."""
     lines = [f"> **{result.verdict}**"]
     lines += [f"> {sentence}" for sentence in result.summary]
     text = "  \n".join(lines)
-    held = _held_out(result, len(result.measurements))
+    held = _held_out(result, 8)
     return f"{text}\n\n{held}" if held else text
 
 
@@ -72,13 +82,19 @@ def _wrong(sets: Mapping[str, tuple[DeclaredSet, SetResult]]) -> str:
     for name, (_, result) in sets.items():
         said = [f"fails: {result.failed}"] if result.failed else []
         said += [f"{f.name} {_number(f)}, independently {f.independent:g}: pull {f.pull:+.1f}" for f in _off(result)]
+        said += [
+            f"{f.name} isn't determined; independently {f.independent:g}" for f in result.figures if f.value is None
+        ]
         said += [f"{at} is given, which these recordings can't determine" for at in result.made_up]
         said += [f"the name `{name.name}` is contradicted: {name.why or 'it isn’t in the truth'}" for name in result.names if name.is_right == "contradicted"]  # fmt: skip
         said += [f"the name `{name}` isn't given" for name in result.missing]
         said += [f"{measurement_title(m.measurement)}: held-out chi2 over n is {m.after_over_n:.3g}, and nothing tells of it" for m in result.measurements if m.is_silent]  # fmt: skip
         found += [f"- [{name}](#{name}): {words}" for words in said]
     lines = found or ["Nothing."]
-    note = f"Wanted: pulls within 2, no name that is contradicted, held-out chi2 over n of {EXPLAINED:g} at most where nothing more is told."
+    note = (
+        f"Wanted: pulls within 2, no name that is contradicted, and held-out chi2 over n of {EXPLAINED:g} at most where nothing more is told "
+        f"(or below the {QUANTILE:.1%} quantile of chi2, which few numbers exceed by chance)."
+    )
     return "\n".join(["## What is wrong", "", note, "", *lines, ""])
 
 
@@ -110,7 +126,7 @@ def _section(name: str, one: DeclaredSet, result: SetResult) -> str:
     if result.figures:
         parts += ["| figure | here | independent | pull |", "| --- | --- | --- | --- |"]
         for f in result.figures:
-            pull = "-" if f.pull is None else f"**{f.pull:+.1f}**" if abs(f.pull) > 2.0 else f"{f.pull:+.1f}"
+            pull = "-" if f.pull is None else f"**{f.pull:+.1f}**" if abs(f.pull) > PULL else f"{f.pull:+.1f}"
             beside = f"{f.independent:g}" + (f" ± {f.independent_std:.2g}" if f.independent_std else "")
             unit = "" if f.unit == "1" else f", {f.unit}"
             parts.append(f"| {f.name}{unit} | {_number(f)} | {beside} | {pull} |")
@@ -142,12 +158,18 @@ def _held_out(result: SetResult, most: int) -> str:
     ranked = sorted(result.measurements, key=lambda m: -max(m.before, m.after) / m.n)
     rows = [(measurement_title(m.measurement) + (f", {m.side}" if len({o.side for o in ranked}) > 1 else ""), m.n, m.before, m.after) for m in ranked[:most]]  # fmt: skip
     rows.append(("all", result.n, result.before, result.after))
-    lines += [f"| {what} | {n} | {before:.0f} | {after:.0f} | {after / n:.3g} |" for what, n, before, after in rows]
+    lines += [
+        f"| {what} | {n} | {_chi2(before)} | {_chi2(after)} | {after / n:.3g} |" for what, n, before, after in rows
+    ]
     return "\n".join([*lines, ""])
 
 
+def _chi2(value: float) -> str:
+    return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"
+
+
 def _off(result: SetResult) -> list[JudgedFigure]:
-    return [f for f in result.figures if f.pull is not None and abs(f.pull) > 2.0]
+    return [f for f in result.figures if f.pull is not None and abs(f.pull) > PULL]
 
 
 def _number(figure: JudgedFigure) -> str:

@@ -109,17 +109,20 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
 
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as pool:
         geometry = pool.submit(pinhole)
+        edges_left_out: list[str] = []
         levels = step("noise", lambda: fit_noise(recordings, side))
         kernels = step("psf", lambda: fit_psf_field(recordings, side))
         camera = CameraFit(
             noise=levels,
             spectral=step("spectral", lambda: fit_spectral(recordings, side, levels)),
-            mtf=step("mtf", lambda: fit_mtf(recordings, side, levels)) or (),
+            mtf=step("mtf", lambda: fit_mtf(recordings, side, levels, edges_left_out)) or (),
             psf=kernels.kernels if kernels else (),
             psf_field=kernels.parts if kernels else (),
             psf_symmetry=kernels.symmetry if kernels else None,
             geometry=geometry.result(),
         )
+    if camera.mtf:  # else the first is the reason why there is none
+        skipped.extend(Skipped(step="mtf", reason=reason, side=side) for reason in edges_left_out)
     # independent of the order of the threads; a fit may name a part of its step
     order: dict[str, int] = {name: number for number, name in enumerate(STEPS)}
     return SideFit(camera, tuple(sorted(skipped, key=lambda item: order.get(item.step, len(order)))))

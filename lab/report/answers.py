@@ -47,7 +47,7 @@ def effect_line(effect: NamedEffect) -> str:
     fields = law.choices() if law else {}
     sizes = [
         f"{described[name].meaning if name in described else words.parameter_name(name, value)} "
-        f"{measured(value.value, value.std, value.unit)}"
+        f"{measured(value.value, value.std, value.unit)}{'' if value.sign_known else ', sign unknown'}"
         for name, value in effect.parameters.items()
         if value.std is None or abs(value.value) >= TOLD_SIGMA * value.std
     ]
@@ -56,8 +56,8 @@ def effect_line(effect: NamedEffect) -> str:
         for name, value in effect.choices.items()
         if name in fields
     ]
-    where = " and ".join(effect.sides)
-    return f"{at_beginning(effect_title(effect.name))}, {where}: {'; '.join(sizes)}."
+    who = f"{at_beginning(effect_title(effect.name))}, {' and '.join(effect.sides)}"
+    return f"{who}: {'; '.join(sizes)}." if sizes else f"{who}."
 
 
 def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:

@@ -65,6 +65,16 @@ def test_a_filter_before_an_aligned_screen_is_named() -> None:
         assert abs(found.value - 1.9) < 2.0 * found.std
 
 
+@pytest.mark.slow  # half a minute
+def test_an_aperture_of_half_the_stated_area_is_named() -> None:
+    """Truth: 0.45 of a pixel of 3.75 um, stated 0.89: the side is 1.02 um shorter. The bands of the screen, whose cells are 4.0 px, come out
+    about a tenth of the change too small, hence 10 %."""
+    result = _shared("foreign_aperture")
+    assert result.verdict == "explained"
+    assert [e.name for e in result.effects] == ["pixel_aperture"]
+    assert result.effects[0].parameters["side_change_um"].value == pytest.approx(-1.022, rel=0.1)
+
+
 CASES: list[tuple[str, tuple[Law, ...], str]] = [
     ("healthy mono", (), "MONO"),
     ("glare", (VeilingGlareLaw(2.0, 0),), "GRBG"),

@@ -34,7 +34,11 @@ def _names(law: Law) -> set[str]:
     return {e.name for e in diagnose(recordings_of(camera, Plan(kinds=kinds))).effects}
 
 
-@pytest.mark.parametrize("law", [*STRONG, *(pytest.param(law, marks=pytest.mark.slow) for law in MORE)], ids=str)
+@pytest.mark.parametrize(
+    "law",
+    [*STRONG, *(pytest.param(law, marks=pytest.mark.slow) for law in MORE)],
+    ids=lambda law: f"{law.name}-{law.variant}",
+)
 def test_a_strong_effect_by_another_law_has_no_second_name(law: Law) -> None:
     """Its own name, or its family's, and nothing else."""
     assert law.effect is not None

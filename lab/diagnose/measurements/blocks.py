@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.flat_light import misstated_levels
 from lab.diagnose.measurements.library import measurements
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.fit.noise.evaluation import LEAST_REACH
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, FitResult, Skipped
@@ -56,6 +58,7 @@ def measurement_model(
     skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for reason in study.copies.told]
     if not study.noise.gain_is_known:
         skipped.append(Skipped(step="diagnose conversion_gain_dn_per_e", reason=NO_GAIN, side=side))
+    skipped += _far_from_full(study)
     blocks = []
     for measurement in measurements():
         try:
@@ -70,6 +73,21 @@ def measurement_model(
     if study.stated.fill_factor is None and baseline is None:
         model = replace(model, unstated_jacobian=_any_aperture(model))
     return model, tuple(skipped)
+
+
+def _far_from_full(study: Study) -> list[Skipped]:
+    """A remark where no flat reaches `LEAST_REACH` of the full well, to which parameters of the response refer."""
+    flats = study.recordings.captures(FlatCapture, study.side)
+    highest = max((level for flat in flats for level in study.levels(flat).whole.values()), default=np.inf)
+    reach = (highest - study.noise.black) / (study.saturation_dn - study.noise.black)
+    if reach >= LEAST_REACH:
+        return []
+    reason = (
+        f"the brightest flat reaches {100 * reach:.2g} % of it, {100 * LEAST_REACH:.0f} % are needed: parameters that refer to full well (nonlinearity's, "
+        f"brighter-fatter's) are extrapolated from there, and hold for signals up to {highest - study.noise.black:.4g} DN; expose longer, or correct "
+        "bit_depth or white_level_dn"
+    )
+    return [Skipped(step="diagnose full_well_e", reason=reason, side=study.side)]
 
 
 def _any_aperture(model: MeasurementModel) -> dict[str, FloatArray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,12 +12,11 @@ from lab.diagnose.measurements.held_out import held_out_of
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.mtf.edges_in_frame import find_edges
+from lab.fit.mtf.phases import check_phases
 from lab.fit.mtf.recordings import measure_edge
 from lab.fit.mtf.samples import Region
 from lab.fit.mtf.transfer_function import EdgeMtf
-from sim.sensor import mosaic
 
-LEAST_TILT_DEG = 0.5  # below, no frame has enough rows or columns along the edge
 PLAIN = np.array([0.25])  # cy/px: where `measure_edge` evaluates its own MTF, which isn't used here
 
 
@@ -74,7 +72,7 @@ def measured_edges(study: Study) -> list[MeasuredEdge]:
                 for region in regions:
                     try:
                         measured = measure_edge(study.recordings, part, channel, None, PLAIN, region)
-                        _check_phases(study, channel, region, measured.angle_deg)
+                        check_phases("slanted_edge", study.stated.cfa, channel, region, measured.angle_deg)
                     except NotDetermined as refused:
                         reasons.append(refused.reason)
                         continue
@@ -86,28 +84,6 @@ def measured_edges(study: Study) -> list[MeasuredEdge]:
     if not edges:
         raise NotDetermined("slanted_edge", reasons[0])
     return edges
-
-
-def _check_phases(study: Study, channel: str, region: Region, angle_deg: float) -> None:
-    """Raise `NotDetermined` where the edge crosses less than one sample period of its channel.
-
-    Aliasing makes the position at which a row or column crosses the edge err periodically, by its phase to the samples. Over less than a
-    period this error doesn't average out, and biases the angle.
-    """
-    tilt_deg = abs((angle_deg + 45.0) % 90.0 - 45.0)
-    lines = region[2] - region[0] if abs((angle_deg + 90.0) % 180.0 - 90.0) < 45.0 else region[3] - region[1]
-    period_px = mosaic.step(study.stated.cfa) / len(mosaic.phases(study.stated.cfa)[channel])
-    crossed_px = lines * float(np.tan(np.deg2rad(tilt_deg)))
-    if crossed_px < period_px:
-        wanted = (
-            f"{math.ceil(lines * period_px / crossed_px)} lines are enough"
-            if tilt_deg > LEAST_TILT_DEG
-            else "tilt it by 5 deg"
-        )
-        raise NotDetermined(
-            "slanted_edge",
-            f"an edge at {tilt_deg:.2g} deg over {lines} lines crosses {crossed_px:.2g} of the {period_px:g} px between samples of {channel}: {wanted}",
-        )
 
 
 def _found(study: Study, capture: SlantedEdgeCapture) -> list[Region]:

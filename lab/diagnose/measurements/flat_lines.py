@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.dark_readout import DarkReadOut, dark_readout
+from lab.diagnose.measurements.dark_readout import OFFSETS_STD, DarkReadOut, dark_readout
 from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, FlatLevel, flats
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
@@ -25,7 +25,7 @@ def line_block(study: Study) -> Block:
     """Steps in the means of rows and columns at halves and quarters of a side, and the difference of even and odd lines of a plane of the
     mosaic, relative to the mean signal.
 
-    What dark frames have of both is subtracted. The standard deviation of a step is measured at all other places. No effect predicts a
+    What dark frames have of both is subtracted, and may be another in light by `OFFSETS_STD`. The standard deviation of a step is measured at all other places. No effect predicts a
     step. Raises NotDetermined without unclipped
     flats, and for frames too small.
     """
@@ -43,31 +43,38 @@ def line_block(study: Study) -> Block:
     values: list[float] = []
     labels: list[Label] = []
     whole: list[tuple[float, float]] = []
+    subtracted: list[float] = []
     for held_out, (whole_image, noise) in sorted(images.items()):
         part = [u for u in levels if u.held_out == held_out]
         members = tuple(c.id for u in part for c in u.captures)
         image, of_dark = (whole_image, 0.0) if dark is None else _without_dark(study, dark, part, whole_image)
         for axis, name in ((0, "column"), (1, "row")):
-            line = np.asarray(image.mean(axis=axis, dtype=float))
+            line, with_dark = (np.asarray(one.mean(axis=axis, dtype=float)) for one in (image, whole_image))
             shot = noise / image.shape[axis]
             least = float(np.sqrt((study.noise.prnu**2 + of_dark) / image.shape[axis] + shot))
             for share, value, std, size in _steps(line, period, least):
                 values.append(value)
                 whole.append((std**2 + LINE_FLOOR**2, shot * size))
                 labels.append(Label(share * len(line), name, f"{name} {share * len(line):.0f}", members, held_out))
+            subtracted += [found[1] for found in _steps(with_dark - line, period, least)]
             value, std = _stripes(line, period, least)
             values.append(value)
             whole.append((std**2 + LINE_FLOOR**2, shot * 4.0 / len(line)))
             labels.append(Label(0.0, name, f"even and odd {name}s", members, held_out))
+            subtracted.append(_stripes(with_dark - line, period, least)[0])
     covariance = np.diag([total for total, _ in whole])
     conditions = [label.condition for label in labels]
     for i, label in enumerate(labels):
         for j in range(i):
             if conditions[j] == label.condition:  # the same pixels, seen and held out: only the noise is another
                 covariance[i, j] = covariance[j, i] = min(max(whole[k][0] - whole[k][1], 0.0) for k in (i, j))
+    jacobian = {
+        f"in light: {name}": OFFSETS_STD * np.where(np.array(conditions) == name, subtracted, 0.0)
+        for name in (dict.fromkeys(conditions) if dark is not None else ())
+    }
     return Block(
         measurement=FLAT_LINES, reach=1.0, value=np.array(values), covariance=covariance, labels=tuple(labels),
-        reads=frozenset(), predict=lambda effects: Prediction(np.zeros(len(values)), {}), scale=np.ones(len(values)),
+        reads=frozenset(), predict=lambda effects: Prediction(np.zeros(len(values)), jacobian), scale=np.ones(len(values)),
     )  # fmt: skip
 
 

@@ -88,15 +88,16 @@ def _seen(study: Study) -> list[RepeatedMeans]:
 def _dark_scatter(study: Study) -> tuple[float, float]:
     """Variance of a dark frame's mean beside that by the noise of independent pixels, DN^2, and its standard deviation.
 
-    A variance v of f degrees of freedom has the standard deviation v sqrt(2 / f). Without repeated dark frames it may be as large as
-    rows leave whose noise is that of their pixels.
+    A variance v of f degrees of freedom stands for a true one of about v f / (f - 2), known to sqrt(2 / f) of it. Without repeated dark
+    frames it may be as large as rows leave whose noise is that of their pixels.
     """
     noise, camera = study.noise, study.camera
     whole = noise.jitter_dn**2
     if noise.jitter_freedom == 0.0:
         return 0.0, max(whole, noise.read_dn**2 / camera.rows)
     pixels = noise.read_dn**2 / (camera.rows * camera.cols)
-    return max(whole - pixels, 0.0), whole * float(np.sqrt(2.0 / noise.jitter_freedom))
+    free = noise.jitter_freedom
+    return max(whole - pixels, 0.0), whole * float(np.sqrt(2.0 / free)) * free / max(free - 2.0, 1.0)
 
 
 def _by_exposure(repeats: list[RepeatedMeans]) -> list[list[RepeatedMeans]]:

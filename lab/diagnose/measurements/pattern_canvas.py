@@ -154,6 +154,21 @@ class Canvas:
         """Inverse Fourier transform: the picture (rows, cols) at the window's pixels."""
         return np.asarray(fft.irfft2(spectrum, self.shape))
 
+    @cached_property
+    def whole(self) -> _Spectrum:
+        """Spectrum of the drawn pattern at all frequencies of the drawing, as of point samples at the pixels' centres."""
+        rows, cols = self.fine.shape
+        fy, fx = fft.fftfreq(rows, 1.0 / OVERSAMPLE)[:, None], fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
+        # divided by the sinc of a sample's square, and shifted from the first sample's centre to the pixel's
+        across, down = (np.exp(1j * np.pi * f * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(f / OVERSAMPLE) for f in (fx, fy))
+        return _Spectrum(self.drawn * across * down / OVERSAMPLE**2, fx, fy)
+
+    def sampled(self, spectrum: NDArray[np.complex128]) -> FloatArray:
+        """The picture (rows, cols) of a spectrum like `whole`'s, sampled at the pixels, aliases included."""
+        cols = self.fine.shape[1]
+        folded = spectrum.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) * OVERSAMPLE
+        return np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE])
+
     def beyond(self, otf: CubicSpline, fill_factor: float) -> list[list[BeyondPart]]:
         """The aliased parts of the picture, from frequencies above 0.5 cy/px that the lens passes: a list for each ring and each pair of
         opposite sectors (|fx| >= |fy| or not), of its finer rings.
@@ -173,12 +188,6 @@ class Canvas:
                 if parts:
                     found.append(parts)
         return found
-
-    def beyond_picture(self, otf: CubicSpline, fill_factor: float) -> FloatArray:
-        """The sum of all parts of `beyond`, (rows, cols)."""
-        above = self._above(otf, fill_factor)
-        inside = above.between(BEYOND_CY_PER_PX[0][0], BEYOND_CY_PER_PX[-1][-1])
-        return self._aliased(np.where(inside, above.spectrum, 0.0), above.rows)
 
     def _above(self, otf: CubicSpline, fill_factor: float) -> _Above:
         """The spectrum of the drawn pattern behind lens and pixel, up to the lens's cutoff."""
@@ -202,6 +211,15 @@ class Canvas:
         folded = np.zeros((self.shape[0], cols // 2 + 1), complex)
         folded[:, : part.shape[1]] = spread.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) / OVERSAMPLE
         return np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE])
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """The spectrum of the drawn pattern, and its frequencies, cy/px."""
+
+    spectrum: NDArray[np.complex128]  # (OVERSAMPLE rows, OVERSAMPLE cols / 2 + 1)
+    fx: FloatArray  # (1, OVERSAMPLE cols / 2 + 1)
+    fy: FloatArray  # (OVERSAMPLE rows, 1)
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,7 @@ from lab.fit.psf.screen_registration import ScreenWarp, register
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.frame import with_reflections
+from sim.optics.diffraction import aperture_otf
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 
@@ -57,12 +58,15 @@ NODES = (4, 3)  # of a band, in radius and angle, at which an effect's OTF is ev
 #: halves of bands. Where cells are a whole number of pixels, a mosaic's red and blue pixels have the same samples at f and
 #: 1/2 cy/px - f. Errors within a strong band at low frequencies would then leak into a weak one at high frequencies.
 EVEN_ORDER = 8
+#: Highest total order, and the frequency at which the powers end, of the change of the OTF that the registration fits. With more freedom
+#: (order 6) it takes a displacement that goes with the phase of the cells on the pixels for an OTF: 0.025 px where 0.01 px is reached.
+REGISTERED_ORDER, REGISTERED_CY_PER_PX = 4, 1.5
 EVEN_TERMS = sum(order + 1 for order in range(0, EVEN_ORDER + 1, 2))
 GHOST_BLUR_PX = 3.0  # standard deviation of the Gaussian blur of the ghost's term
 LEAST_BEYOND = (
     5e-4  # contrast (rms) of the parts beyond the bands from which on they are fitted; weaker ones are taken as drawn
 )
-REFINEMENTS = 2  # Gauss-Newton steps of the registration
+REFINEMENTS = 3  # Gauss-Newton steps of the registration
 FEWEST_CELLS = 400
 MOST_MOVES = 4  # times that a displaced channel is drawn anew: a linear step finds about half of a shift by half a cell
 SCALING = np.array(
@@ -311,17 +315,19 @@ def _refined(
 ) -> ScreenWarp:
     """The registration `warp`, improved on the pattern itself by a Gauss-Newton step."""
     canvas, otf = Canvas.of(target, warp, window), lens_otf(study, channel, light)
-    fy, fx = canvas.frequencies
-    spectrum = canvas.low * canvas.passed(otf, study.camera.fill_factor)
     mask = channel_pixels(study, canvas, channel, seen)
+    whole = canvas.whole
+    lens = whole.spectrum * otf(np.minimum(np.hypot(whole.fx, whole.fy), otf.x[-1]))
+    drawn = lens * aperture_otf(whole.fx, whole.fy, study.camera.fill_factor)
     picture, across, down = (
-        canvas.picture(part * spectrum)[mask] for part in (below_nyquist(canvas), 2j * np.pi * fx, 2j * np.pi * fy)
+        canvas.sampled(part)[mask] for part in (drawn, 2j * np.pi * whole.fx * drawn, 2j * np.pi * whole.fy * drawn)
     )
-    picture = picture + canvas.beyond_picture(otf, study.camera.fill_factor)[mask]
     terms = warp.basis(mask_points(mask, window))
-    # the bands' contrasts are fitted as well: where cells are a whole number of pixels, a loss of contrast looks like a displacement
-    bands = [canvas.picture(np.where(part, spectrum, 0.0))[mask] for *_, part in _band_masks(canvas)]
-    columns = np.concatenate([across * terms, down * terms, bands, [np.ones_like(picture)]])
+    # a smooth change of the OTF is fitted as well: with the phase of the cells on the pixels, aliases look like a displacement
+    fx, fy = (np.clip(f, -REGISTERED_CY_PER_PX, REGISTERED_CY_PER_PX) for f in (whole.fx, whole.fy))
+    powers = even_powers(fx, fy, REGISTERED_ORDER, REGISTERED_CY_PER_PX)
+    smooth = [canvas.sampled(term * lens)[mask] for term in powers]
+    columns = np.concatenate([across * terms, down * terms, smooth, [np.ones_like(picture)]])
     scale = np.sqrt(np.mean(columns**2, axis=1))[:, None]
     columns = columns / scale
     step = np.linalg.lstsq(columns @ columns.T, columns @ (seen[window][mask] - picture), rcond=1e-12)[0] / scale[:, 0]
@@ -462,10 +468,12 @@ class _LinearModel:
         return value, shown, share * spread
 
 
-def even_powers(fx: FloatArray, fy: FloatArray) -> list[FloatArray]:
-    """The `EVEN_TERMS` products fx^i fy^j of even i + j up to `EVEN_ORDER`, frequencies over the bands' highest."""
-    x, y = fx / RINGS_CY_PER_PX[-1], fy / RINGS_CY_PER_PX[-1]
-    return [x ** (n - k) * y**k for n in range(0, EVEN_ORDER + 1, 2) for k in range(n + 1)]
+def even_powers(
+    fx: FloatArray, fy: FloatArray, order: int = EVEN_ORDER, end: float = RINGS_CY_PER_PX[-1]
+) -> list[FloatArray]:
+    """The products fx^i fy^j of even i + j up to `order`, frequencies over `end`."""
+    x, y = fx / end, fy / end
+    return [x ** (n - k) * y**k for n in range(0, order + 1, 2) for k in range(n + 1)]
 
 
 def _band(

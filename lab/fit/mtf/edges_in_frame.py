@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from lab.errors import NotDetermined
 from lab.fit.mtf.estimate_mtf import planes_mtf
+from lab.fit.mtf.phases import check_phases
 from lab.fit.mtf.samples import Region, region_planes
 from sim.camera import Cfa
 from sim.sensor.mosaic import step as period
@@ -20,17 +21,19 @@ LEAST_EDGE_PX, LEAST_ROOM_PX, MOST_EDGES = (
     20.0,
     24,
 )  # least length, least room on either side, most edges of a frame
+MOST_REFUSED = 72  # edges of a frame that are too little tilted, after which no more are looked for
 
 
 @dataclass(frozen=True)
 class FoundEdge:
-    """An edge: a region (row0, col0, row1, col1) about its middle, its angle from the vertical, and the length that is
-    used.
+    """An edge: a region (row0, col0, row1, col1) about its middle, its angle from the vertical, the length that is used, and why it can't be
+    used ("": it can), as it crosses less than a period of the samples.
     """
 
     region: Region
     angle_deg: float
     length_px: float
+    refused: str = ""
 
 
 def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None = None) -> tuple[FoundEdge, ...]:
@@ -38,8 +41,9 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
 
     Line segments (LSD, von Gioi et al. 2010) of the frame binned to the pitch of a channel. About the middle of each
     segment a region is laid that holds no other edge. It is kept where both sides are uniform and unsaturated, and the
-    MTF of the green (or only) channel can be determined. Raises `NotDetermined` where none is left, with the reason of
-    the last one refused.
+    MTF of the green (or only) channel can be determined. Edges that cross less than a period of the samples come with
+    the reason why they can't be used, after the others. Raises `NotDetermined` where none can be used, with the reason of the last one
+    refused.
     """
     values = np.asarray(frame, dtype=float)
     if values.ndim != 2 or not np.isfinite(values).all():
@@ -52,12 +56,14 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
         raise NotDetermined("mtf", "no edge found in the frame: it is uniform")
     picture = ndimage.gaussian_filter(np.clip((binned - low) / (high - low), 0.0, 1.0), 1.0)
     lines = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(np.rint(255.0 * picture).astype(np.uint8))[0]
+    channel = "Y" if cfa == "MONO" else "G"
     found: list[FoundEdge] = []
     reason = "no straight line of 40 px or more stands out"
     segments = np.empty((0, 4)) if lines is None else lines.reshape(-1, 4) * step
     lengths = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
     for index in np.argsort(-lengths):
-        if lengths[index] < LEAST_EDGE_PX or len(found) == MOST_EDGES:
+        usable = sum(not f.refused for f in found)
+        if lengths[index] < LEAST_EDGE_PX or usable == MOST_EDGES or len(found) - usable == MOST_REFUSED:
             break
         x0, y0, x1, y1 = segments[index]
         middle, along = (
@@ -76,15 +82,13 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
                 break
             # across the edge, only so much that the next side of a square stays outside the region
             room = np.maximum(half, np.minimum(LEAST_ROOM_PX + half.min(), 0.47 * lengths[index] * np.abs(along).max()))
-            start = np.maximum(np.ceil(np.array(middle) - room), 0).astype(int)
-            stop = np.minimum(np.floor(np.array(middle) + room) + 1, values.shape).astype(int)
-            region = (int(start[0]), int(start[1]), int(stop[0]), int(stop[1]))
-            part = values[start[0] : stop[0], start[1] : stop[1]]
+            region = _region_about(middle, room, values.shape)
+            part = values[region[0] : region[2], region[1] : region[3]]
             if saturation_dn is not None and np.mean(part >= saturation_dn) > 0.002:
                 reason = f"the edge at row {middle[0]:.0f}, column {middle[1]:.0f} is saturated; expose it shorter"
                 continue
             try:
-                planes = region_planes(values, region, cfa, "Y" if cfa == "MONO" else "G", 0.0)
+                planes = region_planes(values, region, cfa, channel, 0.0)
                 edge = planes_mtf(planes, np.array([0.1, 0.25]))
             except NotDetermined as refused:
                 reason = f"at row {middle[0]:.0f}, column {middle[1]:.0f}: {refused.reason}"
@@ -96,8 +100,28 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
                     f"what lies at row {middle[0]:.0f}, column {middle[1]:.0f} isn't one edge between two even fields"
                 )
                 continue
-            found.append(FoundEdge(region, edge.angle_deg, float(share * lengths[index])))
+            reason = _refusal(cfa, channel, region, edge.angle_deg)
+            found.append(FoundEdge(region, edge.angle_deg, float(share * lengths[index]), reason))
             break
-    if not found:
+    found.sort(key=lambda f: bool(f.refused))
+    if not found or found[0].refused:
         raise NotDetermined("mtf", f"no edge found in the frame: {reason}")
     return tuple(found)
+
+
+def _region_about(middle: tuple[float, float], room: NDArray[np.float64], shape: tuple[int, ...]) -> Region:
+    """The region that reaches `room` (rows, columns), px, to both sides of a place, within a frame of that shape."""
+    start = np.maximum(np.ceil(np.array(middle) - room), 0).astype(int)
+    stop = np.minimum(np.floor(np.array(middle) + room) + 1, shape).astype(int)
+    return int(start[0]), int(start[1]), int(stop[0]), int(stop[1])
+
+
+def _refusal(cfa: Cfa, channel: str, region: Region, angle_deg: float) -> str:
+    """Why an edge crosses too few phases of the samples; empty where it crosses enough."""
+    try:
+        check_phases("mtf", cfa, channel, region, angle_deg)
+    except NotDetermined as refused:
+        return (
+            f"at row {0.5 * (region[0] + region[2]):.0f}, column {0.5 * (region[1] + region[3]):.0f}: {refused.reason}"
+        )
+    return ""

@@ -12,6 +12,7 @@ from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
 from lab.fit.mtf.edges_in_frame import FoundEdge, find_edges
 from lab.fit.mtf.estimate_mtf import DEFAULT_FREQUENCY_CY_PER_PX, planes_mtf
+from lab.fit.mtf.phases import check_phases
 from lab.fit.mtf.samples import Region, region_planes
 from lab.fit.mtf.transfer_function import EdgeMtf
 from lab.formats.recording_set import RecordingSet
@@ -58,33 +59,40 @@ def measure_edge(
 
 
 def _edges_of(recordings: RecordingSet, capture: SlantedEdgeCapture) -> tuple[FoundEdge, ...]:
-    """Edges of the frame of a capture; see `find_edges`."""
+    """Edges of the frame of a capture, those that can be used first; see `find_edges`."""
     camera = recordings.camera(capture.side)
     return find_edges(recordings.frame(capture), camera.cfa, camera.saturation_dn)
 
 
-def fit_mtf(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None) -> tuple[MtfCurve, ...]:
+def fit_mtf(
+    recordings: RecordingSet, side: Side, noise: NoiseFit | None = None, left_out: list[str] | None = None
+) -> tuple[MtfCurve, ...]:
     """One MTF curve for every slanted-edge capture of `side` and every channel (R, G, B; or Y), captures in their
     order.
 
     A capture without a region gives the curves of all edges found in its frame, each with its region. The black level
     is that of `noise` where it was fitted, else the stated one. The angle is given in the half turn next to the
-    nominal one of the capture. A capture without a usable edge is left out. Raises `NotDetermined` where none has one.
+    nominal one of the capture. Edges that can't be used are left out, among them those that cross less than one sample period of their
+    channel; `left_out` gets a line for each. Raises `NotDetermined` where none can be used.
     """
     captures = recordings.captures(SlantedEdgeCapture, side)
     if not captures:
         raise NotDetermined("mtf", "no slanted_edge captures")
     camera = recordings.camera(side)
-    curves, reasons = [], []
+    curves: list[MtfCurve] = []
+    reasons: list[str] = [] if left_out is None else left_out
     for capture in captures:
         try:
-            regions = [capture.region] if capture.region else [f.region for f in _edges_of(recordings, capture)]
+            found = () if capture.region else _edges_of(recordings, capture)
         except NotDetermined as refused:
             reasons.append(f"{capture.id}: {refused.reason}")
             continue
+        reasons += [f"{capture.id}: {f.refused}" for f in found if f.refused]
+        regions = [capture.region] if capture.region else [f.region for f in found if not f.refused]
         for region, channel in itertools.product(regions, ("Y",) if camera.cfa == "MONO" else ("R", "G", "B")):
             try:
                 edge = measure_edge(recordings, [capture], channel, noise, region=region)
+                check_phases("mtf", camera.cfa, channel, region, edge.angle_deg)
             except NotDetermined as refused:
                 reasons.append(f"{capture.id} ({channel}): {refused.reason}")
                 continue

@@ -16,10 +16,8 @@ from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
-ALIKE, ALIKE_DN = (
-    0.005,
-    0.1,
-)  # of the signal, and in DN, within which planes are alike: colours differ by tens of percent
+#: Share of the signal, and DN, within which planes are alike: colours differ by tens of percent.
+ALIKE, ALIKE_DN = 0.005, 0.1
 BRIGHT_SHARE = 0.1  # of the range: signal from which on a light counts
 #: Of one light, analogue gains may make colours alike; then the variances over the signals differ by as much. Relative, and standard deviations of
 #: a variance, within which they are alike.
@@ -61,7 +59,7 @@ def alike_planes(recordings: RecordingSet, side: Side) -> AlikePlanes | None:
             continue
         if float(np.mean(frame >= camera.saturation_dn)) > CLIPPED_LIMIT:
             continue
-        means = np.array([plane.mean() for plane in _planes(frame)])
+        means = np.array([plane.mean() for plane in _planes(np.asarray(frame, float))])
         brightest[light] = signal, float(np.abs(means - means.mean()).max()), capture
     if not brightest or any(away > ALIKE * signal + ALIKE_DN for signal, away, _ in brightest.values()):
         return None

@@ -145,11 +145,11 @@ def _judged(
         if law is None:
             continue
         share = max(SAME_SCATTER * law.scatter, LEAST_SAME)
-        for number, at in enumerate(np.flatnonzero(mine)):
+        for number, at in enumerate(np.flatnonzero(mine).tolist()):
             expected = float(law.expected_signal[number])
             found.append(
                 JudgedFrame(
-                    flats[at],
+                    flats[int(at)],
                     float(flat_mean[at]),
                     float(below[at]) + expected,
                     share * expected + least,
@@ -161,7 +161,7 @@ def _judged(
 
 def _put_back(recordings: RecordingSet, pairs: Sequence[tuple[JudgedFrame, JudgedFrame]]) -> RecordingSet:
     """The recordings with the frames of each pair exchanged."""
-    frame_of = {}
+    frame_of: dict[str, str] = {}
     for a, b in pairs:
         frame_of |= {a.capture.id: b.capture.frame, b.capture.id: a.capture.frame}
     captures = tuple(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -12,12 +11,8 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
-from lab.fit.spectral.sensitivity import (
-    NEGATIVE_LIGHT,
-    RADIOMETER_RELATIVE_STD,
-    different_spectra,
-    trapezoid_weights,
-)
+from lab.fit.spectral.channel_signals import RADIOMETER_RELATIVE_STD, ChannelSignals
+from lab.fit.spectral.sensitivity import NEGATIVE_LIGHT, different_spectra, trapezoid_weights
 from lab.fit.weighted_lines import DarkLine, dark_line
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import NoiseFit
@@ -31,27 +26,6 @@ CLIPPED_LIMIT = 1e-4  # share of clipped pixels above which a mean is too low
 SATURATED_SHARE = 0.98  # of the fitted full well
 FLAT_RANGE = (0.2, 0.9)  # of saturation: flats that may help out
 MIN_LIGHTS = 5
-
-
-@dataclass(frozen=True, eq=False)
-class ChannelSignals:
-    """Signals of one channel, e/s, and the operator on its quantum efficiency.
-
-    `operator` (n, m), `value`, `std` (n,). `saturated` (k, m), `limit` (k,): operator and lower limits of saturated
-    signals. `light`: paths of the spectra; two channels share the error of a light.
-    """
-
-    operator: FloatArray
-    value: FloatArray
-    std: FloatArray
-    saturated: FloatArray
-    limit: FloatArray
-    light: tuple[str, ...] = ()
-
-    @property
-    def has_gaps(self) -> bool:
-        """Whether lights saturate."""
-        return self.limit.size > 0
 
 
 class SpectralCaptures:
@@ -291,9 +265,9 @@ class SpectralCaptures:
                 np.array([g[0] for g in good]),
                 np.array([g[1] for g in good]),
                 np.array([g[2] for g in good]),
+                tuple(seen),
                 np.array([h[0] for h in high]).reshape(-1, size),
                 np.array([h[1] for h in high]),
-                tuple(seen),
             )
         return result
 
@@ -333,9 +307,9 @@ class SpectralCaptures:
                 np.concatenate(rows),
                 np.concatenate(values_),
                 np.concatenate(stds),
+                tuple(seen),
                 own.saturated,
                 own.limit,
-                tuple(seen),
             )
         return result
 

@@ -38,17 +38,30 @@ def smooth_root(wave: FloatArray, roughness: FloatArray) -> FloatArray:
 
 
 def rough_root(wave: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
-    """As `smooth_root`, with fine structure added: exponential correlation over 5 nm, as high as `fine_share` of what
-    the curvature amounts to over 10 nm.
-
-    The lights hardly determine it; the uncertainty has to include it.
-    """
+    """As `smooth_root`, with fine structure added (`fine_covariance`)."""
     smooth = smooth_root(wave, roughness)
     if fine_share == 0.0:
         return smooth
+    return np.asarray(np.linalg.cholesky(smooth @ smooth.T + fine_covariance(wave, roughness, fine_share)))
+
+
+def fine_covariance(wave: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
+    """Covariance (m, m) of fine structure: exponential correlation over 5 nm, as high as `fine_share` of what the curvature amounts to over
+    10 nm.
+
+    The lights hardly determine it; the uncertainty has to include it.
+    """
     height = fine_share * LOCAL_WIDTH_NM**1.5 * roughness
-    fine = np.outer(height, height) * np.exp(-np.abs(wave[:, None] - wave) / FINE_LENGTH_NM)
-    return np.linalg.cholesky(smooth @ smooth.T + fine)
+    return np.asarray(np.outer(height, height) * np.exp(-np.abs(wave[:, None] - wave) / FINE_LENGTH_NM))
+
+
+def signal_covariance(wave: FloatArray, operator: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
+    """Covariance (n, n) of the signals `operator` S of curves S with the prior of `rough_root`, up to straight lines."""
+    smooth = operator @ smooth_root(wave, roughness)
+    covariance = smooth @ smooth.T
+    if fine_share > 0.0:
+        covariance = covariance + operator @ fine_covariance(wave, roughness, fine_share) @ operator.T
+    return np.asarray(covariance)
 
 
 def straight_lines(wave: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import linalg, optimize
 
 from lab.fit.spectral.bounds import LowerBounds, within_bounds
-from lab.fit.spectral.captures import ChannelSignals
+from lab.fit.spectral.channel_signals import RADIOMETER_RELATIVE_STD, ChannelSignals, light_errors
 from lab.fit.spectral.curvature_prior import smooth_root, straight_lines
 from lab.fit.spectral.sensitivity import COVERAGE_FACTOR, Sensitivity
 from sim.spectrum import FloatArray
@@ -75,6 +75,7 @@ def solved_with_maker(
     common = COMMON_LINE_STD**2 * kernel_line + weight[0] * kernel_smooth
     single = OWN_LINE_STD**2 * kernel_line + weight[1] * kernel_smooth
     result = []
+    errors = light_errors({str(c): s for c, s in enumerate(signals)})
     for c in range(count):
         m = maker[c]
         # Covariance of the curve with all signals, then its own
@@ -93,7 +94,9 @@ def solved_with_maker(
                 np.sqrt(np.clip(np.diag(covariance), 0.0, None)),
                 COVERAGE_FACTOR,
                 covariance,
-                linalg.cho_solve(factor, cross.T).T[:, at] / signals[c].std,
+                RADIOMETER_RELATIVE_STD
+                * (linalg.cho_solve(factor, cross.T).T[:, at] / signals[c].std)
+                @ errors[str(c)],
             )
         )
     return result

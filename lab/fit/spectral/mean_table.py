@@ -11,7 +11,7 @@ The power's common factor is unknown or cancels: the curves are relative to thei
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,14 +19,15 @@ import numpy as np
 
 from lab.errors import InputError, NotDetermined
 from lab.fit.number_table import TableRow, table_rows
+from lab.fit.spectral.bandwidth import BANDWIDTH_LOG_RATIO, likely_widths
+from lab.fit.spectral.channel_signals import RADIOMETER_RELATIVE_STD, ChannelSignals, Scatter, joint_covariance
 from lab.fit.spectral.recordings import FINE_SHARE, OUTPUT_STEP_NM
+from lab.fit.spectral.scatter import scatter_remarks
 from lab.fit.spectral.sensitivity import (
     COVERAGE_FACTOR,
     MIN_SPECTRA,
     NEGATIVE_LIGHT,
-    RADIOMETER_RELATIVE_STD,
-    Sensitivity,
-    solved_sensitivity,
+    solved_sensitivities,
     trapezoid_weights,
 )
 from lab.formats.foreign_text import read_foreign_csv, remarks_on
@@ -123,8 +124,8 @@ def _line(row: TableRow) -> _Line:
         spectrum = _measured_spectrum(row.file, name)
         wavelength_nm, value = spectrum.arrays
         high = value > LINE_SHARE * value.max()
-        centre = float(np.average(wavelength_nm[high], weights=value[high]))
-        return _Line(centre, float(np.trapezoid(value, wavelength_nm) / value.max()), spectrum)
+        middle_nm = float(np.average(wavelength_nm[high], weights=value[high]))
+        return _Line(middle_nm, float(np.trapezoid(value, wavelength_nm) / value.max()), spectrum)
     centre, width = row.known(CENTRE, 1.0), row.known(WIDTH, 0.1)
     centre = row.known("wavelength_nm", 1.0) if centre is None else centre
     width = row.known("bandwidth_nm", 0.1) if width is None else width
@@ -222,18 +223,6 @@ def _fitted(lights: Sequence[_TableLight], channels: Sequence[str], remarks: lis
             raise NotDetermined(
                 "spectral", f"channel {channel} has fewer than {MIN_SPECTRA} lights; add means at other wavelengths"
             )
-    low = min(one.wavelength_nm - one.bandwidth_nm for one in lights)
-    high = max(one.wavelength_nm + one.bandwidth_nm for one in lights)
-    wave = np.arange(np.floor(low), np.ceil(high) + GRID_NM, GRID_NM)
-    unit = float(np.median([one.power * one.wavelength_nm for one in lights]))
-    solved = {}
-    for channel, own in by_channel.items():
-        value = np.array([one.rate for one in own])
-        noise = np.array([one.rate_std for one in own])
-        operator = np.array([_photons(one, wave) for one in own]) / unit * trapezoid_weights(wave)
-        scale = float(np.abs(value).max()) or 1.0
-        std = np.hypot(noise, RADIOMETER_RELATIVE_STD * value) / scale
-        solved[channel] = scale, solved_sensitivity(wave, operator, value / scale, std, None, FINE_SHARE)
     centres = [one.wavelength_nm for one in lights]
     out = (
         np.arange(np.ceil(min(centres) / OUTPUT_STEP_NM), np.floor(max(centres) / OUTPUT_STEP_NM) + 1) * OUTPUT_STEP_NM
@@ -242,9 +231,31 @@ def _fitted(lights: Sequence[_TableLight], channels: Sequence[str], remarks: lis
         raise NotDetermined(
             "spectral", f"the lights within {min(centres):g}..{max(centres):g} nm don't span the spectrum"
         )
-    at = np.stack([np.interp(out, wave, row) for row in np.eye(wave.size)], axis=1)
-    value = np.concatenate([scale * (at @ one.sensitivity) for scale, one in solved.values()])
-    joint = _joint_covariance(at, solved, by_channel)
+
+    def signals_of(factor: float) -> tuple[FloatArray, dict[str, ChannelSignals]]:
+        return _signals(by_channel, factor)
+
+    def solved_on(factor: float) -> tuple[FloatArray, FloatArray, Scatter]:
+        wave, signals = signals_of(factor)
+        solved, scatter = solved_sensitivities(wave, signals, FINE_SHARE)
+        at = np.stack([np.interp(out, wave, row) for row in np.eye(wave.size)], axis=1)
+        curves = np.concatenate([at @ one.sensitivity for one in solved.values()])
+        return curves, joint_covariance(at, solved), scatter
+
+    value, joint, scatter = solved_on(1.0)
+    is_stated = all(one.spectrum is None for one in lights)  # measured spectra are used as they are
+    widths = likely_widths(signals_of, scatter, FINE_SHARE) if is_stated else None
+    if widths is not None:
+        stated = float(np.median([one.bandwidth_nm for one in lights]))
+        remarks.append(
+            f"the stated bandwidth of {stated:g} nm contradicts the means, by odds above {round(np.exp(BANDWIDTH_LOG_RATIO), -2):.0f}: light "
+            f"of at most {widths.widest * stated:.1f} nm fits, and the sensitivities are fitted with it; measure the width of a line"
+        )
+        parts = [(share, *solved_on(factor)) for factor, share in widths.share.items()]
+        value = np.sum([share * curves for share, curves, *_ in parts], axis=0)
+        joint = np.sum([share * (own + np.outer(c - value, c - value)) for share, c, own, _ in parts], axis=0)
+        scatter = max(parts, key=lambda part: part[0])[3]
+    remarks += scatter_remarks(scatter)
     peak = int(np.argmax(value))
     ratio = value / value[peak]
     variance = np.diag(joint) - 2.0 * ratio * joint[peak] + ratio**2 * joint[peak, peak]
@@ -272,31 +283,40 @@ def _measured_photons(light: _TableLight, spectrum: Spectrum, wave: FloatArray) 
     return np.asarray(shape * wave * light.power / np.trapezoid(spectrum.arrays[1], spectrum.arrays[0]))
 
 
-def _photons(light: _TableLight, wave: FloatArray) -> FloatArray:
-    """Photons per nm, up to a factor: a triangle of the light's bandwidth, as a monochromator with equal slits has, or as it was measured."""
+def _signals(
+    by_channel: Mapping[str, Sequence[_TableLight]], factor: float
+) -> tuple[FloatArray, dict[str, ChannelSignals]]:
+    """Wavelengths (m,), and the signals of each channel in lights of `factor` times the stated bandwidth; photons and rates are relative."""
+    lights = [one for own in by_channel.values() for one in own]
+    low = min(one.wavelength_nm - factor * one.bandwidth_nm for one in lights)
+    high = max(one.wavelength_nm + factor * one.bandwidth_nm for one in lights)
+    wave = np.arange(np.floor(low), np.ceil(high) + GRID_NM, GRID_NM)
+    photons = float(np.median([one.power * one.wavelength_nm for one in lights]))
+    highest = max(abs(one.rate) for one in lights) or 1.0
+    found = {}
+    for channel, own in by_channel.items():
+        value = np.array([one.rate for one in own]) / highest
+        noise = np.array([one.rate_std for one in own]) / highest
+        found[channel] = ChannelSignals(
+            np.array([_photons(one, wave, factor) for one in own]) / photons * trapezoid_weights(wave),
+            value,
+            np.hypot(noise, RADIOMETER_RELATIVE_STD * value),
+            tuple(f"{one.wavelength_nm} nm, {one.power}" for one in own),
+            np.zeros((0, wave.size)),
+            np.zeros(0),
+        )
+    return wave, found
+
+
+def _photons(light: _TableLight, wave: FloatArray, factor: float) -> FloatArray:
+    """Photons per nm, up to a factor: a triangle of `factor` times the light's bandwidth, as a monochromator with equal slits has, or as it was
+    measured.
+    """
     if light.spectrum is not None:
         return _measured_photons(light, light.spectrum, wave)
-    shape = np.clip(1.0 - np.abs(wave - light.wavelength_nm) / light.bandwidth_nm, 0.0, None)
+    shape = np.clip(1.0 - np.abs(wave - light.wavelength_nm) / (factor * light.bandwidth_nm), 0.0, None)
     area = float(np.sum(shape * trapezoid_weights(wave)))
     if area <= 0.0:  # narrower than the grid, and between its points
         shape = np.clip(1.0 - np.abs(wave - light.wavelength_nm) / GRID_NM, 0.0, None)
         area = float(np.sum(shape * trapezoid_weights(wave)))
     return np.asarray(shape * light.power * light.wavelength_nm / area)
-
-
-def _joint_covariance(
-    at: FloatArray, solved: dict[str, tuple[float, Sensitivity]], by_channel: dict[str, list[_TableLight]]
-) -> FloatArray:
-    """Covariance of the curves of all channels, channel after channel. Channels share the error of the reference's reading of each light."""
-    blocks = []
-    for c, (scale, one) in solved.items():
-        row = []
-        for d, (_, two) in solved.items():
-            if c == d:
-                row.append(scale**2 * at @ one.covariance @ at.T)
-                continue
-            same = np.array([[a.wavelength_nm == b.wavelength_nm for b in by_channel[d]] for a in by_channel[c]])
-            rates = np.outer([a.rate for a in by_channel[c]], [b.rate for b in by_channel[d]])
-            row.append(at @ one.gain @ (RADIOMETER_RELATIVE_STD**2 * same * rates) @ two.gain.T @ at.T)
-        blocks.append(row)
-    return np.block(blocks)

@@ -9,17 +9,12 @@ from numpy.typing import NDArray
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
-from lab.fit.spectral.bounds import LowerBounds
-from lab.fit.spectral.captures import ChannelSignals, SpectralCaptures
+from lab.fit.spectral.captures import SpectralCaptures
+from lab.fit.spectral.channel_signals import ChannelSignals, joint_covariance
 from lab.fit.spectral.maker_departures import compare_curves
 from lab.fit.spectral.maker_prior import solved_with_maker
-from lab.fit.spectral.sensitivity import (
-    COVERAGE_FACTOR,
-    RADIOMETER_RELATIVE_STD,
-    Sensitivity,
-    solved_sensitivity,
-    trapezoid_weights,
-)
+from lab.fit.spectral.scatter import scatter_remarks
+from lab.fit.spectral.sensitivity import COVERAGE_FACTOR, Sensitivity, solved_sensitivities, trapezoid_weights
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
 from lab.one_blas_thread import one_blas_thread
@@ -68,17 +63,8 @@ def fit_spectral(recordings: RecordingSet, side: Side, noise: NoiseFit | None = 
             )
         )
     else:
-        solved = {
-            c: solved_sensitivity(
-                captures.wave,
-                s.operator,
-                s.value,
-                s.std,
-                LowerBounds(s.saturated, s.limit) if s.has_gaps else None,
-                FINE_SHARE,
-            )
-            for c, s in signals.items()
-        }
+        solved, scatter = solved_sensitivities(captures.wave, signals, FINE_SHARE)
+        captures.remarks += scatter_remarks(scatter)
     return _result(captures, solved, signals, maker_is_prior=bool(maker))
 
 
@@ -134,13 +120,14 @@ def _result(
                 f"{channel} isn't identifiable at {where}: no light that was measured tells it there; capture narrowband light there"
             )
     channels = list(solved)
-    joint = _joint_covariance(captures.wave, out, solved, signals)
+    at = np.stack([np.interp(out, captures.wave, row) for row in np.eye(captures.wave.size)], axis=1)
+    joint = joint_covariance(at, solved)
     value = np.concatenate([np.interp(out, captures.wave, solved[c].sensitivity) for c in channels])
     # PRNU of the region differs between channels; the conversion gain is common
     prnu = (captures.noise.prnu_percent if captures.noise is not None else None) or 0.0
     for k, channel in enumerate(channels):
-        at = slice(k * out.size, (k + 1) * out.size)
-        joint[at, at] += (prnu / 100.0) ** 2 / captures.pixels[channel] * np.outer(value[at], value[at])
+        own = slice(k * out.size, (k + 1) * out.size)
+        joint[own, own] += (prnu / 100.0) ** 2 / captures.pixels[channel] * np.outer(value[own], value[own])
     absolute = np.sqrt(np.diag(joint) + (captures.gain_std / captures.gain * value) ** 2)
     peak = int(np.argmax(value))
     ratio = value / value[peak]
@@ -203,28 +190,3 @@ def _intervals(wave: FloatArray, where: NDArray[np.bool_]) -> tuple[tuple[float,
     """First and last wavelength of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(int), [0]])))
     return tuple((float(wave[a]), float(wave[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))
-
-
-def _joint_covariance(
-    wave: FloatArray, out: FloatArray, solved: dict[str, Sensitivity], signals: dict[str, ChannelSignals]
-) -> FloatArray:
-    """Covariance (channels x k, channels x k) of the curves of all channels at `out` (k,), channel after channel.
-
-    Channels share the error of the radiometer for each light: Cov(S_c, S_d) = G_c diag(r^2 C_c C_d) G_d^T, G the
-    Jacobian by the signals.
-    """
-    at = np.stack([np.interp(out, wave, row) for row in np.eye(wave.size)], axis=1)
-    blocks = []
-    for c, one in solved.items():
-        row = []
-        for d, two in solved.items():
-            if c == d:
-                row.append(at @ one.covariance @ at.T)
-                continue
-            place = {path: i for i, path in enumerate(signals[d].light)}
-            pairs = np.array([(i, place[p]) for i, p in enumerate(signals[c].light) if p in place], int).reshape(-1, 2)
-            i, j = pairs.T
-            shared = RADIOMETER_RELATIVE_STD**2 * signals[c].value[i] * signals[d].value[j]
-            row.append((at @ one.gain[:, i] * shared) @ (at @ two.gain[:, j]).T)
-        blocks.append(row)
-    return np.block(blocks)

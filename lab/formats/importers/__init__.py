@@ -106,5 +106,7 @@ def read_foreign(kind: str, path: Path, options: ImportOptions | None = None) ->
 def _with_notes(recordings: RecordingSet, path: Path) -> Manifest:
     """The manifest with the warnings in its notes, one a line, without the folder in which the recordings were."""
     folder = path if path.is_dir() else path.parent
-    lines = [line.replace(f"{folder}/", "").replace(str(folder), folder.resolve().name) for line in recordings.warnings]
+    lines = [line.removeprefix(f"{folder}: ") for line in recordings.warnings]
+    if folder != Path():
+        lines = [line.replace(f"{folder}/", "") for line in lines]
     return recordings.manifest.model_copy(update={"notes": "\n".join([recordings.manifest.notes, *lines])})

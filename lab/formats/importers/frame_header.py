@@ -49,6 +49,7 @@ class FrameHeader:
 def frame_header(file: Path) -> FrameHeader | None:
     """The header of a frame's file; None where it states nothing that is known here."""
     suffix = file.suffix.lower()
+    found: FrameHeader | None = None
     try:
         if is_fits(file):
             header = fits_header(file, with_image=False)
@@ -63,8 +64,6 @@ def frame_header(file: Path) -> FrameHeader | None:
                 data = stream.read(HEAD_BYTES)
             block = _exif_of_png(data) if data.startswith(PNG) else _exif_of_jpeg(data)
             found = _of_tiff(io.BytesIO(block)) if block is not None else None
-        else:
-            return None
     except (OSError, InputError, rawpy.LibRawError):
         return None
     return found

@@ -169,8 +169,8 @@ def _tiled(
             )
     cut = []
     for name, kept, blank in (
-        ("row", rows, overscan[:, cols].all(axis=1)),
-        ("column", cols, overscan[rows].all(axis=0)),
+        ("row", rows, np.asarray(overscan[:, cols].all(axis=1))),
+        ("column", cols, np.asarray(overscan[rows].all(axis=0))),
     ):
         between = np.setdiff1d(np.arange(kept[0], kept[-1] + 1), kept)
         for run in np.split(between, np.flatnonzero(np.diff(between) > 1) + 1) if between.size else ():

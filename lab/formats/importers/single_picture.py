@@ -56,8 +56,9 @@ def read_slanted_edge(path: Path, options: ImportOptions) -> RecordingSet:
     except NotDetermined as refused:
         raise InputError(f"{path}: no slanted edge: {refused.reason}; give a picture of one") from refused
     capture = {"id": "edge", "kind": "slanted_edge"}
-    angles = ", ".join(f"{edge.angle_deg:.1f}" for edge in found)
-    notes = (*notes, f"{path}: {len(found)} edges, at {angles} degrees from the vertical")
+    usable = [edge for edge in found if not edge.refused]
+    angles = ", ".join(f"{edge.angle_deg:.1f}" for edge in usable)
+    notes = (*notes, f"{path}: {len(usable)} edges, at {angles} degrees from the vertical")
     return _recordings(path, frame, camera, options, capture, notes, {})
 
 

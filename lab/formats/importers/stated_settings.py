@@ -6,7 +6,7 @@ has, one that is off by a unit, and rows that fit their frames when all are move
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import log10
@@ -17,7 +17,7 @@ from lab.errors import InputError
 from lab.formats.importers.frame_header import FrameHeader, frame_header
 from lab.formats.recording_set import Manifest
 
-#: Longest exposure of a frame (that of a sequence's darks), and of one with light beyond which a unit is suspected, s.
+#: Longest exposure that is taken without a header that says it (that of a sequence's darks), and of one with light that isn't told, s.
 LONGEST_S, LONGEST_LIT_S = 3600.0, 60.0
 #: Factor within which a shutter that is marked in thirds of a stop is meant, half of a third: 1/60 s is 1/64 s. Others are measured: relative.
 MARKED_FACTOR, MEASURED_SHARE = 2.0 ** (1.0 / 6.0), 0.02
@@ -38,7 +38,6 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
 
     `images`: the file of each frame by its path. Raises InputError where the exposures can't be right: `where` names what lists them.
     """
-    check_exposures([(str(images[c.frame]), c.exposure_s) for c in manifest.captures])
     headers = {path: frame_header(file) for path, file in images.items()}
     seen = [
         _Seen(capture, images[capture.frame], header)
@@ -53,28 +52,28 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
             f"{one.file}: exposure_s = {one.capture.exposure_s:g} s, its {one.header.source} says {one.header.exposure_s:g} s{_and(off)}: "
             f"it seems to be in {unit}; write seconds"
         )
+    confirmed = {one.capture.id for one in timed} - {one.capture.id for one in off}
+    doubted = [c for c in manifest.captures if c.exposure_s is not None and c.id not in confirmed]
+    _check_limit([c for c in doubted if c.exposure_s > LONGEST_S], images)
     if moved := _moved(timed, off):
         raise InputError(
             f"{where}: {len(off)} of {len(timed)} exposures contradict their frames ({off[0].file.name}: {off[0].capture.exposure_s:g} s, its "
             f"{off[0].header.source} says {off[0].header.exposure_s:g} s), and fit those of the frames of {moved}: move the column of the "
             "frames by one row"
         )
-    lines = [_said(off, "exposure_s", "s", lambda one: one.capture.exposure_s, lambda one: one.header.exposure_s)]
-    warm = [one for one in seen if _differ(one.capture.temperature_c, one.header.temperature_c, TEMPERATURE_C)]
-    lines.append(
-        _said(warm, "temperature_c", "degree C", lambda one: one.capture.temperature_c, lambda one: one.header.temperature_c)
-    )  # fmt: skip
-    gains = [one for one in seen if _differ(one.capture.gain_db, one.header.gain_db, GAIN_DB)]
-    lines.append(_said(gains, "gain_db", "dB", lambda one: one.capture.gain_db, lambda one: one.header.gain_db))
+    lines = [_said("exposure_s", "s", [(one, one.capture.exposure_s, one.header.exposure_s) for one in off])]
+    warm = [(one, one.capture.temperature_c, one.header.temperature_c) for one in seen]
+    lines.append(_said("temperature_c", "degree C", [one for one in warm if _differ(*one[1:], TEMPERATURE_C)]))
+    gains = [(one, one.capture.gain_db, one.header.gain_db) for one in seen]
+    lines.append(_said("gain_db", "dB", [one for one in gains if _differ(*one[1:], GAIN_DB)]))
     for side, camera in manifest.cameras.items():
         own = [one for one in seen if one.capture.side == side]
         f_number, key = camera.f_number, "f_number"
         if f_number is None and (opened := [one for one in own if one.header.f_number is not None]):
             f_number, key = opened[0].header.f_number, f"f_number (of {opened[0].file.name})"
-        wide = [one for one in own if not same_f_number(f_number, one.header.f_number)]
-        lines.append(_said(wide, key, "", lambda _, said=f_number: said, lambda one: one.header.f_number))
-        lines.append(_uneven_gain(own))
-    return [line for line in lines if line] + _long_or_overlapping(manifest.captures, images)
+        wide = [(one, f_number, one.header.f_number) for one in own]
+        lines += [_said(key, "", [one for one in wide if not same_f_number(*one[1:])]), _uneven_gain(own)]
+    return [line for line in (*lines, _long(doubted, images)) if line] + _overlapping(manifest.captures, images)
 
 
 @dataclass(frozen=True)
@@ -86,14 +85,13 @@ class _Seen:
     header: FrameHeader
 
 
-def check_exposures(stated: Sequence[tuple[str, float | None]]) -> None:
-    """Refuse exposures (what has it, s) beyond `LONGEST_S`: InputError with one line."""
-    too_long = [(name, exposure_s) for name, exposure_s in stated if exposure_s is not None and exposure_s > LONGEST_S]
+def _check_limit(too_long: Sequence[Capture], images: Mapping[str, Path]) -> None:
+    """Refuse exposures beyond the limit that no file confirms: InputError with one line."""
     if too_long:
-        name, exposure_s = too_long[0]
         more = f", and {len(too_long) - 1} more" if len(too_long) > 1 else ""
         raise InputError(
-            f"{name}: exposure_s = {exposure_s:g} is beyond the limit of {LONGEST_S:g} s{more}; write seconds (microseconds over 1e6)"
+            f"{images[too_long[0].frame]}: exposure_s = {too_long[0].exposure_s:g} is beyond the limit of {LONGEST_S:g} s{more}, and no header says "
+            "so; write seconds (microseconds over 1e6)"
         )
 
 
@@ -137,22 +135,16 @@ def _moved(timed: Sequence[_Seen], off: Sequence[_Seen]) -> str | None:
     return None
 
 
-def _and(off: Sequence[_Seen]) -> str:
+def _and(off: Sequence[object]) -> str:
     return f" (so do {len(off) - 1} more)" if len(off) > 1 else ""
 
 
-def _said(
-    off: Sequence[_Seen],
-    key: str,
-    unit: str,
-    stated: Callable[[_Seen], float | None],
-    header: Callable[[_Seen], float | None],
-) -> str:
-    """The line for a quantity whose statement the frames' files contradict; empty where none does."""
+def _said(key: str, unit: str, off: Sequence[tuple[_Seen, float | None, float | None]]) -> str:
+    """The line for a quantity of which frames, what is stated and what their files say differ; empty where none does."""
     if not off:
         return ""
-    one, of = off[0], f" {unit}" if unit else ""
-    return f"{one.file}: {key} = {stated(one):g}{of}, its {one.header.source} says {header(one):g}{of}{_and(off)}; the former is used: correct what is wrong"
+    (one, stated, header), of = off[0], f" {unit}" if unit else ""
+    return f"{one.file}: {key} = {stated:g}{of}, its {one.header.source} says {header:g}{of}{_and(off)}; the former is used: correct what is wrong"
 
 
 def _uneven_gain(own: Sequence[_Seen]) -> str:
@@ -177,16 +169,21 @@ def _uneven_gain(own: Sequence[_Seen]) -> str:
     )
 
 
-def _long_or_overlapping(captures: Sequence[Capture], images: Mapping[str, Path]) -> list[str]:
-    """The lines for exposures with light that are longer than usual, and for those that are longer than the time to the next frame."""
+def _long(doubted: Sequence[Capture], images: Mapping[str, Path]) -> str:
+    """The line for exposures with light that are longer than usual; empty where there is none."""
+    long = [c for c in doubted if c.kind != "dark" and c.exposure_s > LONGEST_LIT_S]
+    if not long:
+        return ""
+    more = f", and {len(long) - 1} more" if len(long) > 1 else ""
+    return (
+        f"{images[long[0].frame]}: exposure_s = {long[0].exposure_s:g} of a {long[0].kind}{more}, beyond {LONGEST_LIT_S:g} s of light: "
+        "check that it is in seconds, not in milliseconds or microseconds"
+    )
+
+
+def _overlapping(captures: Sequence[Capture], images: Mapping[str, Path]) -> list[str]:
+    """The line for the first exposure of each side that is longer than the time to the next frame."""
     lines = []
-    long = [c for c in captures if c.kind != "dark" and c.exposure_s is not None and c.exposure_s > LONGEST_LIT_S]
-    if long:
-        more = f", and {len(long) - 1} more" if len(long) > 1 else ""
-        lines.append(
-            f"{images[long[0].frame]}: exposure_s = {long[0].exposure_s:g} of a {long[0].kind}{more}, beyond {LONGEST_LIT_S:g} s of light: "
-            "check that it is in seconds, not in milliseconds or microseconds"
-        )
     timed = [(c.time.timestamp(), c) for c in captures if c.time is not None and c.exposure_s is not None]
     for side in dict.fromkeys(c.side for _, c in timed):
         own = sorted((one for one in timed if one[1].side == side), key=lambda one: one[0])

@@ -7,6 +7,7 @@ from functools import cache
 from lab.diagnose import diagnose
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.shown_in_means import is_judged_in_means, must_show_in_means, shown_in_means
+from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.measurements.noise import variance_block
 from lab.diagnose.measurements.noise_neighbours import neighbour_block
@@ -21,6 +22,7 @@ from sim.effects.brighter_fatter import BrighterFatter
 from sim.effects.inter_pixel_capacitance import InterPixelCapacitance
 from sim.effects.nonlinearity import Nonlinearity
 from sim.effects.row_noise import RowNoise
+from tests.lab.diagnose.metadata.lies import restated
 from tests.lab.diagnose.on_blocks import measured_model, names, rendered, study, verdict
 
 BEND = Nonlinearity(quadratic_percent=-10.0)
@@ -84,3 +86,14 @@ def test_an_exposure_typed_ten_times_too_long_is_told_where_no_light_is_stated()
     # the response's law through seven levels gives the level's exposure to some thousandths
     fits_s = float(told.check.split("have this level at ")[1].split(" s")[0])
     assert abs(fits_s / exposures[3] - 1.0) < 0.01
+
+
+def test_what_refers_to_full_well_is_told_to_be_extrapolated() -> None:
+    """12-bit data called 16 bits reach 6 % of the range."""
+    recordings = rendered(3)
+    for bit_depth, white_dn, lines in ((12, 4095.0, 0), (16, 65535.0, 1)):
+        called = restated(recordings, bit_depth=bit_depth, white_level_dn=white_dn)
+        _, skipped = measurement_model(called, "left")
+        found = [s.reason for s in skipped if s.step == "diagnose full_well_e"]
+        assert len(found) == lines
+        assert all("reaches 5." in reason for reason in found)

@@ -11,10 +11,10 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.edge_estimator import REAL_AT, profile_interpolation, spread_operator
-from lab.diagnose.measurements.edge_profiles import _check_phases
 from lab.diagnose.measurements.slanted_edge import ASIDE, _Edges, edge_block
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.fit.mtf.phases import check_phases
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
@@ -176,4 +176,4 @@ def test_an_edge_that_crosses_less_than_a_period_is_left_out(cfa: str, rows: int
     assert ("2.6 deg", study.camera.channels[0]) not in labels
     capture = next(c for c in study.recordings.captures("slanted_edge") if c.angle_deg == 2.6)
     with pytest.raises(NotDetermined, match=told):
-        _check_phases(study, study.camera.channels[0], capture.region, 2.6)
+        check_phases("slanted_edge", study.stated.cfa, study.camera.channels[0], capture.region, 2.6)

@@ -63,3 +63,15 @@ def test_fit_looks_for_edges_where_no_region_is_stated():
     assert all(c.mtf10_cy_per_px is None or c.mtf10_cy_per_px > c.mtf50_cy_per_px for c in curves)
     # 1.5 um pixels: regions lie 60 px from the middle of the frame
     assert all(np.hypot(*c.field_mm) == pytest.approx(60 * 1.5e-3, abs=0.01) for c in curves)
+
+
+def test_edges_that_cross_less_than_a_period_of_their_channel_are_left_out():
+    """A side at 0.8 deg over 108 lines crosses 1.5 px: a period of green (1 px), less than one of red and blue (2 px)."""
+    light = squares((220, 220), [(110, 110, 60, 0.8)], 0.6)
+    raw = (64 + np.round(0.4 * np.random.default_rng(0).poisson(8000 * light))).astype(np.uint16)
+    stated = capture("edge-1", region=None, angle_deg=None, field_mm=None)
+    left_out: list[str] = []
+    curves = fit_mtf(recordings({"edge-1": raw}, [stated]), "left", None, left_out)
+    assert [c.channel for c in curves] == ["G"] * 4
+    assert len(left_out) == 8
+    assert all("of the 2 px between samples of" in line and "lines are enough" in line for line in left_out)

@@ -104,21 +104,16 @@ def _measured(path: Path, *, files: bool) -> Path:
 def test_measured_lines_stand_for_those_that_were_set(tmp_path: Path, files: bool) -> None:
     """With the measured lines the curves are those of `test_the_relative_sensitivities_of_the_table_s_camera`; with the stated ones they are moved by
     4 nm, which is 8 % of the peak on the flanks."""
-    found = _spectral(_measured(tmp_path, files=files))
+    file = _measured(tmp_path, files=files)
+    file.write_text(file.read_text().replace(",404,20,", ",414,20,"))  # one is far off, which is told
+    found = _spectral(file)
+    off = "1 lines are centred elsewhere than they are set, by 14."
+    assert any(off in remark for remark in found.remarks)
     wave = np.array(found.wavelength_nm)
     peak = max(float(_truth(c, wave).max()) for c in CURVES)
     for channel in CURVES:
         value, std = (np.array(getattr(found, f"relative_sensitivity{part}")[channel]) for part in ("", "_std"))
         assert np.all(np.abs(value - _truth(channel, wave) / peak) < 4.0 * np.hypot(std, 0.002))
-
-
-def test_lines_far_off_their_names_are_told(tmp_path: Path) -> None:
-    file = _measured(tmp_path, files=False)
-    file.write_text(file.read_text().replace(",404,20,", ",414,20,"))
-    assert any(
-        "1 lines are centred elsewhere than they are set, by 14.0 nm at most (414 nm: 400.0 nm)" in r
-        for r in _spectral(file).remarks
-    )
 
 
 def test_spectra_of_lines_that_cannot_be_used(tmp_path: Path) -> None:

@@ -1,17 +1,21 @@
 """Folders of images or raws with an index: every kind of capture, and one line for each row that can't be used."""
 
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from lab.errors import InputError
 from lab.fit.geometry.recordings import fit_geometry
 from lab.fit.stereo import fit_stereo
 from lab.formats import recording_set as recording
 from lab.formats.importers import ImportOptions, read_foreign
+from lab.formats.importers.index_file import capture_of_row, read_index
 from lab.formats.importers.raw_folder import read_checkerboard_pairs, read_raw_folder
 
 DATA = Path(__file__).resolve().parents[5] / "shared" / "data" / "opencv_stereo"
@@ -131,6 +135,31 @@ def test_columns_that_are_meant_to_be_others_are_named(folder: Path) -> None:
         assert "\n" not in str(caught.value)
     (folder / "index.csv").write_text(text.replace("target", "target,operator", 1))
     assert f"{folder}/index.csv: columns that no capture has are left out: operator" in read_raw_folder(folder).warnings
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+@given(
+    header=st.lists(st.sampled_from(["frame", "kind", "exposure_s", "exposure_ms", "x", "", "Frame"])),
+    cells=st.text(alphabet='a0.5,;\t"\n -', max_size=60),
+)
+def test_any_index_is_read_or_refused_in_one_line(tmp_path: Path, header: list[str], cells: str) -> None:
+    (tmp_path / "index.csv").write_text(f"{','.join(header)}\n{cells}")
+    try:
+        index = read_index(tmp_path / "index.csv")
+    except InputError as error:
+        assert len(str(error).splitlines()) == 1
+        return
+    for _, row in index.rows:
+        with suppress(InputError):
+            capture_of_row(row)
+
+
+def test_the_notes_keep_the_warnings_without_the_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "index.csv").write_text((folder / "index.csv").read_text().replace("target", "target,operator", 1))
+    notes = "imported from a folder of images\nindex.csv: columns that no capture has are left out: operator"
+    assert read_foreign("raw-folder", folder).manifest.notes == notes
+    monkeypatch.chdir(folder)
+    assert read_foreign("raw-folder", Path()).manifest.notes == notes
 
 
 def test_rows_of_which_the_same_is_said_share_a_line(folder: Path) -> None:
