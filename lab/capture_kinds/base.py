@@ -103,7 +103,7 @@ class Capture(Open):
 
     def remarks(self) -> Iterator[str]:
         """Warnings about the keys, with a remedy. The capture is used nevertheless."""
-        if self.exposure_s > LONGEST_EXPOSURE_S:
+        if (self.exposure_s or 0.0) > LONGEST_EXPOSURE_S:
             yield f"exposure_s is above {LONGEST_EXPOSURE_S:g} s: state it in seconds, not in milliseconds or microseconds"
 
     def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:

@@ -1,11 +1,12 @@
 """What a physical effect declares and where it acts. One effect, one file; `sim.effects.library` lists them.
 
 A first-order camera model leaves physics out. Each effect is one such piece: a change to a stage of the chain of light
-(`sim.stages`). An effect writes those of the nine methods below that it needs, and its parameters as fields.
+(`sim.stages`). An effect writes those of the eight methods below that it needs, and its parameters as fields.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar, Self
 
@@ -36,7 +37,6 @@ class Effect(Frozen):
     - `prototypes`: a small change of a parameter from `absent` isn't its signature.
     - `log_prior`: some combinations of its parameters are unusual.
     - `limits`: hardware bounds a parameter by what the camera is.
-    - `other_forms`: physics has several forms of its law.
     """
 
     name: ClassVar[str]
@@ -51,6 +51,8 @@ class Effect(Frozen):
     invariances: ClassVar[frozenset[str]] = frozenset()
     #: Parameters that shape the effect without sizing it (a filter's edge): a score takes them from the prototype as they are.
     shapes: ClassVar[frozenset[str]] = frozenset()
+    #: Other forms of the law, one standard deviation from this one: values of fields that no fit changes, each by itself.
+    forms: ClassVar[Mapping[str, object]] = {}
     #: Whether a diagnosis looks for it. False: a part that a camera is known to have, or a term of the diagnosis itself.
     is_candidate: ClassVar[bool] = True
     #: One sentence for the report: what physics was left out and how that shows.
@@ -134,12 +136,13 @@ class Effect(Frozen):
         }
 
     def other_forms(self) -> tuple[Self, ...]:
-        """Return this effect by other forms of its law, each one standard deviation away from this form.
+        """Return this effect by each of the other `forms` of its law.
 
         A diagnosis marginalises over the difference of each form from this one, with a standard normal coefficient. It is part of the
-        law's error beside `form_tolerance`, and unlike that has the form's own shape. The default has none.
+        law's error beside `form_tolerance`, and unlike that has the form's own shape.
         """
-        return ()
+        others = ((name, value) for name, value in type(self).forms.items() if getattr(self, name) != value)
+        return tuple(self.model_copy(update={name: value}) for name, value in others)
 
     def on_light(self, light: Light) -> Light:
         """What reaches the lens, given what the radiometer and the screen were told."""

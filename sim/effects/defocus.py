@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Self
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -27,6 +28,7 @@ class Defocus(Effect):
     reference: ClassVar[str] = "H. H. Hopkins, Proc. R. Soc. A 231, 91 (1955)"
     form_tolerance: ClassVar[float] = 0.01
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
+    forms: ClassVar[Mapping[str, object]] = {"spherical_share": SPHERICAL_SHARE}
     sentence: ClassVar[str] = (
         "The sensor is not in the image plane: contrast falls alike in all directions, with the shape of a defocused pupil, "
         "and would come back on stopping down."
@@ -46,9 +48,6 @@ class Defocus(Effect):
     ] = 0.0
 
     spherical_share: Annotated[float, Field(description="share of spherical aberration in the path error")] = 0.0
-
-    def other_forms(self) -> tuple[Self, ...]:
-        return (self.model_copy(update={"spherical_share": SPHERICAL_SHARE}),)
 
     def on_image(self, image: Image) -> Image:
         if self.defocus_um == 0.0:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -14,8 +15,8 @@ from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import ComplexArray, Image
 
-#: Share of the light in the weaker beam of a plate that isn't cut at exactly 45 degrees, or stands behind light that is partly polarised.
-UNEQUAL_BEAM = 0.46
+#: Difference of the two beams over their sum behind a plate that isn't cut at exactly 45 degrees, or in light that is partly polarised.
+BEAM_IMBALANCE = 0.08
 #: Ratios of the displacements' squares between which two plates aren't nearly alike and one isn't alone, and what that costs.
 UNALIKE, UNUSUAL_NATS = (0.002, 0.02, 0.35, 0.55), -4.0
 
@@ -35,6 +36,7 @@ class OpticalLowPassFilter(Effect):
     reference: ClassVar[str] = "Walker-Pavlopoulos plate displacement; J. Greivenkamp, Appl. Opt. 29, 676 (1990)"
     form_tolerance: ClassVar[float] = 0.002
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
+    forms: ClassVar[Mapping[str, object]] = {"plate": "quartz", "beam_imbalance": BEAM_IMBALANCE}
     sentence: ClassVar[str] = (
         "A birefringent anti-alias filter splits each ray into displaced copies: contrast falls as a cosine of spatial "
         "frequency, alike in all colours and at all f-numbers, along rows and columns apart."
@@ -44,7 +46,7 @@ class OpticalLowPassFilter(Effect):
         float,
         Quantity(
             "um",
-            "distance of the two copies along columns, at 589 nm",
+            "distance of the two copies along columns at 589 nm",
             lower=0.0,
             upper=20.0,
             prior=(0.0, 2.0),
@@ -56,7 +58,7 @@ class OpticalLowPassFilter(Effect):
         float,
         Quantity(
             "um",
-            "distance of the two copies along rows, at 589 nm",
+            "distance of the two copies along rows at 589 nm",
             lower=0.0,
             upper=20.0,
             prior=(0.0, 2.0),
@@ -69,13 +71,9 @@ class OpticalLowPassFilter(Effect):
         Literal["quartz"] | None, Field(description="material, by whose dispersion the distances grow")
     ] = None
 
-    beam_share: Annotated[
-        float, Field(ge=0.0, le=0.5, description="share of the light in the weaker of a plate's two beams")
-    ] = 0.5
-
-    def other_forms(self) -> tuple[Self, ...]:
-        quartz = () if self.plate == "quartz" else (self.model_copy(update={"plate": "quartz"}),)
-        return (*quartz, self.model_copy(update={"beam_share": UNEQUAL_BEAM}))
+    beam_imbalance: Annotated[
+        float, Field(ge=0.0, le=1.0, description="difference of a plate's two beams over their sum")
+    ] = 0.0
 
     def log_prior(self) -> float:
         """Filters are made of one plate, or of two nearly alike: not of a thick one and one of a third of its strength."""
@@ -97,7 +95,7 @@ class OpticalLowPassFilter(Effect):
                 fy_cy_per_um,
                 share * self.displacement_x_um,
                 share * self.displacement_y_um,
-                self.beam_share,
+                self.beam_imbalance,
             )
 
         return image.adding(transfer=transfer)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Self
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -39,6 +40,7 @@ class PixelAperture(Effect):
     )
     form_tolerance: ClassVar[float] = 0.01
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
+    forms: ClassVar[Mapping[str, object]] = {"disc_share": 1.0, "soft_share": SOFT_SHARE}
     sentence: ClassVar[str] = (
         "The pixel's aperture differs from the stated one: contrast at high frequencies differs alike in all colours and at all f-numbers."
     )
@@ -66,27 +68,22 @@ class PixelAperture(Effect):
         side = camera.pixel_pitch_um * camera.fill_factor**0.5
         return {"side_change_um": (-min((1.0 - LEAST_SIDE) * side, 5.0), camera.pixel_pitch_um - side)}
 
-    def other_forms(self) -> tuple[Self, ...]:
-        formed = min(1.0, abs(self.side_change_um) / FORMED_UM)
-        return (
-            self.model_copy(update={"disc_share": formed}),
-            self.model_copy(update={"soft_share": formed**0.5 * SOFT_SHARE}),
-        )
-
     def on_charge(self, charge: Charge) -> Charge:
         if self.side_change_um == 0.0:
             return charge
         side = charge.camera.pixel_pitch_um * charge.camera.fill_factor**0.5
         new = max(side + self.side_change_um, LEAST_SIDE * side)
+        formed = min(1.0, abs(self.side_change_um) / FORMED_UM)
+        disc_share, soft_share = formed * self.disc_share, formed**0.5 * self.soft_share
 
         def transfer(fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float) -> FloatArray:
             fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float))
             own = np.sinc(new * fx) * np.sinc(new * fy)
-            if self.disc_share > 0.0:
+            if disc_share > 0.0:
                 q = 2.0 * np.sqrt(np.pi) * new * np.hypot(fx, fy)
                 disc = np.where(q > NULL, 2.0 * j1(q) / np.where(q > NULL, q, 1.0), 1.0)
-                own = (1.0 - self.disc_share) * own + self.disc_share * disc
-            own = own * np.exp(-2.0 * (np.pi * self.soft_share * new) ** 2 * (fx**2 + fy**2))
+                own = (1.0 - disc_share) * own + disc_share * disc
+            own = own * np.exp(-2.0 * (np.pi * soft_share * new) ** 2 * (fx**2 + fy**2))
             stated = np.sinc(side * fx) * np.sinc(side * fy)
             # at the stated aperture's nulls the ratio has no value, beside them it is large: the pixel's own transfer makes up for it
             is_null = (np.abs(np.sinc(side * fx)) <= NULL) | (np.abs(np.sinc(side * fy)) <= NULL)

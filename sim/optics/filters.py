@@ -53,20 +53,20 @@ def birefringent_otf(
     fy_cy_per_um: ArrayLike,
     displacement_x_um: float,
     displacement_y_um: float,
-    beam_share: float = 0.5,
+    beam_imbalance: float = 0.0,
 ) -> NDArray[np.float64] | NDArray[np.complex128]:
     """Return the transfer function of those spots: cos(pi fx dx) cos(pi fy dy), first zero at f = 1 / (2 d).
 
-    `beam_share` (0..0.5) is that of the weaker of a plate's two beams, s: each factor is then cos(phi) - i (1 - 2 s) sin(phi), phi = pi f d,
-    whose modulus has no zero.
+    `beam_imbalance` (0..1) is the difference m of a plate's two beams over their sum: each factor is then cos(phi) - i m sin(phi),
+    phi = pi f d, whose modulus has no zero.
     """
     across, along = (
         np.pi * np.asarray(f, float) * d
         for f, d in ((fx_cy_per_um, displacement_x_um), (fy_cy_per_um, displacement_y_um))
     )
-    if beam_share == 0.5:
+    if beam_imbalance == 0.0:
         return np.asarray(np.cos(across) * np.cos(along))
-    unequal = 1j * (1.0 - 2.0 * beam_share)
+    unequal = 1j * beam_imbalance
     return np.asarray((np.cos(across) - unequal * np.sin(across)) * (np.cos(along) - unequal * np.sin(along)))
 
 

@@ -46,8 +46,9 @@ def test_no_code_outside_sim_applies_an_effect(path: Path) -> None:
 
 
 def test_an_effect_has_at_most_eight_methods_to_write() -> None:
-    """The stage methods and the two that a score asks; none of the library's effects overrides anything else of the base."""
-    writable = {*STAGES.values(), "prototypes", "log_prior"}
+    """The stage methods, the two that a score asks, and what hardware bounds; none of the library's effects overrides anything else of the
+    base."""
+    writable = {*STAGES.values(), "prototypes", "log_prior", "limits"}
     assert len(writable) <= 8
     own = {name for name in vars(Effect) if not name.startswith("_") and callable(getattr(Effect, name))}
     for kind in effects().values():

@@ -29,7 +29,7 @@ OFFSETS_STD = 0.5
 
 
 @dataclass(frozen=True)
-class RowNoise:
+class DarkRowPower:
     """Power of the rows of single frames beyond that of pixels' noise, by band of frequency, DN^2, and its standard deviation."""
 
     power_dn2: FloatArray  # (bands,)
@@ -46,7 +46,7 @@ class DarkReadOut:
     offsets_dn: NDArray[np.float32]  # (rows, cols): mean frame less its mean
     frames: int  # that it is the mean of
 
-    def noise(self, bands: Sequence[range]) -> RowNoise:
+    def noise(self, bands: Sequence[range]) -> DarkRowPower:
         """The noise of rows in `bands`, each a range of cycles a frame.
 
         With a = `contrasts` x cycles of the band, its power P is gamma-distributed about the true one, tau, and P^(1/3) has the mean
@@ -66,9 +66,9 @@ class DarkReadOut:
         likely = weight * root + (1.0 - weight) * around
         power = likely**3 - self.white_dn2
         std = 3.0 * likely**2 * np.sqrt(own * weight)
-        return RowNoise(power, np.hypot(std, LIGHT_STD * np.maximum(power, 0.0)))
+        return DarkRowPower(power, np.hypot(std, LIGHT_STD * np.maximum(power, 0.0)))
 
-    def offsets(self, bands: Sequence[range], step: int) -> RowNoise:
+    def offsets(self, bands: Sequence[range], step: int) -> DarkRowPower:
         """The power of the rows of `offsets_dn` that isn't in those of light frames: their noise, and what may differ by `OFFSETS_STD`."""
         rows = row_profile(self.offsets_dn, step)
         fixed = np.abs(np.fft.rfft(rows)) ** 2 / len(rows)
@@ -76,7 +76,7 @@ class DarkReadOut:
         noise, whole = (
             np.array([of[list(band)].mean() for band in bands]) for of in (self.power_dn2 / self.frames, fixed)
         )
-        return RowNoise(noise, np.hypot(noise / np.sqrt(modes), OFFSETS_STD**2 * whole))
+        return DarkRowPower(noise, np.hypot(noise / np.sqrt(modes), OFFSETS_STD**2 * whole))
 
 
 def row_profile(frame: NDArray[np.floating], step: int) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.dark_readout import RowNoise, dark_readout, row_profile
+from lab.diagnose.measurements.dark_readout import DarkRowPower, dark_readout, row_profile
 from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, dark_level_dn
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.reads import ADDED
@@ -210,7 +210,7 @@ def _measured(
     return found
 
 
-def _any_row_noise(study: Study, levels: Sequence[_Level]) -> RowNoise:
+def _any_row_noise(study: Study, levels: Sequence[_Level]) -> DarkRowPower:
     """The noise of rows where no dark frames tell it: what is most like the seen flats beside light that varies from row to row, and so
     wide a standard deviation that any other is as good.
 
@@ -232,7 +232,7 @@ def _any_row_noise(study: Study, levels: Sequence[_Level]) -> RowNoise:
         std = np.array([max(level.power[k], 1.0) * np.sqrt(2.0 / level.freedom[k]) for level in seen])
         found, _ = nnls(design / size / std[:, None], (power[:, k] - 1.0) / std)
         likely.append(min(float(found[0]) / size[0], MOST_ROW_NOISE * read_dn2))
-    return RowNoise(np.array(likely), np.array(likely) + read_dn2)
+    return DarkRowPower(np.array(likely), np.array(likely) + read_dn2)
 
 
 def _power(rows: FloatArray, bands: Sequence[range]) -> FloatArray:

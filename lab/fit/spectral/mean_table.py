@@ -66,7 +66,7 @@ class _TableLight:
 
 
 @dataclass(frozen=True)
-class _Line:
+class _MeasuredLine:
     """Centre and width of a light (nm), by its measurement where there is one, and its spectrum."""
 
     wavelength_nm: float
@@ -118,14 +118,14 @@ def _channel(row: TableRow, camera: DataSheet) -> str:
     return channel
 
 
-def _line(row: TableRow) -> _Line:
+def _line(row: TableRow) -> _MeasuredLine:
     """The light of a row. Raises InputError where neither what was set nor what was measured says its centre and width."""
     if name := row.cells.get(SPECTRUM):
         spectrum = _measured_spectrum(row.file, name)
         wavelength_nm, value = spectrum.arrays
         high = value > LINE_SHARE * value.max()
         middle_nm = float(np.average(wavelength_nm[high], weights=value[high]))
-        return _Line(middle_nm, float(np.trapezoid(value, wavelength_nm) / value.max()), spectrum)
+        return _MeasuredLine(middle_nm, float(np.trapezoid(value, wavelength_nm) / value.max()), spectrum)
     centre, width = row.known(CENTRE, 1.0), row.known(WIDTH, 0.1)
     centre = row.known("wavelength_nm", 1.0) if centre is None else centre
     width = row.known("bandwidth_nm", 0.1) if width is None else width
@@ -134,7 +134,7 @@ def _line(row: TableRow) -> _Line:
             f"{row.file}: row {row.number}: no {'centre' if centre is None else 'width'} of the line; write wavelength_nm and bandwidth_nm, {CENTRE} "
             f"and {WIDTH}, or a {SPECTRUM}"
         )
-    return _Line(centre, width)
+    return _MeasuredLine(centre, width)
 
 
 def _measured_spectrum(table: Path, name: str) -> Spectrum:

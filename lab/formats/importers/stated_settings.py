@@ -40,7 +40,7 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
     """
     headers = {path: frame_header(file) for path, file in images.items()}
     seen = [
-        _Seen(capture, images[capture.frame], header)
+        _HeaderSeen(capture, images[capture.frame], header)
         for capture in manifest.captures
         if (header := headers[capture.frame]) is not None
     ]
@@ -77,7 +77,7 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _HeaderSeen:
     """A capture with its file and what that says."""
 
     capture: Capture
@@ -113,7 +113,7 @@ def _differ(stated: float | None, header: float | None, allowed: float) -> bool:
     return stated is not None and header is not None and abs(stated - header) > allowed
 
 
-def _unit(off: Sequence[_Seen]) -> str | None:
+def _unit(off: Sequence[_HeaderSeen]) -> str | None:
     """The unit in which all these exposures are, where it isn't the second."""
     for factor, name in UNIT_FACTORS.items():
         if all(same_exposure((one.capture.exposure_s or 0.0) / factor, one.header) for one in off):
@@ -121,7 +121,7 @@ def _unit(off: Sequence[_Seen]) -> str | None:
     return None
 
 
-def _moved(timed: Sequence[_Seen], off: Sequence[_Seen]) -> str | None:
+def _moved(timed: Sequence[_HeaderSeen], off: Sequence[_HeaderSeen]) -> str | None:
     """The rows whose frames all exposures fit, where these aren't their own."""
     if len(timed) < FEWEST_ROWS or len(off) < FEWEST_OFF:
         return None
@@ -139,7 +139,7 @@ def _and(off: Sequence[object]) -> str:
     return f" (so do {len(off) - 1} more)" if len(off) > 1 else ""
 
 
-def _said(key: str, unit: str, off: Sequence[tuple[_Seen, float | None, float | None]]) -> str:
+def _said(key: str, unit: str, off: Sequence[tuple[_HeaderSeen, float | None, float | None]]) -> str:
     """The line for a quantity of which frames, what is stated and what their files say differ; empty where none does."""
     if not off:
         return ""
@@ -147,7 +147,7 @@ def _said(key: str, unit: str, off: Sequence[tuple[_Seen, float | None, float | 
     return f"{one.file}: {key} = {stated:g}{of}, its {one.header.source} says {header:g}{of}{_and(off)}; the former is used: correct what is wrong"
 
 
-def _uneven_gain(own: Sequence[_Seen]) -> str:
+def _uneven_gain(own: Sequence[_HeaderSeen]) -> str:
     """The line for frames of one side whose ISO speeds differ otherwise than their gains."""
     known = [one for one in own if one.header.iso is not None]
     if not known:

@@ -65,7 +65,7 @@ def test_later_steps_get_what_earlier_ones_found(
     def noise(recordings: RecordingSet, side: str) -> NoiseFit:
         return NoiseFit(read_noise_e={"left": 1.0, "right": 2.0}[side])
 
-    def mtf(recordings: RecordingSet, side: str, levels: NoiseFit) -> tuple[()]:
+    def mtf(recordings: RecordingSet, side: str, levels: NoiseFit, left_out: list[str]) -> tuple[()]:
         seen["mtf", side] = levels.read_noise_e
         return ()
 

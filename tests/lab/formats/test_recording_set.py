@@ -129,14 +129,14 @@ def test_a_set_travels_to_another_process(folder: Path) -> None:
 
 def test_unknown_kind_and_unknown_keys_are_reported_and_passed_over(folder: Path) -> None:
     edit(folder, lambda m: m["captures"].append({"id": "x", "kind": "hologram", "anything": 1}))
-    edit(folder, lambda m: m["cameras"]["left"].update(shutter="rolling"))
+    edit(folder, lambda m: m["cameras"]["left"].update(coating="broadband"))
     edit(folder, lambda m: next(c for c in m["captures"] if c["kind"] == "white")["screen"].update(nits=300))
     recordings = read(folder)
     assert len(recordings.warnings) == 3
     assert "unknown kind 'hologram'" in recordings.warnings[0]
-    assert any("'shutter'" in line and "camera left" in line for line in recordings.warnings)
+    assert any("'coating'" in line and "camera left" in line for line in recordings.warnings)
     assert any("'nits'" in line and "screen" in line for line in recordings.warnings)
-    assert recordings.camera("left").unknown_keys() == {"shutter": "rolling"}
+    assert recordings.camera("left").unknown_keys() == {"coating": "broadband"}
 
 
 def test_only_unknown_kinds_leave_nothing_to_work_with(folder: Path) -> None:

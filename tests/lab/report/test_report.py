@@ -113,7 +113,7 @@ def test_every_anchor_leads_somewhere(small_set: Callable[..., RecordingSet], ma
 def test_page_says_what_the_results_say(page: Page) -> None:
     for words in (
         "The baseline model leaves physics out; the named effects account for it.",
-        "Optical low-pass filter, left: distance of the two copies along columns 2.104 ± 0.051 µm",
+        "Optical low-pass filter, left: distance of the two copies along columns at 589 nm 2.104 ± 0.051 µm",
         "Optical low-pass filter: probability 99.4 %; rivals: defocus (0.006)",
         "What was found",
         "What to do",
