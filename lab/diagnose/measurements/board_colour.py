@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.boards import FEWEST_CORNERS, REFERENCE_NM, views_of
@@ -14,6 +16,8 @@ from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import BoardView, channel_corners
 from sim.spectrum import FloatArray
+
+Array = NDArray[np.floating[Any]]
 
 COLOUR_VIEWS = 8  # of more views, evenly spaced ones are used, at least as many: every corner is fitted once a channel
 COLOUR_RINGS = (0.3, 0.6, 1.0)  # outer radii of the rings, half diagonals; the last ring has no end
@@ -125,7 +129,7 @@ def _between_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
     return [*found.values()]
 
 
-def _table(study: Study, place: FloatArray, gap: FloatArray, number: int) -> FloatArray:
+def _table(study: Study, place: Array, gap: Array, number: int) -> FloatArray:
     """The `table` of `_rings` of one view, from places and displacements (n, 2), (x, y) px; places near the middle are left out."""
     camera = study.camera
     half = camera.half_diagonal_px

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.diagnose import diagnose
+from lab.diagnose import diagnose, examine
 from lab.diagnose.outcome.board_departure import board_departure
 from lab.diagnose.policy import DecisionPolicy
 from lab.fit.geometry.calibration import calibrate_robustly
@@ -106,8 +106,14 @@ def test_the_verdict_is_unexplained() -> None:
 def test_public_boards_are_no_finding() -> None:
     """They leave 0.11 px, where their pictures' noise explains 0.02 px: more than noise, and what such boards leave."""
     recordings = read_checkerboard_pairs(PAIRS, (6, 9), 25.0)
-    for side in recordings.sides:
-        fit = fit_geometry(recordings, side)
+    fits = {side: fit_geometry(recordings, side) for side in recordings.sides}
+    result = examine(
+        recordings,
+        FitResult(source="x", cameras={side: CameraFit(geometry=fit) for side, fit in fits.items()}),
+        at_once=False,
+    ).result
+    assert result.verdict == "no_mismatch"
+    for side, fit in fits.items():
         assert fit.corner_px_std > 4 * fit.residuals[0].noise_px
         assert board_departure(side, fit, (480, 640), DecisionPolicy()) is None
         strict = board_departure(side, fit, (480, 640), DecisionPolicy(corner_tolerance_px=0.05))
