@@ -1,4 +1,4 @@
-"""Lateral colour of boards: displacement of the corners in red and blue from those in green, and between wavelengths of light."""
+"""Lateral colour of boards: displacement of the corners in red and blue from those in green, and between wavelengths."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ COLOUR_RINGS = (0.3, 0.6, 1.0)  # outer radii of the rings, half diagonals; the 
 class _Shift:
     """What is displaced from what: `table` of `_rings` of each view, and the captures of each.
 
-    `pair`: wavelength (nm) and the one that it is held against, of pictures of one pose in light of one wavelength each; None: `channel`
-    against green within pictures in white light.
+    `pair`: wavelength (nm) and the one that it is held against, of pictures of one pose in light of one wavelength
+    each; None: `channel` against green within pictures in white light.
     """
 
     channel: str
@@ -43,11 +43,11 @@ class _Shift:
 
 
 def board_colour_block(study: Study) -> Block:
-    """Radial displacement (px) of corners or dots, by rings about the frame's middle: in red and blue from those in green, and of pictures
-    of one pose in light of single wavelengths from the one nearest `REFERENCE_NM`.
+    """Radial displacement (px) of corners or dots, by rings about the frame's middle: in red and blue from those in
+    green, and of pictures of one pose in light of single wavelengths from the one nearest `REFERENCE_NM`.
 
-    Raises NotDetermined without charuco captures, where there is neither a green channel nor a pose in light of two wavelengths, and with too
-    few corners.
+    Raises NotDetermined without boards, where there is neither a green channel nor a pose in light of two wavelengths,
+    and with too few corners.
     """
     views, missed = views_of(study, study.side)
     if not views:
@@ -58,10 +58,11 @@ def board_colour_block(study: Study) -> Block:
         lit = len({view.capture.wavelength_nm for view in views} - {None})
         raise NotDetermined(
             "board_colour",
-            f"boards in light of {lit} wavelengths, but no pose in two of them: nothing to hold them against; give the pictures of one pose "
-            "the same `pose`"
+            f"boards in light of {lit} wavelengths, but no pose in two of them: nothing to hold them against; give the "
+            "pictures of one pose the same `pose`"
             if lit > 1
-            else "one channel or one wavelength: nothing to hold it against; take a pose in light of two wavelengths, under one `pose`",
+            else "one channel or one wavelength: nothing to hold it against; take a pose in light of two wavelengths, under "
+            "one `pose`",
         )
     values, variances, labels, pairs = [], [], [], []
     for shift in shifts:
@@ -130,7 +131,8 @@ def _between_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
 
 
 def _table(study: Study, place: Array, gap: Array, number: int) -> FloatArray:
-    """The `table` of `_rings` of one view, from places and displacements (n, 2), (x, y) px; places near the middle are left out."""
+    """The `table` of `_rings` of one view, from places and displacements (n, 2), (x, y) px, without those near the
+    middle."""
     camera = study.camera
     half = camera.half_diagonal_px
     away = place - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)

@@ -87,8 +87,8 @@ def colour_shift_px(
 
 
 def outward_shifts_px(study: Study, distance: float, wavelength_nm: FloatArray, effects: Effects) -> FloatArray:
-    """Predicted displacement outwards (n,), px, of light of n wavelengths at `distance` (half diagonals) from the middle: the mean over
-    four directions."""
+    """Predicted displacement outwards (n,), px, of light of n wavelengths at `distance` (half diagonals) from the
+    middle: the mean over four directions."""
     camera = study.camera
     turn = np.pi / 4.0 + np.pi / 2.0 * np.arange(4)
     x, y = (distance * camera.half_diagonal_um * way for way in (np.cos(turn), np.sin(turn)))

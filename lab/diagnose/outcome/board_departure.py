@@ -1,9 +1,11 @@
-"""Corners of boards that depart from the fitted camera by more than their noise: the geometry fit's own error, as a finding.
+"""Corners of boards that depart from the fitted camera by more than their noise: the geometry fit's own error, as a
+finding.
 
-The fit frees the camera, Brown's distortion, the poses and each board's warp. What its residuals hold beyond noise is then the
-board's shape or print, motion, or a distortion that these terms don't follow. The noise of a corner doesn't come from the residuals'
-size, in which such an error would hide, but from the picture about the corner (`fit_corners`, `dot_centres`). Where that isn't known, it
-is the part of the residuals that neighbouring corners don't share (`correlated_errors`).
+The fit frees the camera, Brown's distortion, the poses and each board's warp. What its residuals hold beyond noise is
+then the board's shape or print, motion, or a distortion that these terms don't follow. The noise of a corner doesn't
+come from the residuals' size, in which such an error would hide, but from the picture about the corner (`fit_corners`,
+`dot_centres`). Where that isn't known, it is the part of the residuals that neighbouring corners don't share
+(`correlated_errors`).
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ POSE_PARAMETERS = 6
 
 @dataclass(frozen=True)
 class _Part:
-    """The corners of a part: standard deviation of a coordinate as found and as noise explains it, px; chi2 of n numbers."""
+    """The corners of a part: standard deviation of a coordinate as found and as noise explains it, px; chi2 of n
+    numbers."""
 
     found_px: float
     noise_px: float
@@ -41,7 +44,8 @@ class _Part:
         return float(np.sqrt(max(self.found_px**2 - self.noise_px**2, 0.0)))
 
     def sigma(self, slack: float) -> float:
-        """chi2 as a quantile of the normal distribution (Wilson and Hilferty 1931), with standard deviations `slack` too small."""
+        """chi2 as a quantile of the normal distribution (Wilson and Hilferty 1931), with standard deviations `slack`
+        too small."""
         spread = 2.0 / (9.0 * self.n)
         return float((np.cbrt(self.chi2 / (1.0 + slack) ** 2 / self.n) - 1.0 + spread) / np.sqrt(spread))
 
@@ -49,11 +53,12 @@ class _Part:
 def board_departure(
     side: Side, geometry: GeometryFit | None, shape: tuple[int, int], policy: DecisionPolicy
 ) -> Unexplained | None:
-    """Where and by how much the corners of a fit depart from its camera; None where noise and `corner_tolerance_px` explain them.
+    """Where and by how much the corners of a fit depart from its camera; None where noise and `corner_tolerance_px`
+    explain them.
 
-    All corners, those of each view, and those of each ninth of a frame of `shape` (rows, cols) are tested. A part departs where its chi2
-    against noise is beyond `slice_false_alarm_rate`, corrected for the number of parts, and its departure beyond noise is larger than
-    both `corner_tolerance_px` and the noise.
+    All corners, those of each view, and those of each ninth of a frame of `shape` (rows, cols) are tested. A part
+    departs where its chi2 against noise is beyond `slice_false_alarm_rate`, corrected for the number of parts, and its
+    departure beyond noise is larger than both `corner_tolerance_px` and the noise.
     """
     if geometry is None or not geometry.residuals:
         return None
@@ -89,8 +94,9 @@ def board_departure(
     worst = max(departing, key=lambda part: part.departure_px)
     return Unexplained(
         side=side, measurement=BOARDS.name, axis=BOARDS.axis, where=_where(bad_views, bad_cells, len(views)),
-        shape=f"the corners of boards depart from the camera's geometry by {worst.found_px:.2f} px (standard deviation of a coordinate), "
-        f"noise explains {worst.noise_px:.2f} px; a bent board, an unflat print or a distortion beyond the fitted terms does that",
+        shape=f"the corners of boards depart from the camera's geometry by {worst.found_px:.2f} px (standard deviation of a "
+        f"coordinate), noise explains {worst.noise_px:.2f} px; a bent board, an unflat print or a distortion beyond the "
+        "fitted terms does that",
         significance_sigma=round(worst.sigma(policy.covariance_slack), 2),
         chi2_before=worst.chi2, chi2_after=worst.n, n=round(worst.n), captures=tuple(sorted(bad_views or by_view)),
         correction="none: the geometry's standard deviations hold what neighbouring corners share",
@@ -98,12 +104,12 @@ def board_departure(
 
 
 def _noise_px(geometry: GeometryFit, view: ViewResiduals) -> float:
-    """Standard deviation of a coordinate by noise, px: of the view's picture, else of what neighbouring corners don't share; NaN where
-    neither is known."""
+    """Standard deviation of a coordinate by noise, px: of the view's picture, else of what neighbouring corners don't
+    share; NaN where neither is known."""
     known = view.noise_px
     if known is None:
         known = geometry.corner_errors.noise_px if geometry.corner_errors is not None else np.nan
-    return max(known, FLOOR_PX)
+    return float(np.maximum(known, FLOOR_PX))
 
 
 def _part(rest: FloatArray, noise_px: FloatArray, share: float) -> _Part:

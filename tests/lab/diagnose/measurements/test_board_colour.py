@@ -47,7 +47,8 @@ def study_of(folder: Path, percent: float, *, one_pose: bool = True) -> Study:
 
 @pytest.mark.parametrize("percent", [0.0, 0.38])
 def test_scales_of_wavelengths_are_compared_within_a_pose(tmp_path: Path, percent: float) -> None:
-    """A ring has the floor of 0.012 px, its dots, and that displacements grow within it; 3.5 standard deviations of the widest ring."""
+    """A ring has the floor of 0.012 px, its dots, and that displacements grow within it; 3.5 standard deviations of the
+    widest ring."""
     study = study_of(tmp_path, percent)
     block = board_colour_block(study)
     assert {label.condition for label in block.labels} == {

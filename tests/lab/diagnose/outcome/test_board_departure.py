@@ -1,4 +1,5 @@
-"""Boards that aren't flat in a way that no warp follows: the geometry fit's own error is a mismatch, and noise isn't."""
+"""Boards that aren't flat in a way that no warp follows: the geometry fit's own error is a mismatch, and noise
+isn't."""
 
 from __future__ import annotations
 
@@ -40,9 +41,9 @@ def departure(fit: GeometryFit) -> Unexplained | None:
 
 @pytest.mark.parametrize("noise_is_known", [False, True])
 def test_a_board_that_bows_anew_in_each_pose_is_told(noise_is_known: bool) -> None:
-    """A sheet of 300 mm that bows by 1.5 mm to the one side and to the other: 0.34 px of 0.09 px noise. The warp of the fit is one for all
-    poses, so that it can't follow. 1650 free numbers know 0.09 px to 0.09 / sqrt(2 x 1650) = 0.0016 px; the parts of the fit's residuals
-    are told apart to some 3 %.
+    """A sheet of 300 mm that bows by 1.5 mm to the one side and to the other: 0.34 px of 0.09 px noise. The warp of the
+    fit is one for all poses, so that it can't follow. 1650 free numbers know 0.09 px to 0.09 / sqrt(2 x 1650) = 0.0016
+    px; the parts of the fit's residuals are told apart to some 3 %.
     """
     fit = fitted(tuple(1.5 * (-1) ** k for k in range(10)), noise_is_known=noise_is_known)
     found = departure(fit)
@@ -59,7 +60,8 @@ def test_a_board_that_bows_anew_in_each_pose_is_told(noise_is_known: bool) -> No
 
 
 def test_only_the_poses_that_bow_are_told() -> None:
-    """0.8 mm: 0.2 px in all, so that noise and the tolerance hold for the whole, and 0.28 px in the most tilted pose."""
+    """0.8 mm: 0.2 px in all, so that noise and the tolerance hold for the whole, and 0.28 px in the most tilted
+    pose."""
     found = departure(fitted(tuple(0.8 * (-1) ** k for k in range(10))))
     assert found is not None
     assert found.captures == ("left-0", "left-2", "left-7")
