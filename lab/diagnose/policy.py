@@ -92,6 +92,15 @@ class DecisionPolicy(Frozen):
             off=0.0,
         ),
     ] = 0.15
+    corner_tolerance_px: Annotated[
+        float,
+        Rule(
+            "significance",
+            "px",
+            "standard deviation of a corner's coordinate beyond noise, up to which boards are taken as flat and as printed",
+            "twice the 0.11 px that plain boards of public stereo pairs leave beside Brown's distortion (docs/explanation/accuracy.md)",
+        ),
+    ] = 0.2
     lone_score_margin: Annotated[
         float,
         Rule(

@@ -16,6 +16,7 @@ from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata import misstatements, unchecked
+from lab.diagnose.outcome.board_departure import board_departure
 from lab.diagnose.outcome.detectability import detectability
 from lab.diagnose.outcome.effect_sets import side_models
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
@@ -131,14 +132,21 @@ def diagnose_side(
     improved, corrections = improved_model(
         recordings, side, fit, baseline, model, verdict.effects, verdict.discrepancies
     )
+    fitted = fit.cameras.get(side) if fit is not None else None
+    shape = (model.camera.rows, model.camera.cols)
+    departure = board_departure(side, fitted.geometry if fitted is not None else None, shape, policy)
+    found = located(side, verdict)
+    if departure is not None and all(m.measurement != departure.measurement for m in found):
+        found.append(Mismatch(**departure.model_dump(include=set(Mismatch.model_fields))))
     left = (
         *wrong,
         *unexplained(recordings, side, verdict, corrections, policy),
         *misstated_light(
             side,
-            fit.cameras.get(side) if fit is not None else None,
+            fitted,
             levels_are_judged=any(b.measurement is PHOTON_TRANSFER for b in model.blocks),
         ),
+        *(() if departure is None else (departure,)),
     )
     return SideFindings(
         side=side,
@@ -146,7 +154,7 @@ def diagnose_side(
         is_judged=True,
         gain_is_known=model.gain_is_known,
         threshold=verdict.threshold if np.isfinite(verdict.threshold) else None,
-        mismatches=tuple(located(side, verdict)),
+        mismatches=tuple(found),
         named=tuple(
             NamedCandidate(c, shown_in(verdict, c, policy), family_corrections(verdict, c, corrections, policy))
             for c in verdict.named

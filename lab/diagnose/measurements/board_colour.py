@@ -1,67 +1,91 @@
-"""Lateral colour of boards: displacement of the corners in red and blue from those in green."""
+"""Lateral colour of boards: displacement of the corners in red and blue from those in green, and between wavelengths."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.boards import FEWEST_CORNERS, views_of
-from lab.diagnose.measurements.lateral_colour import COLOUR_FLOOR_PX, colour_shift_px
+from lab.diagnose.measurements.boards import FEWEST_CORNERS, REFERENCE_NM, views_of
+from lab.diagnose.measurements.lateral_colour import COLOUR_FLOOR_PX, colour_shift_px, outward_shifts_px
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import channel_corners
+from lab.fit.geometry.board_detection import BoardView, channel_corners
 from sim.spectrum import FloatArray
+
+Array = NDArray[np.floating[Any]]
 
 COLOUR_VIEWS = 8  # of more views, evenly spaced ones are used, at least as many: every corner is fitted once a channel
 COLOUR_RINGS = (0.3, 0.6, 1.0)  # outer radii of the rings, half diagonals; the last ring has no end
 
 
-def board_colour_block(study: Study) -> Block:
-    """Radial displacement (px) of the corners in red and blue from those in green, by rings about the frame's middle.
+@dataclass(frozen=True)
+class _Shift:
+    """What is displaced from what: `table` of `_rings` of each view, and the captures of each.
 
-    Raises NotDetermined for a camera without a green channel, without charuco captures, and with too few corners.
+    `pair`: wavelength (nm) and the one that it is held against, of pictures of one pose in light of one wavelength
+    each; None: `channel` against green within pictures in white light.
     """
-    if "G" not in study.channels:
-        raise NotDetermined("board_colour", "one channel: nothing to hold it against")
+
+    channel: str
+    pair: tuple[float, float] | None
+    tables: list[FloatArray]
+    captures: list[tuple[str, ...]]
+
+    @property
+    def condition(self) -> str:
+        """The light in words."""
+        return "white light" if self.pair is None else f"light of {self.pair[0]:g} nm against {self.pair[1]:g} nm"
+
+
+def board_colour_block(study: Study) -> Block:
+    """Radial displacement (px) of corners or dots, by rings about the frame's middle: in red and blue from those in
+    green, and of pictures of one pose in light of single wavelengths from the one nearest `REFERENCE_NM`.
+
+    Raises NotDetermined without boards, where there is neither a green channel nor a pose in light of two wavelengths,
+    and with too few corners.
+    """
     views, missed = views_of(study, study.side)
-    if not views and not missed:
-        raise NotDetermined("board_colour", "no charuco captures")
-    views = views[:: max(1, len(views) // COLOUR_VIEWS)]
-    camera = study.camera
-    half = camera.half_diagonal_px
-    points: dict[str, list[FloatArray]] = {c: [] for c in study.channels if c != "G"}
-    for k, view in enumerate(views):
-        fits = channel_corners(study.recordings.frame(view.capture), camera.cfa, view)
-        away = view.image_px - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
-        radius = np.hypot(*away.T)
-        for channel, gathered in points.items():
-            use = fits[channel].trusted & fits["G"].trusted & (radius > 0.05 * half)
-            gap = (fits[channel].points - fits["G"].points)[use]
-            unit = (away / np.maximum(radius, 1e-9)[:, None])[use]
-            n = int(use.sum())
-            gathered.append(np.column_stack([radius[use] / half, unit, gap, np.full(n, k)]))
-    values, variances, labels = [], [], []
-    for channel, parts in points.items():
+    if not views:
+        raise NotDetermined("board_colour", "no board is found" if missed else "no charuco captures")
+    white = [view for view in views if view.capture.wavelength_nm is None] if "G" in study.channels else []
+    shifts = _within_pictures(study, white) + _between_pictures(study, views)
+    if not shifts:
+        lit = len({view.capture.wavelength_nm for view in views} - {None})
+        raise NotDetermined(
+            "board_colour",
+            f"boards in light of {lit} wavelengths, but no pose in two of them: nothing to hold them against; give the "
+            "pictures of one pose the same `pose`"
+            if lit > 1
+            else "one channel or one wavelength: nothing to hold it against; take a pose in light of two wavelengths, under "
+            "one `pose`",
+        )
+    values, variances, labels, pairs = [], [], [], []
+    for shift in shifts:
+        n = len(shift.tables)
         for held_out in (False, True):
-            table = np.concatenate(
-                [p for i, p in enumerate(parts) if (i % 3 == 1 and len(parts) >= 3) == held_out] or [np.zeros((0, 6))]
-            )
-            found = _rings(table)
-            ids = tuple(v.capture.id for i, v in enumerate(views) if (i % 3 == 1 and len(views) >= 3) == held_out)
-            for r, value, variance in found:
+            use = [i for i in range(n) if (i % 3 == 1 and n >= 3) == held_out]
+            ids = tuple(name for i in use for name in shift.captures[i])
+            for r, value, variance in _rings(np.concatenate([shift.tables[i] for i in use] or [np.zeros((0, 6))])):
                 values.append(value)
                 variances.append(variance + COLOUR_FLOOR_PX**2)
-                labels.append(Label(r, channel, "outwards", ids, held_out))
+                labels.append(Label(r, shift.channel, shift.condition, ids, held_out))
+                pairs.append(shift.pair)
     if not values:
         raise NotDetermined("board_colour", "too few corners are clear in every colour")
-    light = None
 
     def predict(effects: Effects) -> Prediction:
         mean = np.zeros(len(labels))
-        if effects:
-            mean = np.array(
-                [colour_shift_px(study, label.channel, label.x, light, effects, "charuco") for label in labels]
-            )
+        for k, (label, pair) in enumerate(zip(labels, pairs, strict=True) if effects else ()):
+            if pair is None:
+                mean[k] = colour_shift_px(study, label.channel, label.x, None, effects, "charuco")
+            else:
+                own, other = outward_shifts_px(study, label.x, np.array(pair), effects)
+                mean[k] = own - other
         return Prediction(mean, {})
 
     return Block(
@@ -69,6 +93,53 @@ def board_colour_block(study: Study) -> Block:
         covariance=np.diag(variances), labels=tuple(labels), reads=frozenset({"image.shift"}), predict=predict,
         scale=np.ones(len(values)),
     )  # fmt: skip
+
+
+def _within_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
+    """Of each channel but green, in pictures in white light."""
+    views = views[:: max(1, len(views) // COLOUR_VIEWS)]
+    found = {c: _Shift(c, None, [], []) for c in study.channels if c != "G"} if views else {}
+    for k, view in enumerate(views):
+        fits = channel_corners(study.recordings.frame(view.capture), study.camera.cfa, view)
+        for channel, shift in found.items():
+            use = fits[channel].trusted & fits["G"].trusted
+            shift.tables.append(_table(study, view.image_px[use], (fits[channel].points - fits["G"].points)[use], k))
+            shift.captures.append((view.capture.id,))
+    return [*found.values()]
+
+
+def _between_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
+    """Of each wavelength but the reference, in pictures of one pose: the first of each wavelength."""
+    poses: dict[str, dict[float, BoardView]] = {}
+    for view in views:
+        if view.capture.wavelength_nm is not None:
+            poses.setdefault(view.capture.pose, {}).setdefault(view.capture.wavelength_nm, view)
+    found: dict[tuple[float, float], _Shift] = {}
+    for by_wavelength in poses.values():
+        reference_nm = min(by_wavelength, key=lambda w: abs(w - REFERENCE_NM))
+        other = by_wavelength[reference_nm]
+        for wavelength_nm, view in sorted(by_wavelength.items()):
+            if wavelength_nm == reference_nm:
+                continue
+            pair = (wavelength_nm, reference_nm)
+            shift = found.setdefault(pair, _Shift("Y", pair, [], []))
+            _, own, of_other = np.intersect1d(view.index, other.index, return_indices=True)
+            gap = view.image_px[own] - other.image_px[of_other]
+            shift.tables.append(_table(study, other.image_px[of_other], gap, len(shift.tables)))
+            shift.captures.append((view.capture.id, other.capture.id))
+    return [*found.values()]
+
+
+def _table(study: Study, place: Array, gap: Array, number: int) -> FloatArray:
+    """The `table` of `_rings` of one view, from places and displacements (n, 2), (x, y) px, without those near the
+    middle."""
+    camera = study.camera
+    half = camera.half_diagonal_px
+    away = place - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
+    radius = np.hypot(*away.T)
+    use = radius > 0.05 * half
+    unit = away[use] / radius[use, None]
+    return np.column_stack([radius[use] / half, unit, gap[use], np.full(int(use.sum()), number)])
 
 
 def _rings(table: FloatArray) -> list[tuple[float, float, float]]:
@@ -122,5 +193,7 @@ BOARD_COLOUR = Measurement(
     axis="field",
     unit="half diagonals",
     make=board_colour_block,
-    quantity="displacement from green, px",
+    quantity="displacement from green, or from the reference wavelength, px",
+    conditions="light",
+    conditions_words="in",
 )

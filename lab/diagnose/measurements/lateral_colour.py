@@ -10,7 +10,7 @@ from lab.diagnose.measurements.reads import SHIFT
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.point import displaced_um
-from sim.spectrum import Spectrum
+from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import Uniform
 
 COLOUR_FLOOR_PX = 0.012  # standard deviation beside noise: where cells are whole pixels, errors of the drawn pattern don't average out
@@ -74,24 +74,30 @@ def colour_shift_px(
     It is the mean over four directions of the displacement by the effects, weighted over wavelengths by the photons that each channel
     detects. `light` None: a flat spectrum; `kind`: of the capture.
     """
-    camera = study.camera
     wavelength = np.arange(400.0, 721.0, 10.0)
-    half_um = camera.half_diagonal_um
-    turn = np.pi / 4.0 + np.pi / 2.0 * np.arange(4)
-    x, y = distance * half_um * np.cos(turn), distance * half_um * np.sin(turn)
-    outwards = np.zeros(len(wavelength))
-    for i, w in enumerate(wavelength):
-        shift = displaced_um(camera, x, y, float(w), effects)
-        if shift is not None:
-            outwards[i] = float(np.mean(shift[0] * np.cos(turn) + shift[1] * np.sin(turn)))
+    outwards = outward_shifts_px(study, distance, wavelength, effects)
     if not outwards.any():
         return 0.0
     radiance = np.ones_like(wavelength) if light is None else light.at(wavelength)
-    model = Uniform(camera, effects)
+    model = Uniform(study.camera, effects)
     radiance = model.radiance(wavelength, radiance, kind) * model.transmittance(wavelength)
-    seen = [radiance * wavelength * camera.quantum_efficiency[c].at(wavelength) for c in (channel, "G")]
+    seen = [radiance * wavelength * study.camera.quantum_efficiency[c].at(wavelength) for c in (channel, "G")]
     own, green = (float(s @ outwards / max(s.sum(), 1e-300)) for s in seen)
-    return (own - green) / camera.pixel_pitch_um
+    return own - green
+
+
+def outward_shifts_px(study: Study, distance: float, wavelength_nm: FloatArray, effects: Effects) -> FloatArray:
+    """Predicted displacement outwards (n,), px, of light of n wavelengths at `distance` (half diagonals) from the
+    middle: the mean over four directions."""
+    camera = study.camera
+    turn = np.pi / 4.0 + np.pi / 2.0 * np.arange(4)
+    x, y = (distance * camera.half_diagonal_um * way for way in (np.cos(turn), np.sin(turn)))
+    outwards = np.zeros(len(wavelength_nm))
+    for i, w in enumerate(wavelength_nm):
+        shift = displaced_um(camera, x, y, float(w), effects)
+        if shift is not None:
+            outwards[i] = float(np.mean(shift[0] * np.cos(turn) + shift[1] * np.sin(turn)))
+    return outwards / camera.pixel_pitch_um
 
 
 LATERAL_COLOUR = Measurement(

@@ -21,7 +21,7 @@ def misstated_exposure_unit(recordings: RecordingSet, side: Side) -> Misstatemen
 
     The unit is the larger one in which no exposure is above `USUAL_S`, and all fit in that time.
     """
-    captures = recordings.captures(side=side)
+    captures = [c for c in recordings.captures(side=side) if c.exposure_s is not None]  # boards may state none
     longest = max((c.exposure_s for c in captures), default=0.0)
     span_s = _span_s(captures)
     # the first or the last capture may lie outside of the span, as a time is that of the beginning or of the end
@@ -40,7 +40,9 @@ def misstated_exposure_unit(recordings: RecordingSet, side: Side) -> Misstatemen
         else f"the longest is {longest:.6g} s, above {LONGEST_EXPOSURE_S:g} s"
     )
     scaled = tuple(
-        c.model_copy(update={"exposure_s": UNITS[unit] * c.exposure_s}) if c.side == side else c
+        c.model_copy(update={"exposure_s": UNITS[unit] * c.exposure_s})
+        if c.side == side and c.exposure_s is not None
+        else c
         for c in recordings.manifest.captures
     )
     return Misstatement(

@@ -165,6 +165,7 @@ def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
                 dx_px=numbers(np.round(rest[:, 0], 5)),
                 dy_px=numbers(np.round(rest[:, 1], 5)),
                 depth_mm=numbers(np.round(depth, 3)),
+                noise_px=None if view.std_px is None else float(np.sqrt(np.mean(view.std_px**2))),
             )
         )
     return tuple(found)

@@ -69,7 +69,10 @@ class CornerErrors(Frozen):
 
 
 class ViewResiduals(Frozen):
-    """Corners of one view, numbered row by row: measured places, residuals (measured less predicted) and depths."""
+    """Corners of one view, numbered row by row: measured places, residuals (measured less predicted) and depths.
+
+    `noise_px`: standard deviation of a coordinate by the noise of the view's picture, rms over its corners; None where it isn't known.
+    """
 
     capture: str
     corner: tuple[int, ...]
@@ -78,6 +81,7 @@ class ViewResiduals(Frozen):
     dx_px: tuple[float, ...]
     dy_px: tuple[float, ...]
     depth_mm: tuple[float, ...]
+    noise_px: float | None = None
 
 
 class ProjectionUncertainty(Frozen):

@@ -46,6 +46,18 @@ def test_microseconds_given_as_seconds_are_told() -> None:
     assert "12 captures" in warning  # darks of a millisecond are 1000 us
 
 
+def test_captures_without_a_stated_exposure_say_nothing_of_its_unit() -> None:
+    """Imported pictures of boards may state none; the others' exposures are still told and corrected."""
+    recordings = recording_set(Sensor(shape=(32, 48), cfa="MONO"), DARKS, LADDER)
+    assert misstated_exposure_unit(_changed(recordings, exposure_s=lambda _, c: None), "left") is None
+    found = misstated_exposure_unit(
+        _changed(recordings, exposure_s=lambda k, c: 1e6 * c.exposure_s if k else None), "left"
+    )
+    assert found is not None
+    for k, (right, one) in enumerate(zip(recordings.captures(), found.corrected.captures(), strict=True)):
+        assert one.exposure_s == (pytest.approx(right.exposure_s) if k else None)
+
+
 @pytest.mark.parametrize(("unit", "factor"), [("milliseconds", 1e3), ("microseconds", 1e6)])
 def test_exposures_longer_than_the_time_in_which_they_were_taken_are_told(unit: str, factor: float) -> None:
     """Up to 20 ms, a frame a second: 20 s, or 20,000 s, don't fit in between."""
