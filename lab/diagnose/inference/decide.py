@@ -19,7 +19,7 @@ from lab.diagnose.inference.locate import Slice, mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.naming import excludes_rivals, named_members
 from lab.diagnose.inference.outlying import OutlyingLevel, freed, outlying_levels
-from lab.diagnose.inference.refit import is_of_usual_size, log_likelihood, refit
+from lab.diagnose.inference.refit import is_of_usual_size, log_likelihood, refit, refit_alone
 from lab.diagnose.inference.score import prototype_changes, signatures_of
 from lab.diagnose.inference.search import ModelSet, Search
 from lab.diagnose.inference.weigh import UNKNOWN, Candidate
@@ -119,6 +119,8 @@ def decide(
             abstained.remove(strongest)
             named = _refitted(search, [*named, claimed])
             continue
+        named = [_with_a_size(model, c, effects, policy) for c in named] if not parts else named
+        effects = tuple(c.effect for c in named)
         sizeless = [c for c in named if c.is_compatible_with_absence(policy.least_size_sigma)] if not parts else []
         if sizeless:
             # what it explains is told where it is a mismatch without it
@@ -198,6 +200,37 @@ def _veto(search: Search, named: Sequence[Candidate], candidate: Candidate) -> V
     """The held-out captures' veto on one of the named candidates."""
     without = search.fitted(tuple(c.effect for c in named if c is not candidate), converged=True)
     return vetoed(search.model, candidate, tuple(c.effect for c in named), without.effects, search.policy)
+
+
+def _with_a_size(
+    model: MeasurementModel, candidate: Candidate, effects: tuple[Effect, ...], policy: DecisionPolicy
+) -> Candidate:
+    """Return the candidate as the recordings tell its size, where every parameter is compatible with absence though the effect isn't.
+
+    Of several sizes that the recordings don't tell apart (a quadratic and a cubic bend), one by itself is told where that fits as well,
+    the likeliest. Where the size is tied to a shape (a flicker's modulation to its frequency), its standard deviation is that for the
+    other parameters as they are told. Where that is wider than the likelihood ratio against absence allows, as no normal distribution holds
+    (one hot pixel of a few hundred), it is the widest that leaves absence `least_size_sigma` away.
+    """
+    if not candidate.is_compatible_with_absence(policy.least_size_sigma):
+        return candidate
+    at, sizes = effects.index(candidate.effect), candidate.sizes
+    if len(sizes) > 1:
+        alone = [refit_alone(model, effects, at, name, sizes, policy) for name in sizes]
+        best = max(alone, key=lambda fit: fit.log_posterior)
+        told = replace(candidate, effect=best.effects[at], std=best.std[at])
+        if not told.is_compatible_with_absence(policy.least_size_sigma):
+            return told
+    whole = refit(model, effects, policy, passes=1)
+    effect, conditional = whole.effects[at], whole.conditional_std[at]
+    told = replace(candidate, effect=effect, std=whole.std[at] | {n: conditional[n] for n in sizes if n in conditional})
+    if len(sizes) == 1 and told.is_compatible_with_absence(policy.least_size_sigma):
+        gain = whole.log_likelihood - log_likelihood(model, (*effects[:at], *effects[at + 1 :]), policy)
+        ((name, absent),) = sizes.items()
+        if 2.0 * gain > policy.least_size_sigma**2:
+            widest = abs(float(getattr(effect, name)) - absent) / policy.least_size_sigma
+            return replace(told, std=told.std | {name: widest})
+    return told
 
 
 def _with_every_mode(

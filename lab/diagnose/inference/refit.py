@@ -3,7 +3,7 @@ bounds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from types import MappingProxyType
@@ -90,7 +90,8 @@ class Fit:
     `log_posterior` is the log-likelihood and log prior there, less `parameter_log_odds` for every parameter.
     `jacobian` (n, p) is that of the prediction by the coordinates that were fitted.
     `promised_gain`: the log posterior that one more Newton step of all coordinates would gain.
-    `tolerated`: the share of the laws' form tolerances by which the seen numbers are likeliest.
+    `tolerated`: the share of the laws' form tolerances by which the seen numbers are likeliest. `conditional_std`: as `std`, of each
+    parameter with the others as they stand.
     """
 
     effects: tuple[Effect, ...]
@@ -101,6 +102,7 @@ class Fit:
     converged: bool = True  # False: a rough fit
     promised_gain: float = 0.0
     tolerated: float = 1.0
+    conditional_std: tuple[dict[str, float | None], ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -195,6 +197,22 @@ def refit(
     return found
 
 
+def refit_alone(
+    model: MeasurementModel,
+    effects: Effects,
+    index: int,
+    parameter: str,
+    sizes: Collection[str],
+    policy: DecisionPolicy,
+) -> Fit:
+    """Return the fit of a set in which of one member's `sizes` only `parameter` is fitted, the others absent; its shapes, and the other
+    members, are fitted as always."""
+    coords = coordinates(effects, model.camera)
+    gone = [c for c in coords if c.index == index and c.name in sizes and c.name != parameter]
+    less = moved(effects, gone, np.array([c.to_u(c.absent) for c in gone]))
+    return _fit(model, less, [c for c in coords if c not in gone], policy, False, None)
+
+
 def _fit(
     model: MeasurementModel,
     effects: tuple[Effect, ...],
@@ -261,13 +279,18 @@ def _fit(
     if of_any_size:
         prior_std = np.maximum(prior_std, np.abs(u - prior_centre))  # of the normal prior with the same slope there
     at_best = _prediction_jacobian(model, best, coords, u, typical, high)
-    std = _standard_deviations(model.seen_gaussian(best).whiten(at_best[seen]), coords, u, prior_std, len(best))
+    whitened = model.seen_gaussian(best).whiten(at_best[seen])
+    std = _standard_deviations(whitened, coords, u, prior_std, len(best))
+    alone = [
+        _standard_deviations(whitened[:, [k]], [c], u[[k]], prior_std[[k]], len(best)) for k, c in enumerate(coords)
+    ]
+    conditional = tuple({n: s for one in alone for n, s in one[i].items()} for i in range(len(best)))
     log_prior += sum(_usual_log_odds(e, s) for e, s in zip(best, std, strict=True))
     promised = _promised_gain(
         tolerated.gaussian, model.seen_value, at_best[seen], (u - prior_centre) / prior_std, prior_std
     )
     log_posterior = value + log_prior - policy.parameter_log_odds * len(coords)
-    return Fit(best, tuple(std), value, log_posterior, at_best, not rough, promised, tolerated.share)
+    return Fit(best, tuple(std), value, log_posterior, at_best, not rough, promised, tolerated.share, conditional)
 
 
 def is_of_usual_size(effects: Effects, camera: CameraModel) -> bool:

@@ -67,12 +67,17 @@ class Candidate:
         others = [(n, p) for n, p in self.members if n != self.effect.name]
         return tuple(sorted([*others, *self.rivals], key=lambda item: -item[1]))
 
+    @property
+    def sizes(self) -> dict[str, float]:
+        """The fitted parameters that size the effect, with their values without it: all but shapes, or all where there is nothing else."""
+        kind = type(self.effect)
+        absent = {name: q.absent for name, q in kind.quantities().items() if q.absent is not None and name in self.std}
+        return {name: value for name, value in absent.items() if name not in kind.shapes} or absent
+
     def is_compatible_with_absence(self, sigma: float) -> bool:
         """Say whether every parameter that sizes the effect lies within `sigma` standard deviations of its value without it. A parameter
         whose standard deviation isn't known isn't compatible."""
-        kind = type(self.effect)
-        absent = {name: q.absent for name, q in kind.quantities().items() if q.absent is not None and name in self.std}
-        sizes = {name: value for name, value in absent.items() if name not in kind.shapes} or absent
+        sizes = self.sizes
 
         def is_near(name: str, value: float) -> bool:
             std = self.std[name]
