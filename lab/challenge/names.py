@@ -18,6 +18,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -37,6 +38,8 @@ from sim.effects.library import effects as library
 from sim.parameters import Frozen
 
 Kind = Literal["bench", "healthy", "strong", "blur"]
+#: Non-centrality from which on a concealed effect has to be named.
+LEAST_VISIBLE = 1000.0
 #: How many cases of each class there are, and the most of them that may have a false name; the fewest right names of `blur`.
 COUNTS: dict[Kind, int] = {"bench": 60, "healthy": 150, "strong": 150, "blur": 60}
 MOST_FALSE: dict[Kind, int] = {"bench": 0, "healthy": 1, "strong": 1, "blur": 0}
@@ -58,7 +61,8 @@ BLUR_ROWS, BLUR_COLS = 192, 256
 
 
 class NameRun(Frozen):
-    """The names of one case. `false`: names, with the side, that nothing concealed gives; `missing`: what is concealed and has no name."""
+    """The names of one case. `false`: names, with the side, that nothing concealed gives; `missing`: what is concealed and has no name;
+    `noncentrality`: of what is concealed, where it was measured (some laws can't be made strong enough for a small frame)."""
 
     case: str
     concealed: tuple[str, ...] = ()
@@ -66,6 +70,7 @@ class NameRun(Frozen):
     named: tuple[str, ...] = ()
     false: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
+    noncentrality: float | None = None
     commit: str = ""
     cpu_s: float = 0.0
     wall_s: float = 0.0
@@ -80,8 +85,9 @@ def run_case(kind: Kind, number: int, folder: Path) -> NameRun:
         found = session_of(("--seed", str(1000 + number)), folder)
         run = _judged(found, OF_THE_BENCH, {})
     else:
-        recordings, wanted, families = MADE[kind](number)
-        run = _judged(diagnose(recordings, at_once=False), wanted, families)
+        made = MADE[kind](number)
+        run = _judged(diagnose(made.recordings, at_once=False), made.wanted, made.right_besides)
+        run = run.model_copy(update={"noncentrality": made.noncentrality})
     used = {"wall_s": time.monotonic() - began_s, "cpu_s": time.process_time() - cpu_s, "commit": commit()}
     return run.model_copy(update={"case": case_name(kind, number)} | used)
 
@@ -113,11 +119,19 @@ def _judged(
     )
 
 
-Made = tuple[RecordingSet, frozenset[tuple[str, str]], dict[str, frozenset[str]]]
+@dataclass(frozen=True)
+class Made:
+    """A drawn camera's recordings. `wanted` and `right_besides`: as of `_judged`; `noncentrality`: of what is concealed, where it was
+    measured."""
+
+    recordings: RecordingSet
+    wanted: frozenset[tuple[str, str]] = frozenset()
+    right_besides: dict[str, frozenset[str]] = field(default_factory=dict)
+    noncentrality: float | None = None
 
 
 def _healthy(number: int) -> Made:
-    return draw(SEED, number, "foreign", kind="healthy").recordings, frozenset(), {}
+    return Made(draw(SEED, number, "foreign", kind="healthy").recordings)
 
 
 def _strong(number: int) -> Made:
@@ -125,7 +139,7 @@ def _strong(number: int) -> Made:
     one = case.truth.concealed[0]
     besides = frozenset(case.truth.accepts) | families_of(one)
     wanted = frozenset({(one.effect, "left")} if one.effect is not None else set())
-    return case.recordings, wanted, {one.effect or one.name: besides}
+    return Made(case.recordings, wanted, {one.effect or one.name: besides}, one.noncentrality)
 
 
 def blur_law(number: int, pitch_um: float, side_um: float) -> Law:
@@ -150,7 +164,7 @@ def _blur(number: int) -> Made:
     plan = Plan(screen_cell_px=frame.screen_cell_px, screen_turn_deg=frame.screen_turn_deg)
     camera = ConcealedCamera(seed, [law], rows=BLUR_ROWS, cols=BLUR_COLS)
     name = str(law.effect)
-    return (
+    return Made(
         recordings_of(camera, plan),
         frozenset({(name, "left")}),
         {name: frozenset({library()[name].family.value})},
@@ -196,8 +210,11 @@ def table(runs: dict[str, NameRun]) -> str:
     for kind, count in COUNTS.items():
         of = [run for name, run in runs.items() if name.startswith(f"{kind}-")]
         if of:
-            false, whole = Rate.over(bool(run.false) for run in of), Rate.over(not run.missing for run in of)
-            lines.append(f"| {kind} | {len(of)} of {count} | {false.count} | {MOST_FALSE[kind]} | {whole.count} |")
+            visible = [run for run in of if run.noncentrality is None or run.noncentrality > LEAST_VISIBLE]
+            false, whole = Rate.over(bool(run.false) for run in of), Rate.over(not run.missing for run in visible)
+            lines.append(
+                f"| {kind} | {len(of)} of {count} | {false.count} | {MOST_FALSE[kind]} | {whole.count} of {whole.of} |"
+            )
     for name, run in sorted(runs.items()):
         if run.false:
             lines.append(f"\n{name} ({', '.join(run.concealed) or 'healthy'}): {', '.join(run.false)}.")

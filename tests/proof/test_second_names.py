@@ -86,5 +86,5 @@ def test_a_family_stands_for_its_effect() -> None:
 def test_the_table_names_every_false_name() -> None:
     runs = {"bench-001": NameRun(case="bench-001"), "healthy-002": NameRun(case="healthy-002", false=("coma (left)",))}
     told = table(runs)
-    assert "| bench | 1 of 60 | 0 | 0 | 1 |" in told
+    assert "| bench | 1 of 60 | 0 | 0 | 1 of 1 |" in told
     assert "healthy-002 (healthy): coma (left)." in told
