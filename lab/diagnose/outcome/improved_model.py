@@ -3,14 +3,14 @@ other."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from lab.diagnose.inference.discrepancy import Discrepancy
-from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.measurement_model import MeasurementModel, form_name
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.curves import freed_curve
 from lab.formats.camera_file import CameraFile
@@ -78,7 +78,7 @@ def improved_model(
         for freed in (freed_curve(curve, channel, estimates),)
     }
     corrections: list[Correction] = []
-    acting: list[Effect] = [*always, *effects]
+    acting: list[Effect] = [*always, *(_nearest_form(e, estimates) for e in effects)]
     for one, (kind, why) in zip(discrepancies, applied, strict=True):
         block = model.blocks[one.index]
         name = block.measurement.title
@@ -102,6 +102,13 @@ def improved_model(
     unknown = "" if model.gain_is_known else ", conversion gain unknown: electrons of 1 DN/e are DN"
     name = f"{recordings.manifest.name} {side}{unknown}".strip()
     return CameraFile(name, improved, tuple(acting)), tuple(corrections)
+
+
+def _nearest_form(effect: Effect, estimates: Mapping[str, float]) -> Effect:
+    """Return the effect by that form of its law whose coefficient in `estimates` is nearest to 1, if it is nearer to 1 than to 0."""
+    found = {number: estimates.get(form_name(effect, number), 0.0) for number in range(len(effect.other_forms()))}
+    near = min(found, key=lambda number: abs(found[number] - 1.0), default=None)
+    return effect if near is None or found[near] < 0.5 else effect.other_forms()[near]
 
 
 def _applied(

@@ -13,9 +13,9 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose import Diagnosis, examine
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.gaussian import chi2
-from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.measurement_model import MeasurementModel, form_name
 from lab.diagnose.measurements.block import Block, Label, Prediction
-from lab.diagnose.outcome.improved_model import improved_model
+from lab.diagnose.outcome.improved_model import _nearest_form, improved_model
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.formats.recording_set import Manifest, RecordingSet
@@ -24,6 +24,7 @@ from mocks.former import ConcealedCamera, Plan
 from mocks.former import laws as concealed_laws
 from sim.effects.base import Effect
 from sim.effects.model_discrepancy import ModelDiscrepancy
+from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.point import TRANSFER, Blur
 from sim.uniform import Uniform
 from tests.lab.diagnose.on_blocks import declared
@@ -146,3 +147,10 @@ def test_a_correction_acts_on_the_stage_of_its_measurement(axis: str, unit: str,
     gap = likeliest_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy())
     improved, _ = improved_model(SET, "left", None, content, model, (), (gap,))
     assert [e.along for e in improved.effects if isinstance(e, ModelDiscrepancy)] == [along]
+
+
+def test_the_form_that_the_recordings_show_is_saved() -> None:
+    """Of a filter's forms, quartz's dispersion at 0.9 of its strength; neither at 0.3."""
+    plain = OpticalLowPassFilter(displacement_x_um=2.0)
+    assert _nearest_form(plain, {form_name(plain, 0): 0.9, form_name(plain, 1): 0.2}).plate == "quartz"  # type: ignore[attr-defined]
+    assert _nearest_form(plain, {form_name(plain, 0): 0.3}) == plain
