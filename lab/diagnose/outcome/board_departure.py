@@ -29,7 +29,7 @@ POSE_PARAMETERS = 6
 
 
 @dataclass(frozen=True)
-class _Part:
+class _Departure:
     """The corners of a part: standard deviation of a coordinate as found and as noise explains it, px; chi2 of n
     numbers."""
 
@@ -81,7 +81,7 @@ def board_departure(
     by_cell = {name: _part(rest[at], noise_px[at], share) for name, at in cells.items() if at.sum() >= MIN_CORNERS}
     least_sigma = -float(special.ndtri(policy.slice_false_alarm_rate / (1 + len(by_view) + len(by_cell))))
 
-    def departs(part: _Part) -> bool:
+    def departs(part: _Departure) -> bool:
         is_large = part.departure_px > max(policy.corner_tolerance_px, part.noise_px)
         return is_large and part.sigma(policy.covariance_slack) > least_sigma
 
@@ -112,13 +112,13 @@ def _noise_px(geometry: GeometryFit, view: ViewResiduals) -> float:
     return float(np.maximum(known, FLOOR_PX))
 
 
-def _part(rest: FloatArray, noise_px: FloatArray, share: float) -> _Part:
+def _part(rest: FloatArray, noise_px: FloatArray, share: float) -> _Departure:
     n = share * rest.size
     chi2 = float(np.sum(np.square(rest / noise_px[:, None])))
-    return _Part(float(np.sqrt(np.sum(rest**2) / n)), float(np.sqrt(np.mean(noise_px**2))), chi2, n)
+    return _Departure(float(np.sqrt(np.sum(rest**2) / n)), float(np.sqrt(np.mean(noise_px**2))), chi2, n)
 
 
-def _where(views: dict[str, _Part], cells: dict[str, _Part], count: int) -> str:
+def _where(views: dict[str, _Departure], cells: dict[str, _Departure], count: int) -> str:
     """Captures and parts of the frame that depart, in words, the worst first."""
     words = []
     if views:
@@ -129,6 +129,6 @@ def _where(views: dict[str, _Part], cells: dict[str, _Part], count: int) -> str:
     return "; ".join(words) or f"all {count} captures alike"
 
 
-def _listed(parts: dict[str, _Part]) -> str:
+def _listed(parts: dict[str, _Departure]) -> str:
     worst = sorted(parts.items(), key=lambda item: -item[1].found_px)[:LISTED]
     return ", ".join(f"{name} ({part.found_px:.2f} px)" for name, part in worst)

@@ -57,6 +57,7 @@ def table(fit: SpectralFit, name: str = "relative_sensitivity") -> np.ndarray:
     return np.array([getattr(fit, name)[channel] for channel in "RGB"])
 
 
+@pytest.mark.slow  # make real takes the sweep through every time
 def test_a_real_sweep_agrees_with_division_and_all_rows_are_surer_than_half(tmp_path: Path) -> None:
     rows = rows_of("measured")
     whole = fitted(rows, tmp_path)
