@@ -368,7 +368,9 @@ def _covered(truth: CaseTruth, found: DiagnosisResult | None) -> Iterable[bool]:
         effect = named.get(hidden.effect or "")
         for name, value in hidden.parameters.items() if effect is not None else ():
             said = effect.parameters.get(name)  # type: ignore[union-attr]
-            if said is not None and said.std is not None:
+            if said is not None and said.interval is not None:
+                yield said.interval[0] <= value <= said.interval[1]
+            elif said is not None and said.std is not None:
                 away = said.value - value if said.sign_known else abs(said.value) - abs(value)
                 yield abs(away) <= INTERVAL_SIGMAS * said.std
 

@@ -127,7 +127,7 @@ def page_environment() -> jinja2.Environment:
     )
 
     def parameter_value(value: ParameterValue) -> str:
-        return measured(value.value, value.std, value.unit)
+        return measured(value.value, value.std, value.unit, value.interval)
 
     def stated(value: float | None, unit: str) -> str:
         return "" if value is None else measured(value, None, unit)

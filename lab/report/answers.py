@@ -47,7 +47,7 @@ def effect_line(effect: NamedEffect) -> str:
     fields = law.choices() if law else {}
     sizes = [
         f"{described[name].meaning if name in described else words.parameter_name(name, value)} "
-        f"{measured(value.value, value.std, value.unit)}{'' if value.sign_known else ', sign unknown'}"
+        f"{measured(value.value, value.std, value.unit, value.interval)}{'' if value.sign_known else ', sign unknown'}"
         for name, value in effect.parameters.items()
         if value.std is None or abs(value.value) >= TOLD_SIGMA * value.std
     ]

@@ -56,8 +56,13 @@ class KeyFigure:
         return f"{measured(self.value, self.std, self.unit)} {self.note}".rstrip()
 
 
-def measured(value: float, std: float | None = None, unit: str = "") -> str:
-    """`value ± std unit`, the standard deviation to two digits and the value to the same place; without one, the value to four digits."""
+def measured(
+    value: float, std: float | None = None, unit: str = "", interval: tuple[float, float] | None = None
+) -> str:
+    """`value ± std unit`, the standard deviation to two digits and the value to the same place; without one, the value to four digits, or
+    `value (low to high) unit` with an interval."""
+    if interval is not None:
+        return f"{value:.3g} ({interval[0]:.3g} to {interval[1]:.3g}) {shown_unit(unit)}".rstrip()
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
         number = f"{value:.4g}"
     else:

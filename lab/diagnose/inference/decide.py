@@ -19,7 +19,7 @@ from lab.diagnose.inference.locate import Slice, mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.naming import excludes_rivals, named_members
 from lab.diagnose.inference.outlying import OutlyingLevel, freed, outlying_levels
-from lab.diagnose.inference.refit import is_of_usual_size, log_likelihood, refit, refit_alone
+from lab.diagnose.inference.refit import is_of_usual_size, log_likelihood, profile_interval, refit, refit_alone
 from lab.diagnose.inference.score import prototype_changes, signatures_of
 from lab.diagnose.inference.search import ModelSet, Search
 from lab.diagnose.inference.weigh import UNKNOWN, Candidate
@@ -93,7 +93,6 @@ def decide(
     vetoed_sets: set[frozenset[str]] = set()
     while True:
         named.sort(key=lambda c: -c.log_odds)
-        effects = tuple(c.effect for c in named)
         losing = next((v for c in reversed(named) for v in (_veto(search, named, c),) if v is not None), None)
         if losing is not None:
             refused.append(losing)
@@ -119,14 +118,15 @@ def decide(
             abstained.remove(strongest)
             named = _refitted(search, [*named, claimed])
             continue
-        named = [_with_a_size(model, c, effects, policy) for c in named] if not parts else named
-        effects = tuple(c.effect for c in named)
-        sizeless = [c for c in named if c.is_compatible_with_absence(policy.least_size_sigma)] if not parts else []
-        if sizeless:
-            # what it explains is told where it is a mismatch without it
-            named = _refitted(search, named, sizeless[-1])
-            continue
         if not parts:
+            sized = [(c, _with_a_size(model, c, effects, policy)) for c in named]
+            sizeless = [c for c, told in sized if told is None]
+            if sizeless:
+                # what it explains is told where it is a mismatch without it
+                named = _refitted(search, named, sizeless[-1])
+                continue
+            named = [told for _, told in sized if told is not None]
+            effects = tuple(c.effect for c in named)
             told = tuple(_with_every_mode(model, tied_family(c, policy), effects, policy) for c in named)
             plain = Verdict(model, threshold, top, before, told, tuple(abstained), after, (), models=search.models())
             return _verdict(plain, left, refused, policy)
@@ -204,13 +204,13 @@ def _veto(search: Search, named: Sequence[Candidate], candidate: Candidate) -> V
 
 def _with_a_size(
     model: MeasurementModel, candidate: Candidate, effects: tuple[Effect, ...], policy: DecisionPolicy
-) -> Candidate:
-    """Return the candidate as the recordings tell its size, where every parameter is compatible with absence though the effect isn't.
+) -> Candidate | None:
+    """Return the candidate as the recordings tell its size where every parameter is compatible with absence by its standard deviation, or
+    None where the likelihood doesn't exclude absence either.
 
-    Of several sizes that the recordings don't tell apart (a quadratic and a cubic bend), one by itself is told where that fits as well,
-    the likeliest. Where the size is tied to a shape (a flicker's modulation to its frequency), its standard deviation is that for the
-    other parameters as they are told. Where that is wider than the likelihood ratio against absence allows, as no normal distribution holds
-    (one hot pixel of a few hundred), it is the widest that leaves absence `least_size_sigma` away.
+    Of several sizes that the recordings don't tell apart (a quadratic and a cubic bend), one by itself is told where that fits as well, the
+    likeliest. A size that no normal distribution describes, as it is tied to a shape (a flicker's modulation to its frequency) or small in
+    number (one hot pixel of a few hundred), is told by the interval of its profile likelihood.
     """
     if not candidate.is_compatible_with_absence(policy.least_size_sigma):
         return candidate
@@ -221,16 +221,14 @@ def _with_a_size(
         told = replace(candidate, effect=best.effects[at], std=best.std[at])
         if not told.is_compatible_with_absence(policy.least_size_sigma):
             return told
-    whole = refit(model, effects, policy, passes=1)
-    effect, conditional = whole.effects[at], whole.conditional_std[at]
-    told = replace(candidate, effect=effect, std=whole.std[at] | {n: conditional[n] for n in sizes if n in conditional})
-    if len(sizes) == 1 and told.is_compatible_with_absence(policy.least_size_sigma):
-        gain = whole.log_likelihood - log_likelihood(model, (*effects[:at], *effects[at + 1 :]), policy)
-        ((name, absent),) = sizes.items()
-        if 2.0 * gain > policy.least_size_sigma**2:
-            widest = abs(float(getattr(effect, name)) - absent) / policy.least_size_sigma
-            return replace(told, std=told.std | {name: widest})
-    return told
+    whole, rest = (
+        model.seen_gaussian(effects, 1.0),
+        refit(model, (*effects[:at], *effects[at + 1 :]), policy, tolerance=0.0),
+    )
+    if 2.0 * (whole.log_likelihood(model.seen_value) - rest.log_likelihood) < policy.least_size_sigma**2:
+        return None
+    intervals = {name: profile_interval(model, effects, at, name, policy) for name in sizes}
+    return replace(candidate, std=candidate.std | dict.fromkeys(sizes), intervals=intervals)
 
 
 def _with_every_mode(

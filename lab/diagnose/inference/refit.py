@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import brentq, least_squares
 
 from lab.diagnose.inference.gaussian import Gaussian
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -34,6 +34,8 @@ TYPICAL_LOG, LEAST = 0.1, 1e-9
 DIFFERENCE_STEP = 0.02
 #: Shares of the declared form tolerances that are tried, from the whole to the policy's least, by equal factors.
 TOLERATED_SHARES = 3
+#: Profile intervals end at this many times the fitted distance from absence.
+MOST_WIDENED = 100.0
 
 
 @dataclass(frozen=True)
@@ -211,6 +213,58 @@ def refit_alone(
     gone = [c for c in coords if c.index == index and c.name in sizes and c.name != parameter]
     less = moved(effects, gone, np.array([c.to_u(c.absent) for c in gone]))
     return _fit(model, less, [c for c in coords if c not in gone], policy, False, None)
+
+
+def profile_interval(
+    model: MeasurementModel, effects: Effects, index: int, parameter: str, policy: DecisionPolicy
+) -> tuple[float, float]:
+    """Return the interval of one member's parameter by its profile likelihood, in the parameter's unit (Pawitan, In All Likelihood, 2001).
+
+    It holds the values at which the log posterior of all other parameters, fitted there, is within `least_size_sigma`^2 / 2 of its largest.
+    The parameter itself has no prior. The covariance holds the whole of the form tolerances, as standard deviations do. An end to which the
+    posterior doesn't fall is a bound of the parameter, or `MOST_WIDENED` times as far from absence as the fit.
+    """
+    coords = coordinates(effects, model.camera)
+    (one,) = [c for c in coords if c.index == index and c.name == parameter]
+    others = [c for c in coords if c is not one]
+    low, high = one.bounds
+    start = float(np.clip(one.to_u(float(getattr(effects[index], parameter))), low, high))
+    absent = one.to_u(one.absent)
+    fits: dict[float, tuple[float, tuple[Effect, ...]]] = {}
+    drop = 0.5 * policy.least_size_sigma**2
+
+    def profile(u: float) -> float:
+        if u not in fits:
+            about = fits[min(fits, key=lambda at: abs(at - u))][1] if fits else tuple(effects)
+            fit = _fit(model, moved(about, [one], np.array([u])), others, policy, True, None, tolerance=0.0)
+            fits[u] = fit.log_posterior, fit.effects
+        return fits[u][0]
+
+    def is_within(u: float) -> bool:
+        return profile(u) >= max(value for value, _ in fits.values()) - drop
+
+    def bracket(direction: float) -> tuple[float, float]:
+        """The outermost value tried within the interval, and the first beyond it."""
+        inside, step = start, 0.25 * (abs(start - absent) or one.typical(one.absent))
+        while True:
+            outside = float(np.clip(inside + direction * step, low, high))
+            if outside in (low, high) or abs(outside - absent) > MOST_WIDENED * abs(start - absent):
+                return (outside, outside) if is_within(outside) else (inside, outside)
+            if not is_within(outside):
+                return inside, outside
+            inside, step = outside, 2.0 * step
+
+    brackets = [bracket(-1.0), bracket(1.0)]
+    least = max(value for value, _ in fits.values()) - drop
+    ends = []
+    for inside, outside in brackets:
+        is_crossed = profile(inside) > least > profile(outside)
+        ends.append(
+            brentq(lambda u: profile(u) - least, inside, outside, xtol=1e-3 * abs(outside - inside))
+            if is_crossed
+            else outside
+        )
+    return one.to_value(ends[0]), one.to_value(ends[1])
 
 
 def _fit(

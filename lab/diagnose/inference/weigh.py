@@ -4,7 +4,7 @@ metadata."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -37,6 +37,7 @@ class Candidate:
     measurements that show the effect.
     `remark`: metadata that would explain the recordings as well, in words.
     `among_listed`: probabilities of the effect and its rivals if the cause is one of them, likeliest first; empty where none was weighed.
+    `intervals`: of sizes that no normal distribution describes, from low to high; their standard deviation is None.
     `unsigned`: parameters whose sign, turned together, the recordings don't tell. `modes`: values of the parameters in other modes of the
     posterior that are as likely.
     `members`: where the family is named and not the effect, the family's effects with their probabilities, likeliest first.
@@ -50,6 +51,7 @@ class Candidate:
     explained_share: float = 1.0
     is_closed: bool = True
     is_closed_somewhere: bool = True
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     unsigned: frozenset[str] = frozenset()
     modes: tuple[dict[str, float], ...] = ()
     remark: str = ""

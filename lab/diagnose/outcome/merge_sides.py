@@ -114,7 +114,10 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
             value, std = _mean(values_of_sides, is_shared="light" in kind.stages())
             told, unit = told_as(field, quantity, gain_is_known=bool(in_electrons))
             is_signed = all(field not in c.unsigned for c in candidates)
-            parameters[told] = ParameterValue(value=value, std=std, unit=unit, sign_known=is_signed)
+            interval = _interval(field, candidates)
+            parameters[told] = ParameterValue(
+                value=value, std=None if interval else std, unit=unit, sign_known=is_signed, interval=interval
+            )
         chosen = [_choices(c.effect) for c in candidates]
         choices = {
             field: " and ".join(dict.fromkeys(one[field] for one in chosen if field in one)) for field in chosen[0]
@@ -205,10 +208,24 @@ def _plain_name(field: str, unit: str) -> str:
 
 def _number(parameter: ParameterValue) -> str:
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    if parameter.interval is not None:
+        low, high = parameter.interval
+        return f"{parameter.value:.3g} ({low:.3g} to {high:.3g}){unit}"
     if parameter.std is None:
         return f"{parameter.value:.4g}{unit}"
     digits = max(0, min(6, 1 - int(np.floor(np.log10(max(parameter.std, 1e-6))))))
     return f"{parameter.value:.{digits}f} ± {parameter.std:.{digits}f}{unit}"
+
+
+def _interval(field: str, candidates: Sequence[Candidate]) -> tuple[float, float] | None:
+    """The interval of a parameter that at least one side tells by an interval: it holds those of all sides."""
+    if all(field not in c.intervals for c in candidates):
+        return None
+    ends = list[tuple[float, float]]()
+    for c in candidates:
+        value, std = float(getattr(c.effect, field)), c.std.get(field)
+        ends.append(c.intervals.get(field) or (value - 2.0 * (std or 0.0), value + 2.0 * (std or 0.0)))
+    return min(low for low, _ in ends), max(high for _, high in ends)
 
 
 def _mean(values: list[tuple[float, float | None]], is_shared: bool) -> tuple[float, float | None]:

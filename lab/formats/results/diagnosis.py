@@ -24,12 +24,17 @@ class Mismatch(Frozen):
 
 
 class ParameterValue(Frozen):
-    """An estimated parameter of an effect. `sign_known`: False where the recordings show its size only, as it acts by its square."""
+    """An estimated parameter of an effect.
+
+    `sign_known`: False where the recordings show its size only, as it acts by its square. `interval`: from low to high, 95 %, of a value
+    whose error no normal distribution describes; it has no standard deviation.
+    """
 
     value: float
     std: float | None
     unit: str
     sign_known: bool = True
+    interval: tuple[float, float] | None = None
 
 
 class Rival(Frozen):
