@@ -240,30 +240,28 @@ def profile_interval(
             fits[u] = fit.log_posterior, fit.effects
         return fits[u][0]
 
-    def is_within(u: float) -> bool:
-        return profile(u) >= max(value for value, _ in fits.values()) - drop
+    def top() -> float:
+        return max(fits, key=profile)
 
-    def bracket(direction: float) -> tuple[float, float]:
-        """The outermost value tried within the interval, and the first beyond it."""
-        inside, step = start, 0.25 * (abs(start - absent) or one.typical(one.absent))
-        while True:
-            outside = float(np.clip(inside + direction * step, low, high))
-            if outside in (low, high) or abs(outside - absent) > MOST_WIDENED * abs(start - absent):
-                return (outside, outside) if is_within(outside) else (inside, outside)
-            if not is_within(outside):
-                return inside, outside
-            inside, step = outside, 2.0 * step
+    profile(start)
+    for direction in (-1.0, 1.0):
+        outside, step = start, 0.25 * (abs(start - absent) or one.typical(one.absent))
+        while profile(outside) >= profile(top()) - drop and outside != (low if direction < 0.0 else high):
+            if abs(outside - absent) > MOST_WIDENED * abs(start - absent):
+                break
+            outside, step = float(np.clip(outside + direction * step, low, high)), 2.0 * step
 
-    brackets = [bracket(-1.0), bracket(1.0)]
-    least = max(value for value, _ in fits.values()) - drop
+    best = top()
+    least = profile(best) - drop
     ends = []
-    for inside, outside in brackets:
-        is_crossed = profile(inside) > least > profile(outside)
-        ends.append(
-            brentq(lambda u: profile(u) - least, inside, outside, xtol=1e-3 * abs(outside - inside))
-            if is_crossed
-            else outside
-        )
+    for beyond in ([u for u in fits if u < best], [u for u in fits if u > best]):
+        out = [u for u in beyond if profile(u) < least]
+        if not out:
+            ends.append(max(beyond, key=lambda u: abs(u - best), default=best))
+            continue
+        first = min(out, key=lambda u: abs(u - best))
+        inside = max([best, *(u for u in beyond if abs(u - best) < abs(first - best))], key=lambda u: abs(u - best))
+        ends.append(float(brentq(lambda u: profile(u) - least, inside, first, xtol=1e-2 * abs(first - inside))))
     return one.to_value(ends[0]), one.to_value(ends[1])
 
 

@@ -15,6 +15,7 @@ from lab.diagnose.inference.refit import (
     _wide_slope,
     coordinates,
     is_of_usual_size,
+    profile_interval,
     refit,
 )
 from lab.diagnose.measurements.block import Block, Label, Prediction
@@ -144,3 +145,29 @@ def test_an_aperture_stays_within_the_pitch() -> None:
     )
     pitch_um = CAMERA.pixel_pitch_um
     assert fit.effects[0].side_change_um == pytest.approx(pitch_um * (1.0 - np.sqrt(0.9)), rel=1e-3)  # type: ignore[attr-defined]
+
+
+def test_a_profile_interval_is_that_of_a_normal_likelihood() -> None:
+    """A drift in white noise is linear in its size: four standard deviations, within 10 % as the law's tolerance grows with the size. By noise
+    alone the deviation is s / sqrt(sum(t^2))."""
+    minutes, noise = np.linspace(0.0, 1.0, 30), 0.004
+    model = _timed_model(np.random.default_rng(5), 2.0, noise)
+    fit = refit(model, (SourceDrift(drift_percent_per_min=2.0),), DecisionPolicy(), tolerance=0.0)
+    low, high = profile_interval(model, fit.effects, 0, "drift_percent_per_min", DecisionPolicy())
+    std = fit.std[0]["drift_percent_per_min"]
+    assert std is not None
+    assert std > 100.0 * noise / np.sqrt(np.sum(minutes**2))
+    assert high - low == pytest.approx(4.0 * std, rel=0.1)
+
+
+def test_profile_intervals_cover_a_weak_blur() -> None:
+    """40 draws of a diffusion whose square is some two standard deviations from absence: at least 34 of the 95 % intervals hold it, which
+    fewer do with a probability of 0.3 %, and some but not all reach absence."""
+    kind = effect("charge_diffusion")
+    intervals = []
+    for seed in range(40):
+        model = contrast_model(np.random.default_rng(500 + seed), (kind(length_um=0.1),))
+        fit = refit(model, (kind(length_um=0.1),), DecisionPolicy())
+        intervals.append(profile_interval(model, fit.effects, 0, "length_um", DecisionPolicy()))
+    assert sum(low <= 0.1 <= high for low, high in intervals) >= 34
+    assert 0 < sum(low == 0.0 for low, _ in intervals) < 40
