@@ -54,7 +54,9 @@ def measurement_model(
         for a in assumptions(recordings.camera(side), camera_fit)
     ]
     misstated = frozenset(name for level in misstated_levels(camera_fit) for name in level.captures)
-    study = Study(recordings, side, camera, _saturation_dn(camera_fit), misstated)
+    study = Study(
+        recordings, side, camera, _saturation_dn(camera_fit), misstated, camera_fit.noise if camera_fit else None
+    )
     skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for reason in study.copies.told]
     if not study.noise.gain_is_known:
         skipped.append(Skipped(step="diagnose conversion_gain_dn_per_e", reason=NO_GAIN, side=side))

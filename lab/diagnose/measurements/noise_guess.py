@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from lab.capture_kinds.base import Capture
+from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.pixel_outliers import sound_pixels
 from lab.diagnose.measurements.repeatability import (
     LAMP_FLOOR,
@@ -20,6 +21,7 @@ from lab.diagnose.measurements.repeatability import (
     steady,
 )
 from lab.fit.rounding import unrounded
+from lab.formats.results import NoiseFit
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
@@ -32,6 +34,7 @@ USUAL_JITTER_DN = 0.02  # usual standard deviation of a dark frame's mean, from 
 USUAL_JITTER_FREEDOM = 2.0  # degrees of freedom that count for the usual one
 UNKNOWN_JITTER_DN = 0.05  # where no dark frames are repeated
 USUAL_PRNU = 0.008  # where no flats tell
+USUAL_LAMP = 3e-4  # relative standard deviation of a flat frame's mean, where no flats are repeated
 #: Local mean of a plane of the mosaic: side of the box and width of the border that is left out, px. The wide one is used in planes of
 #: at least `WIDE_PLANE_PX` a side. In planes below `LEAST_PLANE_PX` PRNU isn't measured.
 WIDE_WINDOW_PX, NARROW_WINDOW_PX = (9, 6), (3, 1)
@@ -62,64 +65,111 @@ class NoiseGuess:
 
 
 def noise_guess(study: Study) -> NoiseGuess:
-    """First estimates from dark and flat captures; what they don't determine is taken from the data sheet, else a usual value.
+    """Return the noise fit's gain, black level, dark current, read noise and PRNU where there is a fit; else first estimates from dark and
+    flat captures. What these don't determine is taken from the data sheet, else a usual value.
 
-    The gain is the slope of temporal variance over signal of repeated flats, else the stated one, else that of any repeats.
+    Without a fit, the gain is the slope of temporal variance over signal of repeated flats, else the stated one, else that of any repeats.
     """
-    recordings, stated = study.recordings, study.stated
-    black = stated.black_level_dn if stated.black_level_dn is not None else 0.0
-    dark, read, jitter, jitter_freedom = 0.0, 1.0, BLACK_FLOOR_DN, 0.0
-    dark_c = study.temperature_c
-    # without dark frames: a dark current as stated, or of some tens of electrons
-    expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
-    dark_std = max(expected * (stated.conversion_gain_dn_per_e or 1.0), 0.5)
-    black_std = 0.05 * study.camera.white_level_dn
-    if stated.black_level_dn is not None:
-        black_std = max(STATED_BLACK_DN, STATED_BLACK_SHARE * black)
-    darks = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
-    if darks:
-        # at one temperature, that of most captures: the baseline's dark current doesn't depend on it
-        off = [0.0 if study.temperature_c is None or g[0].temperature_c is None else abs(g[0].temperature_c - study.temperature_c) for g in darks]  # fmt: skip
-        sound = study.once(sound_pixels)
-        frames_mean = [np.array([float(recordings.frame(c).mean(where=sound)) for c in g]) for g in darks]
-        near = [i for i, away in enumerate(off) if away <= min(off) + ALIKE_C]
-        t = np.array([darks[i][0].exposure_s for i in near])
-        level = np.array([frames_mean[i].mean() for i in near])
-        black_std = 1.0
-        if len(t) > 1 and np.ptp(t) > 0:
-            dark, black = (float(v) for v in np.polyfit(t, level, 1))
-            dark = max(dark, 0.0)
-            warm = [c for i in near for c in darks[i] if c.temperature_c is not None]
-            if warm:  # long exposures determine the dark current
-                dark_c = float(np.average([c.temperature_c for c in warm], weights=[c.exposure_s for c in warm]))
-            dark_std = max(dark, 0.5)  # an effect such as glow may be all of it
-        else:
-            black = float(level[0])
-            black_std += dark_std * float(t[0])
-        first = min((darks[i] for i in near), key=lambda g: g[0].exposure_s)
-        if len(first) > 1:
-            repeats = TemporalVariance()
-            for capture in first[:4]:
-                repeats.add(recordings.frame(capture))
-            read = float(np.sqrt(repeats.variance_dn2))
-        own_dn2 = read**2 / recordings.frame(first[0]).size if len(first) > 1 else 0.0
-        jitter, jitter_freedom = _jitter(study, darks, frames_mean, own_dn2)
-        jitter = max(jitter, BLACK_FLOOR_DN)
-    gain, lamp = stated.conversion_gain_dn_per_e, 3e-4
-    signal, variance, prnu = _transfer_points(study, black)
+    first = _from_darks(study, _as_stated(study))
+    fitted = study.fitted
+    if fitted is not None and fitted.conversion_gain_dn_per_e is not None:
+        return _as_fitted(study, first, fitted, fitted.conversion_gain_dn_per_e)
+    signal, variance, prnu = _transfer_points(study, first.black)
+    gain, lamp = study.stated.conversion_gain_dn_per_e, USUAL_LAMP
     if len(signal) > 1:
         s, v = np.array(signal), np.array(variance)
-        low = s < 0.5 * (study.saturation_dn - black)
+        low = s < 0.5 * (study.saturation_dn - first.black)
         use = low if low.sum() > 2 else np.ones_like(low)
-        gain = _transfer_slope(s[use], v[use], read)
-        lamp = level_repeatability(repeated_levels(study, black, gain, read))
+        gain = _transfer_slope(s[use], v[use], first.read_dn)
+        lamp = level_repeatability(repeated_levels(study, first.black, gain, first.read_dn))
     elif gain is None:
-        gain = _scene_gain(study, black, read)
-    known = gain is not None and gain > 0
-    gain = gain if gain is not None and known else 1.0
-    return NoiseGuess(
-        black, dark, dark_c, gain, known, read, prnu, jitter, jitter_freedom, max(lamp, LAMP_FLOOR), black_std, dark_std
+        gain = _scene_gain(study, first.black, first.read_dn)
+    if gain is None or gain <= 0:
+        return replace(first, prnu=prnu, jitter_lamp=max(lamp, LAMP_FLOOR))
+    return replace(first, gain=gain, gain_is_known=True, prnu=prnu, jitter_lamp=max(lamp, LAMP_FLOOR))
+
+
+def _as_fitted(study: Study, first: NoiseGuess, fitted: NoiseFit, gain_at_0_db: float) -> NoiseGuess:
+    """Return the noise fit's figures in the place of first estimates. The fit states its gain for 0 dB."""
+    gain = gain_at_0_db * 10.0 ** (_flats_gain_db(study) / 20.0)
+    black = first.black if fitted.black_level_dn is None else fitted.black_level_dn
+    read_dn = first.read_dn if fitted.read_noise_e is None else fitted.read_noise_e * gain
+    return replace(
+        first,
+        black=black,
+        dark_dn_per_s=first.dark_dn_per_s
+        if fitted.dark_current_e_per_s is None
+        else max(fitted.dark_current_e_per_s * gain, 0.0),
+        dark_c=first.dark_c if fitted.dark_temperature_c is None else fitted.dark_temperature_c,
+        gain=gain,
+        gain_is_known=True,
+        read_dn=read_dn,
+        prnu=first.prnu if fitted.prnu_percent is None else 0.01 * fitted.prnu_percent,
+        jitter_lamp=max(level_repeatability(repeated_levels(study, black, gain, read_dn)), LAMP_FLOOR),
     )
+
+
+def _as_stated(study: Study) -> NoiseGuess:
+    """Return what the data sheet states, with usual values in the place of what it doesn't."""
+    stated = study.stated
+    black, black_std = 0.0, 0.05 * study.camera.white_level_dn
+    if stated.black_level_dn is not None:
+        black = stated.black_level_dn
+        black_std = max(STATED_BLACK_DN, STATED_BLACK_SHARE * black)
+    # without dark frames: a dark current as stated, or of some tens of electrons
+    expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
+    return NoiseGuess(
+        black=black, dark_dn_per_s=0.0, dark_c=study.temperature_c, gain=1.0, gain_is_known=False, read_dn=1.0, prnu=USUAL_PRNU,
+        jitter_dn=BLACK_FLOOR_DN, jitter_freedom=0.0, jitter_lamp=USUAL_LAMP, black_std=black_std,
+        dark_std=max(expected * (stated.conversion_gain_dn_per_e or 1.0), 0.5),
+    )  # fmt: skip
+
+
+def _from_darks(study: Study, stated: NoiseGuess) -> NoiseGuess:
+    """Return black level, dark current, read noise and repeatability by the dark captures; as stated where there are none.
+
+    They are of one temperature, that of most captures: the baseline's dark current doesn't depend on it.
+    """
+    recordings = study.recordings
+    darks = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
+    if not darks:
+        return stated
+    off = [0.0 if study.temperature_c is None or g[0].temperature_c is None else abs(g[0].temperature_c - study.temperature_c) for g in darks]  # fmt: skip
+    sound = study.once(sound_pixels)
+    frames_mean = [np.array([float(recordings.frame(c).mean(where=sound)) for c in g]) for g in darks]
+    near = [i for i, away in enumerate(off) if away <= min(off) + ALIKE_C]
+    t = np.array([darks[i][0].exposure_s for i in near])
+    level = np.array([frames_mean[i].mean() for i in near])
+    dark, dark_c, black_std, dark_std = stated.dark_dn_per_s, stated.dark_c, 1.0, stated.dark_std
+    if len(t) > 1 and np.ptp(t) > 0:
+        dark, black = (float(v) for v in np.polyfit(t, level, 1))
+        dark = max(dark, 0.0)
+        warm = [c for i in near for c in darks[i] if c.temperature_c is not None]
+        if warm:  # long exposures determine the dark current
+            dark_c = float(np.average([c.temperature_c for c in warm], weights=[c.exposure_s for c in warm]))
+        dark_std = max(dark, 0.5)  # an effect such as glow may be all of it
+    else:
+        black = float(level[0])
+        black_std += dark_std * float(t[0])
+    first = min((darks[i] for i in near), key=lambda g: g[0].exposure_s)
+    read, own_dn2 = stated.read_dn, 0.0
+    if len(first) > 1:
+        repeats = TemporalVariance()
+        for capture in first[:4]:
+            repeats.add(recordings.frame(capture))
+        read = float(np.sqrt(repeats.variance_dn2))
+        own_dn2 = read**2 / recordings.frame(first[0]).size
+    jitter, freedom = _jitter(study, darks, frames_mean, own_dn2)
+    return replace(
+        stated, black=black, dark_dn_per_s=dark, dark_c=dark_c, read_dn=read, jitter_dn=max(jitter, BLACK_FLOOR_DN), jitter_freedom=freedom,
+        black_std=black_std, dark_std=dark_std,
+    )  # fmt: skip
+
+
+def _flats_gain_db(study: Study) -> float:
+    """Return the most frequent amplification of flats, dB, at which the noise is fitted; the fit states its gain for 0 dB."""
+    gains = [flat.gain_db or 0.0 for flat in study.recordings.captures(FlatCapture, study.side)]
+    return max(sorted(set(gains)), key=gains.count, default=0.0)
 
 
 def _transfer_points(study: Study, black: float) -> tuple[list[float], list[float], float]:

@@ -19,6 +19,7 @@ from lab.diagnose.measurements.saturation import CLIPPED_SHARE, clipping_level_d
 from lab.errors import NotDetermined
 from lab.fit.noise.copied_frames import CopiedFrames, copied_frames
 from lab.formats.recording_set import DataSheet, RecordingSet
+from lab.formats.results import NoiseFit
 from sim.camera import CameraModel, Side
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
@@ -42,9 +43,9 @@ class Levels:
 class Study:
     """One side of a recording set, from which measurements are made. What they share is computed once.
 
-    `camera`: the baseline; its gain, black level, dark current, read noise and full well are replaced by first estimates
-    (`noise_guess`). `saturation_dn`: code from which on pixels clip (None: estimated). `misstated`: ids of flats whose stated number of photons contradicts
-    the others.
+    `camera`: the baseline; its gain, black level, dark current, read noise and full well are those of the noise fit, or first estimates
+    where there is none (`noise_guess`). `saturation_dn`: code from which on pixels clip (None: estimated). `misstated`: ids of flats whose stated number of photons contradicts
+    the others. `fitted`: the side's noise fit, None where its recordings don't determine one.
     """
 
     def __init__(
@@ -54,8 +55,9 @@ class Study:
         camera: CameraModel,
         saturation_dn: float | None = None,
         misstated: frozenset[str] = frozenset(),
+        fitted: NoiseFit | None = None,
     ) -> None:
-        self.misstated = misstated
+        self.misstated, self.fitted = misstated, fitted
         #: Captures that are left out, as their frames weren't taken anew.
         self.copies: CopiedFrames = copied_frames(recordings, side)
         self.recordings = recordings.without(self.copies.ids) if self.copies.ids else recordings
