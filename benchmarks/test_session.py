@@ -25,7 +25,7 @@ import pytest
 from benchmarks.table import Row, show
 from lab.fit.geometry.recordings import fit_geometry
 from lab.fit.mtf.recordings import fit_mtf
-from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.noise_fit import fit_noise
 from lab.fit.psf.recordings import fit_psf_field
 from lab.fit.spectral.recordings import fit_spectral
 from lab.formats import recording_set as recording

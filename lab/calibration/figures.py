@@ -6,7 +6,7 @@ Curves and kernels are left out: they have no single value that a limit could bo
 from __future__ import annotations
 
 from lab.fit.compare import FEW, numbers_of, place_of
-from lab.fit.noise.temperature_law import SensorTemperature
+from lab.fit.noise.dark_current import SensorTemperature
 from lab.formats.results import FitResult
 from lab.formats.results.figure_names import plain_name, unit_of
 from sim.camera import Side

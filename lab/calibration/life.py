@@ -24,7 +24,7 @@ from lab.capture.store import Store
 from lab.capture.tables import CalibrationRow, FigureRow, ResultRow, SessionRow
 from lab.errors import InputError
 from lab.fit.compare import FALSE_ALARM_RATE, Numbers, sidak_part, sigma_of_probability
-from lab.fit.noise.temperature_law import SensorTemperature
+from lab.fit.noise.dark_current import SensorTemperature
 from lab.formats.results import FitResult
 from lab.formats.results.figure_names import plain_name
 from sim.camera import Side

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.fit.noise.level_statistics import MeasuredLevel, level_statistics
 from lab.fit.noise.noise_fit import noise_fit
 from lab.fit.spectral import estimate_sensitivity
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import NoiseFit
+from lab.measure.levels import MeasuredLevel, level_statistics
 from sim.camera import CameraModel, Lens
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lab.capture_kinds.flat import FlatCapture
-from lab.fit.noise.stated_light import stated_light
 from lab.formats.results import CameraFit, InconsistentLevel
+from lab.measure.stated_light import stated_light
 from sim.spectrum import Spectrum
 from sim.uniform import electron_rate
 
@@ -58,7 +58,7 @@ def _rate(study: Study, one: FlatLight, channel: str) -> float:
 
 
 def misstated_levels(fit: CameraFit | None) -> tuple[InconsistentLevel, ...]:
-    """Levels whose stated number of photons contradicts the others, as found by the noise fit (`lab.fit.noise.level_consistency`)."""
+    """Levels whose stated number of photons contradicts the others, as found by the noise fit (`lab.fit.noise.evaluation`)."""
     if fit is None or fit.noise is None:
         return ()
     return tuple(level for level in fit.noise.inconsistent_levels if level.light_unit == "photons" and level.captures)

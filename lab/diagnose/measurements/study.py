@@ -17,9 +17,9 @@ from lab.diagnose.measurements.noise_guess import NoiseGuess, noise_guess
 from lab.diagnose.measurements.reads import LAG, acting
 from lab.diagnose.measurements.saturation import CLIPPED_SHARE, clipping_level_dn
 from lab.errors import NotDetermined
-from lab.fit.noise.copied_frames import CopiedFrames, copied_frames
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
+from lab.measure.mishaps import CopiedFrames, copied_frames
 from sim.camera import CameraModel, Side
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum

@@ -9,16 +9,16 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.dark_level import DARK
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata.misstatement import Misstatement
-from lab.fit.noise.dark_signal import DARKER_SHARE
-from lab.fit.noise.exchanged_frames import exchanged_frames
 from lab.formats.recording_set import RecordingSet
+from lab.measure.level_lines import DARKER_SHARE
+from lab.measure.mishaps import exchanged_frames
 from sim.camera import Side
 
 FEWEST = 3  # darks, and flats
 
 
 def misplaced_frames(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Pairs of darks and flats that hold each other's frames (`lab.fit.noise.exchanged_frames`); None where none is found."""
+    """Pairs of darks and flats that hold each other's frames (`lab.measure.mishaps`); None where none is found."""
     found = exchanged_frames(recordings, side)
     if found is None:
         return None

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
-from lab.fit.noise.alike_planes import ALIKE, alike_planes
 from lab.formats.recording_set import RecordingSet
+from lab.measure.mishaps import ALIKE, alike_planes
 from sim.camera import Side
 
 
 def misstated_mosaic(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """A stated mosaic whose planes are alike in every light (`lab.fit.noise.alike_planes`); None where they differ. The maker's curves are of
+    """A stated mosaic whose planes are alike in every light (`lab.measure.mishaps`); None where they differ. The maker's curves are of
     colours, and are left out."""
     found = alike_planes(recordings, side)
     if found is None:

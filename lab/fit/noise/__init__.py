@@ -2,17 +2,16 @@
 
 Definitions: EMVA Standard 1288, release 4.0 (linear). The steps, one module each:
 
-- `frame_sums`, `level_statistics`: means, temporal and spatial variances of the repeats of one level; `shading`,
-  `defective_pixels`;
-- `dark_signal`: dark means against exposure; `saturation`: which flats clip, and where;
-- `robust_response`, `level_consistency`: which flats serve the lines, and what their means scatter;
-- `photon_transfer`: conversion gain and curvature from variances against means; `evaluation`: the state that these
-  leave for the rest;
-- `read_noise`, `dark_current`, `fixed_pattern` (DSNU, PRNU, shading), `response` (linearity, full well, quantum
-  efficiency), `variance_curvature`, `lamp_drift`;
+- `lab.measure.levels`: means, temporal and spatial variances of the repeats of one level, without defective pixels and
+  the smooth shading; `lab.measure.stated_light`: the light that flats state;
+- `lab.measure.level_lines`: dark means against exposure, which flats clip, and a response that outliers don't move;
+- `evaluation`: which flats serve the lines, what their means scatter, and the state that all figures rest on;
+- `photon_transfer`: conversion gain and curvature from variances against means;
+- `dark_current` (black level, read noise, dark current), `fixed_pattern` (DSNU, PRNU, shading), `response` (linearity,
+  full well, quantum efficiency, curvature of the variance);
 - `emva1288`: the figures by the letter of the standard, beside the physical fit;
-- `dark_pixels`, `pixel_maps`: figures and maps of single pixels;
-- `noise_fit`: the results; `recordings`: the step on a recording set.
+- `lab.measure.dark_pixels`, `pixel_maps`: figures and maps of single pixels;
+- `noise_fit`: the step on a recording set, and its results.
 
 Where the fit departs from the letter of the standard:
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lab.fit.noise.defective_pixels import DEFECT_SIGMA
+from lab.fit.noise.dark_current import dark_signal_hidden
 from lab.fit.noise.evaluation import Evaluation, in_electrons
-from lab.fit.noise.level_statistics import MeasuredLevel
-from lab.fit.noise.read_noise import dark_signal_hidden
 from lab.fit.rounding import HIDDEN_DN2, QUANTISATION_DN2
 from lab.fit.weighted_lines import chi2_factor, root
+from lab.measure.levels import DEFECT_SIGMA, MeasuredLevel
 
 ASYMMETRY = 0.002  # difference of the light on opposite edges, of the mean, above which it is reported
 

@@ -12,11 +12,11 @@ from collections.abc import Hashable
 from pathlib import Path
 
 from lab.errors import InputError
-from lab.fit.noise.level_statistics import MeasuredLevel, PlaneStatistics
 from lab.fit.noise.noise_fit import noise_fit
 from lab.fit.number_table import TableRow, table_rows
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, ChannelNoise, Emva1288, FitResult, NoiseFit, Skipped
+from lab.measure.levels import MeasuredLevel, PlaneStatistics
 
 NEEDED = ("kind", "exposure_s", "mean_dn", "variance_dn2", "pixels", "repeats")
 KNOWN = (*NEEDED, "channel", "photons_per_pixel", "wavelength_nm", "temperature_c")

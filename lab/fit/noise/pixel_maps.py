@@ -11,13 +11,10 @@ import numpy as np
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
-from lab.fit.noise.dark_pixels import stack_of
-from lab.fit.noise.defective_pixels import defective_pixels
-from lab.fit.noise.frame_sums import BoolArray
-from lab.fit.noise.level_statistics import Stack
-from lab.fit.noise.shading import shading
 from lab.fit.rounding import QUANTISATION_DN2
 from lab.formats.recording_set import RecordingSet
+from lab.measure.dark_pixels import stack_of
+from lab.measure.levels import BoolArray, Stack, defective_pixels, shading
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray

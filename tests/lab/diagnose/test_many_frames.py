@@ -14,8 +14,8 @@ from lab.diagnose.measurements.dark_frames import dark_frames
 from lab.diagnose.measurements.noise_guess import TemporalVariance
 from lab.diagnose.measurements.study import Study, mean_frame
 from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
-from lab.fit.noise.exchanged_frames import exchanged_frames
 from lab.formats.recording_set import Manifest, RecordingSet
+from lab.measure.mishaps import exchanged_frames
 from lab.predict.camera_model import camera_model
 
 SIDE_PX = 128

@@ -12,7 +12,7 @@ from lab.diagnose.measurements.flat_light import misstated_levels
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
-from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
 from lab.predict.camera_model import assumptions, camera_model

@@ -14,7 +14,7 @@ from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, GeometryFit, NoiseFit, StereoFit
 
 STEPS = {
-    "noise": "lab.fit.noise.recordings.fit_noise",
+    "noise": "lab.fit.noise.noise_fit.fit_noise",
     "spectral": "lab.fit.spectral.recordings.fit_spectral",
     "mtf": "lab.fit.mtf.recordings.fit_mtf",
     "psf": "lab.fit.psf.recordings.fit_psf_field",

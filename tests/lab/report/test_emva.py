@@ -10,7 +10,7 @@ import re
 import numpy as np
 import pytest
 
-from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
 from lab.report import render_report

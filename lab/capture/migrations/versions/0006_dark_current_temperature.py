@@ -23,7 +23,7 @@ def upgrade() -> None:
     op.execute(
         "DELETE FROM figures WHERE id NOT IN (SELECT max(id) FROM figures GROUP BY calibration_id, camera, side, name, place)"
     )
-    # The temperature of earlier ones isn't known; silicon's law is as in lab/fit/noise/temperature_law.py.
+    # The temperature of earlier ones isn't known; silicon's law is as in lab/fit/noise/dark_current.py.
     op.execute("UPDATE figures SET doubling_c = 7.2, doubling_c_std = 1.4 WHERE name LIKE 'noise dark_current%e_per_s'")
     op.create_index("ix_figures_once", "figures", ["calibration_id", "camera", "side", "name", "place"], unique=True)
 

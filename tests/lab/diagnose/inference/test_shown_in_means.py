@@ -14,7 +14,7 @@ from lab.diagnose.measurements.noise_neighbours import neighbour_block
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.outcome.mismatches import unexplained
 from lab.diagnose.policy import DecisionPolicy
-from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
 from sim.effects.adc_step import AdcStep

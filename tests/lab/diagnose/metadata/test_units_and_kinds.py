@@ -12,7 +12,7 @@ import pytest
 from lab.diagnose.metadata import misstatements
 from lab.diagnose.metadata.exposure_unit import misstated_exposure_unit
 from lab.diagnose.metadata.mono_sensor import misstated_mosaic
-from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import RecordingSet, inspect
 from tests.lab.diagnose.metadata.lies import restated

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.fit.noise.level_statistics import MeasuredLevel, level_statistics
 from lab.fit.noise.noise_fit import noise_fit
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import NoiseFit
+from lab.measure.levels import MeasuredLevel, level_statistics
 from sim.sensor.mosaic import planes
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.fit.noise.dark_pixels import DarkPixels, read_noise_distribution
-from lab.fit.noise.level_statistics import Stack
+from lab.measure.dark_pixels import DarkPixels, read_noise_distribution
+from lab.measure.levels import Stack
 
 
 def spread_of(read_dn: np.ndarray, repeats: int) -> DarkPixels:

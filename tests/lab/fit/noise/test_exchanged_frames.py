@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.noise.exchanged_frames import exchanged_frames
-from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import RecordingSet
+from lab.measure.mishaps import exchanged_frames
 from tests.lab.fit.noise.synthetic_sensor import Sensor, recording_set, scores
 
 CMOS = Path(__file__).parents[5] / "shared" / "data" / "emva1288_cmos_crop"

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.fit.noise.defective_pixels import defective_pixels
-from lab.fit.noise.level_statistics import level_statistics
-from lab.fit.noise.shading import shading
+from lab.measure.levels import defective_pixels, level_statistics, shading
 
 
 def test_statistics_agree_with_their_definitions() -> None:

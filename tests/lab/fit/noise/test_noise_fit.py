@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.noise_fit import noise_fit
+from lab.measure.levels import MeasuredLevel
 from tests.lab.fit.noise.synthetic_sensor import TRUTHS, Sensor, levels, measured, scores
 
 

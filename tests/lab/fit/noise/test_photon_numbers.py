@@ -7,10 +7,10 @@ import pytest
 from scipy import constants
 
 from lab.capture_kinds.flat import FlatCapture
-from lab.fit.noise.photon_numbers import photon_numbers, why_not
-from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult, NoiseFit
+from lab.measure.stated_light import photon_numbers, why_not
 from lab.report.emva import data_sheets
 
 SHAPE, PITCH_UM, WAVELENGTH_NM = (96, 96), 5.0, 530.0

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.noise.noise_fit import noise_fit
-from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.noise_fit import fit_noise, noise_fit
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import RecordingSet, read
 from tests.lab.fit.noise.synthetic_sensor import LADDER, TRUTHS, Sensor, levels, measured, recording_set, scores

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.noise_fit import noise_fit
-from lab.fit.noise.robust_response import RobustResponse, robust_response
 from lab.formats.results import NoiseFit
+from lab.measure.level_lines import RobustResponse, robust_response
+from lab.measure.levels import MeasuredLevel
 from tests.lab.fit.noise.synthetic_sensor import Sensor, levels
 
 BEND = 0.02  # of the response at saturation

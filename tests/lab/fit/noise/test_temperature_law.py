@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.fit.noise.temperature_law import temperature_law
+from lab.fit.noise.dark_current import temperature_law
 
 
 def test_dark_currents_follow_arrhenius_and_double() -> None:

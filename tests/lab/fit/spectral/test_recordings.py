@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.noise_fit import fit_noise
 from lab.fit.spectral.captures import MIN_LIGHTS
 from lab.fit.spectral.recordings import fit_spectral
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet, read

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lab.errors import InputError
-from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.noise_fit import fit_noise
 from lab.formats import recording_set as recording
 from lab.formats.importers import read_foreign
 from lab.formats.importers.emva1288 import parse_descriptor, read_emva1288

@@ -1,21 +1,57 @@
-"""Photons on a pixel by the irradiance that a reference photodiode measured, for flats whose manifest states no number of photons.
-
-    n = E A t wavelength / (h c)
-
-E: irradiance in the plane of the sensor; A: area of a pixel, the square of the pitch; t: exposure. Source: EMVA 1288 release 4.0, eq. 3.
-The photodiode stands where the sensor is, and the camera has no lens: behind one the sensor's irradiance is another.
-"""
+"""The light that flats state: photons, a photodiode's irradiance, a radiance, or the exposure alone."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
-from lab.fit.noise.stated_light import StatedLight, stated_light
 from lab.formats.recording_set import DataSheet
+
+# --- stated light --------------------------------------------------------------------------------------------------
+# How much light a flat's manifest states: photons a pixel, or else the time of exposure to one lamp.
+
+
+@dataclass(frozen=True)
+class StatedLight:
+    """The light of one flat. Amounts of one unit and wavelength compare where the lamp is the same.
+
+    `std`, `calibration_std`: relative standard uncertainties where it was measured, by its readings, and by the reference's calibration,
+    which is common to all that it measured.
+    """
+
+    amount: float
+    unit: Literal["photons", "s"]
+    wavelength_nm: float | None
+    std: float = 0.0
+    calibration_std: float = 0.0
+
+    @property
+    def lamp(self) -> tuple[bool, float | None]:
+        """What flats without a measured radiance share where their amounts compare."""
+        return self.unit == "photons", self.wavelength_nm
+
+
+def stated_light(flat: FlatCapture) -> StatedLight:
+    """Photons per pixel where they are stated, else the exposure (s)."""
+    if flat.photons_per_pixel is not None:
+        return StatedLight(flat.photons_per_pixel, "photons", flat.wavelength_nm)
+    return StatedLight(flat.exposure_s, "s", flat.wavelength_nm)
+
+
+# --- photon numbers ------------------------------------------------------------------------------------------------
+# Photons on a pixel by the irradiance that a reference photodiode measured, for flats whose manifest states no
+# number of photons.
+#
+#     n = E A t wavelength / (h c)
+#
+# E: irradiance in the plane of the sensor; A: area of a pixel, the square of the pitch; t: exposure. Source: EMVA 1288 release 4.0, eq. 3.
+# The photodiode stands where the sensor is, and the camera has no lens: behind one the sensor's irradiance is another.
+
 
 #: Irradiances of one exposure that differ by less are one level: sd of their readings, and a share that lamps move by.
 SAME_SIGMA, SAME_SHARE = 4.0, 0.005

@@ -1,27 +1,243 @@
-"""Statistics of the repeats of one level: means, temporal and spatial variances, covariances of neighbours.
+"""Statistics of the repeats of one level: means, temporal and spatial variances, defective pixels, shading.
 
-Repeats are read one after the other and not kept. Each frame is compared with the mean of those before it, plane by
-plane, after the difference of the means of the two planes has been subtracted (Welford's recursion). A lamp that
-drifts between repeats is then no temporal noise. This costs one of the N degrees of freedom of a plane for each frame,
-as in EMVA 1288 with two frames.
+One level is all frames of one exposure, light and temperature. Its frames are read once, and no more than one level is held in memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from lab.fit.noise.defective_pixels import DEFECT_SIGMA
-from lab.fit.noise.frame_sums import BoolArray, Float32Array, add_frame, pattern_sums, plane_sums
-from lab.fit.noise.shading import SHADING_DEGREE, shading_factors, surface_degree
 from lab.fit.rounding import HIDDEN_DN2, QUANTISATION_DN2, rounding_std_dn, unrounded, variance_rounding_std
+from lab.formats.recording_set import DataSheet
 from sim.camera import Cfa
 from sim.sensor.mosaic import planes, step
 from sim.spectrum import FloatArray
+
+# --- frame sums ----------------------------------------------------------------------------------------------------
+# Compiled loops over the pixels of a frame: sums by plane, Welford's recursion, spatial sums.
+
+
+# mypy: disallow-untyped-decorators=False
+
+
+Float32Array = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+
+
+@njit(cache=True)
+def plane_sums(frame: NDArray[np.uint16], bad: BoolArray, period: int) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Sums of a frame (rows, cols) by phase of the mosaic.
+
+    Sums over all pixels and over the good ones (2, phases); the highest code, how often it and 0 come, and less the
+    number of bad pixels (4, phases).
+    """
+    phases = period * period
+    sums = np.zeros((2, phases))
+    counts = np.zeros((4, phases), np.int64)
+    rows, cols = frame.shape
+    for i in range(rows):
+        for offset in range(period):
+            p = (i % period) * period + offset
+            total, highest, zeros = np.int64(0), np.int64(0), np.int64(0)
+            for j in range(offset, cols, period):
+                value = np.int64(frame[i, j])
+                total += value
+                highest = max(highest, value)
+                zeros += value == 0
+            sums[0, p] += total
+            counts[2, p] += zeros
+            if highest > counts[0, p]:
+                counts[0, p], counts[1, p] = highest, 0
+            if highest == counts[0, p]:
+                for j in range(offset, cols, period):
+                    counts[1, p] += frame[i, j] == highest
+    sums[1] = sums[0]
+    if bad.size > 0:
+        for i in range(rows):
+            for j in range(cols):
+                if bad[i, j]:
+                    p = (i % period) * period + j % period
+                    sums[1, p] -= frame[i, j]
+                    counts[3, p] -= 1
+    return sums, counts
+
+
+@njit(cache=True)
+def add_frame(
+    frame: NDArray[np.uint16],
+    mean: Float32Array,
+    squares: Float32Array,
+    shift: FloatArray,
+    bad: BoolArray,
+    period: int,
+    count: int,
+    products: FloatArray,
+    pairs: NDArray[np.int64],
+) -> None:
+    """Add frame number `count` (from 2) to `mean` and `squares`, by Welford's recursion.
+
+    `shift` (phases,): by how much the mean of each phase lies above that of `mean`. `products`, `pairs` (2, phases):
+    sums of products of adjacent and of diagonal neighbours, and their numbers.
+    """
+    rows, cols = frame.shape
+    share, inverse = np.float32((count - 1) / count), np.float32(1.0 / count)
+    above, row = np.zeros(cols, np.float32), np.zeros(cols, np.float32)
+    some_bad = bad.size > 0
+    for i in range(rows):
+        first = (i % period) * period
+        for j in range(cols):
+            delta = np.float32(frame[i, j]) - mean[i, j] - np.float32(shift[first + j % period])
+            mean[i, j] += delta * inverse
+            squares[i, j] += delta * delta * share
+            row[j] = np.float32(0.0) if some_bad and bad[i, j] else delta
+        # Sums of a row in single precision, of the frame in double: exact to 1e-6
+        for offset in range(period):
+            here, there = first + offset, first + (offset + 1) % period
+            beside = np.float32(0.0)
+            for j in range(offset, cols - 1, period):
+                beside += row[j] * row[j + 1]
+            number = len(range(offset, cols - 1, period))
+            for p in (here, there):
+                products[0, p] += share * beside
+                pairs[0, p] += number
+            if i == 0:
+                continue
+            upper = ((i - 1) % period) * period
+            straight = np.float32(0.0)
+            for j in range(offset, cols, period):
+                straight += row[j] * above[j]
+            for p in (here, upper + offset):
+                products[0, p] += share * straight
+                pairs[0, p] += len(range(offset, cols, period))
+            left, right = np.float32(0.0), np.float32(0.0)
+            for j in range(offset, cols - 1, period):
+                right += row[j] * above[j + 1]
+                left += row[j + 1] * above[j]
+            other = upper + (offset + 1) % period
+            for p in (here, other):
+                products[1, p] += share * right
+                pairs[1, p] += number
+            for p in (there, upper + offset):
+                products[1, p] += share * left
+                pairs[1, p] += number
+        above, row = row, above
+
+
+@njit(cache=True)
+def pattern_sums(
+    image: Float32Array, surface: Float32Array, bad: BoolArray, mean: float, good_mean: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Spatial sums of an image.
+
+    Of image - mean over all pixels: sum of squares, sums of rows and of columns. Of image - good_mean over good
+    pixels: sum and sum of squares. Of image - surface over good pixels: sum, sum of squares, largest modulus, sums of
+    rows and of columns.
+    """
+    rows, cols = image.shape
+    sums = np.zeros(6)
+    row_sums, col_sums, row_rest, col_rest = np.zeros(rows), np.zeros(cols), np.zeros(rows), np.zeros(cols)
+    some_bad = bad.size > 0
+    for i in range(rows):
+        for j in range(cols):
+            value = float(image[i, j])
+            from_mean = value - mean
+            sums[0] += from_mean * from_mean
+            row_sums[i] += from_mean
+            col_sums[j] += from_mean
+            if some_bad and bad[i, j]:
+                continue
+            good = value - good_mean
+            sums[1] += good
+            sums[2] += good * good
+            rest = value - surface[i, j]
+            sums[3] += rest
+            sums[4] += rest * rest
+            sums[5] = max(sums[5], abs(rest))
+            row_rest[i] += rest
+            col_rest[j] += rest
+    return sums, row_sums, col_sums, row_rest, col_rest
+
+
+# --- shading -------------------------------------------------------------------------------------------------------
+# The smooth surface of an image: shading of the lens and the lamp.
+
+
+SHADING_DEGREE = 6
+F = TypeVar("F", bound=np.floating[Any])
+
+
+def shading_factors(image: NDArray[F], degree: int) -> tuple[NDArray[F], NDArray[F]]:
+    """The smooth surface as a product (rows, k) @ (k, cols), in the precision of the image. Least squares on means of
+    blocks.
+    """
+    rows, cols = image.shape
+    # At most 32 blocks an axis; each degree needs three
+    counts = [int(np.clip(size // 8, 1, 32)) for size in (rows, cols)]
+    block = rows // counts[0], cols // counts[1]
+    inner = image[: counts[0] * block[0], : counts[1] * block[1]]
+    means = inner.reshape(counts[0], block[0], counts[1], block[1]).mean(axis=(1, 3), dtype=float)
+    full, small = [], []
+    for size, count, width in zip((rows, cols), counts, block, strict=True):
+        order = surface_degree(size, degree)
+        at = 2.0 * (np.arange(size) + 0.5) / size - 1.0
+        basis = np.polynomial.legendre.legvander(at, order)
+        full.append(basis)
+        small.append(basis[: count * width].reshape(count, width, -1).mean(axis=1))
+    coefficients = np.linalg.pinv(small[0]) @ means @ np.linalg.pinv(small[1]).T
+    return (full[0] @ coefficients).astype(image.dtype), np.ascontiguousarray(full[1].T.astype(image.dtype))
+
+
+def surface_degree(size: int, degree: int = SHADING_DEGREE) -> int:
+    """Degree of the surface along an axis of `size` pixels; small images have too few blocks for the full one."""
+    return min(degree, int(np.clip(size // 8, 1, 32)) // 3)
+
+
+def shading(image: NDArray[F], degree: int = SHADING_DEGREE) -> NDArray[F]:
+    """Smooth surface of an image (rows, cols): the polynomial of `degree` in rows and in columns nearest to its block
+    means.
+    """
+    down, across = shading_factors(image, degree)
+    return down @ across
+
+
+# --- defective pixels ----------------------------------------------------------------------------------------------
+# Pixels that stand out of their plane.
+
+
+DEFECT_SIGMA = 8.0  # a normal pattern of a million pixels doesn't reach that far
+
+
+def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa) -> BoolArray:
+    """Pixels of a mean frame (rows, cols) beyond 8 robust standard deviations of their plane, as a mask (rows, cols).
+
+    Robust: 1.4826 times the median modulus of the residual from the smooth surface.
+    """
+    bad = np.zeros(image.shape, bool)
+    for name, plane in planes(image, cfa).items():
+        rest = plane - np.median(plane)
+        # Most pixels of a rounded plane may be equal: the least scale is then that of rounding, else a tenth of a DN
+        least = np.sqrt(QUANTISATION_DN2) if not np.median(np.abs(rest)) > 0 else 0.1
+        for _ in range(2):  # glow widens the first scale, hot pixels distort the first surface
+            limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), least)
+            rest = rest - shading(np.clip(rest, -limit, limit))
+        limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), least)
+        planes(bad, cfa)[name][...] = np.abs(rest) > limit
+    return bad
+
+
+# --- level statistics ----------------------------------------------------------------------------------------------
+# Statistics of the repeats of one level: means, temporal and spatial variances, covariances of neighbours.
+#
+# Repeats are read one after the other and not kept. Each frame is compared with the mean of those before it, plane by
+# plane, after the difference of the means of the two planes has been subtracted (Welford's recursion). A lamp that
+# drifts between repeats is then no temporal noise. This costs one of the N degrees of freedom of a plane for each frame,
+# as in EMVA 1288 with two frames.
 
 
 @dataclass(frozen=True)
@@ -389,3 +605,77 @@ def level_statistics(
     for frame in frames:
         stack.add(frame)
     return stack.statistics()
+
+
+# --- recorded levels -----------------------------------------------------------------------------------------------
+# The levels of one camera that the noise fit works on: flats, and the darks of one temperature.
+
+
+BLACK_CLIPPED_SHARE = 1e-3  # of pixels at 0 in a dark, above which darks are clipped
+
+
+@dataclass(frozen=True)
+class Remarks:
+    """What a fit has to say beside its figures, each sentence once."""
+
+    sentences: list[str] = field(default_factory=list)
+
+    def add(self, sentence: str) -> None:
+        """Add a sentence where it isn't there yet."""
+        if sentence not in self.sentences:
+            self.sentences.append(sentence)
+
+
+@dataclass(frozen=True)
+class RecordedLevels:
+    """Levels of one camera at one gain.
+
+    `names`: planes of the mosaic. `flats`: in ascending light. `all_darks`: in ascending exposure; `darks`: those of
+    `temperature_c`, none where they are clipped at 0 (`black_clipped`). `defects`: pixels that were left out of all
+    levels.
+    """
+
+    camera: DataSheet
+    gain_db: float
+    defects: int
+    names: tuple[str, ...]
+    flats: tuple[MeasuredLevel, ...]
+    all_darks: tuple[MeasuredLevel, ...]
+    darks: tuple[MeasuredLevel, ...]
+    temperature_c: float | None
+    black_clipped: bool
+
+    @property
+    def white_dn(self) -> float:
+        """Highest code."""
+        return self.camera.saturation_dn
+
+    @classmethod
+    def of(
+        cls,
+        darks: Sequence[MeasuredLevel],
+        flats: Sequence[MeasuredLevel],
+        camera: DataSheet,
+        gain_db: float,
+        defects: int,
+        names: tuple[str, ...],
+        remarks: Remarks,
+    ) -> RecordedLevels:
+        """Choose the darks of the temperature at which most flats (or else most darks) were taken."""
+        bright = tuple(sorted(flats, key=lambda level: (level.light, level.exposure_s)))
+        every = tuple(sorted(darks, key=lambda level: level.exposure_s))
+        present = [level.temperature_c for level in every]
+        wanted = [rounded_c(level.temperature_c) for level in bright]
+        temperature = max(dict.fromkeys(present), key=lambda t: (wanted.count(t), present.count(t)), default=None)
+        own = tuple(level for level in every if level.temperature_c == temperature)
+        clipped = any(level.plane[name].zero_share > BLACK_CLIPPED_SHARE for level in own for name in names)
+        if clipped:
+            remarks.add(
+                "dark frames are clipped at 0 DN: black level, read noise, dark current and DSNU aren't determined; raise the black level"
+            )
+        return cls(camera, gain_db, defects, names, bright, every, () if clipped else own, temperature, clipped)
+
+
+def rounded_c(temperature_c: float | None) -> float | None:
+    """A temperature to a degree; levels of one degree belong together."""
+    return None if temperature_c is None else float(round(temperature_c))

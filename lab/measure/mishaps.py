@@ -1,8 +1,9 @@
-"""Frames of a photon-transfer series that stand under each other's captures: two levels, or a dark and a flat, exchanged in an index."""
+"""Captures that aren't what they are said to be: copies of a frame, frames exchanged between levels, a mosaic without colours."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -12,11 +13,70 @@ from scipy import stats
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
-from lab.fit.noise.photon_numbers import light_of
-from lab.fit.noise.robust_response import robust_response
+from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.formats.recording_set import RecordingSet
+from lab.measure.level_lines import CLIPPED_LIMIT, robust_response
+from lab.measure.stated_light import light_of
 from sim.camera import Side
 from sim.spectrum import FloatArray
+
+# --- copied frames -------------------------------------------------------------------------------------------------
+# Copied frames: a capture whose frame equals an earlier one's bit for bit wasn't taken anew.
+
+
+NOISELESS_DN = 0.5  # frames of a smaller standard deviation may be equal by chance
+LISTED = 3  # copies that are told one by one; of more, as many are named
+
+
+@dataclass(frozen=True)
+class CopiedFrames:
+    """Captures of one side whose frames are copies: (capture, the earlier one that it equals)."""
+
+    side: Side
+    pairs: tuple[tuple[Capture, Capture], ...] = ()
+
+    @property
+    def ids(self) -> frozenset[str]:
+        """Ids of the copies."""
+        return frozenset(copy.id for copy, _ in self.pairs)
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Which captures, and what is done, in one line each; in one line for all where there are more than `LISTED`."""
+        if len(self.pairs) <= LISTED:
+            return tuple(
+                f"the frame of capture {copy.id} ({copy.kind}) is bit for bit that of {twin.id} ({twin.kind}), noise and all: it wasn't taken anew "
+                "and is left out; take it again"
+                for copy, twin in self.pairs
+            )
+        named = ", ".join(f"{copy.id} is {twin.id}" for copy, twin in self.pairs[:LISTED])
+        line = (
+            f"the frames of {len(self.pairs)} captures of the {self.side} camera are copies of others, bit for bit, noise and all ({named} ..): they "
+            "weren't taken anew and are left out, so that temporal noise is unknown where no other repeat is left; give frames that were captured "
+            "one by one"
+        )
+        return (line,)
+
+
+def copied_frames(recordings: RecordingSet, side: Side, captures: Sequence[Capture] | None = None) -> CopiedFrames:
+    """The copies among `captures` (all of the side). Frames of a standard deviation below `NOISELESS_DN` may be equal, and aren't tested."""
+    first: dict[bytes, Capture] = {}
+    found = []
+    for capture in recordings.captures(side=side) if captures is None else captures:
+        frame = recordings.frame(capture)
+        if frame.std(dtype=np.float32) < NOISELESS_DN:
+            continue
+        mark = hashlib.blake2b(frame.tobytes(), digest_size=16).digest()
+        twin = first.setdefault(mark, capture)
+        if twin is not capture and twin.frame != capture.frame:
+            found.append((capture, twin))
+    return CopiedFrames(side, tuple(found))
+
+
+# --- exchanged frames ----------------------------------------------------------------------------------------------
+# Frames of a photon-transfer series that stand under each other's captures: two levels, or a dark and a flat,
+# exchanged in an index.
+
 
 SEED = 1288  # of the subsets of captures that the robust law draws
 MEAN_STD, MEAN_STD_DN = (
@@ -179,3 +239,84 @@ def _told(alike: Sequence[JudgedFrame]) -> str:
 
 def _setting(capture: Capture) -> str:
     return f"{capture.kind}, {capture.exposure_s:.4g} s"
+
+
+# --- alike planes --------------------------------------------------------------------------------------------------
+# A sensor without colour filters that is stated with a mosaic: its planes answer every light alike.
+
+
+#: Share of the signal, and DN, within which planes are alike: colours differ by tens of percent.
+ALIKE, ALIKE_DN = 0.005, 0.1
+BRIGHT_SHARE = 0.1  # of the range: signal from which on a light counts
+#: Of one light, analogue gains may make colours alike; then the variances over the signals differ by as much. Relative, and standard deviations of
+#: a variance, within which they are alike.
+SAME_GAIN, SAME_GAIN_SIGMA = 0.1, 4.0
+
+
+@dataclass(frozen=True)
+class AlikePlanes:
+    """The captures of bright lights in which all planes are alike; `largest`: departure of a plane from their mean, as a share of the signal."""
+
+    stated: str
+    lights: int
+    largest: float
+    captures: tuple[str, ...]
+
+    def told(self, side: Side) -> str:
+        """What is stated and what fits, as a sentence."""
+        return (
+            f"The four planes of the {side} camera answer {self.lights} light{'s' if self.lights > 1 else ''} alike within {100 * self.largest:.2g} %, as "
+            f"those of a sensor without colour filters do, but cfa = {self.stated} is stated: correct cfa to MONO, or give frames that weren't made grey."
+        )
+
+
+def alike_planes(recordings: RecordingSet, side: Side) -> AlikePlanes | None:
+    """The planes of a stated mosaic, where they are alike in every bright light: of flats and narrowband captures, the brightest frame of
+    each light that doesn't clip. None where they differ, or where no light is bright enough.
+    """
+    camera = recordings.camera(side)
+    if camera.cfa == "MONO":
+        return None
+    darks = recordings.captures(DarkCapture, side)
+    black = float(recordings.frame(darks[0]).mean()) if darks else (camera.black_level_dn or 0.0)
+    brightest: dict[tuple[Hashable, ...], tuple[float, float, Capture]] = {}
+    for capture in (*recordings.captures(FlatCapture, side), *recordings.captures(NarrowbandCapture, side)):
+        frame = recordings.frame(capture)
+        signal = float(frame.mean()) - black
+        light = (capture.kind, getattr(capture, "wavelength_nm", None), getattr(capture, "radiance", None))
+        if signal < BRIGHT_SHARE * camera.saturation_dn or (light in brightest and signal <= brightest[light][0]):
+            continue
+        if float(np.mean(frame >= camera.saturation_dn)) > CLIPPED_LIMIT:
+            continue
+        means = np.array([plane.mean() for plane in _planes(np.asarray(frame, float))])
+        brightest[light] = signal, float(np.abs(means - means.mean()).max()), capture
+    if not brightest or any(away > ALIKE * signal + ALIKE_DN for signal, away, _ in brightest.values()):
+        return None
+    lights = {light[:2] for light in brightest}  # a lamp may be read before every pass
+    if len(lights) == 1 and not _same_gain(recordings, side, max(brightest.values(), key=lambda one: one[0])[2]):
+        return None
+    return AlikePlanes(
+        camera.cfa,
+        len(lights),
+        max(away / signal for signal, away, _ in brightest.values()),
+        tuple(capture.id for _, _, capture in brightest.values()),
+    )
+
+
+def _planes(frame: FloatArray) -> Sequence[FloatArray]:
+    even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
+    return [even[row::2, col::2] for row in (0, 1) for col in (0, 1)]
+
+
+def _same_gain(recordings: RecordingSet, side: Side, capture: Capture) -> bool:
+    """Whether the planes have one temporal variance in a capture and a repeat of it; False without a repeat."""
+    setting = (capture.kind, capture.exposure_s, capture.gain_db)
+    repeats = [
+        c for c in recordings.captures(side=side) if c.id != capture.id and (c.kind, c.exposure_s, c.gain_db) == setting
+    ]
+    if not repeats:
+        return False
+    one, other = (_planes(np.asarray(recordings.frame(c), float)) for c in (capture, repeats[0]))
+    variance = np.array([float((a - b).var()) for a, b in zip(one, other, strict=True)])
+    within = max(SAME_GAIN, SAME_GAIN_SIGMA * float(np.sqrt(2.0 / one[0].size)))
+    return bool(np.all(np.abs(variance / variance.mean() - 1.0) <= within))
