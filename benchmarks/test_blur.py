@@ -25,11 +25,10 @@ from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.capture_kinds.screen import ScreenState
 from lab.fit.mtf import edge_mtf
 from lab.fit.psf import estimate_kernel
-from lab.fit.psf.levelled_captures import ScreenPictures
-from lab.fit.psf.normal_equations import normal_equations
+from lab.fit.psf.kernel import displaced, normal_equations
 from lab.fit.psf.photograph import photographed_kernel
 from lab.fit.psf.screen_kernel import measure_field
-from lab.fit.psf.target_displacement import displaced
+from lab.fit.psf.screen_registration import ScreenPictures
 from sim.camera import CameraModel, Lens
 from sim.frame import Exposure, expected_electrons
 from sim.optics.imaging import MeasuredPsf
@@ -336,9 +335,8 @@ def test_sub_pixel_kernels() -> None:
 
 
 def sub_pixel(cells: np.ndarray, seen: np.ndarray, support: int) -> np.ndarray:
-    """`lab.fit.psf.regularised_kernel.solve_kernel` on the normal equations of every 4th sample."""
-    from lab.fit.psf.normal_equations import NormalEquations
-    from lab.fit.psf.regularised_kernel import solve_kernel
+    """`lab.fit.psf.kernel.solve_kernel` on the normal equations of every 4th sample."""
+    from lab.fit.psf.kernel import NormalEquations, solve_kernel
 
     half, size = support // 2, support * support
     windows = np.lib.stride_tricks.sliding_window_view(cells, (support, support))

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.optimize import minimize
 
-from lab.fit.psf.normal_equations import normal_equations
+from lab.fit.psf.kernel import normal_equations
 
 Array = NDArray[np.floating[Any]]
 

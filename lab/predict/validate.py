@@ -21,7 +21,7 @@ from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.mtf.recordings import measure_edge
 from lab.fit.mtf.transfer_function import EdgeMtf
-from lab.fit.psf.expected_kernel import expected_kernel
+from lab.fit.psf.screen_kernel import expected_kernel
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline, RectBivariateSpline
 from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.psf.drawn_pattern import area_drawn
+from lab.fit.psf.screen_kernel import area_drawn
 from lab.fit.psf.screen_registration import ScreenWarp
 from sim.camera import CameraModel
 from sim.frame import screen_light

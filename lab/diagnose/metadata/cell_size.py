@@ -9,8 +9,7 @@ import numpy as np
 from lab.diagnose.measurements.pattern_contrast import BERNOULLI
 from lab.diagnose.metadata.misstatement import Misstatement
 from lab.errors import NotDetermined
-from lab.fit.psf.levelled_captures import ScreenPictures, screen_pictures
-from lab.fit.psf.screen_registration import register
+from lab.fit.psf.screen_registration import ScreenPictures, register, screen_pictures
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 

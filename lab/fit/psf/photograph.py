@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from lab.errors import NotDetermined
-from lab.fit.psf.drawn_pattern import DrawnPattern
-from lab.fit.psf.regularised_kernel import KernelEstimate, solve_kernel
-from lab.fit.psf.screen_kernel import screen_kernel
+from lab.fit.psf.kernel import KernelEstimate, solve_kernel
+from lab.fit.psf.screen_kernel import DrawnPattern, screen_kernel
 from lab.fit.psf.screen_registration import LEAST_CORRELATION, ScreenWarp
 from lab.one_blas_thread import one_blas_thread
 

@@ -1,19 +1,26 @@
-"""Kernels of all channels of a screen pose, and of parts of the field: registration and kernel in turn."""
+"""Kernels of all channels of a screen pose, and of parts of the field: registration and kernel in turn.
+
+The pattern is drawn on samples of a part of a pixel (`DrawnPattern`), since on samples of a pixel the sharp borders of
+its cells can't be placed. The kernel is solved on these samples and brought to the pixels of the sensor (`on_pixels`),
+for each channel on its own pixels of the mosaic. `expected_kernel` says to which kernel this converges for a given
+transfer function.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.interpolate import RectBivariateSpline
 
-from lab.fit.psf.drawn_pattern import DrawnPattern
-from lab.fit.psf.levelled_captures import ScreenPictures
-from lab.fit.psf.pixel_sampling import on_pixels, pixel_matrix
-from lab.fit.psf.regularised_kernel import KernelEstimate, solve_kernel
-from lab.fit.psf.screen_registration import register
-from lab.fit.psf.simplex import on_simplex
+from lab.errors import NotDetermined
+from lab.fit.psf.kernel import KernelEstimate, NormalEquations, on_simplex, solve_kernel
+from lab.fit.psf.screen_registration import ScreenPictures, ScreenWarp, register
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases
@@ -25,6 +32,190 @@ REGISTRATION_STEPS = 3
 RIM_SHARE = 0.04  # of a kernel in its outermost pixels, above which the support is doubled
 GRID_STD = 5e-4  # of the maximum of the kernel: error of five taps on half pixels for a diffraction-limited kernel
 SHIFT_STD_PX = 0.005  # common to all corners, beside their noise: shading differs between neighbouring squares
+
+
+def on_pixels(fine: Array, oversample: int) -> Array:
+    """A kernel from samples of 1 / `oversample` px to pixels, sum 1."""
+    matrix = pixel_matrix(len(fine), oversample)
+    kernel = matrix @ fine @ matrix.T
+    return np.asarray(kernel / kernel.sum())
+
+
+def pixel_matrix(size: int, oversample: int) -> Array:
+    """One axis of `on_pixels`, (pixels, size).
+
+    Light spread over a pixel is light spread over `oversample` adjacent samples: a filter with the response sinc(f) /
+    sinc(f / oversample).
+    """
+    reach = oversample
+    half = (size // 2 - oversample // 2) // oversample
+    taps = symmetric_taps(lambda f: np.sinc(f) / np.sinc(f / oversample), 0.8, oversample, reach)
+    matrix = np.zeros((2 * half + 1, size + 2 * reach))
+    for row in range(2 * half + 1):
+        middle = size // 2 + reach + oversample * (row - half)
+        matrix[row, middle - reach : middle + reach + 1] = taps
+    return matrix[:, reach : matrix.shape[1] - reach]
+
+
+def symmetric_taps(response: Callable[[Array], Array], highest_cy_per_px: float, oversample: int, reach: int) -> Array:
+    """2 reach + 1 symmetric filter taps on samples of 1 / `oversample` px, sum 1.
+
+    Their frequency response is the least-squares fit of `response` (cy/px) up to `highest_cy_per_px`.
+    """
+    frequency = np.linspace(0.0, highest_cy_per_px, 61)
+    order = np.arange(reach + 1)
+    terms = np.cos(2.0 * np.pi * frequency[:, None] * order / oversample) * np.where(order > 0, 2.0, 1.0)
+    weight = np.where(frequency == 0.0, 1e3, 1.0)
+    # At fine sampling the taps are nearly collinear over the band: the solution of least norm
+    taps = np.linalg.lstsq(terms * weight[:, None], weight * response(frequency), rcond=1e-9)[0]
+    taps = np.concatenate([taps[:0:-1], taps])
+    return np.asarray(taps / taps.sum())
+
+
+@dataclass(frozen=True)
+class DrawnPattern:
+    """The target drawn on samples of 1 / `oversample` px through `warp`, and the pixels (n,) of one channel.
+
+    `picture`: the drawing, (oversample rows, oversample cols). `surroundings`: its local mean, which is what light
+    from beyond the support sees. `row`, `col`, `value` (n,): places (px) and levelled values of the pixels. `support`:
+    width of the kernel in samples, odd.
+    """
+
+    warp: ScreenWarp
+    picture: Array
+    surroundings: Array
+    row: NDArray[np.int64]
+    col: NDArray[np.int64]
+    value: Array
+    support: int
+    oversample: int
+
+    @staticmethod
+    def of(
+        seen: Array,
+        pattern: NDArray[np.uint8],
+        warp: ScreenWarp,
+        places: Sequence[tuple[int, int]],
+        step: int,
+        support_px: int,
+        oversample: int,
+        least: int = 0,
+    ) -> DrawnPattern:
+        """Draw `pattern` (cells) and choose the pixels of a channel.
+
+        `seen` (rows, cols): the levelled picture, 0 dark .. 1 lit, NaN where it isn't to be used. `places`: first
+        (row, col) of the phases of the channel, `step`: period of the mosaic. Raises `NotDetermined` for fewer than
+        `least` pixels; 0: twice the number of elements of the kernel.
+        """
+        rows, cols = seen.shape
+        target = pattern.astype(float)
+        # The map is smooth: on a coarse grid, interpolated by cubic splines
+        y, x = np.arange(-8.0, rows + 16.0, 8.0), np.arange(-8.0, cols + 16.0, 8.0)
+        at = warp.cells(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
+        fine_y, fine_x = np.arange(oversample * rows) / oversample, np.arange(oversample * cols) / oversample
+        cell_x, cell_y = (RectBivariateSpline(y, x, at[:, :, k])(fine_y, fine_x) for k in (0, 1))
+        picture = area_drawn(target, cell_x, cell_y)
+        # Take out the squares of the drawing and of the grid of the kernel, a sample each
+        taps = symmetric_taps(lambda f: np.sinc(f / oversample) ** -2, 0.6, oversample, 2)
+        for axis in (0, 1):
+            picture = ndimage.correlate1d(picture, taps, axis=axis, mode="nearest")
+        wide = oversample * support_px
+        surroundings = cv2.GaussianBlur(picture, (6 * wide + 1,) * 2, wide, borderType=cv2.BORDER_REPLICATE)
+
+        coarse = np.gradient(at[:, :, 0])
+        margin = (support_px / 2.0 + 2.0) * float(np.hypot(coarse[0].mean(), coarse[1].mean())) / 8.0  # cells
+        inside = (
+            (cell_x > margin)
+            & (cell_x < target.shape[1] - margin)
+            & (cell_y > margin)
+            & (cell_y < target.shape[0] - margin)
+        )
+        usable = inside[::oversample, ::oversample] & np.isfinite(seen)
+        usable[: support_px + 1] = usable[-support_px - 1 :] = False
+        usable[:, : support_px + 1] = usable[:, -support_px - 1 :] = False
+        of_channel = np.zeros_like(usable)
+        for row0, col0 in places:
+            of_channel[row0::step, col0::step] = True
+        row, col = np.nonzero(usable & of_channel)
+        support = oversample * support_px + 1  # odd, as oversample x support_px is even
+        if len(row) < (least or 2 * support**2):
+            raise NotDetermined(
+                "psf", f"only {len(row)} pixels of the channel see the pattern: let it fill more of the frame"
+            )
+        return DrawnPattern(warp, picture, surroundings, row, col, seen[row, col], support, oversample)
+
+    def parts(self, count: int) -> list[DrawnPattern]:
+        """The pattern in `count` x `count` parts of about equal rows and columns, without parts of too few pixels."""
+        across = [np.linspace(v.min(), v.max() + 1, count + 1) for v in (self.row, self.col)]
+        found = []
+        for top, bottom in zip(across[0][:-1], across[0][1:], strict=True):
+            for left, right in zip(across[1][:-1], across[1][1:], strict=True):
+                chosen = (self.row >= top) & (self.row < bottom) & (self.col >= left) & (self.col < right)
+                if np.count_nonzero(chosen) >= 2 * self.support**2:
+                    found.append(self.within(chosen))
+        return found
+
+    def within(self, chosen: NDArray[np.bool_]) -> DrawnPattern:
+        """Only the pixels `chosen`, (n,)."""
+        return replace(self, row=self.row[chosen], col=self.col[chosen], value=self.value[chosen])
+
+    def normal(self) -> NormalEquations:
+        """Normal equations of the elements of the kernel and, last, of the light from beyond its support."""
+        s, h = self.support, self.support // 2
+        size = s * s + 1
+        gram, right = np.zeros((size, size)), np.zeros(size)
+        # Rotated by 180 degrees: a convolution
+        windows = np.lib.stride_tricks.sliding_window_view(self.picture[::-1, ::-1], (s, s))
+        last = np.array(windows.shape[:2]) - 1
+        for start in range(0, len(self.row), 4096):
+            part = slice(start, start + 4096)
+            row, col, value = self.oversample * self.row[part], self.oversample * self.col[part], self.value[part]
+            design = np.empty((len(row), size))
+            design[:, :-1] = windows[last[0] - row + h, last[1] - col + h].reshape(len(row), -1)
+            design[:, -1] = self.surroundings[row, col]
+            gram += design.T @ design
+            right += value @ design
+        return NormalEquations(gram, right, float(self.value @ self.value), len(self.row))
+
+    def blurred(self, estimate: KernelEstimate) -> Array:
+        """The drawing blurred by the estimate, on its own samples."""
+        from scipy.signal import fftconvolve  # here: the library takes a while to load
+
+        return np.asarray(
+            (1.0 - estimate.outside) * fftconvolve(self.picture, estimate.kernel, mode="same")
+            + estimate.outside * self.surroundings
+        )
+
+    def refined(self, estimate: KernelEstimate) -> ScreenWarp:
+        """The warp after one Gauss-Newton step of its displacement, without a common shift, which belongs to the
+        kernel.
+        """
+        blurred, at = self.blurred(estimate), (self.oversample * self.row, self.oversample * self.col)
+        down, across = (np.gradient(blurred, 1.0 / self.oversample, axis=axis)[at] for axis in (0, 1))
+        residual = self.value - blurred[at]
+        terms = self.warp.basis(np.column_stack([self.col, self.row]).astype(float))[1:]
+        mean = terms.mean(axis=1)
+        terms = terms - mean[:, None]
+        columns = np.concatenate([across * terms, down * terms])
+        inlier = np.abs(residual) < 5.0 * np.sqrt(np.mean(residual**2))
+        step = np.linalg.lstsq((columns * inlier) @ columns.T, (columns * inlier) @ residual, rcond=1e-10)[0]
+        step = step.reshape(2, -1)
+        return self.warp.displaced(np.column_stack([-step @ mean, step]))
+
+
+def area_drawn(target: Array, cell_x: Array, cell_y: Array) -> Array:
+    """Mean of `target` (cells) over squares the size of a sample about the points `cell_x`, `cell_y`; dark outside.
+
+    The squares are aligned with the cells: the error is of second order in their rotation. A square may hold any
+    number of cells.
+    """
+    from sim.scene.area import aligned_means  # here: the compiler's library takes a while to load
+
+    table = np.pad(target.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    wide, high = (
+        float(sum(np.abs(part).mean() for part in np.gradient(cell[::16, ::16]))) / 16.0 for cell in (cell_x, cell_y)
+    )
+    return np.asarray(aligned_means(table, cell_x, cell_y, wide, high))
 
 
 @dataclass(frozen=True)
@@ -150,3 +341,41 @@ def screen_kernel(drawn: DrawnPattern, channel: str, estimate: KernelEstimate) -
         corner_rms_px=drawn.warp.corner_rms_px,
         centre_px=(float(drawn.row.mean()), float(drawn.col.mean())),
     )
+
+
+def expected_kernel(
+    transfer: Callable[[Array, Array], NDArray[np.complex128]], support_px: int, cell_px: float, oversample: int = 2
+) -> Array:
+    """Kernel on the pixels of the sensor, (support, support), sum 1, that `measure_field` converges to for a
+    transfer function of lens and pixel.
+
+    `transfer(fx, fy)`, in cy/px, broadcasts over both. `cell_px`: size of a cell of the pattern. The kernel is the
+    least-squares solution on samples of 1 / `oversample` px that maps the drawing of a random pattern to what the
+    pixels record of it. Where a lens passes detail beyond what these samples resolve, it differs from samples of the
+    point-spread function, because borders of cells lie between the samples. With P the power spectrum of the pattern,
+    D the response of the drawing and H the transfer function, the normal equations at samples n, m are
+
+        sum_m k(m) integral P D^2 exp(2 pi i f (n - m)) df = integral P D H exp(2 pi i f n) df
+    """
+    support = oversample * support_px + 1
+    fine = 4 * oversample
+    count = max(32, 4 * support_px) * fine
+    fy, fx = np.fft.fftfreq(count, 1.0 / fine), np.fft.rfftfreq(count, 1.0 / fine)
+    taps = symmetric_taps(lambda f: np.sinc(f / oversample) ** -2, 0.6, oversample, 2)
+    order = np.arange(len(taps)) - len(taps) // 2
+    drawn_y, drawn_x = (
+        np.sinc(f / oversample) * (np.cos(2.0 * np.pi * f[:, None] * order / oversample) @ taps) for f in (fy, fx)
+    )
+    power = np.square(np.sinc(cell_px * fy))[:, None] * np.square(np.sinc(cell_px * fx))
+    drawn = drawn_y[:, None] * drawn_x
+    every = fine // oversample
+    own = np.fft.irfft2(power * drawn**2, (count, count))[::every, ::every]
+    cross = np.fft.irfft2(power * drawn * transfer(fx[None, :], fy[:, None]), (count, count))[::every, ::every]
+    place = np.arange(support) - support // 2
+    lag = place[:, None] - place
+    matrix = own[lag[:, None, :, None], lag[None, :, None, :]].reshape(support**2, support**2)
+    # A small ridge where the pattern has no power; the sum is known far better, from the mean of the pattern
+    matrix = matrix + 1e-4 * own[0, 0] * np.eye(support**2)
+    mean = 1e3 * own[0, 0]
+    kernel = np.linalg.solve(matrix + mean, cross[place[:, None], place].ravel() + mean)
+    return on_pixels(kernel.reshape(support, support), oversample)

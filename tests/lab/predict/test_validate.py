@@ -11,7 +11,7 @@ import pytest
 from lab.challenge.recordings import recordings_of
 from lab.errors import Cancelled
 from lab.fit import fit_recording_set
-from lab.fit.psf.expected_kernel import expected_kernel
+from lab.fit.psf.screen_kernel import expected_kernel
 from lab.formats.camera_file import fitted_camera
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, ValidationResult

@@ -1,4 +1,6 @@
-"""Kernels of recordings of a screen drawn in closed form: squares blurred by a Gaussian are products of normal distribution functions."""
+"""Kernels of recordings of a screen drawn in closed form: squares blurred by a Gaussian are products of normal
+distribution functions. And the test of radial symmetry on kernels over the field.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +17,16 @@ from lab.capture_kinds.screen import ScreenState
 from lab.capture_kinds.white import WhiteCapture
 from lab.errors import NotDetermined
 from lab.fit.psf import recordings
-from lab.fit.psf.levelled_captures import ScreenPictures, screen_pictures
-from lab.fit.psf.recordings import PsfFit, fit_psf_field
-from lab.fit.psf.screen_kernel import ScreenField, measure_field
-from lab.fit.psf.screen_registration import register, target_corners
+from lab.fit.psf.recordings import PsfFit, fit_psf_field, radial_symmetry
+from lab.fit.psf.screen_kernel import ScreenField, ScreenKernel, measure_field
+from lab.fit.psf.screen_registration import ScreenPictures, register, screen_pictures, target_corners
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
+from tests.lab.fit.psf.drawn_targets import (
+    gaussian,
+)
 
 SHAPE = (200, 250)
-
-
 CELL_PX, TURN = 4.1, np.radians(1.7)
-
-
 SIGMA_PX = {"R": 0.75, "G": 0.6, "B": 0.5}
 BOARD = (np.indices((40, 50)) // 5).sum(axis=0).astype(np.uint8) % 2
 PATTERN = np.random.default_rng(77).integers(0, 2, (40, 50)).astype(np.uint8)
@@ -230,3 +230,41 @@ def test_another_pattern_than_the_target_is_refused():
 def test_a_saturated_screen_is_refused():
     with pytest.raises(NotDetermined, match="saturated"):
         fit_psf_field(screen_recordings(electrons=10100.0), "left", patches=0)
+
+
+def kernel_at(row_px, col_px, sigma_row, sigma_col, angle_deg, rng):
+    size, std = 9, 2e-4
+    kernel = gaussian(size, sigma_row, sigma_col, angle_deg) + rng.normal(0, std, (size, size))
+    return ScreenKernel(
+        channel="G",
+        kernel=kernel,
+        kernel_std=np.full((size, size), std),
+        covariance=std**2 * np.eye(size * size),
+        fine=None,
+        oversample=2,
+        outside=0.0,
+        corner_rms_px=0.0,
+        centre_px=(row_px, col_px),
+    )
+
+
+def field(blur, seed=0):
+    rng = np.random.default_rng(seed)
+    places = [(r, c) for r in (-200, 0, 200) for c in (-300, 0, 300)]
+    return [kernel_at(r, c, *blur(r, c), rng) for r, c in places]
+
+
+def test_a_symmetric_lens_passes_and_an_asymmetric_one_does_not():
+    def symmetric(r, c):  # longer along the radius, the farther out
+        return 0.8 + 0.4 * (r * r + c * c) / 130000, 0.8, np.degrees(np.arctan2(c, r)) if r or c else 0.0
+
+    passed = [radial_symmetry(field(symmetric, seed), (0.0, 0.0)) for seed in range(20)]
+    # a Gaussian's second moment grows with sigma^2: not quite the parabola of the test, but by less than the noise
+    assert sum(p.symmetric for p in passed) >= 18
+    assert passed[0].radial_growth_px2 > 5 * abs(passed[0].tangential_growth_px2)
+    tilted = radial_symmetry(field(lambda r, c: (0.8 + 0.1 * c / 300, 0.8 + 0.1 * c / 300, 0.0)), (0.0, 0.0))
+    assert not tilted.symmetric
+    astigmatic = radial_symmetry(field(lambda r, c: (0.9, 0.8, 0.0)), (0.0, 0.0))
+    assert not astigmatic.symmetric
+    with pytest.raises(NotDetermined, match="5 at unequal distances"):
+        radial_symmetry(field(symmetric)[:4], (0.0, 0.0))

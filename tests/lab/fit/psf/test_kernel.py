@@ -1,4 +1,4 @@
-"""The estimated kernel against known ones, and targets that are refused."""
+"""The estimated kernel against known ones, its parts against direct sums and whole matrices, targets that are refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.signal import fftconvolve
 from benchmarks.peers.mosleh import mosleh_kernel
 from lab.errors import NotDetermined
 from lab.fit.psf import estimate_kernel
-from lab.fit.psf.target_displacement import displacement
+from lab.fit.psf.kernel import KernelPrior, displacement, log_likelihood, normal_equations, on_simplex
 from tests.lab.fit.psf.drawn_targets import (
     KERNELS,
     blurred_target,
@@ -18,6 +18,97 @@ from tests.lab.fit.psf.drawn_targets import (
     misplacement,
     psnr_db,
 )
+
+SUPPORT = 7
+
+
+def test_normal_equations_are_the_direct_sums():
+    rng = np.random.default_rng(0)
+    sharp, blurred, s, h = rng.random((19, 23)), rng.random((19, 23)), 5, 2
+    # the definition, word by word
+    design = np.array(
+        [
+            [sharp[r - i + h, c - j + h] for i in range(s) for j in range(s)]
+            for r in range(h, 19 - h)
+            for c in range(h, 23 - h)
+        ]
+    )
+    inner = blurred[h:-h, h:-h].ravel()
+    normal = normal_equations(sharp, blurred, s)
+    np.testing.assert_allclose(normal.gram, design.T @ design, rtol=1e-12)
+    np.testing.assert_allclose(normal.right, design.T @ inner, rtol=1e-12)
+    assert normal.power == pytest.approx(inner @ inner, rel=1e-12)
+    assert normal.count == len(inner)
+
+
+@pytest.mark.parametrize(("shape", "s"), [((40, 31), 1), ((31, 40), 15), ((90, 17), 3), ((19, 60), 9)])
+def test_every_element_is_the_direct_sum_at_other_shapes(shape: tuple[int, int], s: int):
+    """Wider than tall and the reverse, more columns than a block of the products holds, and a kernel of one element."""
+    rng = np.random.default_rng(1)
+    sharp, h = 5.0 + rng.random(shape), s // 2
+    windows = np.lib.stride_tricks.sliding_window_view(sharp, (s, s))[:, :, ::-1, ::-1].reshape(-1, s * s)
+    assert windows.shape[0] == (shape[0] - 2 * h) * (shape[1] - 2 * h)
+    np.testing.assert_allclose(normal_equations(sharp, sharp, s).gram, windows.T @ windows, rtol=1e-12)
+
+
+def test_simplex_solution_meets_the_optimality_conditions():
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(60, 40))
+    quadratic, linear = root.T @ root, rng.normal(size=40) * 10
+    x = on_simplex(quadratic, linear, np.full(40, 1 / 40))
+    assert x.sum() == pytest.approx(1, abs=1e-12)
+    assert x.min() >= 0
+    slope = quadratic @ x - linear
+    free = x > 0
+    assert 0 < free.sum() < 40
+    level = slope[free].mean()
+    np.testing.assert_allclose(slope[free], level, atol=1e-8)
+    assert (slope[~free] > level - 1e-8).all()
+
+
+@pytest.fixture(params=[0.0, 1.6])
+def prior(request: pytest.FixtureRequest) -> KernelPrior:
+    return KernelPrior(np.random.default_rng(2).uniform(0.01, 1.0, SUPPORT**2), request.param, 0.3)
+
+
+@pytest.fixture
+def covariance(prior: KernelPrior) -> np.ndarray:
+    """strength^2 E C E, element by element from the definition."""
+    row, col = np.divmod(np.arange(SUPPORT**2), SUPPORT)
+    apart2 = (row[:, None] - row) ** 2 + (col[:, None] - col) ** 2
+    same = np.eye(SUPPORT**2)
+    correlation = np.exp(-0.5 * apart2 / prior.length**2) + 1e-4 * same if prior.length else same
+    return prior.strength**2 * np.outer(prior.envelope, prior.envelope) * correlation
+
+
+@pytest.fixture
+def information() -> np.ndarray:
+    design = np.random.default_rng(3).normal(size=(200, SUPPORT**2))
+    return 40.0 * design.T @ design
+
+
+def test_precision_and_posterior_are_those_of_the_covariance(
+    prior: KernelPrior, covariance: np.ndarray, information: np.ndarray
+):
+    """Bayes' rule for Gaussians, and the condition that the sum is 1. The covariance's condition is 1e8, hence 1e-7."""
+    precision = prior.precision()
+    np.testing.assert_allclose(precision @ covariance, np.eye(SUPPORT**2), atol=1e-7 * np.abs(precision).max())
+    free = np.linalg.inv(information + np.linalg.inv(covariance))
+    share = free.sum(axis=1)
+    expected = free - np.outer(share, share) / share.sum()
+    np.testing.assert_allclose(prior.posterior(information), expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_the_marginal_likelihood_is_that_of_the_whole_covariance(
+    prior: KernelPrior, covariance: np.ndarray, information: np.ndarray
+):
+    """ln N(y; 0, 1 + A C A^T) by the matrix determinant lemma, up to what doesn't depend on C, on arbitrary data."""
+    weighted = np.random.default_rng(4).normal(size=SUPPORT**2)
+    size = SUPPORT**2
+    inner = np.linalg.inv(np.linalg.inv(covariance) + information)
+    expected = 0.5 * weighted @ inner @ weighted - 0.5 * np.linalg.slogdet(np.eye(size) + covariance @ information)[1]
+    found = log_likelihood(prior.whitened(information), prior.whitened_right(weighted))
+    assert found == pytest.approx(expected, rel=1e-8)
 
 
 def test_an_asymmetric_kernel_keeps_its_orientation():
