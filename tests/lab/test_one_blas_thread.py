@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from lab.fit.mtf import estimate_mtf
+from lab.fit.mtf import transfer_function
 from lab.one_blas_thread import one_blas_thread
 from tests.lab.fit.mtf.drawn_edges import edge
 
@@ -87,9 +87,9 @@ def test_the_last_to_leave_gives_them_back():
 
 def test_an_edge_is_measured_with_one(monkeypatch: pytest.MonkeyPatch):
     seen: list[set[int]] = []
-    measured = estimate_mtf.measured_mtf
+    measured = transfer_function.measured_mtf
     monkeypatch.setattr(
-        estimate_mtf, "measured_mtf", lambda *arguments: (seen.append(blas_threads()), measured(*arguments))[1]
+        transfer_function, "measured_mtf", lambda *arguments: (seen.append(blas_threads()), measured(*arguments))[1]
     )
-    estimate_mtf.edge_mtf(np.asarray(edge(64, 5.0, 0.5)))
+    transfer_function.edge_mtf(np.asarray(edge(64, 5.0, 0.5)))
     assert seen == [{1}]

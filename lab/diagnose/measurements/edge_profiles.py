@@ -11,10 +11,8 @@ from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.measurements.held_out import held_out_of
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.mtf.edges_in_frame import find_edges
-from lab.fit.mtf.phases import check_phases
-from lab.fit.mtf.recordings import measure_edge
-from lab.fit.mtf.samples import Region
+from lab.fit.mtf.edge_finding import Region
+from lab.fit.mtf.recordings import check_phases, find_edges, measure_edge
 from lab.fit.mtf.transfer_function import EdgeMtf
 
 PLAIN = np.array([0.25])  # cy/px: where `measure_edge` evaluates its own MTF, which isn't used here
