@@ -3,7 +3,7 @@
 Every number that a fit states with a standard deviation is compared, found by its name: `x` beside `x_std`. The
 numbers of a curve or a kernel share one row: that of the point with the largest difference, corrected for the number
 of points (Sidak). Dark currents are compared at the sensor temperature of A (`lab.fit.noise.dark_current`). The geometry of cameras is also compared by its effect: both calibrations project the same points,
-after the rigid motion that they imply between each other is removed (`lab.fit.geometry.projection_errors`). Parameters
+after the rigid motion that they imply between each other is removed (`lab.fit.geometry.pinhole`). Parameters
 that differ much may project alike, and the reverse.
 """
 
@@ -19,8 +19,18 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-from lab.fit.geometry.pinhole import COUNT, NAMES, intrinsics_of_fit, project, unproject
-from lab.fit.geometry.projection_errors import difference, grid, grid_points, implied_motion, seen_points
+from lab.fit.geometry.pinhole import (
+    COUNT,
+    NAMES,
+    difference,
+    grid,
+    grid_points,
+    implied_motion,
+    intrinsics_of_fit,
+    project,
+    seen_points,
+    unproject,
+)
 from lab.fit.noise.dark_current import SensorTemperature
 from lab.fit.tuples import triple
 from lab.formats.results import (

@@ -40,13 +40,14 @@ from lab.fit.geometry.pinhole import (
     NAMES,
     cross_matrices,
     distortion_of,
+    grid,
+    grid_points,
     intrinsics_of,
     intrinsics_of_fit,
     matrix_of,
     project_with_jacobian,
     unproject,
 )
-from lab.fit.geometry.projection_errors import grid, grid_points
 from lab.fit.geometry.recordings import corner_errors
 from lab.fit.tuples import numbers, rows, triple, triples
 from lab.formats.recording_set import RecordingSet

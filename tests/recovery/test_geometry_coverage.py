@@ -8,13 +8,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from lab.fit.compare import compare
-from lab.fit.geometry.calibration import calibrate_robustly
-from lab.fit.geometry.corners import CornerFits
-from lab.fit.geometry.cross_validation import cross_validation
-from lab.fit.geometry.lateral_colour import channel_geometry
-from lab.fit.geometry.pinhole import intrinsics_of
-from lab.fit.geometry.projection_errors import difference, grid, grid_points, points_at
-from lab.fit.geometry.recordings import geometry_result
+from lab.fit.geometry.board_detection import CornerFits
+from lab.fit.geometry.calibration import calibrate_robustly, cross_validation
+from lab.fit.geometry.pinhole import difference, grid, grid_points, intrinsics_of, points_at
+from lab.fit.geometry.recordings import channel_geometry, geometry_result
 from lab.fit.stereo import StereoPair, depth_std, solve_rig
 from lab.formats.results import CameraFit, FitResult
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen

@@ -21,8 +21,7 @@ from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import BoardView, find_boards
 from lab.fit.geometry.bundle_adjustment import BundleAdjustment, Solution
-from lab.fit.geometry.calibration import Calibration, calibrate_robustly, observations_of
-from lab.fit.geometry.distortion_model import MODELS, free_intrinsics
+from lab.fit.geometry.calibration import MODELS, Calibration, calibrate_robustly, free_intrinsics, observations_of
 from lab.fit.geometry.pinhole import NAMES, intrinsics_of
 from lab.formats.results import Skipped
 from sim.camera import Side

@@ -1,21 +1,206 @@
-"""A stated number of squares, or size of markers, that the frames of a board contradict."""
+"""A stated number of squares, or size of markers, that the frames of a board contradict.
+
+The number of squares of a board follows from its frames alone (`board_layout`). Markers are numbered row by row over
+the light squares of a board: their numbers and places fit a homography for one number of columns only. The corners of
+a plain checkerboard are counted by OpenCV's detector, which grows a grid from the middle. Frames don't tell the length
+of a square: a board twice as large at twice the distance gives the same image.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.diagnose.measurements.boards import BOARDS
 from lab.diagnose.metadata.misstatement import Misstatement
 from lab.fit.geometry.board_detection import as_grey, luminance
-from lab.fit.geometry.board_layout import BoardLayout, board_layout
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
+
+Array = NDArray[np.floating[Any]]
+Grey = NDArray[np.uint8]
+FEWEST_MARKERS = 6  # of a frame: a homography has 8 parameters, and a marker's centre gives two equations
+MOST_COLUMNS = 40
+#: Rms distance of the markers' centres from a homography, over a marker's side: the most of a layout that fits (distortion gives some
+#: hundredths), and the least ratio of any other layout's to it.
+FITS, WORSE = 0.15, 5.0
+FEWEST_ABSENT = 4  # markers that should be in view and aren't found, from which on a stated row counts as missing
+LARGEST_PX = 1000.0  # side of a frame in which a plain board's corners are counted; larger frames are reduced
+SMALLEST_GRID = (3, 3)  # inner corners from which the search for a plain board starts
 
 LOOKED_AT = 6  # most frames of a board that are used
 FEWEST_PICTURES = 2
 #: Tolerance of a marker's side, relative and absolute: detection finds a blurred dark marker up to 7 % too small.
 MARKER_TOLERANCE, MARKER_PX = 0.15, 2.0
+
+
+@dataclass(frozen=True)
+class BoardLayout:
+    """The layout that frames of a board fit."""
+
+    squares: tuple[int, int]  # rows, columns
+    marker_share: float | None  # a marker's side over a square's; None without markers
+    marker_px: float | None  # a marker's side; None without markers
+    rms: (
+        float | None
+    )  # rms distance of the markers' centres from their places, over a marker's side; None without markers
+    rms_stated: float | None  # the same with the stated squares; None without markers, or where no homography fits
+    pictures: int  # number of frames used
+
+
+@dataclass(frozen=True)
+class _Markers:
+    """The n markers found in one frame."""
+
+    number: NDArray[np.int64]
+    corners: Array  # (n, 4, 2), px
+    centres: Array  # (n, 2), px
+    shape: tuple[int, int]  # of the frame: rows, columns
+
+    @property
+    def side_px(self) -> float:
+        """Median side of a marker, px."""
+        return float(np.median(np.linalg.norm(np.roll(self.corners, 1, axis=1) - self.corners, axis=2)))
+
+
+def board_layout(pictures: Sequence[Grey], capture: CharucoCapture) -> BoardLayout | None:
+    """The layout that frames (rows, cols) of one board fit; None where they don't determine it. `capture`: what is stated about it."""
+    if capture.dictionary == "none":
+        return _plain_layout(pictures)
+    code = getattr(cv2.aruco, capture.dictionary, None)
+    if not capture.has_markers or not isinstance(code, int):
+        return None
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(code))
+    seen = [found for picture in pictures if (found := _markers(detector, picture)) is not None]
+    if not seen:
+        return None
+    stated_cols = capture.squares[1]
+    of_stated = {(stated_cols, parity): _rms(seen, stated_cols, parity) for parity in (0, 1)}
+    rms_stated = min(of_stated.values())
+    rms = of_stated
+    if rms_stated > FITS:
+        rms = {(count, parity): _rms(seen, count, parity) for count in range(2, MOST_COLUMNS + 1) for parity in (0, 1)}
+    (cols, parity), best = min(rms.items(), key=lambda item: item[1])
+    if best > FITS or any(other < WORSE * best for (count, _), other in rms.items() if count != cols):
+        return None
+    rows = 1 + max(int(_places(one.number, cols, parity)[:, 1].max()) for one in seen)
+    if capture.squares[0] > rows and not _lacks_rows(seen, cols, parity, rows, capture.squares[0]):
+        rows = capture.squares[0]
+    return BoardLayout(
+        squares=(rows, cols),
+        marker_share=float(np.median(np.concatenate([_sides(one, cols, parity) for one in seen]))),
+        marker_px=float(np.median([one.side_px for one in seen])),
+        rms=best,
+        rms_stated=rms_stated if np.isfinite(rms_stated) else None,
+        pictures=len(seen),
+    )
+
+
+def _markers(detector: Any, picture: Grey) -> _Markers | None:
+    """The markers whose number occurs once in a frame; None for fewer than `FEWEST_MARKERS`."""
+    corners, ids, _ = detector.detectMarkers(picture)
+    if ids is None:
+        return None
+    number = ids.ravel().astype(np.int64)
+    quads = np.asarray(corners, float).reshape(-1, 4, 2)
+    once = np.array([np.count_nonzero(number == one) == 1 for one in number])
+    if once.sum() < FEWEST_MARKERS:
+        return None
+    number, quads = number[once], quads[once]
+    # the centre is where the diagonals meet, which a projection keeps
+    along, across = quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]
+    between = quads[:, 1] - quads[:, 0]
+    share = (between[:, 0] * across[:, 1] - between[:, 1] * across[:, 0]) / (
+        along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
+    )
+    rows, cols = picture.shape
+    return _Markers(number, quads, quads[:, 0] + share[:, None] * along, (rows, cols))
+
+
+def _places(number: NDArray[np.int64], cols: int, parity: int) -> Array:
+    """Places (n, 2), (x, y) in squares, of markers on a board of `cols` columns, whose first light square is the first (parity 0) or the
+    second (parity 1)."""
+    rows = 2 * (int(number.max()) // cols + 2)
+    row, col = np.nonzero((np.indices((rows, cols)).sum(axis=0) + parity) % 2 == 0)
+    return np.column_stack([col, row])[number].astype(float)
+
+
+def _homography(one: _Markers, cols: int, parity: int) -> tuple[Array, float] | None:
+    """The homography from the board (squares) to the frame (px), fitted to all markers, and the rms distance of their centres from it, px.
+    None where none fits."""
+    places = _places(one.number, cols, parity)
+    if np.ptp(places[:, 0]) == 0 or np.ptp(places[:, 1]) == 0:
+        return None
+    found, _ = cv2.findHomography(places, one.centres, 0)
+    if found is None:
+        return None
+    left = cv2.perspectiveTransform(places[:, None], found)[:, 0] - one.centres
+    return found, float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+
+
+def _rms(seen: Sequence[_Markers], cols: int, parity: int) -> float:
+    """Rms distance of the markers' centres from the homographies of all frames, over a marker's side; infinite where a frame has none."""
+    total, count = 0.0, 0
+    for one in seen:
+        fitted = _homography(one, cols, parity)
+        if fitted is None or not np.isfinite(fitted[1]):
+            return np.inf
+        total += len(one.number) * (fitted[1] / one.side_px) ** 2
+        count += len(one.number)
+    return float(np.sqrt(total / count))
+
+
+def _sides(one: _Markers, cols: int, parity: int) -> Array:
+    """Sides (n,) of the markers, in squares."""
+    fitted = _homography(one, cols, parity)
+    assert fitted is not None  # the layout fits
+    flat = cv2.perspectiveTransform(one.corners.reshape(-1, 1, 2), np.linalg.inv(fitted[0])).reshape(-1, 4, 2)
+    return np.asarray(np.linalg.norm(np.roll(flat, 1, axis=1) - flat, axis=2).mean(axis=1))
+
+
+def _lacks_rows(seen: Sequence[_Markers], cols: int, parity: int, rows: int, stated: int) -> bool:
+    """Whether `FEWEST_ABSENT` markers of the rows from `rows` to `stated` should lie inside frames in which they aren't found."""
+    row, col = np.nonzero((np.indices((stated, cols)).sum(axis=0) + parity) % 2 == 0)
+    beyond = np.column_stack([col, row])[row >= rows].astype(float)
+    absent = 0
+    for one in seen:
+        fitted = _homography(one, cols, parity)
+        if fitted is None:
+            continue
+        at = cv2.perspectiveTransform(beyond[:, None], fitted[0])[:, 0]
+        margin = 1.5 * one.side_px
+        absent += int(np.all((at > margin) & (at < np.array(one.shape[::-1]) - margin), axis=1).sum())
+    return absent >= FEWEST_ABSENT
+
+
+def _plain_layout(pictures: Sequence[Grey]) -> BoardLayout | None:
+    """The squares of a plain checkerboard, the smaller number first, where most frames show the same number; else None.
+
+    A board that is stated too small would be found anywhere on the larger one, at unrelated poses in the frames of a pair.
+    """
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+    counts: list[tuple[int, int]] = []
+    for picture in pictures:
+        shrink = min(1.0, LARGEST_PX / max(picture.shape))
+        small = (
+            cv2.resize(picture, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA) if shrink < 1.0 else picture
+        )
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST_GRID, flags)
+        if found:
+            rows, cols = sorted(meta.shape[:2])
+            counts.append((rows + 1, cols + 1))
+    if not counts:
+        return None
+    squares = max(set(counts), key=counts.count)
+    if 2 * counts.count(squares) <= len(counts):
+        return None
+    return BoardLayout(squares, None, None, None, None, counts.count(squares))
 
 
 def misstated_board(recordings: RecordingSet, side: Side) -> Misstatement | None:

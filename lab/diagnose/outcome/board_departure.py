@@ -5,7 +5,7 @@ The fit frees the camera, Brown's distortion, the poses and each board's warp. W
 then the board's shape or print, motion, or a distortion that these terms don't follow. The noise of a corner doesn't
 come from the residuals' size, in which such an error would hide, but from the picture about the corner (`fit_corners`,
 `dot_centres`). Where that isn't known, it is the part of the residuals that neighbouring corners don't share
-(`correlated_errors`).
+(`fit_correlated_errors`).
 """
 
 from __future__ import annotations

@@ -3,30 +3,31 @@
 The boards are the `charuco` captures. A plain checkerboard is a `charuco` capture whose `dictionary` is `"none"`:
 `squares` counts its squares `[rows, cols]`, so that it has `rows - 1` x `cols - 1` inner corners. `marker_mm` is
 ignored then, and all inner corners have to be in view. Pictures of a plain checkerboard become a recording set that
-way, each picture one capture, the pictures of a pair under one `pose`. A grid of dots is one whose `dictionary` is `"dots"`: its
-`rows - 1` x `cols - 1` dots stand where a checkerboard has its inner corners (`dot_grid`).
+way, each picture one capture, the pictures of a pair under one `pose`. A grid of dots is one whose `dictionary` is
+`"dots"`: its `rows - 1` x `cols - 1` dots stand where a checkerboard has its inner corners (`dot_grid`).
 
 Corners are found on the raw mosaic. A board is black and white, so that each plane of the mosaic, levelled by itself,
 shows the same picture. Interleaved they are the luminance, sampled at every pixel. No demosaicing moves a corner. Each
-corner is then fitted (`fit_corners`) over the pixels that no marker touches.
+corner is then fitted as the product of two blurred straight edges, to hundredths of a pixel (`fit_corners`), over the
+pixels that no marker touches.
 
 Points are those of OpenCV: (x, y) px, x to the right along columns, (0, 0) the centre of the top-left pixel.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import erf
 
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
-from lab.fit.geometry.corners import CornerFits, fit_corners
-from lab.fit.geometry.dots import dot_centres, dot_grid
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
 from sim.camera import Side
@@ -34,8 +35,233 @@ from sim.sensor.mosaic import phases, planes
 
 Array = NDArray[np.floating[Any]]
 
+#: Radius of the window about a dot, over the spacing of the dots; and the share of that radius beyond which is background.
+DOT_WINDOW, DOT_BACKGROUND = 0.5, 0.8
+#: Share of a dot's contrast that is subtracted from the weights; least contrast of a dot, in a picture of 0..1.
+LEAST_DOT_SHARE, LEAST_DOT_CONTRAST = 0.1, 0.1
+CENTROID_PASSES = 4
+
 MIN_CORNERS = 8  # of a view: a pose has six parameters
 WINDOW_PX = 9.0  # largest radius of the window of a corner
+
+
+class CornerFits(NamedTuple):
+    """Corners (n, 2), (x, y), px; which fits are to be trusted (n,); standard deviation of a coordinate by the noise
+    of the picture, px (n,).
+    """
+
+    points: Array
+    trusted: NDArray[np.bool_]
+    std_px: Array
+
+
+def fit_corners(
+    picture: Array,
+    points: Array,
+    across: Array,
+    down: Array,
+    half_px: Array,
+    clear: Callable[[Array], NDArray[np.bool_]] | None = None,
+) -> CornerFits:
+    """Checkerboard corners by least squares (Levenberg-Marquardt, all corners at once).
+
+        I = level + gradient . r + contrast E(d1) E(d2)
+
+    E: a blurred edge, an error function of -1..1; d1, d2: distances from two lines through the corner. `points` (n,
+    2), (x, y): the first guess, good to about 2 px. `across`, `down` (n, 2): directions of the axes of the board
+    there. `half_px` (n,): radius of the window. `clear(points) -> bool` says which pixels may be used. Trusted are
+    fits that converged near the guess, are sharp enough, and explain the picture.
+    """
+    points = np.array(points, dtype=float)
+    count = len(points)
+    size = int(np.ceil(half_px.max()))
+    offset = np.arange(-size, size + 1, dtype=float)
+    dx, dy = (grid.ravel() for grid in np.meshgrid(offset, offset))
+    dx, dy = dx[np.hypot(dx, dy) <= half_px.max() + 0.5], dy[np.hypot(dx, dy) <= half_px.max() + 0.5]
+    base = np.round(points)
+    x, y = base[:, :1] + dx, base[:, 1:] + dy  # (n, window)
+    rows, cols = picture.shape
+    used = (x >= 0) & (x < cols) & (y >= 0) & (y < rows)
+    used &= np.hypot(dx, dy)[None, :] <= half_px[:, None] + 0.5
+    if clear is not None:
+        used &= clear(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(used.shape)
+    value = picture[np.clip(y, 0, rows - 1).astype(int), np.clip(x, 0, cols - 1).astype(int)]
+    weight = used.astype(float)
+
+    # Edge 1 runs along `across`, edge 2 along `down`. Parameters: place (2), angles of the normals (2), width, level,
+    # gradient (2), contrast.
+    p = np.zeros((count, 9))
+    p[:, :2] = points - base
+    p[:, 2] = np.arctan2(across[:, 0], -across[:, 1])
+    p[:, 3] = np.arctan2(down[:, 0], -down[:, 1])
+    p[:, 4] = 1.0
+    p[:, 5:] = _damped_step(_corner_model(p, dx, dy)[1][:, :, 5:], weight, value)[0]
+    damping = np.full(count, 1e-3)
+    cost = _residual_squares(p, dx, dy, value, weight)
+    limit = np.array([1.0, 1.0, 0.3, 0.3, 0.5, np.inf, np.inf, np.inf, np.inf])
+    moving = np.arange(count)  # corners that still move
+    for _ in range(25):
+        model, jacobian = _corner_model(p[moving], dx, dy)
+        change, _ = _damped_step(jacobian, weight[moving], value[moving] - model, damping[moving])
+        tried = p[moving] + np.clip(change, -limit, limit)
+        tried[:, 4] = np.clip(tried[:, 4], 0.2, 4.0)
+        new = _residual_squares(tried, dx, dy, value[moving], weight[moving])
+        better = new <= cost[moving]
+        moved = np.abs(tried - p[moving])[:, :2].max(axis=1)
+        p[moving[better]], cost[moving[better]] = tried[better], new[better]
+        damping[moving] = np.clip(np.where(better, damping[moving] * 0.1, damping[moving] * 10.0), 1e-10, 1e6)
+        moving = moving[np.where(better, moved > 1e-4, damping[moving] < 1e3)]
+        if not len(moving):
+            break
+    covariance = _damped_step(_corner_model(p, dx, dy)[1], weight, value)[1]
+    unit_std = np.sqrt(np.abs(covariance[:, 0, 0] + covariance[:, 1, 1]))
+    pixels = weight.sum(axis=1)
+    residual = np.sqrt(cost / np.maximum(pixels - 9.0, 1.0))
+    found = base + p[:, :2]
+    trusted = (
+        (np.linalg.norm(found - points, axis=1) < 2.5)
+        & (pixels > 16)
+        & (np.abs(p[:, 8]) > 3.0 * residual)
+        & (residual * unit_std < 0.5)
+    )
+    return CornerFits(found, trusted, residual * unit_std / np.sqrt(2.0))
+
+
+def _corner_model(p: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
+    """Model (n, window) and its Jacobian (n, window, 9)."""
+    x, y = dx - p[:, :1], dy - p[:, 1:2]
+    width = p[:, 4:5]
+    edges, derivatives, across, along = [], [], [], []
+    for angle in (p[:, 2:3], p[:, 3:4]):
+        u = np.cos(angle) * x + np.sin(angle) * y
+        edges.append(erf(u / (np.sqrt(2.0) * width)))
+        derivatives.append(np.sqrt(2.0 / np.pi) / width * np.exp(-0.5 * (u / width) ** 2))
+        across.append(np.cos(angle) * y - np.sin(angle) * x)
+        along.append(u)
+    contrast = p[:, 8:9]
+    first, second = derivatives[0] * edges[1] * contrast, derivatives[1] * edges[0] * contrast
+    jacobian = np.stack(
+        [
+            -first * np.cos(p[:, 2:3]) - second * np.cos(p[:, 3:4]),
+            -first * np.sin(p[:, 2:3]) - second * np.sin(p[:, 3:4]),
+            first * across[0],
+            second * across[1],
+            -(first * along[0] + second * along[1]) / width,
+            np.ones_like(x),
+            np.broadcast_to(dx, x.shape),
+            np.broadcast_to(dy, x.shape),
+            edges[0] * edges[1],
+        ],
+        axis=-1,
+    )
+    model = p[:, 5:6] + p[:, 6:7] * dx + p[:, 7:8] * dy + contrast * edges[0] * edges[1]
+    return model, jacobian
+
+
+def _residual_squares(p: Array, dx: Array, dy: Array, value: Array, weight: Array) -> Array:
+    """Weighted sum of squared residuals (n,)."""
+    x, y = dx - p[:, :1], dy - p[:, 1:2]
+    width = np.sqrt(2.0) * p[:, 4:5]
+    one, two = (erf((np.cos(angle) * x + np.sin(angle) * y) / width) for angle in (p[:, 2:3], p[:, 3:4]))
+    model = p[:, 5:6] + p[:, 6:7] * dx + p[:, 7:8] * dy + p[:, 8:9] * one * two
+    return np.asarray((weight * (value - model) ** 2).sum(axis=1))
+
+
+def _damped_step(jacobian: Array, weight: Array, residual: Array, damping: Array | None = None) -> tuple[Array, Array]:
+    """Damped least squares of every corner: steps (n, k) and the inverse normal matrices (n, k, k)."""
+    weighted = jacobian * weight[:, :, None]
+    normal = np.swapaxes(weighted, 1, 2) @ jacobian
+    scale = np.einsum("nkk->nk", normal)
+    ridge = (1e-9 if damping is None else damping[:, None]) * scale + 1e-12
+    normal = normal + ridge[:, :, None] * np.eye(normal.shape[1])
+    inverse = np.linalg.inv(normal)
+    right = np.swapaxes(weighted, 1, 2) @ residual[:, :, None]
+    return (inverse @ right)[:, :, 0], inverse
+
+
+def dot_grid(grey: NDArray[np.uint8], rows: int, cols: int) -> Array:
+    """First estimates of the dots' centres, (rows, cols, 2), (x, y) px. Dots are dark on light or light on dark, and all are in view.
+
+    Raises `NotDetermined` where no grid of that size is found.
+    """
+    for picture in (grey, np.ascontiguousarray(255 - grey)):
+        for flags in (cv2.CALIB_CB_SYMMETRIC_GRID, cv2.CALIB_CB_SYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING):
+            found, centres = cv2.findCirclesGrid(picture, (cols, rows), flags=flags)
+            if found:
+                return np.asarray(centres.reshape(rows, cols, 2), float)
+    raise NotDetermined("geometry", f"no grid of {rows} x {cols} dots found: all of it has to be in view, and in focus")
+
+
+def dot_centres(
+    picture: Array, points: Array, rows: int, cols: int, index: NDArray[np.int64] | None = None
+) -> CornerFits:
+    """Centroids of the dots at `points` (n, 2), (x, y), in a picture (rows, cols) of 0..1.
+
+        c = sum w r / sum w,   w = max((I - background) / (peak - background) - `LEAST_DOT_SHARE`, 0)
+
+    within half a spacing. The background is the median beyond 0.8 of that radius. A coordinate has the standard deviation
+    s sqrt(sum |r - c|^2 / 2) / sum w, with s the noise of the background over the contrast. In perspective, the centroid of the ellipse
+    isn't the image of the dot's centre: for dots of radius a at distance z and a focal length of f px they differ by about
+    f (a / z)^2 sin(2 tilt) / 2 px.
+    """
+    points = np.array(points, float)
+    index = np.arange(rows * cols) if index is None else index
+    spacing = _spacing(points, index, cols)
+    radius = np.maximum(DOT_WINDOW * spacing, 2.0)
+    size = int(np.ceil(radius.max())) + 1
+    offset = np.arange(-size, size + 1)
+    dx, dy = (grid.ravel() for grid in np.meshgrid(offset, offset))
+    std = np.full(len(points), np.inf)
+    trusted = np.zeros(len(points), bool)
+    for k in range(len(points)):
+        found = _centroid(picture, points[k], float(radius[k]), dx, dy)
+        if found is not None:
+            points[k], std[k], trusted[k] = found[0], found[1], True
+    return CornerFits(points, trusted, std)
+
+
+def _centroid(
+    picture: Array, start: Array, radius: float, dx: NDArray[np.int64], dy: NDArray[np.int64]
+) -> tuple[Array, float] | None:
+    """The centroid of one dot and the standard deviation of a coordinate; None where there is no dot, or it touches the frame's border."""
+    height, width = picture.shape
+    at, std = start, np.inf
+    for _ in range(CENTROID_PASSES):
+        x, y = np.rint(at[0]) + dx, np.rint(at[1]) + dy
+        away = np.hypot(x - at[0], y - at[1])
+        near = away <= radius
+        x, y, away = x[near], y[near], away[near]
+        if min(x.min(), y.min()) < 0 or x.max() >= width or y.max() >= height:
+            return None
+        value = picture[y.astype(int), x.astype(int)]
+        rim, inner, inside = (
+            value[away > DOT_BACKGROUND * radius],
+            value[away < 0.3 * radius],
+            away <= DOT_BACKGROUND * radius,
+        )
+        background = float(np.median(rim)) if rim.size else np.nan
+        contrast = float(np.mean(inner)) - background if inner.size else np.nan
+        if not abs(contrast) >= LEAST_DOT_CONTRAST:
+            return None
+        share = (value - background) / contrast
+        weight = np.where(inside, np.maximum(share - LEAST_DOT_SHARE, 0.0), 0.0)
+        total = float(weight.sum())
+        at = np.array([weight @ x, weight @ y]) / total
+        noise = float(np.median(np.abs(rim - background))) / 0.6745 / abs(contrast)
+        std = noise * float(np.sqrt(0.5 * np.sum(np.square(away[weight > 0])))) / total
+    return (at, std) if np.hypot(*(at - start)) < 0.5 * radius else None
+
+
+def _spacing(points: Array, index: NDArray[np.int64], cols: int) -> Array:
+    """Distance of each dot to the nearest of its neighbours in the grid, px."""
+    place = {int(number): k for k, number in enumerate(index)}
+    found = np.full(len(points), np.inf)
+    for number, k in place.items():
+        for other in (number + cols, number + 1 if (number + 1) % cols else -1):
+            if other in place:
+                distance = float(np.hypot(*(points[place[other]] - points[k])))
+                found[k], found[place[other]] = min(found[k], distance), min(found[place[other]], distance)
+    return np.where(np.isfinite(found), found, np.nanmedian(found))
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,13 @@
-"""One camera from views of a board, without the corners and views that don't fit."""
+"""One camera from views of a board, without the corners and views that don't fit (`calibrate_robustly`).
+
+The distortion model is chosen by views that its fit has not seen (`choose_model`). The error of the camera model shows
+where two halves of the views, calibrated separately, differ beyond their uncertainties (`cross_validation`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +17,9 @@ from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import MIN_CORNERS, BoardView
 from lab.fit.geometry.bundle_adjustment import (
     BundleAdjustment,
+    CorrelatedErrors,
     Observation,
+    RigParameters,
     Solution,
     board_key,
     board_pose,
@@ -22,13 +28,16 @@ from lab.fit.geometry.bundle_adjustment import (
     rms_px,
     with_boards,
 )
-from lab.fit.geometry.correlated_errors import CorrelatedErrors
-from lab.fit.geometry.distortion_model import MODELS, choose_model, free_intrinsics
-from lab.fit.geometry.projection_errors import points_at, projection_std
-from lab.formats.results import DistortionModel, Skipped
+from lab.fit.geometry.pinhole import COUNT, NAMES, Difference, difference, points_at, projection_std
+from lab.formats.results import CrossValidation, DistortionModel, Skipped
 from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]
+FOLDS = 5
+#: Of the squared error of held-out views, by which a richer model has to be worse to be refused.
+OVERFITTING_SHARE = 0.05
+#: From simple to rich; each model has the coefficients of those before it.
+MODELS = (("k1",), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"))
 
 MIN_VIEWS = 3
 OUTLYING_VIEW_RATIO = 3.0  # rms of a view over the median rms, above which it is left out
@@ -39,6 +48,94 @@ LARGEST_RMS_SHARE = 0.005  # rms over the diagonal of the frame, above which no 
 LARGEST_FOCAL_STD = 0.1  # relative; above it the focal length isn't determined
 PARALLEL_DEG = 5.0
 MOST_LISTED = 3  # views named in a refusal
+
+DIFFERENCE_SIGMA = 2.6  # significance of 1 %, above which two halves of the views differ beyond their uncertainties
+
+
+def free_intrinsics(coefficients: Sequence[str], *, centre: bool = True) -> NDArray[np.bool_]:
+    """Mask (12,) of the intrinsics that a distortion model fits: the pinhole and these coefficients; without `centre`
+    the principal point is held.
+    """
+    pinhole = ("fx", "fy", "cx", "cy") if centre else ("fx", "fy")
+    return np.array([name in (*pinhole, *coefficients) for name in NAMES])
+
+
+def choose_model(
+    views: Sequence[BoardView], shape: tuple[int, int], solution: Solution
+) -> tuple[tuple[str, ...], tuple[DistortionModel, ...]]:
+    """Choose the coefficients of the distortion model by cross-validation, and list how well each of `MODELS` predicts
+    held-out views.
+
+    Each model is fitted to the other views; of a held-out view only the pose is fitted. The richest model is taken
+    unless a simpler one predicts the held-out views better, by more than its standard deviation and by 5 % of the
+    squared error. A coefficient is never dropped for being small: this would claim that it is known to be 0, and make
+    the uncertainty of the others too small.
+    """
+    folds = [np.arange(start, len(views), min(FOLDS, len(views))) for start in range(min(FOLDS, len(views)))]
+    scores = {model: np.zeros(len(views)) for model in MODELS}
+    for fold in folds:
+        rest = [k for k in range(len(views)) if k not in fold]
+        chosen = [views[k] for k in rest]
+        if len(chosen) < 2:
+            continue
+        start = solution.state
+        start = replace(start, rotations=start.rotations[rest], translations_mm=start.translations_mm[rest])
+        boards = {board_key(view): number for number, view in enumerate(first_view_of_boards(views))}
+        for model in MODELS:
+            free = free_intrinsics(model)
+            held = replace(start, intrinsics=np.where(free, start.intrinsics, 0.0))
+            observations = [Observation(view, pose=k, board=boards[board_key(view)]) for k, view in enumerate(chosen)]
+            trained = BundleAdjustment(observations, free[None, :], shape, boards=len(boards)).solve(held).state
+            for k in map(int, fold):
+                scores[model][k] = _held_out_square(views[k], trained, boards[board_key(views[k])], solution, k, shape)
+    counts = sum(len(view.index) for view in views)
+    best = MODELS[-1]
+    reasons = dict.fromkeys(MODELS, "")
+    for model in reversed(MODELS[:-1]):
+        worse = scores[best] - scores[model]
+        error = float(np.std(worse, ddof=1) * np.sqrt(len(worse)))
+        if worse.sum() > max(error, OVERFITTING_SHARE * scores[model].sum()):
+            reasons[best] = "refused: it predicts held-out views worse than a simpler one does"
+            best = model
+    listed = []
+    for model in MODELS:
+        reason = reasons[model]
+        if model == best:
+            reason = "chosen: no simpler model predicts held-out views better"
+        elif not reason:
+            change = 100.0 * (np.sqrt(scores[model].sum() / scores[best].sum()) - 1.0)
+            reason = f"simpler, and no better: held-out views change by {change:+.2g} %"
+        listed.append(
+            DistortionModel(
+                coefficients=model,
+                held_out_rms_px=float(np.sqrt(scores[model].sum() / counts)),
+                chosen=model == best,
+                reason=reason,
+            )
+        )
+    return best, tuple(listed)
+
+
+def first_view_of_boards(views: Sequence[BoardView]) -> list[BoardView]:
+    """The first view of each board."""
+    first: dict[tuple[object, ...], BoardView] = {}
+    for view in views:
+        first.setdefault(board_key(view), view)
+    return list(first.values())
+
+
+def _held_out_square(
+    view: BoardView, trained: RigParameters, board: int, solution: Solution, pose: int, shape: tuple[int, int]
+) -> float:
+    """Sum of squared residuals, px^2, of a view that the camera `trained` has not seen."""
+    state = replace(
+        trained,
+        warps_mm=trained.warps_mm[board : board + 1],
+        rotations=solution.state.rotations[pose : pose + 1],
+        translations_mm=solution.state.translations_mm[pose : pose + 1],
+    )
+    only = BundleAdjustment([Observation(view, pose=0)], np.zeros((1, COUNT), dtype=bool), shape, only_poses=True)
+    return float(np.sum(only.solve(state).residuals[0] ** 2))
 
 
 @dataclass(frozen=True)
@@ -67,7 +164,7 @@ class Calibration:
 
     @property
     def points(self) -> Array:
-        """Corners (n, 3), mm, in the frame of the camera; they determine the implied motion of `projection_errors`."""
+        """Corners (n, 3), mm, in the frame of the camera; they determine the motion that two calibrations imply."""
         return placed_points(self.views, self.solution)
 
     def projection_std(self, image: Array, distance_mm: float | None) -> Array:
@@ -244,3 +341,75 @@ def _check_focal_length(solution: Solution) -> None:
     raise NotDetermined(
         "geometry", f"the focal length isn't determined: {why}; tilt the board by 20..40 deg in several views"
     )
+
+
+def cross_validation(calibration: Calibration) -> CrossValidation | None:
+    """`halves_differ` as a result: the error of the model apart from that of the sampling."""
+    found = halves_differ(calibration)
+    if found is None:
+        return None
+    whole, sampling_px = found
+    explained = whole.rms_px if whole.significance_sigma > DIFFERENCE_SIGMA else 0.0
+    beyond = max(explained, whole.expected_px) ** 2 - sampling_px**2
+    return CrossValidation(
+        difference_px=whole.rms_px,
+        expected_px=whole.expected_px,
+        sampling_px=sampling_px,
+        significance_sigma=whole.significance_sigma,
+        model_error_px=float(np.sqrt(max(beyond, 0.0) / 2.0)),
+    )
+
+
+def halves_differ(calibration: Calibration) -> tuple[Difference, float] | None:
+    """Difference of two cameras, each calibrated from every other view, at the places of the corners, and its expected
+    rms, px, by the independent noise of the corners alone; None where the halves are too small.
+
+    The errors that neighbouring corners share are those of all views.
+    """
+    views, coefficients = calibration.views, distortion_coefficients(calibration.solution)
+    halves = [views[0::2], views[1::2]]
+    if min(len(half) for half in halves) < MIN_VIEWS:
+        return None
+    solved = [calibrate(half, calibration.shape, coefficients) for half in halves]
+    if not all(one.determined for one in solved):
+        return None
+    errors = calibration.solution.errors
+    if errors is not None:
+        solved = [
+            with_model_error(half, calibration.shape, one, errors) for half, one in zip(halves, solved, strict=True)
+        ]
+    one, two = solved
+    points = calibration.points
+    points = points[:: max(1, len(points) // 300)]
+    covariances = (
+        one.of_camera() + two.of_camera(),
+        one.of_camera(only_sampling=True) + two.of_camera(only_sampling=True),
+    )
+    whole, sampling = (
+        difference(one.state.intrinsics[0], two.state.intrinsics[0], covariance, calibration.points, points)
+        for covariance in covariances
+    )
+    return whole, sampling.expected_px
+
+
+def widened(calibration: Calibration, validation: CrossValidation | None) -> Calibration:
+    """The calibration, with its covariance multiplied by the square of what its halves differ by beyond their
+    uncertainties; as it is where they agree.
+    """
+    if validation is None or validation.significance_sigma <= DIFFERENCE_SIGMA:
+        return calibration
+    factor = max(1.0, validation.difference_px / validation.expected_px)
+    solution = calibration.solution
+    return replace(
+        calibration,
+        solution=replace(
+            solution,
+            covariance=factor**2 * solution.covariance,
+            sampling_covariance=solution.covariance_by_sampling,
+        ),
+    )
+
+
+def distortion_coefficients(solution: Solution) -> tuple[str, ...]:
+    """Names of the distortion coefficients that were fitted."""
+    return tuple(name for name, free in zip(NAMES[4:], solution.free[0, 4:], strict=True) if free)

@@ -23,7 +23,7 @@ from scipy import ndimage, spatial
 
 from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.errors import NotDetermined
-from lab.fit.geometry.corners import fit_corners
+from lab.fit.geometry.board_detection import fit_corners
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 from sim.sensor.mosaic import planes

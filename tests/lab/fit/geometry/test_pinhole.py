@@ -1,4 +1,6 @@
-"""The pinhole with distortion against OpenCV's."""
+"""The pinhole with distortion against OpenCV's; the uncertainty and the difference of projections, and the motion that
+is taken out of them.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +8,30 @@ import cv2
 import numpy as np
 import pytest
 
+from lab.fit.geometry.calibration import calibrate_robustly
 from lab.fit.geometry.pinhole import (
     cross_matrices,
+    difference,
     distortion_of,
+    error_operator,
+    grid,
+    grid_points,
+    implied_motion,
     intrinsics_of,
     matrix_of,
+    points_at,
     project,
     project_with_jacobian,
+    projection_std,
     unproject,
 )
+from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 MATRIX = np.array([[420.0, 0, 203.0], [0, 421.0, 147.0], [0, 0, 1]])
 BROWN = np.array([-0.12, 0.06, 5e-4, -3e-4, 0.02])
 RATIONAL = np.array([-0.12, 0.06, 5e-4, -3e-4, 0.02, 0.03, -0.01, 0.004])
+
+INTRINSICS = intrinsics_of(TRUTH.left, TRUTH.distortion_left)
 
 
 @pytest.fixture
@@ -61,3 +74,71 @@ def test_matrix_and_coefficients_come_back():
 
 def test_cross_matrices_are_cross_products(points):
     np.testing.assert_allclose(cross_matrices(points) @ [1.0, 2.0, 3.0], np.cross(points, [1.0, 2.0, 3.0]))
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return calibrate_robustly(seen(np.random.default_rng(4), poses(12)), SHAPE)
+
+
+def test_equal_cameras_imply_no_motion():
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-200, 200, (80, 2)), rng.uniform(500, 900, 80)])
+    rotation, shift = implied_motion(INTRINSICS, INTRINSICS, points)
+    np.testing.assert_allclose(rotation, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(shift, 0.0, atol=1e-9)
+
+
+def test_a_displaced_principal_point_is_mostly_a_turn():
+    """5 px of the centre are a turn by 5 / f: what is left is second order in the field, and far below 5 px."""
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-200, 200, (80, 2)), rng.uniform(500, 900, 80)])
+    other = INTRINSICS.copy()
+    other[2] += 5.0
+    found = difference(INTRINSICS, other, np.eye(12) * 1e-12, points, points)
+    assert np.linalg.norm(project(points, other) - project(points, INTRINSICS), axis=1).mean() == pytest.approx(5.0)
+    assert found.rms_px < 0.5
+    rotation, _ = implied_motion(INTRINSICS, other, points)
+    # the image moves by +5 px, so the points have to move by -5 px to be seen where they were: a turn about y
+    assert cv2.Rodrigues(rotation)[0][1, 0] == pytest.approx(-5.0 / 1400.0, rel=0.2)
+
+
+def test_error_operator_has_no_motion_left_in_it():
+    """On the corners that tie it down, its columns are orthogonal to every turn and shift."""
+    rng = np.random.default_rng(2)
+    points = np.column_stack([rng.uniform(-200, 200, (80, 2)), rng.uniform(500, 900, 80)])
+    operator = error_operator(INTRINSICS, points, points).reshape(-1, 12)
+    step = 1e-6
+    for k in range(6):
+        turn, shift = np.zeros(3), np.zeros(3)
+        (turn if k < 3 else shift)[k % 3] = step
+        mode = (
+            project(points @ cv2.Rodrigues(turn)[0].T + shift, INTRINSICS) - project(points, INTRINSICS)
+        ).ravel() / step
+        assert np.abs(mode @ operator).max() < 1e-4 * np.linalg.norm(mode) * np.linalg.norm(operator)
+
+
+def test_uncertainty_is_least_where_the_boards_were(calibration):
+    x, y = grid(SHAPE)
+    image = grid_points(x, y)
+    std = calibration.projection_std(image, 700.0).reshape(len(y), len(x))
+    assert std.min() == pytest.approx(std[5:14, 7:18].min())
+    assert std[0, 0] > 4 * std[len(y) // 2, len(x) // 2]
+    far = calibration.projection_std(image, None).reshape(len(y), len(x))
+    assert np.median(far) > np.median(std)  # no board was there
+
+
+def test_difference_of_one_calibration_with_itself_is_none(calibration):
+    points = calibration.points
+    found = difference(calibration.intrinsics, calibration.intrinsics, 2 * calibration.covariance, points, points)
+    assert found.rms_px < 1e-9
+    assert found.significance_sigma < 1e-6
+    # the mean variance over the corners is that of the map: both come from the same operator
+    std = projection_std(calibration.intrinsics, 2 * calibration.covariance, points, points)
+    assert np.all(found.variances_px2.max(axis=1) <= std**2 * (1 + 1e-9))
+
+
+def test_points_are_as_far_as_they_should_be():
+    points = points_at(np.array([[10.0, 20.0], [640.0, 480.0]]), INTRINSICS, 1234.0)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1234.0)
+    np.testing.assert_allclose(project(points, INTRINSICS), [[10.0, 20.0], [640.0, 480.0]], atol=1e-9)

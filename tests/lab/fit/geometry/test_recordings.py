@@ -1,4 +1,7 @@
-"""Intrinsics from recordings of boards drawn with known cameras: recovered, rejected views, refusals, results."""
+"""Intrinsics from recordings of boards drawn with known cameras: recovered, rejected views, refusals, results.
+
+Corners of a checkerboard are found where they are. Lateral colour of drawn corners, and of a camera without it.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,39 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.special import erf
 
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import find_board, luminance
+from lab.fit.geometry.board_detection import CornerFits, find_board, fit_corners, luminance
 from lab.fit.geometry.calibration import calibrate_robustly
-from lab.fit.geometry.recordings import board_warps, fit_geometry, geometry_result
+from lab.fit.geometry.recordings import _fitted_shift, board_warps, channel_geometry, fit_geometry, geometry_result
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import GeometryFit
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
+
+
+def test_corner_is_found_where_it_is():
+    """A corner drawn as the product of two blurred edges, skewed, shaded and noisy."""
+    rng = np.random.default_rng(1)
+    y, x = np.indices((41, 41), dtype=float)
+    found = []
+    for place in rng.uniform(-0.5, 0.5, (60, 2)):
+        dx, dy = x - 20 - place[0], y - 20 - place[1]
+        edges = [erf((np.cos(a) * dx + np.sin(a) * dy) / (0.8 * np.sqrt(2))) for a in (0.2, 1.9)]
+        picture = 0.5 + 0.003 * dx + 0.4 * edges[0] * edges[1] + rng.normal(0, 0.02, dx.shape)
+        points, trusted, _ = fit_corners(
+            picture,
+            np.array([[20.0, 20.0]]),
+            across=np.array([[-np.sin(0.2), np.cos(0.2)]]),
+            down=np.array([[-np.sin(1.9), np.cos(1.9)]]),
+            half_px=np.array([9.0]),
+        )
+        assert trusted[0]
+        found.append(points[0] - 20 - place)
+    std_px = np.std(found)
+    # noise / (contrast slope) over about 4 window-lengths of edge pixels: 0.02 / 0.4 / sqrt(36) = 0.008 px
+    assert std_px < 0.012
+    assert np.abs(np.mean(found, axis=0)).max() < 4 * std_px / np.sqrt(60)
 
 
 def test_intrinsics_of_a_bayer_camera_are_recovered_within_their_uncertainty(charuco_fits, truth):
@@ -149,3 +177,51 @@ def test_result_says_what_it_rests_on(charuco_fits):
     assert near.distance_mm == pytest.approx(400, rel=0.15) and far.distance_mm is None
     assert np.shape(near.projection_px_std) == (len(near.y_px), len(near.x_px))
     assert GeometryFit.model_validate_json(fit.model_dump_json()) == fit
+
+
+def test_lateral_colour_of_drawn_corners():
+    """Red is magnified by 0.03 % and displaced by (0.02, -0.01) px against green."""
+    rng = np.random.default_rng(6)
+    calibration = calibrate_robustly(seen(rng, poses(12), noise_px=0.02), SHAPE)
+    corners = []
+    for view in calibration.views:
+        grown = view.image_px + 3e-4 * (view.image_px - calibration.intrinsics[2:4]) + [0.02, -0.01]
+        noise = [rng.normal(0, 0.02, grown.shape) for _ in range(2)]
+        sure, std = np.ones(len(grown), bool), np.full(len(grown), 0.02)
+        corners.append(
+            {"R": CornerFits(grown + noise[0], sure, std), "G": CornerFits(view.image_px + noise[1], sure, std)}
+        )
+    red, green = channel_geometry(calibration, corners)
+    gap = np.array(red.radial_shift_px) - 3e-4 * np.array(red.radius_px)
+    assert np.all(np.abs(gap) < 4 * np.array(red.radial_shift_px_std) + 1e-6)
+    assert red.radial_shift_px[-1] > 10 * red.radial_shift_px_std[-1]
+    for k, true in enumerate((0.02, -0.01)):
+        assert abs(red.centre_shift_px[k] - true) < 4 * red.centre_shift_px_std[k]
+    assert red.camera_matrix[0][0] / green.camera_matrix[0][0] == pytest.approx(1.0003, abs=1e-4)
+
+
+def test_colours_of_a_camera_without_lateral_colour_agree(charuco_fits):
+    """Corners on each colour's own pixels: no channel may be displaced, whatever its place in the mosaic."""
+    fit = charuco_fits["left"]
+    assert [channel.channel for channel in fit.channels] == ["R", "G", "B"]
+    for channel in fit.channels:
+        if channel.channel != "G":
+            assert np.all(np.abs(channel.centre_shift_px) < 5 * np.array(channel.centre_shift_px_std))
+            assert np.abs(channel.centre_shift_px).max() < 0.02
+            assert abs(channel.radial_shift_px[-1]) < 5 * channel.radial_shift_px_std[-1]
+
+
+def test_corners_with_large_errors_move_the_shift_by_no_more_than_its_uncertainty():
+    """A quarter of the corners has errors of 0.05 +- 0.02 px to the right, the same in every session, as demosaicing makes them.
+
+    From session to session only noise of 0.007 px is new. Over 60 sessions, a standard deviation is known to 1 / sqrt(120) = 9 %: 3 sigma is 28 %.
+    """
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(-1, 1, (2, 300))
+    jacobian = np.zeros((300, 2, 3))
+    jacobian[:, 0, 0], jacobian[:, 1, 0], jacobian[:, 0, 1], jacobian[:, 1, 2] = x, y, 1.0, 1.0
+    same = np.zeros((300, 2))
+    same[:75, 0] = rng.normal(0.05, 0.02, 75)
+    fits = [_fitted_shift(same + rng.normal(0, 0.007, (300, 2)), jacobian, np.ones(300, bool)) for _ in range(60)]
+    spread = np.std([fit[0] for fit in fits], axis=0, ddof=1)
+    assert np.all(spread < 1.28 * np.mean([np.sqrt(np.diag(fit[1])) for fit in fits], axis=0))

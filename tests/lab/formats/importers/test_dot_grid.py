@@ -8,7 +8,7 @@ import pytest
 from scipy.special import erf
 
 from lab.errors import InputError, NotDetermined
-from lab.fit.geometry.dots import dot_centres, dot_grid
+from lab.fit.geometry.board_detection import dot_centres, dot_grid
 from lab.fit.geometry.recordings import fit_geometry
 from lab.formats import recording_set as recording
 from lab.formats.importers import ImportOptions, read_dot_grids, read_foreign
