@@ -1,17 +1,24 @@
 """The relative sensitivity from a table of channel means by wavelength, for recordings whose frames aren't at hand.
 
-One row a light and channel, CSV with a header. Columns: `kind` (dark, narrowband), `exposure_s`, `mean_dn`, `mean_std_dn` (of the mean: noise,
-and scatter of repeats); of narrowband light `wavelength_nm`, `bandwidth_nm` (full width at half maximum) and its power by a reference:
-`radiance_w_per_sr_m2`, or `photodiode_a` with `photodiode_a_per_w`; of a colour sensor `channel` (R, G, B). A line that was measured stands beside
-the one that was set: its centre and width in `measured_wavelength_nm` and `measured_bandwidth_nm`, or the CSV of its spectrum, relative to the
-table, in `spectrum`. It is used in the other's place, whose cells may be empty. A spectrum without another reading of the power is a radiance.
+One row a light and channel, CSV with a header. Columns: `kind` (dark, narrowband), `exposure_s`, `mean_dn`,
+`mean_std_dn` (of the mean: noise, and scatter of repeats); of narrowband light `wavelength_nm`, `bandwidth_nm` (full
+width at half maximum) and its power by a reference: `radiance_w_per_sr_m2`, or `photodiode_a` with
+`photodiode_a_per_w`; of a colour sensor `channel` (R, G, B). A line that was measured stands beside the one that was
+set: its centre and width in `measured_wavelength_nm` and `measured_bandwidth_nm`, or the CSV of its spectrum, relative
+to the table, in `spectrum`. It is used in the other's place, whose cells may be empty. A spectrum without another
+reading of the power is a radiance.
 
-The power's common factor is unknown or cancels: the curves are relative to their highest value. The method is that of frames (`lab.fit.spectral`).
+The power's common factor is unknown or cancels: the curves are relative to their highest value. The method is that of
+frames (`lab.fit.spectral`).
+
+Light of a triangle's width b leaves little structure of the curves finer than b in the signals. Where they hold more
+than curves with usual flanks leave, the light was narrower than stated. Widths are compared by the marginal likelihood
+of the signals of all channels, and scatter of the signals is weighed against that at every width (`likely_widths`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,14 +26,25 @@ import numpy as np
 
 from lab.errors import InputError, NotDetermined
 from lab.fit.number_table import TableRow, table_rows
-from lab.fit.spectral.bandwidth import BANDWIDTH_LOG_RATIO, likely_widths
-from lab.fit.spectral.channel_signals import RADIOMETER_RELATIVE_STD, ChannelSignals, Scatter, joint_covariance
+from lab.fit.spectral.curve_prior import (
+    averaging_matrix,
+    least_misfit,
+    local_roughness,
+    signal_covariance,
+    straight_lines,
+)
 from lab.fit.spectral.recordings import FINE_SHARE, OUTPUT_STEP_NM
-from lab.fit.spectral.scatter import scatter_remarks
 from lab.fit.spectral.sensitivity import (
     COVERAGE_FACTOR,
     MIN_SPECTRA,
     NEGATIVE_LIGHT,
+    RADIOMETER_RELATIVE_STD,
+    ROUGHNESS_FLOORS,
+    ChannelSignals,
+    Scatter,
+    joint_covariance,
+    scatter_evidence,
+    scatter_remarks,
     solved_sensitivities,
     trapezoid_weights,
 )
@@ -38,6 +56,15 @@ from lab.formats.results import CameraFit, FitResult, Skipped, SpectralFit
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.spectrum import FloatArray, Spectrum
 
+#: Of the stated width: halves of it first, and where these are likelier, what lies between. Wider light isn't tried, since it can't be told
+#: from curves that are smoother than their prior.
+HALVES = (1.0, 0.5, 0.25, 0.125)
+BETWEEN = tuple(0.5**0.5 * factor for factor in HALVES)
+#: ln of the likelihood ratio of the likeliest width to the stated one from which on the stated one isn't used: odds of 1,000.
+BANDWIDTH_LOG_RATIO = 6.9
+LEAST_WIDTH_SHARE = 0.02  # of the probability: curves at widths below it are left out
+Signals = Callable[[float], tuple[FloatArray, Mapping[str, ChannelSignals]]]
+
 NEEDED = ("kind", "exposure_s", "mean_dn", "mean_std_dn", "wavelength_nm", "bandwidth_nm")
 RADIANCE = "radiance_w_per_sr_m2"
 PHOTODIODE, RESPONSIVITY = "photodiode_a", "photodiode_a_per_w"
@@ -47,6 +74,62 @@ GRID_NM = 1.0  # on which lights and curves stand
 FINE_POINTS = 10  # of a measured spectrum in a step of the grid
 LINE_SHARE = 0.1  # of a measured spectrum's maximum: samples above it make the line's centre
 CLIPPED_SHARE = 0.95  # of the range above black: a mean above it may be of a clipped plane
+
+
+@dataclass(frozen=True)
+class LikelyWidths:
+    """Factors on the stated bandwidth. `share`: the probabilities of those that count; `widest`: the largest that isn't excluded by the odds by
+    which the stated width is. How narrow light is below that hardly matters, and roughness of the curves themselves looks like narrower light.
+    """
+
+    share: Mapping[float, float]
+    widest: float
+
+
+def likely_widths(signals_of: Signals, scatter: Scatter, fine_share: float) -> LikelyWidths | None:
+    """The widths of narrowband light that fit; None unless the signals contradict the stated one.
+
+    `signals_of`: wavelengths and signals by channel with the operators of a factor on the stated width. `scatter`: what was found at that.
+    """
+    found = {factor: bandwidth_evidence(*signals_of(factor), scatter, fine_share) for factor in HALVES}
+    if max(found.values()) - found[1.0] < BANDWIDTH_LOG_RATIO:
+        return None
+    found |= {factor: bandwidth_evidence(*signals_of(factor), scatter, fine_share) for factor in BETWEEN}
+    highest = max(found.values())
+    kept = {
+        factor: float(np.exp(log - highest))
+        for factor, log in found.items()
+        if log > highest + np.log(LEAST_WIDTH_SHARE)
+    }
+    widest = max(factor for factor, log in found.items() if log > highest - BANDWIDTH_LOG_RATIO)
+    return LikelyWidths({factor: share / sum(kept.values()) for factor, share in kept.items()}, widest)
+
+
+def bandwidth_evidence(
+    wave: FloatArray, signals: Mapping[str, ChannelSignals], scatter: Scatter, fine_share: float
+) -> float:
+    """ln of the marginal likelihood of `signals` under their lights, up to what all lights share.
+
+    The local scale of the curvature prior is that of the signals over the light's power, which doesn't depend on the width.
+    """
+    average, line = averaging_matrix(wave), straight_lines(wave)
+    priors, start = [], []
+    for one in signals.values():
+        level = one.operator.sum(axis=1)
+        middle = one.operator @ wave / level
+        order = np.argsort(middle)
+        local = local_roughness(wave, np.interp(wave, middle[order], (one.value / level)[order]), average)
+        local = np.zeros_like(wave) if local is None else local
+        std = one.scattered(scatter).std
+        tried = []
+        for floor in ROUGHNESS_FLOORS[1::2]:
+            for fine in (0.0, fine_share):  # curves without fine structure aren't evidence for light that would hide it
+                prior = signal_covariance(wave, one.operator, floor + local, fine)
+                tried.append((*least_misfit(prior, one.operator @ line, one.value, std), prior))
+        _, strength, prior = min(tried, key=lambda t: t[0])
+        priors.append(prior)
+        start.append(2.0 * np.log(strength))
+    return scatter_evidence(wave, list(signals.values()), priors, np.array(start), scatter).log_evidence
 
 
 @dataclass(frozen=True)

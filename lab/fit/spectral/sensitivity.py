@@ -1,19 +1,46 @@
-"""`estimate_sensitivity`: the sensitivity of one channel from its signals under known lights."""
+"""`estimate_sensitivity`: the sensitivities of channels from their signals under known lights.
+
+How far signals scatter beyond their stated standard deviations is found by maximum marginal likelihood
+(`scatter_evidence`). Signals C = A S (1 + g) (1 + h) + noise: g is common to the channels in one light, as a lamp that
+flickers or a reading of its power is; h is each channel's own. The curves S have the curvature prior of the fit, of
+free strength, and straight lines are integrated out (restricted likelihood; Patterson and Thompson, 1971), so that
+neither structure of the curves nor their number of parameters is taken for scatter.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import linalg, optimize
 
-from lab.fit.spectral.bounds import LowerBounds, within_bounds
-from lab.fit.spectral.channel_signals import RADIOMETER_RELATIVE_STD, ChannelSignals, Scatter, light_errors
-from lab.fit.spectral.curvature_prior import averaging_matrix, local_roughness, signal_covariance
-from lab.fit.spectral.scatter import CLEAR_LOG_RATIO, COUNTED_LOG_RATIO, scatter_evidence
-from lab.fit.spectral.tikhonov import CurvePrior, likeliest_prior, posterior_under_prior
+from lab.fit.spectral.curve_prior import (
+    CurvePrior,
+    LowerBounds,
+    averaging_matrix,
+    likeliest_prior,
+    local_roughness,
+    posterior_under_prior,
+    signal_covariance,
+    straight_lines,
+    within_bounds,
+)
 from sim.spectrum import FloatArray
+
+RADIOMETER_RELATIVE_STD = 0.003  # repeatability of a measured spectrum
+LEAST_OWN_SHARE = 1e-6  # of a channel's highest signal: the least standard deviation that is its own
+
+#: ln of the likelihood ratio from which on scatter of several channels is counted (Akaike's for one parameter; what the channels share
+#: shows what isn't structure of a curve), and from which on it is told, or counted for a channel alone: twice it is chi2 of two parameters at
+#: their bounds at most, which exceeds 13.8 in one recording of a thousand that has none.
+COUNTED_LOG_RATIO, CLEAR_LOG_RATIO = 1.0, 6.9
+#: Largest relative scatter. Its variance goes with the measured signals; above it, a curve of zero would explain them all by scatter.
+MOST_SCATTER = 0.2
+#: Prior of ln(relative scatter), normal: one per cent, within a factor of ten. It bounds what the signals don't determine.
+_PRIOR_LOG, _PRIOR_STD = np.log(0.01), np.log(10.0)
+_STRENGTH_RANGE = 8.0  # of ln(strength^2) about the start
 
 COVERAGE_FACTOR = 2.0  # times the standard deviation: a band of about 95 %
 ROUGHNESS_FLOORS = (0.02, 0.05, 0.15, 0.4, 1.0, 3.0)  # of the maximum of the local scale; 3: nearly the same everywhere
@@ -22,6 +49,167 @@ SCATTER_STEPS = 4  # at most, of curves and scatter in turn
 SCATTER_AGREEMENT = 0.05  # relative change of the scatter below which it has settled
 MIN_SPECTRA = 3  # lights that differ: a curve with curvature has three points
 DETERMINED_SHARE = 0.25  # of the maximum of the curve: largest standard deviation of a determined value
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Relative standard deviations of signals beyond the stated ones: `common` to the channels in one light, as the lamp and the
+    reading of its power are, and `own`, independent from channel to channel. `log_ratio`: ln of the likelihood ratio to none.
+    """
+
+    common: float = 0.0
+    own: float = 0.0
+    log_ratio: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """Relative standard deviation of one signal by both."""
+        return float(np.hypot(self.common, self.own))
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelSignals:
+    """Signals of one channel and the operator on its sensitivity.
+
+    `operator` (n, m), `value`, `std` (n,): e/s, or relative. `light` (n,): names of the lights; two channels share the error of a light.
+    `saturated` (k, m), `limit` (k,): operator and lower limits of saturated signals.
+    """
+
+    operator: FloatArray
+    value: FloatArray
+    std: FloatArray
+    light: tuple[str, ...]
+    saturated: FloatArray
+    limit: FloatArray
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether lights saturate."""
+        return self.limit.size > 0
+
+    def scattered(self, scatter: Scatter) -> ChannelSignals:
+        """The signals with the standard deviation that `scatter` adds."""
+        return replace(self, std=np.hypot(self.std, scatter.total * self.value))
+
+    def unshared(self, scatter: Scatter) -> ChannelSignals:
+        """The signals with `scatter`, and without the radiometer's repeatability, which the channels share."""
+        square = self.std**2 - (RADIOMETER_RELATIVE_STD * self.value) ** 2
+        least = LEAST_OWN_SHARE * float(np.max(np.abs(self.value)))
+        return replace(self, std=np.sqrt(np.maximum(square, least**2))).scattered(scatter)
+
+
+def light_errors(signals: Mapping[str, ChannelSignals]) -> dict[str, FloatArray]:
+    """Changes (n, lights) of each channel's signals by the relative errors of all lights, which the channels share."""
+    lights = np.array(list(dict.fromkeys(name for one in signals.values() for name in one.light)))
+    return {c: (np.array(one.light)[:, None] == lights) * one.value[:, None] for c, one in signals.items()}
+
+
+def joint_covariance(at: FloatArray, solved: Mapping[str, Sensitivity]) -> FloatArray:
+    """Covariance (channels x k, channels x k) of the curves of all channels, channel after channel, at the wavelengths to which `at` (k, m)
+    interpolates. Between channels it is that of what they share.
+    """
+    return np.block(
+        [
+            [at @ (one.covariance if c == d else one.common @ two.common.T) @ at.T for d, two in solved.items()]
+            for c, one in solved.items()
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class ScatterEvidence:
+    """`log_evidence`: ln of the marginal likelihood at the likeliest `scatter`. `strength` (channels,): ln of the squared strengths of the
+    priors there. The likelihood of no scatter is taken at strengths of its own.
+    """
+
+    log_evidence: float
+    scatter: Scatter
+    strength: FloatArray
+
+
+def scatter_evidence(
+    wave: FloatArray,
+    signals: Sequence[ChannelSignals],
+    prior: Sequence[FloatArray],
+    start: FloatArray,
+    scatter: Scatter,
+) -> ScatterEvidence:
+    """The likeliest scatter of `signals`, all channels at once, from a `start` of ln(strength^2) (channels,) and a first `scatter`.
+
+    `prior`: of each channel the covariance (n, n) of its signals by the curvature of its curve, at strength 1. Of one channel all scatter
+    is its own and stands as `common`.
+    """
+    rest = [linalg.qr(s.operator @ straight_lines(wave))[0][:, 2:] for s in signals]  # lines are integrated out
+    turn = linalg.block_diag(*rest)
+    value = np.concatenate([s.value for s in signals])
+    light = np.concatenate([np.array(s.light) for s in signals])
+    several = len(signals) > 1
+    read = RADIOMETER_RELATIVE_STD if several else 0.0  # part of the stated standard deviations, common to the channels
+    own = np.maximum(
+        np.concatenate([s.std for s in signals]) ** 2 - (read * value) ** 2, 1e-20 * float(np.max(value**2))
+    )
+    y = turn.T @ value
+    noise = (turn.T * own) @ turn
+    alone = (turn.T * value**2) @ turn
+    shared = turn.T @ ((light[:, None] == light) * np.outer(value, value)) @ turn if several else alone
+    curve = [r.T @ p @ r for r, p in zip(rest, prior, strict=True)]
+    ends = np.cumsum([0, *(len(c) for c in curve)])
+    count = len(signals)
+
+    def loss(strength: FloatArray, found: Scatter) -> float:
+        covariance = noise + (read**2 + found.common**2) * shared + found.own**2 * alone
+        for k in range(count):
+            at = slice(ends[k], ends[k + 1])
+            covariance[at, at] += np.exp(strength[k]) * curve[k]
+        try:
+            root = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            return 1e12
+        z = linalg.solve_triangular(root, y, lower=True, check_finite=False)
+        return 0.5 * float(z @ z) + float(np.log(np.diag(root)).sum())
+
+    def penalised(x: FloatArray) -> float:
+        weak = 0.5 * float(np.sum(((x[count:] - _PRIOR_LOG) / _PRIOR_STD) ** 2))
+        return loss(x[:count], _scatter_of(x[count:])) + weak
+
+    without, _ = _least(lambda x: loss(x, Scatter()), start)
+    first = [max(scatter.common, 0.003), *([max(scatter.own, 0.001)] if several else [])]
+    _, x = _least(penalised, np.concatenate([start, np.log(first)]))
+    found = _scatter_of(x[count:])
+    log_evidence = -loss(x[:count], found)
+    return ScatterEvidence(log_evidence, replace(found, log_ratio=log_evidence + without), x[:count])
+
+
+def _scatter_of(log: FloatArray) -> Scatter:
+    """Scatter of the logarithms of common and own."""
+    return Scatter(*np.exp(np.minimum(log, np.log(MOST_SCATTER))).tolist())
+
+
+def _least(loss: Callable[[FloatArray], float], start: FloatArray) -> tuple[float, FloatArray]:
+    """Least `loss` and its place, by a simplex about `start`."""
+    simplex = np.concatenate([start[None], start + np.eye(start.size)])
+    found = optimize.minimize(
+        loss,
+        start,
+        method="Nelder-Mead",
+        bounds=[(x - _STRENGTH_RANGE, x + _STRENGTH_RANGE) for x in start],
+        options={"xatol": 0.05, "fatol": 0.05, "initial_simplex": simplex},
+    )
+    return float(found.fun), np.asarray(found.x)
+
+
+def scatter_remarks(scatter: Scatter) -> list[str]:
+    """What is told of scatter: a line where it is clear."""
+    if scatter.log_ratio < CLEAR_LOG_RATIO:
+        return []
+    shares = [
+        f"{100.0 * part:.2g} % {whose}"
+        for part, whose in ((scatter.common, "common to the channels"), (scatter.own, "of each channel's own"))
+        if part > 0.1 * scatter.total
+    ]
+    return [
+        f"signals scatter beyond their stated standard deviations, by {' and '.join(shares)}: it is in those of the curves; repeat the light's readings"
+    ]
 
 
 @dataclass(frozen=True, eq=False)
