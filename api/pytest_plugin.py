@@ -141,8 +141,7 @@ class FitReference:
 
         `fail_on`: rules as `calibench compare --fail-on` takes them, `[SIDE:]FIGURE[>AMOUNT[%]]`.
         """
-        from lab.fit.changes_that_fail import FailRule, failing
-        from lab.fit.compare import compare
+        from lab.fit.compare import FailRule, compare, failing
         from lab.formats.result_file import read_result, write_result
         from lab.formats.results import FitResult
 

@@ -20,8 +20,7 @@ from api.upload import take_cameras
 from lab.calibration import camera_models
 from lab.calibration.camera_models import CameraModelRecord
 from lab.errors import InputError
-from lab.fit.changes_that_fail import FailRule, failing
-from lab.fit.compare import compare
+from lab.fit.compare import FailRule, compare, failing
 from lab.formats.recording_set import packed
 from lab.formats.results import ComparisonResult, FitResult, ReportFile
 from lab.report.compare import render_comparison

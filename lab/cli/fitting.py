@@ -107,7 +107,7 @@ def compare(
     data: StoreFolder = None,
 ) -> None:
     """Compare two calibrations: figures that changed beyond their uncertainty."""
-    from lab.fit.changes_that_fail import FailRule, failing
+    from lab.fit.compare import FailRule, failing
     from lab.fit.compare import compare as compared
 
     check_writable(json)

@@ -1,17 +1,25 @@
 """Two calibrations of one rig: what changed beyond its uncertainty.
 
-Every number that a fit states with a standard deviation is compared, found by its name: `x` beside `x_std`. The
-numbers of a curve or a kernel share one row: that of the point with the largest difference, corrected for the number
-of points (Sidak). Dark currents are compared at the sensor temperature of A (`lab.fit.noise.dark_current`). The geometry of cameras is also compared by its effect: both calibrations project the same points,
-after the rigid motion that they imply between each other is removed (`lab.fit.geometry.pinhole`). Parameters
-that differ much may project alike, and the reverse.
+Every number that a fit states with a standard deviation is compared, found by its name: `x` beside `x_std`. The numbers
+of a curve or a kernel share one row: that of the point with the largest difference, corrected for the number of points
+(Sidak). Dark currents are compared at the sensor temperature of A (`lab.fit.noise.dark_current`). The geometry of
+cameras is also compared by its effect: both calibrations project the same points, after the rigid motion that they
+imply between each other is removed (`lab.fit.geometry.pinhole`). Parameters that differ much may project alike, and the
+reverse.
+
+Rules by which changes fail a check (`calibench compare --fail-on`) name a figure and a tolerance: `FIGURE`, or
+`FIGURE>AMOUNT` with the amount in the figure's own unit or in percent of A (`left:noise read_noise_e>5%`). `*` in
+FIGURE stands for any text; `SIDE:` before it confines it to a camera. A change fails a rule where it is significant, as
+the comparison decides, and larger than the amount.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -19,6 +27,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
+from lab.errors import InputError
 from lab.fit.geometry.pinhole import (
     COUNT,
     NAMES,
@@ -32,7 +41,6 @@ from lab.fit.geometry.pinhole import (
     unproject,
 )
 from lab.fit.noise.dark_current import SensorTemperature
-from lab.fit.tuples import triple
 from lab.formats.results import (
     CameraFit,
     Change,
@@ -54,7 +62,6 @@ from sim.camera import Side
 from sim.parameters import Frozen
 
 Array = NDArray[np.floating[Any]]
-
 FALSE_ALARM_RATE = 0.01
 MIN_SEEN = 20  # fewest corners that determine an implied motion
 ROUNDING = 1e-9  # relative standard deviation below which a value counts as exact
@@ -72,6 +79,10 @@ NOT_COMPARED_FIELDS = {(MtfCurve, "angle_deg")} | {
 LAMP_DRIFT_PERCENT = {"response_bend_percent": 0.1, "linearity_error_percent": 0.1, "brighter_fatter_percent": 0.3}
 INTEGRAL = "integrated_efficiency_nm"
 AXES = ("wavelength_nm", "frequency_cy_per_px", "radius_px")
+
+#: The name of the difference of two projections, in px, beside the figures of the fits.
+PROJECTION = "projection"
+_RULE = re.compile(r"(?:(?P<side>left|right):)?(?P<figure>[^>]+?)\s*(?:>\s*(?P<amount>[0-9.eE+-]+)\s*(?P<percent>%)?)?")
 
 
 @dataclass(frozen=True)
@@ -171,8 +182,6 @@ def _without_temperature(a: CameraFit, b: CameraFit, side: Side) -> Iterator[Ski
 
 
 # --- significance ----------------------------------------------------------------------------------------------------
-
-
 def sigma_of_probability(p_value: float) -> float:
     """A probability as standard deviations of a normal distribution, two-sided."""
     return -float(special.ndtri(max(p_value, 1e-300) / 2.0))
@@ -189,8 +198,6 @@ def _sidak_whole(p_value: float, number: int) -> float:
 
 
 # --- numbers, by their names -----------------------------------------------------------------------------------------
-
-
 def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
     """Every fitted number under `model`, by name, each name once. A model in a list is named by its text fields: capture,
     channel, board; by its number, too, where others have the same.
@@ -335,8 +342,6 @@ def place_of(numbers: Numbers, at: int) -> str:
 
 
 # --- geometry --------------------------------------------------------------------------------------------------------
-
-
 def _covariance(fit: GeometryFit) -> Array | None:
     """Covariance (12, 12) of the intrinsics, or None where the fit doesn't state it."""
     if fit.covariance is None:
@@ -375,8 +380,8 @@ def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange 
     return ProjectionChange(
         side=side,
         as_stated_px=float(np.sqrt(np.mean(np.sum(stated**2, axis=1)))),
-        implied_turn_mrad=triple(1e3 * Rotation.from_matrix(rotation).as_rotvec()),
-        implied_shift_mm=triple(shift),
+        implied_turn_mrad=(1e3 * Rotation.from_matrix(rotation).as_rotvec()).tolist(),
+        implied_shift_mm=shift.tolist(),
         difference_px=found.rms_px,
         expected_px=found.expected_px,
         significance_sigma=found.significance_sigma,
@@ -421,3 +426,68 @@ def _rotation_changes(a: StereoFit, b: StereoFit) -> Iterator[Change]:
             significance_sigma=sigma_of_probability(2.0 * float(special.ndtr(-abs(rotation_mrad[k]) / std))),
             changed=False,
         )
+
+
+@dataclass(frozen=True)
+class FailRule:
+    """One rule. `amount`: the largest difference that passes, in the figure's unit, or as a share of A's value where `relative`."""
+
+    figure: str
+    side: str | None = None
+    amount: float = 0.0
+    relative: bool = False
+
+    @classmethod
+    def parse(cls, text: str) -> FailRule:
+        """The rule that a text states. Raises InputError."""
+        refused = InputError(f"--fail-on {text!r}: give FIGURE, or FIGURE>AMOUNT with an optional %, SIDE: before it")
+        found = _RULE.fullmatch(text.strip())
+        if found is None:
+            raise refused
+        try:
+            amount = float(found["amount"] or 0.0)
+        except ValueError:
+            raise refused from None
+        if not 0.0 <= amount < float("inf"):
+            raise refused
+        relative = found["percent"] is not None
+        return cls(found["figure"].strip(), found["side"], amount / 100.0 if relative else amount, relative)
+
+    def _names(self, name: str, side: str | None) -> bool:
+        return fnmatchcase(name, self.figure) and self.side in (None, side)
+
+    def _exceeded(self, row: Change) -> bool:
+        return abs(row.difference) > self.amount * (abs(row.a) if self.relative else 1.0)
+
+    def concerns(self, comparison: ComparisonResult) -> bool:
+        """Whether the comparison has any figure of this rule."""
+        return any(self._names(row.name, row.side) for row in comparison.changes) or any(
+            self._names(PROJECTION, item.side) for item in comparison.projection
+        )
+
+    def failing(self, comparison: ComparisonResult) -> list[str]:
+        """The changes that fail this rule, by name."""
+        rows = [
+            " ".join(part for part in (row.side, row.name, row.where) if part)
+            for row in comparison.changes
+            if row.changed and self._names(row.name, row.side) and self._exceeded(row)
+        ]
+        projections = [
+            f"{item.side} {PROJECTION}"
+            for item in comparison.projection
+            if item.changed
+            and self._names(PROJECTION, item.side)
+            and item.difference_px > (0.0 if self.relative else self.amount)
+        ]
+        return rows + projections
+
+
+def failing(comparison: ComparisonResult, rules: Sequence[FailRule]) -> list[str]:
+    """The changes that fail any rule, by name. Raises InputError for a rule that concerns no figure of the comparison: a misspelt name,
+    or a figure that one of the two fits lacks, would never fail."""
+    for rule in rules:
+        if not rule.concerns(comparison):
+            raise InputError(
+                f"--fail-on {rule.figure!r}: no such figure in both; `calibench compare A B --all` lists those that are compared"
+            )
+    return list(dict.fromkeys(name for rule in rules for name in rule.failing(comparison)))

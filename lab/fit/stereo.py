@@ -49,7 +49,6 @@ from lab.fit.geometry.pinhole import (
     unproject,
 )
 from lab.fit.geometry.recordings import corner_errors
-from lab.fit.tuples import numbers, rows, triple, triples
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
 from lab.one_blas_thread import one_blas_thread
@@ -250,20 +249,20 @@ def _result(
     along = translation / baseline
     of_translation = solution.covariance[at + 3 : at + 6, at + 3 : at + 6]
     return StereoFit(
-        rotation=triples(state.rotation),
-        rotation_std_rad=triple(std[:3]),
-        translation_mm=triple(translation),
-        translation_mm_std=triple(std[3:]),
+        rotation=state.rotation.tolist(),
+        rotation_std_rad=std[:3].tolist(),
+        translation_mm=translation.tolist(),
+        translation_mm_std=std[3:].tolist(),
         baseline_mm=baseline,
         baseline_mm_std=float(np.sqrt(along @ of_translation @ along)),
         rms_px=solution.rms_px,
         pairs=len(pairs),
-        camera_matrix_left=triples(matrix_of(state.intrinsics[0])),
-        distortion_left=numbers(distortion_of(state.intrinsics[0])),
-        camera_matrix_right=triples(matrix_of(state.intrinsics[1])),
-        distortion_right=numbers(distortion_of(state.intrinsics[1])),
+        camera_matrix_left=matrix_of(state.intrinsics[0]).tolist(),
+        distortion_left=distortion_of(state.intrinsics[0]).tolist(),
+        camera_matrix_right=matrix_of(state.intrinsics[1]).tolist(),
+        distortion_right=distortion_of(state.intrinsics[1]).tolist(),
         parameters=solution.names,
-        covariance=rows(solution.covariance),
+        covariance=solution.covariance.tolist(),
         corner_px_std=solution.noise_px,
         corner_errors=corner_errors(solution),
         rejected=rejected,
@@ -328,8 +327,8 @@ def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tupl
     calibration, total = maps.reshape(2, len(y), len(x))
     return DepthUncertainty(
         depth_mm=float(depth_mm),
-        x_px=numbers(x),
-        y_px=numbers(y),
+        x_px=x.tolist(),
+        y_px=y.tolist(),
         calibration_mm_std=_open_rows(calibration),
         total_mm_std=_open_rows(total),
     )
@@ -359,11 +358,11 @@ def rectification(state: RigParameters, pairs: Sequence[StereoPair], shape: tupl
         ]
         gaps += [row_px[1] - row_px[0]] if row_px else []
     return Rectification(
-        rotation_left=triples(rotation_one),
-        rotation_right=triples(rotation_two),
-        projection_left=rows(new_one),
-        projection_right=rows(new_two),
-        disparity_to_depth=rows(to_depth),
+        rotation_left=rotation_one.tolist(),
+        rotation_right=rotation_two.tolist(),
+        projection_left=new_one.tolist(),
+        projection_right=new_two.tolist(),
+        disparity_to_depth=to_depth.tolist(),
         row_rms_px=float(np.sqrt(np.mean(np.concatenate(gaps) ** 2))),
     )
 

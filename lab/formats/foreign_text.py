@@ -1,7 +1,8 @@
 """Text that other programs wrote: its encoding, the separators of its tables, and the names of their columns.
 
-Recording sets are UTF-8 with commas and decimal points. What a user brings may be Latin-1 or UTF-16, and a table of a program that is set to
-another language has semicolons (or tabs) with decimal commas. It is read, and a remark says as what; where two readings are possible, it is refused.
+Recording sets are UTF-8 with commas and decimal points. What a user brings may be Latin-1 or UTF-16, and a table of a
+program that is set to another language has semicolons (or tabs) with decimal commas. It is read, and a remark says as
+what; where two readings are possible, it is refused.
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ from __future__ import annotations
 import csv
 import difflib
 import io
+import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,3 +163,60 @@ def in_its_unit(name: str) -> str:
     """A name with the unit of its ending in words: `exposure_s, in seconds`."""
     unit = next((words for ending, words in UNITS.items() if name.endswith(f"_{ending}")), None)
     return f"{name}, in {unit}" if unit else name
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """One row: its number in the file, and its cells by column."""
+
+    file: Path
+    number: int
+    cells: dict[str, str]
+
+    def value(self, name: str, least: float = 0.0) -> float:
+        """The cell as a number of `least` or more. Raises InputError."""
+        text = self.cells[name]
+        try:
+            found = float(text)
+        except ValueError:
+            found = math.nan
+        if not (math.isfinite(found) and found >= least):
+            raise InputError(
+                f"{self.file}: row {self.number}: {name} = '{text}' isn't a number of {least:g} or more; correct it"
+            )
+        return found
+
+    def known(self, name: str, least: float = 0.0) -> float | None:
+        """The cell as a number; None where it is empty or has no column."""
+        return self.value(name, least) if self.cells.get(name) else None
+
+
+def table_rows(file: Path, needed: Sequence[str], known: Sequence[str]) -> list[TableRow]:
+    """The rows of `file`, which has the columns `needed` and no others than `known`. Raises InputError with one line."""
+    try:
+        reader = csv.reader(read_foreign_csv(file).text.splitlines())
+        header = [cell.strip() for cell in next(reader, [])]
+        rows = [
+            (reader.line_num, [cell.strip() for cell in row]) for row in reader if any(cell.strip() for cell in row)
+        ]
+    except (InputError, csv.Error) as error:
+        raise InputError(f"{file}: can't be read ({one_line(error)}); give a CSV") from error
+    unknown = [name for name in header if name not in known]
+    missing = [name for name in needed if name not in header]
+    if unknown or missing:
+        told = [f"missing: {', '.join(missing)}"] if missing else []
+        near = {name: nearest_name(name, known) for name in unknown}
+        told += (
+            [
+                f"unknown: {', '.join(name + (f' (write {in_its_unit(one)})' if one else '') for name, one in near.items())}"
+            ]
+            if unknown
+            else []
+        )
+        raise InputError(f"{file}: columns {'; '.join(told)}; columns are {', '.join(known)}, in these units")
+    if not rows:
+        raise InputError(f"{file}: holds no levels; write one row a level and channel")
+    for number, row in rows:
+        if len(row) != len(header):
+            raise InputError(f"{file}: row {number}: {len(row)} cells under {len(header)} columns; correct it")
+    return [TableRow(file, number, dict(zip(header, row, strict=True))) for number, row in rows]

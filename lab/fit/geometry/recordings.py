@@ -36,7 +36,6 @@ from lab.fit.geometry.pinhole import (
     project_with_jacobian,
     unproject,
 )
-from lab.fit.tuples import numbers, rows, triples
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
     BoardWarp,
@@ -87,8 +86,8 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
         theta = intrinsics + parameters @ own[0]
         result = ChannelGeometry(
             channel=channel,
-            camera_matrix=triples(matrix_of(theta)),
-            distortion=numbers(distortion_of(theta)),
+            camera_matrix=matrix_of(theta).tolist(),
+            distortion=distortion_of(theta).tolist(),
             rms_px=own[2],
             corners=int(own[3]),
         )
@@ -98,14 +97,13 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
             line = unproject(intrinsics[2:4] + radius[:, None] * along, intrinsics)
             radial = np.einsum("i,nij->nj", along, project_with_jacobian(line, intrinsics)[2] @ parameters)
             radial[:, 1:3] = 0.0  # a common shift of the frame isn't radial
-            shift_std = numbers(np.sqrt(np.diag(beside[1])[1:3]))
             result = result.model_copy(
                 update={
-                    "centre_shift_px": (float(beside[0][1]), float(beside[0][2])),
-                    "centre_shift_px_std": (shift_std[0], shift_std[1]),
-                    "radius_px": numbers(radius),
-                    "radial_shift_px": numbers(radial @ beside[0]),
-                    "radial_shift_px_std": numbers(np.sqrt(np.einsum("ni,ij,nj->n", radial, beside[1], radial))),
+                    "centre_shift_px": tuple(beside[0][1:3].tolist()),
+                    "centre_shift_px_std": tuple(np.sqrt(np.diag(beside[1])[1:3]).tolist()),
+                    "radius_px": tuple(radius.tolist()),
+                    "radial_shift_px": tuple((radial @ beside[0]).tolist()),
+                    "radial_shift_px_std": tuple(np.sqrt(np.einsum("ni,ij,nj->n", radial, beside[1], radial)).tolist()),
                 }
             )
         found.append(result)
@@ -196,16 +194,16 @@ def geometry_result(
     fx, fy, cx, cy = (float(value) for value in std[:4])
     intrinsics = calibration.intrinsics
     return GeometryFit(
-        camera_matrix=triples(matrix_of(intrinsics)),
+        camera_matrix=matrix_of(intrinsics).tolist(),
         camera_matrix_std=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 0.0)),
-        distortion=numbers(distortion_of(intrinsics)),
-        distortion_std=numbers(std[4 : 4 + len(distortion_of(intrinsics))]),
+        distortion=distortion_of(intrinsics).tolist(),
+        distortion_std=std[4 : 4 + len(distortion_of(intrinsics))].tolist(),
         rms_px=solution.rms_px,
         views=len(calibration.views),
         rejected=(*missed, *calibration.rejected),
         rejected_corners=calibration.rejected_corners,
         parameters=solution.names,
-        covariance=rows(solution.covariance),
+        covariance=solution.covariance.tolist(),
         corner_px_std=solution.noise_px,
         corner_noise_px=of_pictures,
         corner_errors=corner_errors(solution),
@@ -227,7 +225,7 @@ def corner_errors(solution: Solution) -> CornerErrors:
         model_error_px=solution.model_error_px,
         length_squares=None if errors is None else errors.length_squares,
         between_cameras=None if errors is None or len(solution.free) == 1 else errors.between_cameras,
-        sampling_std=numbers(np.sqrt(np.diag(solution.covariance_by_sampling))),
+        sampling_std=np.sqrt(np.diag(solution.covariance_by_sampling)).tolist(),
     )
 
 
@@ -241,10 +239,9 @@ def projection_maps(calibration: Calibration) -> tuple[ProjectionUncertainty, ..
         std = calibration.projection_std(image, distance_mm).reshape(len(y), len(x))
         if not np.isfinite(std).all():  # where the distortion has no inverse
             std = np.where(np.isfinite(std), std, np.nanmax(std))
+        rows = tuple(tuple(row.tolist()) for row in std)
         found.append(
-            ProjectionUncertainty(
-                distance_mm=distance_mm, x_px=numbers(x), y_px=numbers(y), projection_px_std=rows(std)
-            )
+            ProjectionUncertainty(distance_mm=distance_mm, x_px=x.tolist(), y_px=y.tolist(), projection_px_std=rows)
         )
     return tuple(found)
 
@@ -277,11 +274,11 @@ def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
             ViewResiduals(
                 capture=view.capture.id,
                 corner=tuple(int(index) for index in view.index),
-                x_px=numbers(np.round(view.image_px[:, 0], 5)),
-                y_px=numbers(np.round(view.image_px[:, 1], 5)),
-                dx_px=numbers(np.round(rest[:, 0], 5)),
-                dy_px=numbers(np.round(rest[:, 1], 5)),
-                depth_mm=numbers(np.round(depth, 3)),
+                x_px=np.round(view.image_px[:, 0], 5).tolist(),
+                y_px=np.round(view.image_px[:, 1], 5).tolist(),
+                dx_px=np.round(rest[:, 0], 5).tolist(),
+                dy_px=np.round(rest[:, 1], 5).tolist(),
+                depth_mm=np.round(depth, 3).tolist(),
                 noise_px=None if view.std_px is None else float(np.sqrt(np.mean(view.std_px**2))),
             )
         )

@@ -25,7 +25,6 @@ from pathlib import Path
 import numpy as np
 
 from lab.errors import InputError, NotDetermined
-from lab.fit.number_table import TableRow, table_rows
 from lab.fit.spectral.curve_prior import (
     averaging_matrix,
     least_misfit,
@@ -48,7 +47,7 @@ from lab.fit.spectral.sensitivity import (
     solved_sensitivities,
     trapezoid_weights,
 )
-from lab.formats.foreign_text import read_foreign_csv, remarks_on
+from lab.formats.foreign_text import TableRow, read_foreign_csv, remarks_on, table_rows
 from lab.formats.recording_set import DataSheet
 from lab.formats.recording_set.checks import OFF_NAME_NM
 from lab.formats.recording_set.frame_files import locate
