@@ -141,7 +141,7 @@ class FitReference:
 
         `fail_on`: rules as `calibench compare --fail-on` takes them, `[SIDE:]FIGURE[>AMOUNT[%]]`.
         """
-        from lab.fit.compare import FailRule, compare, failing
+        from lab.fit.compare import FailRule, compare, failures
         from lab.formats.result_file import read_result, write_result
         from lab.formats.results import FitResult
 
@@ -155,7 +155,7 @@ class FitReference:
                 f"{file}: no reference yet; run `pytest --calibench-update` once and keep the file", pytrace=False
             )
         comparison = compare(read_result(FitResult, file), fit)
-        if failed := failing(comparison, rules):
+        if failed := failures(comparison, rules):
             rows = [
                 f"  {row.side or ''} {row.name} {row.where}: {row.a:.6g} +- {row.a_std:.2g} -> {row.b:.6g} +- {row.b_std:.2g}, "
                 f"{row.significance_sigma:.1f} sigma"

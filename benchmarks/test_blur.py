@@ -25,8 +25,8 @@ from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.capture_kinds.screen import ScreenState
 from lab.fit.mtf import edge_mtf
 from lab.fit.psf import estimate_kernel
-from lab.fit.psf.kernel import displaced, normal_equations
-from lab.fit.psf.photograph import photographed_kernel
+from lab.fit.psf.kernel import displace, normal_equations
+from lab.fit.psf.photograph import estimate_from_photograph
 from lab.fit.psf.screen_kernel import measure_field
 from lab.fit.psf.screen_registration import ScreenPictures
 from sim.camera import CameraModel, Lens
@@ -190,7 +190,7 @@ def test_corner_errors() -> None:
             # what the displaced target itself tells less: pixels see it interpolated
             traces = [
                 np.trace(np.linalg.inv(normal_equations(u, blurred, len(truth)).gram))
-                for u in (sharp, displaced(sharp, field))
+                for u in (sharp, displace(sharp, field))
             ]
             dbs = [modulus_db(f.kernel, truth) for f in (placed, joint, believed)]
             rows.append([*dbs, dbs[0] - dbs[1], 10 * np.log10(traces[1] / traces[0]), taken])
@@ -362,7 +362,7 @@ def test_a_real_photograph() -> None:
     )
     for oversample in (2, 4):
         start = time.process_time()
-        found = photographed_kernel(photo, pattern, oversample=oversample)
+        found = estimate_from_photograph(photo, pattern, oversample=oversample)
         taken = time.process_time() - start
         print(f"| {oversample} | {100 * found.explained:.2f} | {100 * found.explained_by_box:.1f} | {taken:.1f} |")
     assert found.explained >= 0.96

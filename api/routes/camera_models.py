@@ -20,7 +20,7 @@ from api.upload import take_cameras
 from lab.calibration import camera_models
 from lab.calibration.camera_models import CameraModelRecord
 from lab.errors import InputError
-from lab.fit.compare import FailRule, compare, failing
+from lab.fit.compare import FailRule, compare, failures
 from lab.formats.recording_set import packed
 from lab.formats.results import ComparisonResult, FitResult, ReportFile
 from lab.report.compare import render_comparison
@@ -168,7 +168,7 @@ def compare_calibrations(
     """Two calibrations: what changed beyond its uncertainty, as `calibench compare A B` tells it."""
     result = _compared(service, a, b)
     try:
-        failed = failing(result, [FailRule.parse(rule) for rule in fail_on])
+        failed = failures(result, [FailRule.parse(rule) for rule in fail_on])
     except InputError as error:
         said = (
             str(error)

@@ -107,7 +107,7 @@ def compare(
     data: StoreFolder = None,
 ) -> None:
     """Compare two calibrations: figures that changed beyond their uncertainty."""
-    from lab.fit.compare import FailRule, failing
+    from lab.fit.compare import FailRule, failures
     from lab.fit.compare import compare as compared
 
     check_writable(json)
@@ -120,7 +120,7 @@ def compare(
         err.print(f"report: {escape(str(write_comparison(report_folder, result)))}")
     if str(json) != "-":
         print_comparison(result, every)
-    failed = failing(result, rules)
+    failed = failures(result, rules)
     for name in failed:
         err.print(escape(f"--fail-on: {name} changed"))
     if failed or (check and result.changed):

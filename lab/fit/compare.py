@@ -136,7 +136,7 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
             numbers_b = {name: of for name, of in numbers_b.items() if INTEGRAL not in name}
             reason = "the curves of A and B end at different wavelengths: their integrals aren't of one band"
             skipped.append(Skipped(step="integrated quantum efficiency", reason=reason, side=side))
-        rows += _compared(numbers_a, numbers_b, side, skipped)
+        rows += _compare_numbers(numbers_a, numbers_b, side, skipped)
         if one.geometry is not None and two.geometry is not None:
             found = _projection(one.geometry, two.geometry, side)
             if isinstance(found, Skipped):
@@ -144,7 +144,9 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
             else:
                 projections.append(found)
     if a.stereo is not None and b.stereo is not None:
-        rows += _compared(dict(numbers_of(a.stereo, "stereo ")), dict(numbers_of(b.stereo, "stereo ")), None, skipped)
+        rows += _compare_numbers(
+            dict(numbers_of(a.stereo, "stereo ")), dict(numbers_of(b.stereo, "stereo ")), None, skipped
+        )
         rows += _rotation_changes(a.stereo, b.stereo)
     elif (a.stereo is None) != (b.stereo is None):
         skipped.append(Skipped(step="stereo", reason=f"only {'A' if a.stereo else 'B'} has it"))
@@ -222,9 +224,11 @@ def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
         elif isinstance(value, dict):
             for key in value:
                 if key in std:
-                    yield _listed(f"{name} {key}", value[key], std[key], axis_name, axis)
+                    yield _numbers_under(f"{name} {key}", value[key], std[key], axis_name, axis)
         else:
-            yield _listed(name, value, std, axis_name, axis, sensor if field.startswith("dark_current") else None)
+            yield _numbers_under(
+                name, value, std, axis_name, axis, sensor if field.startswith("dark_current") else None
+            )
 
 
 def sensor_temperature(noise: NoiseFit) -> SensorTemperature:
@@ -239,7 +243,7 @@ def sensor_temperature(noise: NoiseFit) -> SensorTemperature:
     )
 
 
-def _listed(
+def _numbers_under(
     name: str, value: Any, std: Any, axis_name: str, axis: Array | None, sensor: SensorTemperature | None = None
 ) -> tuple[str, Numbers]:
     values, stds = np.atleast_1d(np.array(value, dtype=float)), np.atleast_1d(np.array(std, dtype=float))
@@ -252,7 +256,7 @@ def _identity(model: Frozen) -> str:
     return " ".join(str(value) for field in type(model).model_fields if isinstance(value := getattr(model, field), str))
 
 
-def _compared(
+def _compare_numbers(
     a: dict[str, Numbers], b: dict[str, Numbers], side: Side | None, skipped: list[Skipped]
 ) -> Iterator[Change]:
     alone = {"A": [name for name in a if name not in b], "B": [name for name in b if name not in a]}
@@ -262,14 +266,14 @@ def _compared(
             skipped.append(Skipped(step="numbers", reason=f"only {which} has {shown}", side=side))
     for name, numbers in a.items():
         if name in b:
-            one, two = _aligned(numbers, b[name])
+            one, two = _align(numbers, b[name])
             if one.value.shape != two.value.shape:
                 skipped.append(Skipped(step=name, reason=f"A has {one.value.shape}, B {two.value.shape}", side=side))
             else:
                 yield from _rows(one, two, side)
 
 
-def _aligned(a: Numbers, b: Numbers) -> tuple[Numbers, Numbers]:
+def _align(a: Numbers, b: Numbers) -> tuple[Numbers, Numbers]:
     """Both on the axis of A, where that of B covers it."""
     if a.axis is None or b.axis is None or np.array_equal(a.axis, b.axis) or not len(b.axis):
         return a, b
@@ -465,7 +469,7 @@ class FailRule:
             self._names(PROJECTION, item.side) for item in comparison.projection
         )
 
-    def failing(self, comparison: ComparisonResult) -> list[str]:
+    def failures(self, comparison: ComparisonResult) -> list[str]:
         """The changes that fail this rule, by name."""
         rows = [
             " ".join(part for part in (row.side, row.name, row.where) if part)
@@ -482,7 +486,7 @@ class FailRule:
         return rows + projections
 
 
-def failing(comparison: ComparisonResult, rules: Sequence[FailRule]) -> list[str]:
+def failures(comparison: ComparisonResult, rules: Sequence[FailRule]) -> list[str]:
     """The changes that fail any rule, by name. Raises InputError for a rule that concerns no figure of the comparison: a misspelt name,
     or a figure that one of the two fits lacks, would never fail."""
     for rule in rules:
@@ -490,4 +494,4 @@ def failing(comparison: ComparisonResult, rules: Sequence[FailRule]) -> list[str
             raise InputError(
                 f"--fail-on {rule.figure!r}: no such figure in both; `calibench compare A B --all` lists those that are compared"
             )
-    return list(dict.fromkeys(name for rule in rules for name in rule.failing(comparison)))
+    return list(dict.fromkeys(name for rule in rules for name in rule.failures(comparison)))

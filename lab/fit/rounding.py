@@ -17,7 +17,7 @@ ROUNDING_HARMONICS, WAVE_HARMONICS = 16, 4  # of the saw-tooth
 LEAST_ROUNDING_DN = 1e-3
 
 
-def unrounded(variance: FloatArray | float) -> FloatArray:
+def variance_before_rounding(variance: FloatArray | float) -> FloatArray:
     """A variance before rounding, DN^2: less 1/12, and 0 below `HIDDEN_DN2`. A constant value half way between two
     codes has 1/4 after rounding.
     """
@@ -61,6 +61,6 @@ def variance_rounding_std(temporal: float, spatial: float) -> float:
     With temporal and spatial standard deviations s and t of normal values: (4 s^2 + 1 / pi^2) exp(-2 pi^2 (s^2 + t^2))
     cos(2 pi mean).
     """
-    true = unrounded(temporal)
+    true = variance_before_rounding(temporal)
     size = (4.0 * true + 1.0 / np.pi**2) * np.exp(-2.0 * np.pi**2 * (true + max(spatial, 0.0)))
     return float(size / np.sqrt(2.0))

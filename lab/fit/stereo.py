@@ -35,7 +35,7 @@ from lab.fit.geometry.bundle_adjustment import (
     board_pose,
     rms_px,
 )
-from lab.fit.geometry.calibration import listed
+from lab.fit.geometry.calibration import list_reasons
 from lab.fit.geometry.pinhole import (
     NAMES,
     cross_matrices,
@@ -87,7 +87,7 @@ def fit_stereo(
     pairs, or where no rig explains them.
     """
     shapes = tuple((recordings.camera(side).rows, recordings.camera(side).cols) for side in ("left", "right"))
-    return fit_pairs(paired_views(recordings, left, right), left, right, shapes, depths_mm)
+    return fit_pairs(pair_views(recordings, left, right), left, right, shapes, depths_mm)
 
 
 def fit_pairs(
@@ -104,9 +104,9 @@ def fit_pairs(
             f"{len(pairs)} poses of the board were found by both cameras, {MIN_PAIRS} are needed: capture charuco poses with "
             "both, under the same pose name",
         )
-    pairs, rejected = _numbered_alike(pairs, left, right)
+    pairs, rejected = _split_by_numbering(pairs, left, right)
     if len(pairs) < MIN_PAIRS:
-        raise NotDetermined("stereo", f"{len(pairs)} pairs can be used, {MIN_PAIRS} are needed{listed(rejected)}")
+        raise NotDetermined("stereo", f"{len(pairs)} pairs can be used, {MIN_PAIRS} are needed{list_reasons(rejected)}")
     while True:
         solution = solve_rig(pairs, left, right, shapes[0])
         of_pairs = [
@@ -125,13 +125,13 @@ def fit_pairs(
         raise NotDetermined(
             "stereo",
             f"no rig explains the pairs (rms {solution.rms_px:.1f} px, each camera alone {alone:.2f} px; worst: pose "
-            f"{pairs[worst].left.capture.pose}, {of_pairs[worst]:.1f} px{listed(rejected)}): check that equal poses are the same "
+            f"{pairs[worst].left.capture.pose}, {of_pairs[worst]:.1f} px{list_reasons(rejected)}): check that equal poses are the same "
             "pose of the board, that the rig was rigid, and that neither camera's frames are mirrored",
         )
     return _result(solution, pairs, shapes, depths_mm, tuple(rejected))
 
 
-def paired_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> list[StereoPair]:
+def pair_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> list[StereoPair]:
     """Views of both cameras with the same `pose`, in the order of the left camera; the first of each where a pose was
     repeated.
     """
@@ -162,7 +162,7 @@ def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
     return np.append(np.ones(8, dtype=bool), intrinsics_of_fit(fit)[8:] != 0.0)
 
 
-def _numbered_alike(
+def _split_by_numbering(
     pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit
 ) -> tuple[list[StereoPair], list[Skipped]]:
     """The pairs in which both cameras number the board from the same corner, and those in which they don't.

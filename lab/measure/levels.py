@@ -13,7 +13,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lab.fit.rounding import HIDDEN_DN2, QUANTISATION_DN2, rounding_std_dn, unrounded, variance_rounding_std
+from lab.fit.rounding import (
+    HIDDEN_DN2,
+    QUANTISATION_DN2,
+    rounding_std_dn,
+    variance_before_rounding,
+    variance_rounding_std,
+)
 from lab.formats.recording_set import DataSheet
 from sim.camera import Cfa
 from sim.sensor.mosaic import planes, step
@@ -358,7 +364,7 @@ class PlaneStatistics:
     @property
     def mean_rounding_std(self) -> float:
         """Standard deviation of `mean` by rounding, DN, which no averaging reduces."""
-        return float(rounding_std_dn(unrounded(self.spread)))
+        return float(rounding_std_dn(variance_before_rounding(self.spread)))
 
 
 @dataclass(frozen=True)

@@ -87,9 +87,9 @@ def test_the_last_to_leave_gives_them_back():
 
 def test_an_edge_is_measured_with_one(monkeypatch: pytest.MonkeyPatch):
     seen: list[set[int]] = []
-    measured = transfer_function.measured_mtf
+    measured = transfer_function.measure_mtf
     monkeypatch.setattr(
-        transfer_function, "measured_mtf", lambda *arguments: (seen.append(blas_threads()), measured(*arguments))[1]
+        transfer_function, "measure_mtf", lambda *arguments: (seen.append(blas_threads()), measured(*arguments))[1]
     )
     transfer_function.edge_mtf(np.asarray(edge(64, 5.0, 0.5)))
     assert seen == [{1}]

@@ -20,7 +20,7 @@ from lab.diagnose.measurements.repeatability import (
     repeated_levels,
     steady,
 )
-from lab.fit.rounding import unrounded
+from lab.fit.rounding import variance_before_rounding
 from lab.formats.results import NoiseFit
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -61,7 +61,9 @@ class NoiseGuess:
 
     def spread_dn2(self, signal_dn: FloatArray) -> FloatArray:
         """Variance (DN^2) of pixels at a signal before rounding: shot noise, read noise (0 where rounding hides it), PRNU."""
-        return np.asarray(self.gain * signal_dn + unrounded(self.read_dn**2) + (self.prnu * signal_dn) ** 2)
+        return np.asarray(
+            self.gain * signal_dn + variance_before_rounding(self.read_dn**2) + (self.prnu * signal_dn) ** 2
+        )
 
 
 def noise_guess(study: Study) -> NoiseGuess:

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline, RectBivariateSpline
 from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.psf.screen_kernel import area_drawn
+from lab.fit.psf.screen_kernel import draw_by_area
 from lab.fit.psf.screen_registration import ScreenWarp
 from sim.camera import CameraModel
 from sim.frame import screen_light
@@ -104,7 +104,7 @@ class Canvas:
             inside &= (middle > MARGIN_CELLS) & (middle < count - MARGIN_CELLS)
         inside[:MARGIN_PX] = inside[-MARGIN_PX:] = False
         inside[:, :MARGIN_PX] = inside[:, -MARGIN_PX:] = False
-        return Canvas(warp, window, np.asarray(area_drawn(target, cell_x, cell_y), float), inside)
+        return Canvas(warp, window, np.asarray(draw_by_area(target, cell_x, cell_y), float), inside)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -218,7 +218,7 @@ def _measured(
             for part in (step, step * SCALING):
                 field = _field(camera, points, moved + part)
                 there = np.linalg.lstsq(warp.basis(points).T, field.T, rcond=1e-12)[0].T
-                displaced = Canvas.of(target, warp.displaced(there), window)
+                displaced = Canvas.of(target, warp.displace(there), window)
                 tried.append((part, displaced, _LinearModel.of(study, displaced, channel, light, whole, turned, laid)))
             part, displaced, anew = min(tried, key=lambda one: one[2].left_rms(picture))
             if anew.left_rms(picture) >= design.left_rms(picture):
@@ -331,7 +331,7 @@ def _refined(
     scale = np.sqrt(np.mean(columns**2, axis=1))[:, None]
     columns = columns / scale
     step = np.linalg.lstsq(columns @ columns.T, columns @ (seen[window][mask] - picture), rcond=1e-12)[0] / scale[:, 0]
-    return warp.displaced(step[: 2 * len(terms)].reshape(2, -1))
+    return warp.displace(step[: 2 * len(terms)].reshape(2, -1))
 
 
 def _band_masks(canvas: Canvas) -> Iterator[tuple[tuple[float, float], float | None, NDArray[np.bool_]]]:

@@ -326,9 +326,9 @@ def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
             f"{rows} x {cols} squares and its dictionary is {capture.dictionary}",
         )
     if len(index) < (rows - 1) * (cols - 1):
-        index, points = _with_missing_corners(index, points, rows - 1, cols - 1, picture.shape)
+        index, points = _add_missing_corners(index, points, rows - 1, cols - 1, picture.shape)
     board = board_points(capture, index)
-    fitted, trusted, std_px = refined_corners(picture, points, board[:, :2], capture.square_mm, marker_mm, rows, cols)
+    fitted, trusted, std_px = refine_corners(picture, points, board[:, :2], capture.square_mm, marker_mm, rows, cols)
     if trusted.sum() < MIN_CORNERS:
         raise NotDetermined(
             "geometry",
@@ -371,7 +371,7 @@ def board_points(capture: CharucoCapture, index: NDArray[np.int64]) -> Array:
     )
 
 
-def _with_missing_corners(
+def _add_missing_corners(
     index: NDArray[np.int64], points: Array, rows: int, cols: int, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.int64], Array]:
     """Add the corners between markers that couldn't be read, where a homography and a quadratic correction predict
@@ -416,10 +416,10 @@ def _plain_corners(grey: NDArray[np.uint8], rows: int, cols: int) -> tuple[NDArr
             "geometry", f"no checkerboard of {rows} x {cols} inner corners found: all of it has to be in view"
         )
     grid = corners.reshape(rows, cols, 2).astype(float)
-    return np.arange(rows * cols), numbered(grid, grey if (rows + cols) % 2 else None)
+    return np.arange(rows * cols), order_grid(grid, grey if (rows + cols) % 2 else None)
 
 
-def numbered(grid: Array, grey: NDArray[np.uint8] | None = None) -> Array:
+def order_grid(grid: Array, grey: NDArray[np.uint8] | None = None) -> Array:
     """The points of a grid (rows, cols, 2) in the order of the board, (rows x cols, 2). `grey`: a checkerboard's picture, by whose dark
     first square it is numbered."""
     rows, cols = grid.shape[:2]
@@ -436,7 +436,7 @@ def numbered(grid: Array, grey: NDArray[np.uint8] | None = None) -> Array:
 def _dot_view(picture: Array, grey: NDArray[np.uint8], capture: CharucoCapture) -> BoardView:
     """The centres of a grid of dots."""
     rows, cols = capture.squares
-    points = numbered(dot_grid(grey, rows - 1, cols - 1))
+    points = order_grid(dot_grid(grey, rows - 1, cols - 1))
     index = np.arange((rows - 1) * (cols - 1))
     fits = dot_centres(picture, points, rows - 1, cols - 1)
     if fits.trusted.sum() < MIN_CORNERS:
@@ -462,7 +462,7 @@ def _first_square_is_dark(grey: NDArray[np.uint8], grid: Array) -> bool:
     return bool(level[even].mean() < level[~even].mean())
 
 
-def refined_corners(
+def refine_corners(
     picture: Array, points: Array, board: Array, square_mm: float, marker_mm: float, rows: int, cols: int
 ) -> CornerFits:
     """Corners (n, 2) fitted in the picture, at the pixels that no marker touches."""
@@ -536,7 +536,7 @@ def channel_corners(frame: NDArray[np.generic], cfa: Any, view: BoardView) -> di
                 fits = dot_centres(plane, guess, rows - 1, cols - 1, view.index)
             else:
                 marker_mm = float(capture.marker_mm or 0.0) if capture.has_markers else 0.0
-                fits = refined_corners(plane, guess, view.board_mm[:, :2], capture.square_mm, marker_mm, rows, cols)
+                fits = refine_corners(plane, guess, view.board_mm[:, :2], capture.square_mm, marker_mm, rows, cols)
             of_phases.append(CornerFits(2.0 * fits.points + [col, row], fits.trusted, 2.0 * fits.std_px))
         found[channel] = CornerFits(
             np.mean([fits.points for fits in of_phases], axis=0),

@@ -463,7 +463,7 @@ class BundleAdjustment:
         several = self.boards > 1
         return (*found, *(f"board {k + 1} {name}" if several else name for k in range(self.boards) for name in WARP))
 
-    def _placed(self, state: RigParameters) -> tuple[Array, Array, Array]:
+    def _place_corners(self, state: RigParameters) -> tuple[Array, Array, Array]:
         """All corners (n, 3): in the frame of their camera; rotated into that of camera 0; and placed in it."""
         rotated, placed = np.empty_like(self.flat), np.empty_like(self.flat)
         for observation, part in zip(self.observations, self.parts, strict=True):
@@ -480,7 +480,7 @@ class BundleAdjustment:
 
     def residuals(self, state: RigParameters) -> Array:
         """Seen less predicted (n, 2), px; infinite where a corner would be behind its camera."""
-        own = self._placed(state)[0]
+        own = self._place_corners(state)[0]
         if np.any(own[:, 2] <= 0) or not np.isfinite(own).all():
             return np.full_like(self.seen, np.inf)
         predicted = np.empty_like(self.seen)
@@ -491,7 +491,7 @@ class BundleAdjustment:
 
     def jacobian(self, state: RigParameters) -> tuple[Array, Array]:
         """Jacobian of the predictions by the shared parameters (n, 2, shared) and by the pose (n, 2, 6)."""
-        own, rotated, placed = self._placed(state)
+        own, rotated, placed = self._place_corners(state)
         count = len(own)
         shared = np.zeros((count, 2, self.size))
         by_point = np.empty((count, 2, 3))
@@ -528,7 +528,7 @@ class BundleAdjustment:
         rig = np.zeros(6 if self.cameras > 1 else 0)
         return np.concatenate([*free, rig, state.warps_mm.ravel()])
 
-    def _moved(self, state: RigParameters, shared: Array, poses: Array) -> RigParameters:
+    def _move(self, state: RigParameters, shared: Array, poses: Array) -> RigParameters:
         intrinsics, rotation, translation, warps = (
             state.intrinsics,
             state.rotation,
@@ -584,7 +584,7 @@ class BundleAdjustment:
             converged = False
             while damping < 1e10:
                 shared, poses = _step(parts, damping)
-                tried = self._moved(state, shared, poses)
+                tried = self._move(state, shared, poses)
                 new = self.residuals(tried)
                 new_cost = self._cost(tried, new, noise_px)
                 if new_cost <= cost:
@@ -643,7 +643,7 @@ class BundleAdjustment:
         if self.only_poses:
             return np.zeros((0, 0))
         matrix, mixed, own, _, _ = self._normal(state, residual, noise_px)
-        reduced = _reduced(matrix, mixed, own)[0]
+        reduced = _eliminate_poses(matrix, mixed, own)[0]
         scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
         try:
             inverse = np.linalg.inv(reduced / np.outer(scale, scale))
@@ -652,7 +652,7 @@ class BundleAdjustment:
         return noise_px**2 * 0.5 * (inverse + inverse.T) / np.outer(scale, scale)
 
 
-def _reduced(matrix: Array, mixed: Array, own: Array) -> tuple[Array, Array]:
+def _eliminate_poses(matrix: Array, mixed: Array, own: Array) -> tuple[Array, Array]:
     """Schur complement of the poses, and mixed own^-1."""
     ridge = 1e-12 * np.einsum("pkk->pk", own)
     gain = np.linalg.solve(own + ridge[:, :, None] * np.eye(6), np.swapaxes(mixed, 1, 2))  # (poses, 6, shared)
@@ -666,7 +666,7 @@ def _step(parts: tuple[Array, ...], damping: float) -> tuple[Array, Array]:
     if not len(right):
         return right, np.linalg.solve(damped_own, own_right[:, :, None])[:, :, 0]
     damped = matrix + damping * np.diag(np.diag(matrix))
-    reduced, gain = _reduced(damped, mixed, damped_own)
+    reduced, gain = _eliminate_poses(damped, mixed, damped_own)
     scale = np.sqrt(np.maximum(np.diag(damped), 1e-300))
     reduced_right = right - np.einsum("psk,pk->s", gain, own_right)
     shared = np.linalg.lstsq(reduced / np.outer(scale, scale), reduced_right / scale, rcond=1e-14)[0] / scale

@@ -165,7 +165,7 @@ class Calibration:
     @property
     def points(self) -> Array:
         """Corners (n, 3), mm, in the frame of the camera; they determine the motion that two calibrations imply."""
-        return placed_points(self.views, self.solution)
+        return points_in_camera(self.views, self.solution)
 
     def projection_std(self, image: Array, distance_mm: float | None) -> Array:
         """Standard deviation (n,), px, of projecting to `image` (n, 2) from a distance; NaN where nothing projects."""
@@ -173,7 +173,7 @@ class Calibration:
         return projection_std(self.intrinsics, self.covariance, self.points, points)
 
 
-def placed_points(views: Sequence[BoardView], solution: Solution, camera: int = 0) -> Array:
+def points_in_camera(views: Sequence[BoardView], solution: Solution, camera: int = 0) -> Array:
     """Corners (n, 3), mm, of `views`, one pose each, in the frame of the first camera."""
     state = solution.state
     return np.concatenate(
@@ -231,7 +231,8 @@ def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side:
     while True:
         if len(kept) < MIN_VIEWS:
             raise NotDetermined(
-                "geometry", f"{len(kept)} views of the board can be used, {MIN_VIEWS} are needed{listed(rejected)}"
+                "geometry",
+                f"{len(kept)} views of the board can be used, {MIN_VIEWS} are needed{list_reasons(rejected)}",
             )
         solution = calibrate(kept, shape)
         outlying = _outlying_view(kept, solution)
@@ -302,7 +303,7 @@ def _corner_reason(numbers: list[tuple[int, float]], noise_px: float) -> str:
     return f"corners {which} lie off, where the others have a standard deviation of {noise_px:.3f} px"
 
 
-def listed(rejected: Sequence[Skipped]) -> str:
+def list_reasons(rejected: Sequence[Skipped]) -> str:
     """What was left out and why, for the end of a sentence: the first three, and how many more."""
     more = f"; and {len(rejected) - MOST_LISTED} more" if len(rejected) > MOST_LISTED else ""
     return "".join(f"; {one.step}: {one.reason}" for one in rejected[:MOST_LISTED]) + more
@@ -320,7 +321,7 @@ def _check_board(
         raise NotDetermined(
             "geometry",
             f"no camera explains the corners (rms {solution.rms_px:.1f} px, worst: {views[worst].capture.id}, "
-            f"{of_views[worst]:.1f} px{listed(rejected)}): check that the board has {capture.squares[0]} x "
+            f"{of_views[worst]:.1f} px{list_reasons(rejected)}): check that the board has {capture.squares[0]} x "
             f"{capture.squares[1]} squares, that it is flat, and that it didn't move while it was exposed",
         )
 
@@ -344,8 +345,8 @@ def _check_focal_length(solution: Solution) -> None:
 
 
 def cross_validation(calibration: Calibration) -> CrossValidation | None:
-    """`halves_differ` as a result: the error of the model apart from that of the sampling."""
-    found = halves_differ(calibration)
+    """`compare_halves` as a result: the error of the model apart from that of the sampling."""
+    found = compare_halves(calibration)
     if found is None:
         return None
     whole, sampling_px = found
@@ -360,7 +361,7 @@ def cross_validation(calibration: Calibration) -> CrossValidation | None:
     )
 
 
-def halves_differ(calibration: Calibration) -> tuple[Difference, float] | None:
+def compare_halves(calibration: Calibration) -> tuple[Difference, float] | None:
     """Difference of two cameras, each calibrated from every other view, at the places of the corners, and its expected
     rms, px, by the independent noise of the corners alone; None where the halves are too small.
 
@@ -392,7 +393,7 @@ def halves_differ(calibration: Calibration) -> tuple[Difference, float] | None:
     return whole, sampling.expected_px
 
 
-def widened(calibration: Calibration, validation: CrossValidation | None) -> Calibration:
+def widen_covariance(calibration: Calibration, validation: CrossValidation | None) -> Calibration:
     """The calibration, with its covariance multiplied by the square of what its halves differ by beyond their
     uncertainties; as it is where they agree.
     """

@@ -66,7 +66,7 @@ def distortion_of(intrinsics: Array) -> Array:
     return np.asarray(intrinsics[4:] if np.any(intrinsics[9:]) else intrinsics[4:9])
 
 
-def _distorted(x: Array, y: Array, k: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _distort(x: Array, y: Array, k: Array) -> tuple[Array, Array, Array, Array, Array]:
     """Distorted x, y; g; dg/dr2; and the denominator of g."""
     r2 = x * x + y * y
     above = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
@@ -93,7 +93,7 @@ def _distortion_jacobian(x: Array, y: Array, k: Array, g: Array, derivative: Arr
 def project(points: Array, intrinsics: Array) -> Array:
     """Project points (n, 3) in the frame of the camera to px (n, 2)."""
     x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
-    xd, yd = _distorted(x, y, intrinsics[4:])[:2]
+    xd, yd = _distort(x, y, intrinsics[4:])[:2]
     return np.column_stack([intrinsics[0] * xd + intrinsics[2], intrinsics[1] * yd + intrinsics[3]])
 
 
@@ -103,7 +103,7 @@ def project_with_jacobian(points: Array, intrinsics: Array) -> tuple[Array, Arra
     k = intrinsics[4:]
     depth = points[:, 2]
     x, y = points[:, 0] / depth, points[:, 1] / depth
-    xd, yd, g, derivative, below = _distorted(x, y, k)
+    xd, yd, g, derivative, below = _distort(x, y, k)
     xx, cross, yy = _distortion_jacobian(x, y, k, g, derivative)
     by_point = np.empty((len(points), 2, 3))
     by_point[:, 0, 0], by_point[:, 0, 1] = fx * xx / depth, fx * cross / depth
@@ -130,13 +130,13 @@ def unproject(image: Array, intrinsics: Array) -> Array:
     x, y = wanted_x.copy(), wanted_y.copy()
     with np.errstate(all="ignore"):
         for _ in range(20):
-            xd, yd, g, derivative, _ = _distorted(x, y, k)
+            xd, yd, g, derivative, _ = _distort(x, y, k)
             xx, cross, yy = _distortion_jacobian(x, y, k, g, derivative)
             determinant = xx * yy - cross * cross
             miss_x, miss_y = xd - wanted_x, yd - wanted_y
             x = x - (yy * miss_x - cross * miss_y) / determinant
             y = y - (xx * miss_y - cross * miss_x) / determinant
-        xd, yd, g, derivative, _ = _distorted(x, y, k)
+        xd, yd, g, derivative, _ = _distort(x, y, k)
         xx, cross, yy = _distortion_jacobian(x, y, k, g, derivative)
         # A distortion that folds maps two rays to one pixel; the valid one has a positive Jacobian
         valid = (np.hypot(xd - wanted_x, yd - wanted_y) < 1e-9) & (xx * yy - cross * cross > 0) & (xx > 0)

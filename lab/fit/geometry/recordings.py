@@ -24,8 +24,8 @@ from lab.fit.geometry.calibration import (
     calibrate_robustly,
     cross_validation,
     first_view_of_boards,
-    listed,
-    widened,
+    list_reasons,
+    widen_covariance,
 )
 from lab.fit.geometry.pinhole import (
     COUNT,
@@ -79,8 +79,8 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
         trusted = np.concatenate([fits[channel].trusted & fits["G"].trusted for fits in corners])
         at = np.concatenate([fits[channel].points for fits in corners])
         green = np.concatenate([fits["G"].points for fits in corners])
-        own = _fitted_shift(at - seen, jacobian, trusted)
-        beside = _fitted_shift(at - green, jacobian, trusted) if channel != "G" else None
+        own = _fit_shift(at - seen, jacobian, trusted)
+        beside = _fit_shift(at - green, jacobian, trusted) if channel != "G" else None
         if own is None or (channel != "G" and beside is None):
             continue
         theta = intrinsics + parameters @ own[0]
@@ -119,7 +119,7 @@ def _colour_parameters(intrinsics: Array) -> Array:
     return parameters
 
 
-def _fitted_shift(shift: Array, jacobian: Array, trusted: NDArray[np.bool_]) -> tuple[Array, Array, float, int] | None:
+def _fit_shift(shift: Array, jacobian: Array, trusted: NDArray[np.bool_]) -> tuple[Array, Array, float, int] | None:
     """Robust least squares of shift (n, 2) = jacobian (n, 2, p) values: Huber's, with the spread of the residuals by their median.
 
     Corners have errors by the demosaicing that aren't normal. Cut off at some residual, another set of them counts in each session, and
@@ -167,7 +167,7 @@ def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
     shape = (camera.rows, camera.cols)
     if len(views) < MIN_VIEWS:
         raise NotDetermined(
-            "geometry", f"{len(views)} views of the board can be used, {MIN_VIEWS} are needed{listed(missed)}"
+            "geometry", f"{len(views)} views of the board can be used, {MIN_VIEWS} are needed{list_reasons(missed)}"
         )
     calibration = calibrate_robustly(views, shape, side)
     channels: tuple[ChannelGeometry, ...] = ()
@@ -184,7 +184,7 @@ def geometry_result(
 ) -> GeometryFit:
     """A calibration with its errors as a result; `missed`: captures in which no board was found."""
     validation = cross_validation(calibration)
-    calibration = widened(calibration, validation)
+    calibration = widen_covariance(calibration, validation)
     solution = calibration.solution
     noises = [view.std_px for view in calibration.views if view.std_px is not None]
     of_pictures = float(np.sqrt(np.mean(np.concatenate(noises) ** 2))) if noises else None

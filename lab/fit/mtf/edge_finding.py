@@ -56,7 +56,7 @@ class EdgeCurve:
         """Coefficients (EDGE_ORDER,) of the slope of the edge, px across per px along."""
         return self.poly[1:] * ORDERS / self.half_length
 
-    def shifted(self, change: Array) -> EdgeCurve:
+    def shift(self, change: Array) -> EdgeCurve:
         """The edge with `change` (EDGE_ORDER + 1,) added to its coefficients."""
         return EdgeCurve(self.transposed, self.centre, self.half_length, self.poly + change, self.sign)
 
@@ -193,7 +193,7 @@ class Samples:
         return Samples(along, across, value, plane, planes[0].step, len(planes))
 
 
-def levelled(samples: Samples, distance: Array, inner: float, outer: float) -> tuple[Array, float, float]:
+def level_planes(samples: Samples, distance: Array, inner: float, outer: float) -> tuple[Array, float, float]:
     """Values with the mean levels of each plane mapped to 0 (dark) and 1 (light); and these two levels, averaged over
     the planes.
 
@@ -272,7 +272,7 @@ def first_line(plane: Plane) -> EdgeCurve:
     return EdgeCurve(transposed, centre, half_length, poly, sign)
 
 
-def refined_edge(samples: Samples, edge: EdgeCurve, widest: float) -> EdgeCurve:
+def refine_edge(samples: Samples, edge: EdgeCurve, widest: float) -> EdgeCurve:
     """The polynomial of the edge by Gauss-Newton on the profile, coarse and wide first.
 
     Model: v = E(d), d the distance from the edge, E a free spline profile; dE/d(coefficients) = -E'(d) sign powers /
@@ -299,7 +299,7 @@ def refined_edge(samples: Samples, edge: EdgeCurve, widest: float) -> EdgeCurve:
             kept = kept[chance[kept] < 8000.0 / len(kept)]
         part = samples.where(kept)
         distance, foot, slope = edge.distance(part.along, part.across)
-        value, _, _ = levelled(part, distance, 0.6 * limit, 1.5 * limit)
+        value, _, _ = level_planes(part, distance, 0.6 * limit, 1.5 * limit)
         count = int(np.ceil(limit / spacing))
         spline = Spline(np.arange(-count, count + 1) * (limit / count))
         placed = SortedSamples.of(spline, distance)
@@ -326,7 +326,7 @@ def refined_edge(samples: Samples, edge: EdgeCurve, widest: float) -> EdgeCurve:
         offset = half_way_px(grid, spline.values(esf, grid))
         change[0] = edge.sign * offset * tilt
         change = np.clip(change, -0.25 * limit, 0.25 * limit)
-        edge = edge.shifted(np.concatenate([change, np.zeros(EDGE_ORDER - terms)]))
+        edge = edge.shift(np.concatenate([change, np.zeros(EDGE_ORDER - terms)]))
     return edge
 
 
@@ -335,7 +335,7 @@ def angle_std_deg(
 ) -> float:
     """Standard deviation of the angle of the edge, deg, for noise of given `variance` (n,) of the samples.
 
-    Error propagation through the unweighted least squares of `refined_edge`. `steepness` (n,): derivative of the
+    Error propagation through the unweighted least squares of `refine_edge`. `steepness` (n,): derivative of the
     profile per px; `distance`, `foot`: see `EdgeCurve.distance`; `gradients`: see `illumination_gradients`.
     """
     near = np.abs(distance) < REFINED_PX

@@ -1,6 +1,6 @@
 """The MTF of an edge: the edge profile, its transfer function, and `edge_mtf`, the whole estimator on a region.
 
-The profile is fitted by weighted least squares of the spline and the illumination (`measured_mtf`), in passes, since
+The profile is fitted by weighted least squares of the spline and the illumination (`measure_mtf`), in passes, since
 the noise levels and the gradients depend on it. The transfer function is that of the spline, with its covariance, and
 the frequencies at which it falls to 50 % and 10 % (`edge_result`). Regions that can't be used are refused.
 """
@@ -27,8 +27,8 @@ from lab.fit.mtf.edge_finding import (
     first_line,
     half_way_px,
     illumination_gradients,
-    levelled,
-    refined_edge,
+    level_planes,
+    refine_edge,
     refuse_unusable,
     usable_reach_px,
     widest_gap_px,
@@ -41,7 +41,7 @@ from lab.fit.mtf.edge_spread import (
     Spline,
     posterior,
 )
-from lab.fit.rounding import rounding_std_dn, rounding_waves_dn, unrounded
+from lab.fit.rounding import rounding_std_dn, rounding_waves_dn, variance_before_rounding
 from lab.one_blas_thread import one_blas_thread
 
 Array = NDArray[np.floating[Any]]
@@ -303,14 +303,14 @@ class Quantisation:
         """
         out = np.zeros((geometry.spline.size,) * 2)
         if self.size:
-            spread = unrounded(np.asarray(self.frames * variance / self.size**2, float))
+            spread = variance_before_rounding(np.asarray(self.frames * variance / self.size**2, float))
             for wave in rounding_waves_dn(np.asarray(level / self.size, float), spread):
                 change = self.size * geometry.coefficients(wave)
                 out += np.outer(change, change)
         return out
 
 
-def measured_mtf(
+def measure_mtf(
     planes: Sequence[Plane],
     near: Samples,
     edge: EdgeCurve,
@@ -334,7 +334,7 @@ def measured_mtf(
     kept = np.abs(distance) < outer
     samples, distance, foot = samples.where(kept), distance[kept], foot[kept]
     inner = min(0.6 * outer, core + TAIL_REACH_PX)
-    value, dark_level, light_level = levelled(samples, distance, inner, outer)
+    value, dark_level, light_level = level_planes(samples, distance, inner, outer)
     contrast = light_level - dark_level
     offset = max(dark_level, 0.0) / contrast  # the gradient multiplies the dark level, too
 
@@ -423,7 +423,7 @@ def _knots_px(width: float, reach: float, step: int) -> Array:
 def _blur_width_px(samples: Samples, distance: Array, reach: float) -> float:
     """Standard deviation of the Gaussian with the 10 % to 90 % distance of the profile, px."""
     kept = np.abs(distance) < reach
-    value, _, _ = levelled(samples.where(kept), distance[kept], 0.75 * reach, reach)
+    value, _, _ = level_planes(samples.where(kept), distance[kept], 0.75 * reach, reach)
     count = max(int(reach / 0.5), 4)
     spline = Spline(np.arange(-count, count + 1) * reach / count)
     placed = SortedSamples.of(spline, distance[kept])
@@ -520,13 +520,13 @@ def planes_mtf(
     edge = first_line(planes[0])
     widest = usable_reach_px(planes, edge)
     near = Samples.near(planes, edge, min(max(16.0, 3.0 * planes[0].step), widest) + 8.0)
-    edge = refined_edge(near, edge, widest)
+    edge = refine_edge(near, edge, widest)
     gap = widest_gap_px(near, edge, np.ones(len(near.value), dtype=bool))
     if gap > WIDEST_GAP_PX:
         raise NotDetermined(
             "mtf",
             f"the samples lie {gap:.1f} px apart across the edge: turn the edge by 2 deg or more, or take a longer one",
         )
-    return measured_mtf(
+    return measure_mtf(
         planes, near, edge, usable_reach_px(planes, edge), frequency, noise_std, Quantisation(code, frames)
     )

@@ -179,7 +179,7 @@ def on_simplex(quadratic: Array, linear: Array, start: Array, solves: int = MOST
         x, momentum = new, following
         if done:
             break
-    return _polished(q, c, x, solves)
+    return _polish(q, c, x, solves)
 
 
 def _project_on_simplex(x: Array) -> Array:
@@ -189,7 +189,7 @@ def _project_on_simplex(x: Array) -> Array:
     return np.asarray(np.maximum(x - excess[np.flatnonzero(ordered > excess)[-1]], 0.0))
 
 
-def _polished(q: Array, c: Array, x: Array, solves: int) -> Array:
+def _polish(q: Array, c: Array, x: Array, solves: int) -> Array:
     """Exact optimum from a nearby point by block principal pivoting (Portugal, Judice and Vicente 1994).
 
     Solve on the support, then exchange all elements that violate the optimality conditions. Where this stops to gain,
@@ -253,14 +253,14 @@ class KernelPrior:
         envelope = self.strength * self.envelope
         return np.asarray(inverse / np.outer(envelope, envelope))
 
-    def whitened(self, information: Array) -> Array:
+    def whiten(self, information: Array) -> Array:
         """R^T information R, (k, k), where covariance = R R^T."""
         power, vectors = self._eigen()
         envelope = self.strength * self.envelope
         inner = _both_axes(vectors, information * np.outer(envelope, envelope))
         return np.asarray(inner * np.sqrt(np.outer(power, power)))
 
-    def whitened_right(self, weighted: Array) -> Array:
+    def whiten_right(self, weighted: Array) -> Array:
         """R^T weighted, (k,)."""
         power, vectors = self._eigen()
         scaled = (self.strength * self.envelope * weighted).reshape(self.support, self.support)
@@ -268,7 +268,7 @@ class KernelPrior:
 
     def posterior(self, information: Array) -> Array:
         """Covariance (k, k) of the kernel, given the data and that its sum is 1."""
-        factor = _cholesky_of_one_more(self.whitened(information))
+        factor = _cholesky_of_one_more(self.whiten(information))
         lower, failed = linalg.lapack.dpotri(factor, lower=1, overwrite_c=1)
         if failed:
             raise linalg.LinAlgError("the information of a kernel isn't positive definite")
@@ -332,7 +332,7 @@ def most_likely_prior(
         if at not in tried:
             if at[0] not in unit_problem:
                 unit = KernelPrior(envelope, PRIOR_LENGTHS_PX[at[0]], 1.0)
-                unit_problem[at[0]] = unit.whitened(information), unit.whitened_right(weighted)
+                unit_problem[at[0]] = unit.whiten(information), unit.whiten_right(weighted)
             prior = KernelPrior(envelope, PRIOR_LENGTHS_PX[at[0]], PRIOR_STRENGTHS[at[1]] * top)
             inner, right = unit_problem[at[0]]
             tried[at] = log_likelihood(inner * prior.strength**2, right * prior.strength), prior
@@ -447,7 +447,7 @@ def solve_kernel(
     )
 
 
-def displaced(picture: Array, field: Array) -> Array:
+def displace(picture: Array, field: Array) -> Array:
     """`picture` (rows, cols) read at the place of each pixel plus `field` (2, rows, cols), px, by splines of order
     5.
     """
@@ -484,7 +484,7 @@ def displacement(predicted: Array, seen: Array, border: int, start: Array | None
     ]
     precision = precisions[0]
     for iteration in range(2):
-        moved = displaced(predicted, field)
+        moved = displace(predicted, field)
         residual = (seen - moved)[inner]
         noise2 = float(np.mean(residual**2))
         gradients = [np.gradient(moved, axis=axis)[inner] for axis in (0, 1)]
@@ -585,10 +585,10 @@ def estimate_kernel(
     field = displacement(predicted, b, support // 2) if register else None
     if field is not None:
         # Gauss-Newton: the Jacobian by the kernel is the displaced target
-        carried = displaced(u, field)
+        carried = displace(u, field)
         normal = normal_equations(carried, b, support)
         for step in range(DISPLACEMENT_STEPS):
-            moved = displaced(predicted, field)
+            moved = displace(predicted, field)
             linear = b - moved + fftconvolve(carried, kernel, mode="same")
             right = normal_equations_right(carried, linear, support)
             normal = replace(normal, right=right[0], power=right[1])

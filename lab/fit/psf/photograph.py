@@ -44,7 +44,7 @@ class PhotographedKernel:
 
 
 @one_blas_thread
-def photographed_kernel(
+def estimate_from_photograph(
     photo: ArrayLike,
     pattern: NDArray[np.uint8],
     support_px: int = 5,
@@ -69,14 +69,14 @@ def photographed_kernel(
     seen, quad = seen[first[1] : last[1], first[0] : last[0]], quad - first
     orientations = [np.roll(quad, orientation, axis=0) for orientation in range(4 if corners is None else 1)]
     rough = [
-        _aligned(seen, target, ScreenWarp.of_corners(orientation, target.shape), (2.5, 1.5))
+        _align(seen, target, ScreenWarp.of_corners(orientation, target.shape), (2.5, 1.5))
         for orientation in orientations
     ]
     warp, _ = max(rough, key=lambda found: found[1])
-    warp, correlation = _aligned(seen, target, warp, (1.0, 0.7, 0.5))
+    warp, correlation = _align(seen, target, warp, (1.0, 0.7, 0.5))
     if correlation < LEAST_CORRELATION:
         raise NotDetermined("psf", f"the photograph doesn't show the pattern (correlation {max(correlation, 0.0):.2f})")
-    by_box = _explained_by_pixel_box(seen, target, warp)
+    by_box = _share_of_pixel_box(seen, target, warp)
     light = seen
     for _ in range(ROUNDS):
         drawn = DrawnPattern.of(light, target, warp, [(0, 0)], 1, support_px, oversample)
@@ -84,23 +84,23 @@ def photographed_kernel(
         if light is seen:
             predicted = ndimage.gaussian_filter(drawn.picture, 0.6 * oversample)
         predicted = predicted[oversample * drawn.row, oversample * drawn.col]
-        dark_level, contrast = _fitted_levels(seen[at], predicted, *at, seen.shape)
+        dark_level, contrast = _fit_levels(seen[at], predicted, *at, seen.shape)
         light = (seen - dark_level) / contrast
         drawn = replace(drawn, value=light[at])
         estimate = solve_kernel(drawn.normal(), drawn.support, outside=True, rounds=1)
-        predicted = drawn.blurred(estimate)
-        warp = drawn.refined(estimate)
+        predicted = drawn.blur(estimate)
+        warp = drawn.refine_warp(estimate)
     drawn = DrawnPattern.of(light, target, warp, [(0, 0)], 1, support_px, oversample)
     estimate = solve_kernel(drawn.normal(), drawn.support, outside=True)
     described = screen_kernel(drawn, "Y", estimate)
     at = (drawn.row, drawn.col)
-    model = (dark_level + contrast * drawn.blurred(estimate)[::oversample, ::oversample])[at]
+    model = (dark_level + contrast * drawn.blur(estimate)[::oversample, ::oversample])[at]
     return PhotographedKernel(
         kernel=described.kernel,
         kernel_std=described.kernel_std,
         fine=estimate,
         oversample=oversample,
-        warp=warp.moved(first),
+        warp=warp.shift_origin(first),
         explained=1.0 - float(np.sum((seen[at] - model) ** 2) / np.sum((seen[at] - seen[at].mean()) ** 2)),
         explained_by_box=by_box,
         samples=len(drawn.row),
@@ -131,7 +131,7 @@ def busiest_quadrilateral(picture: Array) -> Array:
     return np.asarray(np.roll(ordered, -int(np.argmin(ordered.sum(axis=1))), axis=0), dtype=float)
 
 
-def _fitted_levels(
+def _fit_levels(
     seen: Array, predicted: Array, row: NDArray[np.int64], col: NDArray[np.int64], shape: tuple[int, ...]
 ) -> tuple[Array, Array]:
     """Dark level and contrast, (rows, cols), as planes in the frame, by least squares of seen = dark level + contrast
@@ -150,7 +150,7 @@ def _fitted_levels(
     return dark_level, np.where(contrast > 0.0, contrast, np.nan)
 
 
-def _aligned(
+def _align(
     seen: Array, target: NDArray[np.uint8], warp: ScreenWarp, blurs_px: Sequence[float]
 ) -> tuple[ScreenWarp, float]:
     """The warp improved by Gauss-Newton on the picture blurred by ever less, and the correlation at the last step."""
@@ -175,11 +175,11 @@ def _aligned(
             ]
             change = np.zeros((2, len(warp.displacement[0])))
             change[:, : len(terms)] = np.clip(step, -blur, blur).reshape(2, -1)
-            warp = warp.displaced(change)
+            warp = warp.displace(change)
     return warp, correlation
 
 
-def _explained_by_pixel_box(seen: Array, target: NDArray[np.uint8], warp: ScreenWarp) -> float:
+def _share_of_pixel_box(seen: Array, target: NDArray[np.uint8], warp: ScreenWarp) -> float:
     """Share of the variance that the pattern averaged over the square of a pixel explains, with free levels."""
     drawn = DrawnPattern.of(seen, target, warp, [(0, 0)], 1, 1, 2)
     pixel = ndimage.correlate1d(drawn.picture, [0.25, 0.5, 0.25], axis=0)

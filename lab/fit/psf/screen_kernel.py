@@ -114,7 +114,7 @@ class DrawnPattern:
         at = warp.cells(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
         fine_y, fine_x = np.arange(oversample * rows) / oversample, np.arange(oversample * cols) / oversample
         cell_x, cell_y = (RectBivariateSpline(y, x, at[:, :, k])(fine_y, fine_x) for k in (0, 1))
-        picture = area_drawn(target, cell_x, cell_y)
+        picture = draw_by_area(target, cell_x, cell_y)
         # Take out the squares of the drawing and of the grid of the kernel, a sample each
         taps = symmetric_taps(lambda f: np.sinc(f / oversample) ** -2, 0.6, oversample, 2)
         for axis in (0, 1):
@@ -177,7 +177,7 @@ class DrawnPattern:
             right += value @ design
         return NormalEquations(gram, right, float(self.value @ self.value), len(self.row))
 
-    def blurred(self, estimate: KernelEstimate) -> Array:
+    def blur(self, estimate: KernelEstimate) -> Array:
         """The drawing blurred by the estimate, on its own samples."""
         from scipy.signal import fftconvolve  # here: the library takes a while to load
 
@@ -186,11 +186,11 @@ class DrawnPattern:
             + estimate.outside * self.surroundings
         )
 
-    def refined(self, estimate: KernelEstimate) -> ScreenWarp:
+    def refine_warp(self, estimate: KernelEstimate) -> ScreenWarp:
         """The warp after one Gauss-Newton step of its displacement, without a common shift, which belongs to the
         kernel.
         """
-        blurred, at = self.blurred(estimate), (self.oversample * self.row, self.oversample * self.col)
+        blurred, at = self.blur(estimate), (self.oversample * self.row, self.oversample * self.col)
         down, across = (np.gradient(blurred, 1.0 / self.oversample, axis=axis)[at] for axis in (0, 1))
         residual = self.value - blurred[at]
         terms = self.warp.basis(np.column_stack([self.col, self.row]).astype(float))[1:]
@@ -200,10 +200,10 @@ class DrawnPattern:
         inlier = np.abs(residual) < 5.0 * np.sqrt(np.mean(residual**2))
         step = np.linalg.lstsq((columns * inlier) @ columns.T, (columns * inlier) @ residual, rcond=1e-10)[0]
         step = step.reshape(2, -1)
-        return self.warp.displaced(np.column_stack([-step @ mean, step]))
+        return self.warp.displace(np.column_stack([-step @ mean, step]))
 
 
-def area_drawn(target: Array, cell_x: Array, cell_y: Array) -> Array:
+def draw_by_area(target: Array, cell_x: Array, cell_y: Array) -> Array:
     """Mean of `target` (cells) over squares the size of a sample about the points `cell_x`, `cell_y`; dark outside.
 
     The squares are aligned with the cells: the error is of second order in their rotation. A square may hold any
@@ -285,20 +285,20 @@ def measure_field(
     local: list[ScreenKernel] = []
     size = support_px
 
-    def drawn_for(channel: str) -> DrawnPattern:
+    def draw_for(channel: str) -> DrawnPattern:
         return DrawnPattern.of(
             pictures.bernoulli, pictures.bernoulli_target, warp, places[channel], step, size, oversample
         )
 
     for channel in (reference, *(name for name in places if name != reference)):
         for _ in range(REGISTRATION_STEPS if channel == reference else 1):
-            drawn = drawn_for(channel)
+            drawn = draw_for(channel)
             estimate = solve_kernel(drawn.normal(), drawn.support, outside=True, rounds=1)
             if size == support_px and _rim_share(estimate.kernel, oversample) > RIM_SHARE:
                 size = 2 * support_px - 1
                 continue
-            warp = drawn.refined(estimate)
-        drawn = drawn_for(channel)
+            warp = drawn.refine_warp(estimate)
+        drawn = draw_for(channel)
         whole = solve_kernel(drawn.normal(), drawn.support, outside=True)
         found[channel] = screen_kernel(drawn, channel, whole)
         if channel == reference and patches > 1:

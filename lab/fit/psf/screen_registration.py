@@ -147,12 +147,12 @@ class ScreenWarp:
         moved = points + (self.displacement @ self.basis(points)).T
         return np.asarray(cv2.perspectiveTransform(moved[:, None, :].astype(np.float64), self.homography)[:, 0])
 
-    def moved(self, origin: Array) -> ScreenWarp:
+    def shift_origin(self, origin: Array) -> ScreenWarp:
         """The same map for a picture of which this one is the part that begins at `origin`, (x, y)."""
         shift = np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, 1.0]])
         return replace(self, homography=self.homography @ shift, centre=self.centre + origin)
 
-    def displaced(self, change: Array) -> ScreenWarp:
+    def displace(self, change: Array) -> ScreenWarp:
         """The map with `change` (2, terms) added to the displacement."""
         return replace(self, displacement=self.displacement + change)
 
@@ -178,7 +178,7 @@ def register(
         cell_px = float(np.sqrt(seen.sum() / checkerboard_target.size))
     square_px = cell_px * float(rows[1] - rows[0])
     picture = np.where(seen, checkerboard, 0.0)
-    points, grid, across, down = _numbered_corners(picture, seen, square_px)
+    points, grid, across, down = _number_corners(picture, seen, square_px)
     half = np.full(len(points), float(np.clip(0.4 * square_px, 2.5, 9.0)))
     fitted, trusted, _ = fit_corners(picture, points, across, down, half)
     points, grid = fitted[trusted], grid[trusted]
@@ -186,8 +186,8 @@ def register(
         raise NotDetermined(
             "psf", f"{len(points)} corners of the checkerboard found, {MIN_CORNERS} needed: focus the screen better"
         )
-    cells = _matched_cells(points, grid, rows, cols, bernoulli, bernoulli_target)
-    return _fitted_warp(points, cells)
+    cells = _match_cells(points, grid, rows, cols, bernoulli, bernoulli_target)
+    return _fit_warp(points, cells)
 
 
 def target_corners(target: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -201,7 +201,7 @@ def target_corners(target: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArra
     return rows, cols
 
 
-def _numbered_corners(
+def _number_corners(
     picture: Array, seen: NDArray[np.bool_], square_px: float
 ) -> tuple[Array, NDArray[np.int64], Array, Array]:
     """Corners numbered by their steps along two directions: points (n, 2), steps (n, 2), and the two step vectors (n,
@@ -226,7 +226,7 @@ def _numbered_corners(
     best: dict[tuple[int, int], int] = {}
     vectors: dict[tuple[int, int], tuple[Array, Array]] = {}
     for seed in tree.query(points.mean(axis=0), k=min(6, len(points)))[1]:
-        numbered, steps = _grown_grid(points, tree, int(seed))
+        numbered, steps = _grow_grid(points, tree, int(seed))
         if len(numbered) > len(best):
             best, vectors = numbered, steps
         if len(best) > 0.7 * len(points):
@@ -240,7 +240,7 @@ def _numbered_corners(
     )
 
 
-def _grown_grid(
+def _grow_grid(
     points: Array, tree: spatial.cKDTree, seed: int
 ) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], tuple[Array, Array]]]:
     """Grid numbers grown from `seed` by nearest neighbours, and the step vectors at each number."""
@@ -270,7 +270,7 @@ def _grown_grid(
     return numbered, vectors
 
 
-def _matched_cells(
+def _match_cells(
     points: Array,
     grid: NDArray[np.int64],
     rows: NDArray[np.int64],
@@ -320,7 +320,7 @@ def _matched_cells(
     return matched
 
 
-def _fitted_warp(points: Array, cells: Array) -> ScreenWarp:
+def _fit_warp(points: Array, cells: Array) -> ScreenWarp:
     """Homography and cubic displacement through the corners, without outliers beyond 5 standard deviations."""
     used = np.isfinite(cells[:, 0])
     points, cells = points[used], cells[used]

@@ -25,7 +25,7 @@ LOCAL_LENGTH_NM = 15.0  # of the local departures
 STATED_DIGITS = 1e-3  # of the maximum: precision of a stated curve
 
 
-def solved_with_maker(
+def solve_with_maker(
     wave: FloatArray, signals: Sequence[ChannelSignals], maker: Sequence[FloatArray]
 ) -> list[Sensitivity]:
     """Sensitivities S_c = M_c (1 + a + b_c) + d_c, with the curves M_c of the maker.

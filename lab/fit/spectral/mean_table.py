@@ -44,7 +44,7 @@ from lab.fit.spectral.sensitivity import (
     joint_covariance,
     scatter_evidence,
     scatter_remarks,
-    solved_sensitivities,
+    solve_sensitivities,
     trapezoid_weights,
 )
 from lab.formats.foreign_text import TableRow, read_foreign_csv, remarks_on, table_rows
@@ -119,7 +119,7 @@ def bandwidth_evidence(
         order = np.argsort(middle)
         local = local_roughness(wave, np.interp(wave, middle[order], (one.value / level)[order]), average)
         local = np.zeros_like(wave) if local is None else local
-        std = one.scattered(scatter).std
+        std = one.with_scatter(scatter).std
         tried = []
         for floor in ROUGHNESS_FLOORS[1::2]:
             for fine in (0.0, fine_share):  # curves without fine structure aren't evidence for light that would hide it
@@ -185,7 +185,7 @@ def fit_mean_table(file: Path, camera: DataSheet) -> FitResult:
     remarks += _lines_off_their_names(lit)
     spectra = dict.fromkeys(name for row in lit if (name := row.cells.get(SPECTRUM)))
     remarks += remarks_on(file.parent, spectra)
-    spectral = _fitted(lights, camera.channels, remarks)
+    spectral = _fit_curves(lights, camera.channels, remarks)
     reason = "a table of channel means holds no frames"
     skipped = tuple(Skipped(step=step, reason=reason, side="left") for step in ("noise", "mtf", "psf", "geometry"))
     return FitResult(source=str(file), cameras={"left": CameraFit(spectral=spectral)}, skipped=skipped)
@@ -298,7 +298,7 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Tabl
     )
 
 
-def _fitted(lights: Sequence[_TableLight], channels: Sequence[str], remarks: list[str]) -> SpectralFit:
+def _fit_curves(lights: Sequence[_TableLight], channels: Sequence[str], remarks: list[str]) -> SpectralFit:
     by_channel = {c: [one for one in lights if one.channel == c] for c in channels}
     for channel, own in by_channel.items():
         if len({one.wavelength_nm for one in own}) < MIN_SPECTRA:
@@ -319,7 +319,7 @@ def _fitted(lights: Sequence[_TableLight], channels: Sequence[str], remarks: lis
 
     def solved_on(factor: float) -> tuple[FloatArray, FloatArray, Scatter]:
         wave, signals = signals_of(factor)
-        solved, scatter = solved_sensitivities(wave, signals, FINE_SHARE)
+        solved, scatter = solve_sensitivities(wave, signals, FINE_SHARE)
         at = np.stack([np.interp(out, wave, row) for row in np.eye(wave.size)], axis=1)
         curves = np.concatenate([at @ one.sensitivity for one in solved.values()])
         return curves, joint_covariance(at, solved), scatter

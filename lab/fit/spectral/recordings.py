@@ -16,7 +16,7 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
-from lab.fit.spectral.maker_curves import compare_curves, solved_with_maker
+from lab.fit.spectral.maker_curves import compare_curves, solve_with_maker
 from lab.fit.spectral.sensitivity import (
     COVERAGE_FACTOR,
     NEGATIVE_LIGHT,
@@ -26,7 +26,7 @@ from lab.fit.spectral.sensitivity import (
     different_spectra,
     joint_covariance,
     scatter_remarks,
-    solved_sensitivities,
+    solve_sensitivities,
     trapezoid_weights,
 )
 from lab.fit.weighted_lines import DarkLine, dark_line
@@ -377,12 +377,12 @@ def fit_spectral(recordings: RecordingSet, side: Side, noise: NoiseFit | None = 
         solved = dict(
             zip(
                 signals,
-                solved_with_maker(captures.wave, list(signals.values()), [maker[c] for c in signals]),
+                solve_with_maker(captures.wave, list(signals.values()), [maker[c] for c in signals]),
                 strict=True,
             )
         )
     else:
-        solved, scatter = solved_sensitivities(captures.wave, signals, FINE_SHARE)
+        solved, scatter = solve_sensitivities(captures.wave, signals, FINE_SHARE)
         captures.remarks += scatter_remarks(scatter)
     return _result(captures, solved, signals, maker_is_prior=bool(maker))
 

@@ -87,15 +87,15 @@ class ChannelSignals:
         """Whether lights saturate."""
         return self.limit.size > 0
 
-    def scattered(self, scatter: Scatter) -> ChannelSignals:
+    def with_scatter(self, scatter: Scatter) -> ChannelSignals:
         """The signals with the standard deviation that `scatter` adds."""
         return replace(self, std=np.hypot(self.std, scatter.total * self.value))
 
-    def unshared(self, scatter: Scatter) -> ChannelSignals:
+    def without_shared_error(self, scatter: Scatter) -> ChannelSignals:
         """The signals with `scatter`, and without the radiometer's repeatability, which the channels share."""
         square = self.std**2 - (RADIOMETER_RELATIVE_STD * self.value) ** 2
         least = LEAST_OWN_SHARE * float(np.max(np.abs(self.value)))
-        return replace(self, std=np.sqrt(np.maximum(square, least**2))).scattered(scatter)
+        return replace(self, std=np.sqrt(np.maximum(square, least**2))).with_scatter(scatter)
 
 
 def light_errors(signals: Mapping[str, ChannelSignals]) -> dict[str, FloatArray]:
@@ -249,7 +249,7 @@ def estimate_sensitivity(
     names = tuple(str(k) for k in range(value.size))
     none = np.zeros((0, wave.size)), np.zeros(0)
     one = ChannelSignals(light * trapezoid_weights(wave), value, std, names, *none)
-    return solved_sensitivities(wave, {"": one})[0][""]
+    return solve_sensitivities(wave, {"": one})[0][""]
 
 
 def _refuse_unusable(wave: FloatArray, light: FloatArray, value: FloatArray, std: FloatArray) -> None:
@@ -296,7 +296,7 @@ def trapezoid_weights(wave: FloatArray) -> FloatArray:
     return np.append(half, 0.0) + np.append(0.0, half)
 
 
-def solved_sensitivities(
+def solve_sensitivities(
     wave: FloatArray, signals: Mapping[str, ChannelSignals], fine_share: float = 0.0
 ) -> tuple[dict[str, Sensitivity], Scatter]:
     """The sensitivities of all channels, and the scatter of their signals beyond the stated standard deviations, which is in theirs.
@@ -323,20 +323,20 @@ def solved_sensitivities(
         }
         if settled:
             break
-        priors = {c: _prior(wave, s.scattered(scatter), fine_share) for c, s in signals.items()}
+        priors = {c: _prior(wave, s.with_scatter(scatter), fine_share) for c, s in signals.items()}
     if scatter.total > 0.0 and len(signals) > 1:
-        return _solved_together(wave, signals, priors, scatter), scatter
+        return _solve_together(wave, signals, priors, scatter), scatter
     errors = light_errors(signals)
     curves = {}
     for c, prior in priors.items():
-        own = signals[c].scattered(scatter)
+        own = signals[c].with_scatter(scatter)
         one = posterior_under_prior(wave, own.operator, own.value, own.std, prior)
         common = RADIOMETER_RELATIVE_STD * one.gain @ errors[c]
         curves[c] = _within(wave, own, one.mean, one.covariance, common)
     return curves, scatter
 
 
-def _solved_together(
+def _solve_together(
     wave: FloatArray, signals: Mapping[str, ChannelSignals], priors: Mapping[str, CurvePrior], scatter: Scatter
 ) -> dict[str, Sensitivity]:
     """The sensitivities of channels that share a relative error of each light.
@@ -345,7 +345,7 @@ def _solved_together(
     precision R_c) give g the precision sum(D_c^T R_c D_c) + 1 / std^2. D_c: signals by lights; G_c: curve by signals.
     """
     errors = light_errors(signals)
-    own = {c: s.unshared(Scatter(own=scatter.own)) for c, s in signals.items()}
+    own = {c: s.without_shared_error(Scatter(own=scatter.own)) for c, s in signals.items()}
     found = {c: posterior_under_prior(wave, s.operator, s.value, s.std, priors[c]) for c, s in own.items()}
     shared = float(np.hypot(RADIOMETER_RELATIVE_STD, scatter.common))
     precision = np.sum([errors[c].T @ one.precision @ errors[c] for c, one in found.items()], axis=0)

@@ -77,7 +77,7 @@ def test_jacobian_is_that_of_the_residuals():
             move[k] = step
         else:
             poses_move[0, k - problem.size] = step
-        return -problem.residuals(problem._moved(state, move, poses_move))
+        return -problem.residuals(problem._move(state, move, poses_move))
 
     first = np.concatenate([np.full(len(v.index), k % 2 == 0) for k, v in enumerate(views)])
     for k in range(problem.size + 6):

@@ -15,7 +15,7 @@ from scipy.special import erf
 from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import CornerFits, find_board, fit_corners, luminance
 from lab.fit.geometry.calibration import calibrate_robustly
-from lab.fit.geometry.recordings import _fitted_shift, board_warps, channel_geometry, fit_geometry, geometry_result
+from lab.fit.geometry.recordings import _fit_shift, board_warps, channel_geometry, fit_geometry, geometry_result
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import GeometryFit
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
@@ -222,6 +222,6 @@ def test_corners_with_large_errors_move_the_shift_by_no_more_than_its_uncertaint
     jacobian[:, 0, 0], jacobian[:, 1, 0], jacobian[:, 0, 1], jacobian[:, 1, 2] = x, y, 1.0, 1.0
     same = np.zeros((300, 2))
     same[:75, 0] = rng.normal(0.05, 0.02, 75)
-    fits = [_fitted_shift(same + rng.normal(0, 0.007, (300, 2)), jacobian, np.ones(300, bool)) for _ in range(60)]
+    fits = [_fit_shift(same + rng.normal(0, 0.007, (300, 2)), jacobian, np.ones(300, bool)) for _ in range(60)]
     spread = np.std([fit[0] for fit in fits], axis=0, ddof=1)
     assert np.all(spread < 1.28 * np.mean([np.sqrt(np.diag(fit[1])) for fit in fits], axis=0))

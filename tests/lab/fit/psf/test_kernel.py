@@ -107,7 +107,7 @@ def test_the_marginal_likelihood_is_that_of_the_whole_covariance(
     size = SUPPORT**2
     inner = np.linalg.inv(np.linalg.inv(covariance) + information)
     expected = 0.5 * weighted @ inner @ weighted - 0.5 * np.linalg.slogdet(np.eye(size) + covariance @ information)[1]
-    found = log_likelihood(prior.whitened(information), prior.whitened_right(weighted))
+    found = log_likelihood(prior.whiten(information), prior.whiten_right(weighted))
     assert found == pytest.approx(expected, rel=1e-8)
 
 
