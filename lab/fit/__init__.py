@@ -18,7 +18,7 @@ from lab.one_blas_thread import one_blas_thread
 from lab.side_processes import in_processes
 from sim.camera import Side
 
-#: Called with the step that was just done and the share of the work that is done, 0..1; from any thread, one call at a time.
+#: Called with the step that was just done and the share of the work that is done, 0..1; from any thread, one at a time.
 Progress = Callable[[str, float], None]
 T = TypeVar("T")
 #: The fits of a side, in the order of a result, and that of the pair.
@@ -26,7 +26,7 @@ Step = Literal["noise", "spectral", "mtf", "psf", "geometry", "stereo"]
 STEPS: tuple[Step, ...] = get_args(Step)
 #: The fits that a diagnosis uses. It measures edges and screens by itself.
 FOR_DIAGNOSIS: tuple[Step, ...] = ("noise", "spectral", "geometry")
-#: Pixels of all frames from which on each side gets a process, which takes 1.5 s to start. Fits of so many take some 6 s.
+#: Pixels of all frames from which on each side gets a process, which takes 1.5 s to start. Their fits take some 6 s.
 WORTH_PROCESSES_PX = 2e7
 
 
@@ -42,10 +42,11 @@ class SideFit:
 def fit_recording_set(
     recordings: RecordingSet, progress: Progress | None = None, steps: Collection[Step] = STEPS
 ) -> FitResult:
-    """Run the fits of `steps`, by default all, on every side and on the stereo pair. Steps that the recordings don't determine are listed
-    in `skipped`, with the reason.
+    """Run the fits of `steps`, by default all, on every side and on the stereo pair. Steps that the recordings don't
+    determine are listed in `skipped`, with the reason.
 
-    Several sides with many frames are fitted at the same time, each in a process of its own. `progress` is called after each step.
+    Several sides with many frames are fitted at the same time, each in a process of its own. `progress` is called after
+    each step.
     """
     from lab.fit.stereo import fit_stereo
 
@@ -87,7 +88,9 @@ def fit_recording_set(
 
 
 def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told: Callable[[Step], None]) -> SideFit:
-    """The fits of `steps` of one side. Geometry runs in a thread of its own. `told` is called with each step that was done."""
+    """Run the fits of `steps` of one side. Geometry runs in a thread of its own. `told` is called with each step that
+    was done.
+    """
     from lab.fit.geometry.recordings import fit_geometry
     from lab.fit.mtf.recordings import fit_mtf
     from lab.fit.noise.noise_fit import fit_noise
@@ -129,7 +132,7 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
 
 
 def _step(work: Callable[[], T], side: Side | None) -> tuple[T | None, tuple[Skipped, ...]]:
-    """The result of a step; None and why it was skipped where the recordings don't determine it."""
+    """Return the result of a step, or None and why it was skipped where the recordings don't determine it."""
     try:
         return work(), ()
     except NotDetermined as refused:
@@ -137,7 +140,7 @@ def _step(work: Callable[[], T], side: Side | None) -> tuple[T | None, tuple[Ski
 
 
 def _pixels(recordings: RecordingSet) -> float:
-    """Number of pixels of all frames; a side whose frame size isn't stated counts 0."""
+    """Count the pixels of all frames; a side whose frame size isn't stated counts 0."""
     return float(
         sum(
             len(recordings.captures(side=side))

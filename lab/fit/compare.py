@@ -66,16 +66,18 @@ FALSE_ALARM_RATE = 0.01
 MIN_SEEN = 20  # fewest corners that determine an implied motion
 ROUNDING = 1e-9  # relative standard deviation below which a value counts as exact
 FEW = 9  # most numbers under one name with a row each; more are a curve
-#: Models that aren't compared: points of plots, and the bands in which a curve departs from the maker's. Those are chosen where the
-#: departure is largest, so that each session has others; the curves that they rest on are compared.
+#: Models that aren't compared: points of plots, and the bands in which a curve departs from the maker's. Those are
+#: chosen where the departure is largest, so that each session has others; the curves that they rest on are compared.
 NOT_COMPARED = (PhotonTransfer, Emva1288Points, MakerDeparture)
-#: Fields that aren't compared: properties of the set-up, and dark currents at the temperatures that a session happened to have.
+#: Fields that aren't compared: properties of the set-up, and dark currents at the temperatures that a session happened
+#: to have.
 NOT_COMPARED_FIELDS = {(MtfCurve, "angle_deg")} | {
     (DarkCurrentLaws, field) for field in ("dark_current_e_per_s", "reference_current_e_per_s")
 }
-#: Standard deviation, percent, by which a calibration's curvature of the response differs from the last beyond what its fit states: a
-#: stabilised lamp drifts by about a thousandth during a series of levels. No repeat of a level shows it, and it bends the means of an
-#: ascending series by as much at saturation. `brighter_fatter_percent` has three times the bend of the response in it.
+#: Standard deviation, percent, by which a calibration's curvature of the response differs from the last beyond what its
+#: fit states: a stabilised lamp drifts by about a thousandth during a series of levels. No repeat of a level shows it,
+#: and it bends the means of an ascending series by as much at saturation. `brighter_fatter_percent` has three times the
+#: bend of the response in it.
 LAMP_DRIFT_PERCENT = {"response_bend_percent": 0.1, "linearity_error_percent": 0.1, "brighter_fatter_percent": 0.3}
 INTEGRAL = "integrated_efficiency_nm"
 AXES = ("wavelength_nm", "frequency_cy_per_px", "radius_px")
@@ -97,8 +99,8 @@ class Numbers:
     sensor: SensorTemperature | None = None
 
     def beside(self, reference: Numbers) -> tuple[Numbers, Array]:
-        """The numbers as they would be at the sensor temperature of the reference, and the standard deviation of their difference
-        from it: by the fits, by the lamps' drifts and by the conversion.
+        """Return the numbers as they would be at the sensor temperature of `reference`, and the standard deviation of
+        their difference from it: by the fits, by the lamps' drifts and by the conversion.
 
         The conversion's part is a share of the larger of both, so that it is as wide for a fall as for a rise.
         """
@@ -113,12 +115,12 @@ class Numbers:
 
 
 def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RATE) -> ComparisonResult:
-    """Differences between two fits of one rig, number by number.
+    """Compare two fits of one rig, number by number.
 
-    `false_alarm_rate`: probability of any `changed` between two calibrations of an unchanged rig. It is shared among the n
-    rows of the comparison (Sidak): each is `changed` beyond z sigma with 2 (1 - Phi(z)) = 1 - (1 - rate)^(1/n), 4.1 for
-    the 239 rows of a session with eight edges, 4.4 for 1000. Rows are taken as independent. They are not; the true rate is
-    lower. `tests/recovery/test_compare_coverage.py` measures it on 105 comparisons of an unchanged camera.
+    `false_alarm_rate`: probability of any `changed` between two calibrations of an unchanged rig. It is shared among
+    the n rows of the comparison (Sidak): each is `changed` beyond z sigma with 2 (1 - Phi(z)) = 1 - (1 - rate)^(1/n),
+    4.1 for the 239 rows of a session with eight edges, 4.4 for 1000. Rows are taken as independent. They are not; the
+    true rate is lower. `tests/recovery/test_compare_coverage.py` measures it on 105 comparisons of an unchanged camera.
     """
     skipped: list[Skipped] = []
     rows: list[Change] = []
@@ -165,7 +167,7 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
 
 
 def _without_temperature(a: CameraFit, b: CameraFit, side: Side) -> Iterator[Skipped]:
-    """That dark currents are compared without their temperature, where one of both doesn't state it."""
+    """Say that dark currents are compared without their temperature, where one of both doesn't state it."""
     if (
         a.noise is None
         or b.noise is None
@@ -177,7 +179,8 @@ def _without_temperature(a: CameraFit, b: CameraFit, side: Side) -> Iterator[Ski
         share = math.log(2.0) * sensor_temperature(a.noise).doublings(sensor_temperature(b.noise))[1]
         yield Skipped(
             step="dark current's temperature",
-            reason=f"{' and '.join(unknown)} without a stated sensor temperature: the dark currents are taken as uncertain by {100 * share:.0f} % "
+            reason=f"{' and '.join(unknown)} without a stated sensor temperature: the dark currents are taken as "
+            f"uncertain by {100 * share:.0f} % "
             "for it; state temperature_c of the darks",
             side=side,
         )
@@ -185,24 +188,24 @@ def _without_temperature(a: CameraFit, b: CameraFit, side: Side) -> Iterator[Ski
 
 # --- significance ----------------------------------------------------------------------------------------------------
 def sigma_of_probability(p_value: float) -> float:
-    """A probability as standard deviations of a normal distribution, two-sided."""
+    """Express a probability as standard deviations of a normal distribution, two-sided."""
     return -float(special.ndtri(max(p_value, 1e-300) / 2.0))
 
 
 def sidak_part(rate: float, number: int) -> float:
-    """Probability allowed for each of `number` tests, so that any of them has `rate` (Sidak)."""
+    """Return the probability allowed for each of `number` tests, so that any of them has `rate` (Sidak)."""
     return float(-np.expm1(np.log1p(-rate) / max(number, 1)))
 
 
 def _sidak_whole(p_value: float, number: int) -> float:
-    """Probability of a value so small among `number` tests (Sidak)."""
+    """Return the probability of a value so small among `number` tests (Sidak)."""
     return float(-np.expm1(number * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
 # --- numbers, by their names -----------------------------------------------------------------------------------------
 def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
-    """Every fitted number under `model`, by name, each name once. A model in a list is named by its text fields: capture,
-    channel, board; by its number, too, where others have the same.
+    """Yield every fitted number under `model`, by name, each name once. A model in a list is named by its text fields:
+    capture, channel, board; by its number, too, where others have the same.
     """
     if isinstance(model, NOT_COMPARED):
         return
@@ -232,7 +235,9 @@ def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
 
 
 def sensor_temperature(noise: NoiseFit) -> SensorTemperature:
-    """At which temperature the dark currents were measured, and their doubling temperature, fitted or else silicon's."""
+    """Return the temperature at which the dark currents were measured, and their doubling temperature, fitted or else
+    silicon's.
+    """
     law = noise.dark_current_temperature
     if law is None or law.doubling_temperature_c is None or law.doubling_temperature_c_std is None:
         return SensorTemperature(temperature_c=noise.dark_temperature_c)
@@ -246,19 +251,21 @@ def sensor_temperature(noise: NoiseFit) -> SensorTemperature:
 def _numbers_under(
     name: str, value: Any, std: Any, axis_name: str, axis: Array | None, sensor: SensorTemperature | None = None
 ) -> tuple[str, Numbers]:
+    """Return a name and its numbers, along `axis` where they are as many as it has."""
     values, stds = np.atleast_1d(np.array(value, dtype=float)), np.atleast_1d(np.array(std, dtype=float))
     along = axis if axis is not None and values.shape == axis.shape else None
     return name, Numbers(name, values, stds, axis_name if along is not None else "", along, sensor)
 
 
 def _identity(model: Frozen) -> str:
-    """Name of a model in a list: its text fields."""
+    """Return the name of a model in a list: its text fields."""
     return " ".join(str(value) for field in type(model).model_fields if isinstance(value := getattr(model, field), str))
 
 
 def _compare_numbers(
     a: dict[str, Numbers], b: dict[str, Numbers], side: Side | None, skipped: list[Skipped]
 ) -> Iterator[Change]:
+    """Yield the changes of the numbers that both fits have, by name; `skipped` gets the others."""
     alone = {"A": [name for name in a if name not in b], "B": [name for name in b if name not in a]}
     for which, names in alone.items():
         if names:
@@ -274,7 +281,7 @@ def _compare_numbers(
 
 
 def _align(a: Numbers, b: Numbers) -> tuple[Numbers, Numbers]:
-    """Both on the axis of A, where that of B covers it."""
+    """Bring both to the axis of A, where that of B covers it."""
     if a.axis is None or b.axis is None or np.array_equal(a.axis, b.axis) or not len(b.axis):
         return a, b
     inside = (a.axis >= b.axis[0]) & (a.axis <= b.axis[-1])
@@ -286,6 +293,7 @@ def _align(a: Numbers, b: Numbers) -> tuple[Numbers, Numbers]:
 
 
 def _rows(a: Numbers, as_measured: Numbers, side: Side | None) -> Iterator[Change]:
+    """Yield the rows of one name: one for each number, or that of the largest difference for a curve."""
     b, std_of_difference = as_measured.beside(a)
     parts = (a.value, b.value, a.std, b.std, std_of_difference)
     value_a, value_b, std_a, std_b, std = (np.ravel(part) for part in parts)
@@ -323,13 +331,13 @@ def _rows(a: Numbers, as_measured: Numbers, side: Side | None) -> Iterator[Chang
 
 
 def title_of(numbers: Numbers, at: int) -> str:
-    """The plain name of a number; of a curve or kernel, that of the whole."""
+    """Return the plain name of a number; of a curve or kernel, that of the whole."""
     name = plain_name(numbers.name, place_of(numbers, at) if numbers.value.size <= FEW else "")
     return name if numbers.sensor is None else f"{name} {numbers.sensor.text}"
 
 
 def place_of(numbers: Numbers, at: int) -> str:
-    """Which of the numbers under one name the one at index `at` is: on the axis, by its symbol, or by its index."""
+    """Say which of the numbers under one name the one at index `at` is: on the axis, by its symbol, or by its index."""
     if numbers.axis is not None:
         quantity, unit = numbers.axis_name.split("_", 1)
         return f"{quantity} {numbers.axis[at]:.4g} {unit.replace('_per_', '/')}"
@@ -347,7 +355,7 @@ def place_of(numbers: Numbers, at: int) -> str:
 
 # --- geometry --------------------------------------------------------------------------------------------------------
 def _covariance(fit: GeometryFit) -> Array | None:
-    """Covariance (12, 12) of the intrinsics, or None where the fit doesn't state it."""
+    """Return the covariance (12, 12) of the intrinsics, or None where the fit doesn't state it."""
     if fit.covariance is None:
         return None
     found = np.zeros((COUNT, COUNT))
@@ -357,6 +365,7 @@ def _covariance(fit: GeometryFit) -> Array | None:
 
 
 def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange | Skipped:
+    """Compare the projections of two fits over the corners of both, without the motion that they imply."""
     of_a, of_b = _covariance(a), _covariance(b)
     first, second = intrinsics_of_fit(a), intrinsics_of_fit(b)
     if of_a is None or of_b is None:
@@ -397,7 +406,7 @@ def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange 
 
 
 def _frame(a: GeometryFit, b: GeometryFit) -> tuple[int, int]:
-    """Rows and columns of the frame, from the maps over it."""
+    """Return the rows and columns of the frame, from the maps over it."""
     fit = a if a.projection else b
     if fit.projection:
         return round(fit.projection[0].y_px[-1]) + 1, round(fit.projection[0].x_px[-1]) + 1
@@ -407,7 +416,7 @@ def _frame(a: GeometryFit, b: GeometryFit) -> tuple[int, int]:
 
 
 def _rotation_changes(a: StereoFit, b: StereoFit) -> Iterator[Change]:
-    """Rotation from the rig of A to that of B, about the axes of the right camera."""
+    """Return the rotation from the rig of A to that of B, about the axes of the right camera."""
     if a.rotation_std_rad is None or b.rotation_std_rad is None:
         return
     rotation_mrad = 1e3 * Rotation.from_matrix(np.array(b.rotation) @ np.array(a.rotation).T).as_rotvec()
@@ -434,7 +443,9 @@ def _rotation_changes(a: StereoFit, b: StereoFit) -> Iterator[Change]:
 
 @dataclass(frozen=True)
 class FailRule:
-    """One rule. `amount`: the largest difference that passes, in the figure's unit, or as a share of A's value where `relative`."""
+    """One rule. `amount`: the largest difference that passes, in the figure's unit, or as a share of A's value where
+    `relative`.
+    """
 
     figure: str
     side: str | None = None
@@ -443,7 +454,7 @@ class FailRule:
 
     @classmethod
     def parse(cls, text: str) -> FailRule:
-        """The rule that a text states. Raises InputError."""
+        """Parse a rule. Raises InputError where the text states none."""
         refused = InputError(f"--fail-on {text!r}: give FIGURE, or FIGURE>AMOUNT with an optional %, SIDE: before it")
         found = _RULE.fullmatch(text.strip())
         if found is None:
@@ -458,19 +469,21 @@ class FailRule:
         return cls(found["figure"].strip(), found["side"], amount / 100.0 if relative else amount, relative)
 
     def _names(self, name: str, side: str | None) -> bool:
+        """Tell whether the rule names a figure of a side."""
         return fnmatchcase(name, self.figure) and self.side in (None, side)
 
     def _exceeded(self, row: Change) -> bool:
+        """Tell whether a change is larger than the amount."""
         return abs(row.difference) > self.amount * (abs(row.a) if self.relative else 1.0)
 
     def concerns(self, comparison: ComparisonResult) -> bool:
-        """Whether the comparison has any figure of this rule."""
+        """Tell whether the comparison has any figure of this rule."""
         return any(self._names(row.name, row.side) for row in comparison.changes) or any(
             self._names(PROJECTION, item.side) for item in comparison.projection
         )
 
     def failures(self, comparison: ComparisonResult) -> list[str]:
-        """The changes that fail this rule, by name."""
+        """Return the changes that fail this rule, by name."""
         rows = [
             " ".join(part for part in (row.side, row.name, row.where) if part)
             for row in comparison.changes
@@ -487,11 +500,13 @@ class FailRule:
 
 
 def failures(comparison: ComparisonResult, rules: Sequence[FailRule]) -> list[str]:
-    """The changes that fail any rule, by name. Raises InputError for a rule that concerns no figure of the comparison: a misspelt name,
-    or a figure that one of the two fits lacks, would never fail."""
+    """Return the changes that fail any rule, by name. Raises InputError for a rule that concerns no figure of the
+    comparison: a misspelt name, or a figure that one of the two fits lacks, would never fail.
+    """
     for rule in rules:
         if not rule.concerns(comparison):
             raise InputError(
-                f"--fail-on {rule.figure!r}: no such figure in both; `calibench compare A B --all` lists those that are compared"
+                f"--fail-on {rule.figure!r}: no such figure in both; `calibench compare A B --all` lists those that "
+                "are compared"
             )
     return list(dict.fromkeys(name for rule in rules for name in rule.failures(comparison)))

@@ -18,15 +18,15 @@ LEAST_ROUNDING_DN = 1e-3
 
 
 def variance_before_rounding(variance: FloatArray | float) -> FloatArray:
-    """A variance before rounding, DN^2: less 1/12, and 0 below `HIDDEN_DN2`. A constant value half way between two
-    codes has 1/4 after rounding.
+    """Return the variance before rounding, DN^2: less 1/12, and 0 below `HIDDEN_DN2`. A constant value half way between
+    two codes has 1/4 after rounding.
     """
     return np.asarray(np.where(np.asarray(variance) >= HIDDEN_DN2, np.subtract(variance, QUANTISATION_DN2), 0.0))
 
 
 def _rounding_harmonics_dn(variance_dn2: FloatArray | float, count: int) -> FloatArray:
-    """Root mean squares (count, ...), DN, of the first harmonics of the saw-tooth: exp(-2 pi^2 k^2 s^2) / (pi k sqrt
-    2).
+    """Return the root mean squares (count, ...), DN, of the first harmonics of the saw-tooth: exp(-2 pi^2 k^2 s^2) /
+    (pi k sqrt 2).
     """
     spread = np.maximum(np.asarray(variance_dn2, float), 0.0)
     k = np.arange(1, count + 1).reshape(-1, *(1,) * spread.ndim)
@@ -34,15 +34,15 @@ def _rounding_harmonics_dn(variance_dn2: FloatArray | float, count: int) -> Floa
 
 
 def rounding_std_dn(variance_dn2: FloatArray | float) -> FloatArray:
-    """Standard deviation of the error of a mean of many pixels by rounding, over all levels: 0.29 DN without noise,
-    0.004 DN for s = 0.45 DN.
+    """Return the standard deviation of the error of a mean of many pixels by rounding, over all levels: 0.29 DN without
+    noise, 0.004 DN for s = 0.45 DN.
     """
     return np.asarray(np.linalg.norm(_rounding_harmonics_dn(variance_dn2, ROUNDING_HARMONICS), axis=0))
 
 
 def rounding_waves_dn(level_dn: FloatArray, variance_dn2: FloatArray) -> list[FloatArray]:
-    """Errors that rounding may leave in means at the levels `level_dn` (n,), for variances `variance_dn2` (n,): (n,)
-    each, one standard deviation.
+    """Return the errors that rounding may leave in means at the levels `level_dn` (n,), for variances `variance_dn2`
+    (n,): (n,) each, one standard deviation.
 
     They are the cosines and sines of the first harmonics, as a level is hardly known to a fraction of a code. Empty
     where noise dithers.
@@ -56,7 +56,8 @@ def rounding_waves_dn(level_dn: FloatArray, variance_dn2: FloatArray) -> list[Fl
 
 
 def variance_rounding_std(temporal: float, spatial: float) -> float:
-    """Standard deviation, DN^2, of the error that rounding may leave in a mean temporal variance, beside its 1/12.
+    """Return the standard deviation, DN^2, of the error that rounding may leave in a mean temporal variance, beside its
+    1/12.
 
     With temporal and spatial standard deviations s and t of normal values: (4 s^2 + 1 / pi^2) exp(-2 pi^2 (s^2 + t^2))
     cos(2 pi mean).

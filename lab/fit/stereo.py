@@ -79,12 +79,12 @@ def fit_stereo(
     right: GeometryFit,
     depths_mm: Sequence[float] = DEPTHS_MM,
 ) -> StereoFit:
-    """Rotation and translation between the cameras from the `charuco` captures of equal `pose`, with uncertainties.
+    """Fit rotation and translation between the cameras to the `charuco` captures of equal `pose`, with uncertainties.
 
-    `rms_px` is the root mean square of the distances of all corners of both cameras from their predictions. The
-    corners are those that the fits of the single cameras rest on. A pair whose rms is more than 3 times the median of
-    the pairs is left out, and one whose views are numbered from opposite ends. `depths_mm`: where the uncertainty of the depth is mapped. Raises `NotDetermined` below 2
-    pairs, or where no rig explains them.
+    `rms_px` is the root mean square of the distances of all corners of both cameras from their predictions. The corners
+    are those that the fits of the single cameras rest on. A pair whose rms is more than 3 times the median of the pairs
+    is left out, and one whose views are numbered from opposite ends. `depths_mm`: where the uncertainty of the depth is
+    mapped. Raises `NotDetermined` below 2 pairs, or where no rig explains them.
     """
     shapes = tuple((recordings.camera(side).rows, recordings.camera(side).cols) for side in ("left", "right"))
     return fit_pairs(pair_views(recordings, left, right), left, right, shapes, depths_mm)
@@ -97,12 +97,12 @@ def fit_pairs(
     shapes: Sequence[tuple[int, int]],
     depths_mm: Sequence[float] = DEPTHS_MM,
 ) -> StereoFit:
-    """`fit_stereo` from views; `shapes` are (rows, cols) of the left and right frames."""
+    """Fit the rig to pairs of views, as `fit_stereo`; `shapes` are (rows, cols) of the left and right frames."""
     if len(pairs) < MIN_PAIRS:
         raise NotDetermined(
             "stereo",
-            f"{len(pairs)} poses of the board were found by both cameras, {MIN_PAIRS} are needed: capture charuco poses with "
-            "both, under the same pose name",
+            f"{len(pairs)} poses of the board were found by both cameras, {MIN_PAIRS} are needed: capture charuco "
+            "poses with both, under the same pose name",
         )
     pairs, rejected = _split_by_numbering(pairs, left, right)
     if len(pairs) < MIN_PAIRS:
@@ -125,22 +125,23 @@ def fit_pairs(
         raise NotDetermined(
             "stereo",
             f"no rig explains the pairs (rms {solution.rms_px:.1f} px, each camera alone {alone:.2f} px; worst: pose "
-            f"{pairs[worst].left.capture.pose}, {of_pairs[worst]:.1f} px{list_reasons(rejected)}): check that equal poses are the same "
-            "pose of the board, that the rig was rigid, and that neither camera's frames are mirrored",
+            f"{pairs[worst].left.capture.pose}, {of_pairs[worst]:.1f} px{list_reasons(rejected)}): check that equal "
+            "poses are the same pose of the board, that the rig was rigid, and that neither camera's frames are "
+            "mirrored",
         )
     return _result(solution, pairs, shapes, depths_mm, tuple(rejected))
 
 
 def pair_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> list[StereoPair]:
-    """Views of both cameras with the same `pose`, in the order of the left camera; the first of each where a pose was
-    repeated.
+    """Pair the views of both cameras with the same `pose`, in the order of the left camera; the first of each where a
+    pose was repeated.
     """
     of_left, of_right = _views_by_pose(recordings, "left", left), _views_by_pose(recordings, "right", right)
     return [StereoPair(view, of_right[pose]) for pose, view in of_left.items() if pose in of_right]
 
 
 def _views_by_pose(recordings: RecordingSet, side: Side, fit: GeometryFit) -> dict[str, BoardView]:
-    """The views that the fit of a camera rests on, by pose, without the corners that it left out."""
+    """Return the views that the fit of a camera rests on, by pose, without the corners that it left out."""
     captures = {capture.id: capture for capture in recordings.captures(CharucoCapture, side)}
     found: dict[str, BoardView] = {}
     for view in fit.residuals:
@@ -156,7 +157,7 @@ def _views_by_pose(recordings: RecordingSet, side: Side, fit: GeometryFit) -> di
 
 
 def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
-    """Mask (12,) of the intrinsics that a fit has fitted."""
+    """Return the mask (12,) of the intrinsics that a fit has fitted."""
     if fit.parameters:
         return np.array([name in fit.parameters for name in NAMES])
     return np.append(np.ones(8, dtype=bool), intrinsics_of_fit(fit)[8:] != 0.0)
@@ -165,10 +166,11 @@ def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
 def _split_by_numbering(
     pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit
 ) -> tuple[list[StereoPair], list[Skipped]]:
-    """The pairs in which both cameras number the board from the same corner, and those in which they don't.
+    """Split the pairs into those in which both cameras number the board from the same corner, and those in which they
+    don't.
 
-    A plain board looks alike from both ends. Numbered from the other one, it is rotated by 180 deg about its normal, and
-    so is the rig of this pair: most pairs say which is right.
+    A plain board looks alike from both ends. Numbered from the other one, it is rotated by 180 deg about its normal,
+    and so is the rig of this pair: most pairs say which is right.
     """
     turns, reversed_turns = [], []
     half_turn = Rotation.from_rotvec([0.0, 0.0, np.pi])
@@ -189,15 +191,16 @@ def _split_by_numbering(
             kept.append(pair)
             continue
         reason = (
-            f"the cameras number its corners from opposite ends: the rig would be turned by {off:.0f} deg beside the other pairs, "
-            f"and by {off_reversed:.1f} deg with one view renumbered; use a board with markers, or an odd number of rows plus columns"
+            f"the cameras number its corners from opposite ends: the rig would be turned by {off:.0f} deg beside the "
+            f"other pairs, and by {off_reversed:.1f} deg with one view renumbered; use a board with markers, or an "
+            "odd number of rows plus columns"
         )
         rejected.append(Skipped(step=f"pose {pair.left.capture.pose}", reason=reason))
     return kept, rejected
 
 
 def rig_observations(pairs: Sequence[StereoPair]) -> list[Observation]:
-    """Pair by pair, left then right; pairs of equal boards share the board."""
+    """Make the observations of a rig, pair by pair, left then right; pairs of equal boards share the board."""
     keys = list(dict.fromkeys(board_key(pair.left) for pair in pairs))
     found = []
     for k, pair in enumerate(pairs):
@@ -207,10 +210,11 @@ def rig_observations(pairs: Sequence[StereoPair]) -> list[Observation]:
 
 
 def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit, shape: tuple[int, int]) -> Solution:
-    """Joint least squares of the rig, the intrinsics of both cameras, the warps of the boards and their poses.
+    """Solve the joint least squares of the rig, the intrinsics of both cameras, the warps of the boards and their
+    poses.
 
-    It starts from the fits of the single cameras. Its covariance takes corners as independent. Observations are pair by pair, left then right. `shape`: (rows,
-    cols).
+    It starts from the fits of the single cameras. Its covariance takes corners as independent. Observations are pair by
+    pair, left then right. `shape`: (rows, cols).
     """
     cameras = np.array([intrinsics_of_fit(left), intrinsics_of_fit(right)])
     observations = rig_observations(pairs)
@@ -241,6 +245,7 @@ def _result(
     depths_mm: Sequence[float],
     rejected: tuple[Skipped, ...],
 ) -> StereoFit:
+    """State the rig as a result, with its depth maps and its rectification."""
     state = solution.state
     at = solution.names.index(RIG[0])
     std = np.sqrt(np.diag(solution.covariance)[at : at + 6])
@@ -275,8 +280,8 @@ def _result(
 
 
 def triangulation_jacobian(solution: Solution, points: Array) -> tuple[Array, Array]:
-    """Jacobian of where both cameras see `points` (n, 3), left then right: by the point (n, 4, 3), and by the shared
-    parameters (n, 4, parameters).
+    """Return the Jacobian of where both cameras see `points` (n, 3), left then right: by the point (n, 4, 3), and by
+    the shared parameters (n, 4, parameters).
     """
     state, free = solution.state, solution.free
     shared = np.zeros((len(points), 4, len(solution.names)))
@@ -295,7 +300,7 @@ def triangulation_jacobian(solution: Solution, points: Array) -> tuple[Array, Ar
 
 
 def depth_std(solution: Solution, points: Array, corner_px_std: float) -> tuple[Array, Array]:
-    """Standard deviation (n,), mm, of the triangulated depth of `points` (n, 3): by the calibration, and by
+    """Return the standard deviation (n,), mm, of the triangulated depth of `points` (n, 3): by the calibration, and by
     calibration and corners together.
 
     `corner_px_std`: standard deviation of a coordinate of a corner in both pictures.
@@ -309,7 +314,7 @@ def depth_std(solution: Solution, points: Array, corner_px_std: float) -> tuple[
 
 
 def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tuple[int, int]]) -> DepthUncertainty:
-    """The map of `depth_std` over the frame of the left camera at one depth, where the right camera sees the point."""
+    """Map `depth_std` over the frame of the left camera at one depth, where the right camera sees the point."""
     x, y = grid(shapes[0])
     state = solution.state
     points = unproject(grid_points(x, y), state.intrinsics[0]) * depth_mm
@@ -338,7 +343,7 @@ def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tupl
 
 
 def rectification(state: RigParameters, pairs: Sequence[StereoPair], shape: tuple[int, int]) -> Rectification:
-    """The rectification of OpenCV, with the rms difference of the rows of the corners that both cameras saw."""
+    """Compute the rectification of OpenCV, with the rms difference of the rows of the corners that both cameras saw."""
     one, two = (matrix_of(camera) for camera in state.intrinsics)
     of_one, of_two = (distortion_of(camera) for camera in state.intrinsics)
     found = cv2.stereoRectify(
@@ -368,8 +373,8 @@ def rectification(state: RigParameters, pairs: Sequence[StereoPair], shape: tupl
 
 
 def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, tuple[Array, Array]]:
-    """Maps (x, y) of OpenCV, each of `shape` (rows, cols), float32, for `cv2.remap` of the frames of each side into
-    the rectified pair.
+    """Return the maps (x, y) of OpenCV, each of `shape` (rows, cols), float32, for `cv2.remap` of the frames of each
+    side into the rectified pair.
 
     In it a point is in the same row of both frames. Raises `NotDetermined` where the fit has no rectification.
     """
@@ -392,5 +397,5 @@ def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, 
 
 
 def _open_rows(values: Array) -> tuple[tuple[float | None, ...], ...]:
-    """A matrix, row by row; None where it isn't finite."""
+    """Return a matrix, row by row, with None where it isn't finite."""
     return tuple(tuple(float(value) if np.isfinite(value) else None for value in row) for row in values)

@@ -21,12 +21,12 @@ class DarkLine:
     covariance: FloatArray
 
     def at(self, exposure_s: float) -> float:
-        """Dark mean at an exposure, DN."""
+        """Return the dark mean at an exposure, DN."""
         return self.black + (self.rate or 0.0) * exposure_s
 
 
 def dark_line(exposure_s: FloatArray, mean: FloatArray, std: FloatArray) -> DarkLine:
-    """Weighted line through dark means `mean` +- `std` (n,); the covariance is scaled by `chi2_factor`."""
+    """Fit a weighted line through dark means `mean` +- `std` (n,); the covariance is scaled by `chi2_factor`."""
     if np.ptp(exposure_s) <= 1e-6 * np.max(exposure_s, initial=1e-12):
         weight = 1.0 / std**2
         value = float(np.sum(weight * mean) / np.sum(weight))
@@ -37,8 +37,8 @@ def dark_line(exposure_s: FloatArray, mean: FloatArray, std: FloatArray) -> Dark
 
 
 def least_squares(basis: FloatArray, values: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Weighted least squares of basis (n, p) solution = values (n,) +- std (n,): solution (p,), covariance (p, p),
-    chi2.
+    """Solve basis (n, p) solution = values (n,) +- std (n,) by weighted least squares: solution (p,), covariance (p,
+    p), chi2.
     """
     scale = np.linalg.norm(basis / std[:, None], axis=0)
     design = basis / std[:, None] / scale
@@ -48,8 +48,8 @@ def least_squares(basis: FloatArray, values: FloatArray, std: FloatArray) -> tup
 
 
 def chi2_factor(chi2: float, freedom: int, p: float = 0.01) -> float:
-    """Factor on a covariance (Birge ratio squared): chi2 per degree of freedom where its probability by chance is
-    below `p`, else 1.
+    """Return the factor on a covariance (Birge ratio squared): chi2 per degree of freedom where its probability by
+    chance is below `p`, else 1.
     """
     if freedom < 1 or special.chdtrc(freedom, chi2) > p:
         return 1.0
@@ -75,12 +75,12 @@ class Linearity:
 
     @property
     def error_percent_std(self) -> float:
-        """Root mean square error of `error_percent` about that of the response without noise."""
+        """Return the root mean square error of `error_percent` about that of the response without noise."""
         return float(np.hypot(self.error_noise_percent, self.error_bias_percent))
 
 
 def linearity(light: FloatArray, signal: FloatArray, covariance_dn2: FloatArray) -> Linearity:
-    """The line through (light, signal), each (n,), of least relative deviations, and the linearity error (EMVA 1288
+    """Fit the line through (light, signal), each (n,), of least relative deviations, and its linearity error (EMVA 1288
     release 4.0).
 
     The error is the mean modulus of the relative deviations in percent. All points are used: give those within 5..95 %
@@ -108,7 +108,8 @@ def linearity(light: FloatArray, signal: FloatArray, covariance_dn2: FloatArray)
 
 
 def _mean_modulus_errors(values: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Standard deviation of mean |x|, and its bias, for normal x (n,) of `covariance` (n, n), drawn once as `values`.
+    """Return the standard deviation of mean |x|, and its bias, for normal x (n,) of `covariance` (n, n), drawn once as
+    `values`.
 
     The mean of |x| for x ~ N(m, s^2) is m (2 Phi(m / s) - 1) + 2 s phi(m / s) (the folded normal distribution), and
     the covariance of two moduli, after Price's theorem, the series of c^k / k! times the means of their k-th
@@ -133,7 +134,7 @@ def _mean_modulus_errors(values: FloatArray, covariance: FloatArray) -> tuple[fl
 
 
 def root(square: float, square_std: float) -> tuple[float, float]:
-    """Square root of a variance that noise may have made negative, with its standard deviation.
+    """Return the square root of a variance that noise may have made negative, with its standard deviation.
 
     Far from 0 the standard deviation is square_std / (2 root). Near 0 it covers 0: twice it reaches the roots of
     square +- 2 square_std.

@@ -57,7 +57,7 @@ class ForeignText:
 
 
 def read_foreign_text(file: Path) -> ForeignText:
-    """The text of `file`: UTF-8, UTF-16 by its byte-order mark or its zeros, else Latin-1 (Windows-1252).
+    """Return the text of `file`: UTF-8, UTF-16 by its byte-order mark or its zeros, else Latin-1 (Windows-1252).
 
     Raises InputError, without the path, where the file can't be read or holds no text.
     """
@@ -87,8 +87,9 @@ def read_foreign_text(file: Path) -> ForeignText:
 
 
 def remarks_on(folder: Path, names: Iterable[str]) -> list[str]:
-    """What was found in tables in `folder` beside plain UTF-8 with commas, one line for all that have it in common. Those that can't be read have
-    none."""
+    """Return what was found in tables in `folder` beside plain UTF-8 with commas, one line for all that have it in
+    common. Those that can't be read have none.
+    """
     found: dict[str, list[Path]] = {}
     for name in names:
         with suppress(InputError):
@@ -100,14 +101,17 @@ def remarks_on(folder: Path, names: Iterable[str]) -> list[str]:
 
 
 def read_foreign_csv(file: Path) -> ForeignText:
-    """The table in `file` with commas between cells and decimal points, line for line. Raises InputError without the path."""
+    """Return the table in `file` with commas between cells and decimal points, line for line. Raises InputError without
+    the path.
+    """
     found = read_foreign_text(file)
     text, remarks = plain_csv(found.text)
     return ForeignText(text, found.remarks + remarks)
 
 
 def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
-    """A table with semicolons or tabs as one with commas; decimal commas become points. What has commas in its first line stays as it is.
+    """Return a table with semicolons or tabs as one with commas; decimal commas become points. What has commas in its
+    first line stays as it is.
 
     Raises InputError where numbers of both kinds stand in it, or where a comma may separate decimals or thousands.
     """
@@ -126,12 +130,14 @@ def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
     if commas and points:
         (row, number), (other_row, other) = commas[0], points[0]
         raise InputError(
-            f"row {row} has {number} and row {other_row} has {other}; write all numbers with decimal points, or all with commas"
+            f"row {row} has {number} and row {other_row} has {other}; write all numbers with decimal points, or all "
+            "with commas"
         )
     if commas and all(THOUSANDS.fullmatch(word) for _, word in commas):
         row, number = commas[0]
         raise InputError(
-            f"row {row}: {number} may be {number.replace(',', '.')} or {number.replace(',', '')}; write it with a decimal point or without the comma"
+            f"row {row}: {number} may be {number.replace(',', '.')} or {number.replace(',', '')}; write it with a "
+            "decimal point or without the comma"
         )
     made = io.StringIO()
     writer = csv.writer(made, lineterminator="\n")
@@ -142,12 +148,14 @@ def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _with_points(cell: str) -> str:
+    """Return a cell with points in the place of its numbers' decimal commas."""
     return re.sub(r"\S+", lambda word: word[0].replace(",", ".") if COMMA_NUMBER.fullmatch(word[0]) else word[0], cell)
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str | None:
-    """The known name that `name` is probably meant to be: the same with another unit, its beginning, or a misspelling of it. None: there is
-    none."""
+    """Return the known name that `name` is probably meant to be: the same with another unit, its beginning, or a
+    misspelling of it. None: there is none.
+    """
     names = list(known)
     asked = re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_")
     stem = asked.rpartition("_")[0]
@@ -160,7 +168,7 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
 
 
 def in_its_unit(name: str) -> str:
-    """A name with the unit of its ending in words: `exposure_s, in seconds`."""
+    """Return a name with the unit of its ending in words: `exposure_s, in seconds`."""
     unit = next((words for ending, words in UNITS.items() if name.endswith(f"_{ending}")), None)
     return f"{name}, in {unit}" if unit else name
 
@@ -174,7 +182,7 @@ class TableRow:
     cells: dict[str, str]
 
     def value(self, name: str, least: float = 0.0) -> float:
-        """The cell as a number of `least` or more. Raises InputError."""
+        """Return the cell as a number of `least` or more. Raises InputError."""
         text = self.cells[name]
         try:
             found = float(text)
@@ -187,12 +195,14 @@ class TableRow:
         return found
 
     def known(self, name: str, least: float = 0.0) -> float | None:
-        """The cell as a number; None where it is empty or has no column."""
+        """Return the cell as a number; None where it is empty or has no column."""
         return self.value(name, least) if self.cells.get(name) else None
 
 
 def table_rows(file: Path, needed: Sequence[str], known: Sequence[str]) -> list[TableRow]:
-    """The rows of `file`, which has the columns `needed` and no others than `known`. Raises InputError with one line."""
+    """Return the rows of `file`, which has the columns `needed` and no others than `known`. Raises InputError with one
+    line.
+    """
     try:
         reader = csv.reader(read_foreign_csv(file).text.splitlines())
         header = [cell.strip() for cell in next(reader, [])]
@@ -206,13 +216,8 @@ def table_rows(file: Path, needed: Sequence[str], known: Sequence[str]) -> list[
     if unknown or missing:
         told = [f"missing: {', '.join(missing)}"] if missing else []
         near = {name: nearest_name(name, known) for name in unknown}
-        told += (
-            [
-                f"unknown: {', '.join(name + (f' (write {in_its_unit(one)})' if one else '') for name, one in near.items())}"
-            ]
-            if unknown
-            else []
-        )
+        hints = [name + (f" (write {in_its_unit(one)})" if one else "") for name, one in near.items()]
+        told += [f"unknown: {', '.join(hints)}"] if unknown else []
         raise InputError(f"{file}: columns {'; '.join(told)}; columns are {', '.join(known)}, in these units")
     if not rows:
         raise InputError(f"{file}: holds no levels; write one row a level and channel")

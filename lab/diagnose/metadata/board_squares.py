@@ -27,8 +27,8 @@ Array = NDArray[np.floating[Any]]
 Grey = NDArray[np.uint8]
 FEWEST_MARKERS = 6  # of a frame: a homography has 8 parameters, and a marker's centre gives two equations
 MOST_COLUMNS = 40
-#: Rms distance of the markers' centres from a homography, over a marker's side: the most of a layout that fits (distortion gives some
-#: hundredths), and the least ratio of any other layout's to it.
+#: Rms distance of the markers' centres from a homography, over a marker's side: the most of a layout that fits
+#: (distortion gives some hundredths), and the least ratio of any other layout's to it.
 FITS, WORSE = 0.15, 5.0
 FEWEST_ABSENT = 4  # markers that should be in view and aren't found, from which on a stated row counts as missing
 LARGEST_PX = 1000.0  # side of a frame in which a plain board's corners are counted; larger frames are reduced
@@ -65,12 +65,14 @@ class _Markers:
 
     @property
     def side_px(self) -> float:
-        """Median side of a marker, px."""
+        """Return the median side of a marker, px."""
         return float(np.median(np.linalg.norm(np.roll(self.corners, 1, axis=1) - self.corners, axis=2)))
 
 
 def board_layout(pictures: Sequence[Grey], capture: CharucoCapture) -> BoardLayout | None:
-    """The layout that frames (rows, cols) of one board fit; None where they don't determine it. `capture`: what is stated about it."""
+    """Find the layout that frames (rows, cols) of one board fit; None where they don't determine it. `capture`: what is
+    stated about it.
+    """
     if capture.dictionary == "none":
         return _plain_layout(pictures)
     code = getattr(cv2.aruco, capture.dictionary, None)
@@ -103,7 +105,7 @@ def board_layout(pictures: Sequence[Grey], capture: CharucoCapture) -> BoardLayo
 
 
 def _markers(detector: Any, picture: Grey) -> _Markers | None:
-    """The markers whose number occurs once in a frame; None for fewer than `FEWEST_MARKERS`."""
+    """Find the markers whose number occurs once in a frame; None for fewer than `FEWEST_MARKERS`."""
     corners, ids, _ = detector.detectMarkers(picture)
     if ids is None:
         return None
@@ -124,16 +126,18 @@ def _markers(detector: Any, picture: Grey) -> _Markers | None:
 
 
 def _places(number: NDArray[np.int64], cols: int, parity: int) -> Array:
-    """Places (n, 2), (x, y) in squares, of markers on a board of `cols` columns, whose first light square is the first (parity 0) or the
-    second (parity 1)."""
+    """Return the places (n, 2), (x, y) in squares, of markers on a board of `cols` columns, whose first light square is
+    the first (parity 0) or the second (parity 1).
+    """
     rows = 2 * (int(number.max()) // cols + 2)
     row, col = np.nonzero((np.indices((rows, cols)).sum(axis=0) + parity) % 2 == 0)
     return np.column_stack([col, row])[number].astype(float)
 
 
 def _homography(one: _Markers, cols: int, parity: int) -> tuple[Array, float] | None:
-    """The homography from the board (squares) to the frame (px), fitted to all markers, and the rms distance of their centres from it, px.
-    None where none fits."""
+    """Fit the homography from the board (squares) to the frame (px) to all markers. Returns it with the rms distance of
+    their centres from it, px; None where none fits.
+    """
     places = _places(one.number, cols, parity)
     if np.ptp(places[:, 0]) == 0 or np.ptp(places[:, 1]) == 0:
         return None
@@ -145,7 +149,9 @@ def _homography(one: _Markers, cols: int, parity: int) -> tuple[Array, float] | 
 
 
 def _rms(seen: Sequence[_Markers], cols: int, parity: int) -> float:
-    """Rms distance of the markers' centres from the homographies of all frames, over a marker's side; infinite where a frame has none."""
+    """Return the rms distance of the markers' centres from the homographies of all frames, over a marker's side;
+    infinite where a frame has none.
+    """
     total, count = 0.0, 0
     for one in seen:
         fitted = _homography(one, cols, parity)
@@ -157,7 +163,7 @@ def _rms(seen: Sequence[_Markers], cols: int, parity: int) -> float:
 
 
 def _sides(one: _Markers, cols: int, parity: int) -> Array:
-    """Sides (n,) of the markers, in squares."""
+    """Return the sides (n,) of the markers, in squares."""
     fitted = _homography(one, cols, parity)
     assert fitted is not None  # the layout fits
     flat = cv2.perspectiveTransform(one.corners.reshape(-1, 1, 2), np.linalg.inv(fitted[0])).reshape(-1, 4, 2)
@@ -165,7 +171,9 @@ def _sides(one: _Markers, cols: int, parity: int) -> Array:
 
 
 def _lacks_rows(seen: Sequence[_Markers], cols: int, parity: int, rows: int, stated: int) -> bool:
-    """Whether `FEWEST_ABSENT` markers of the rows from `rows` to `stated` should lie inside frames in which they aren't found."""
+    """Tell whether `FEWEST_ABSENT` markers of the rows from `rows` to `stated` should lie inside frames in which they
+    aren't found.
+    """
     row, col = np.nonzero((np.indices((stated, cols)).sum(axis=0) + parity) % 2 == 0)
     beyond = np.column_stack([col, row])[row >= rows].astype(float)
     absent = 0
@@ -180,9 +188,11 @@ def _lacks_rows(seen: Sequence[_Markers], cols: int, parity: int, rows: int, sta
 
 
 def _plain_layout(pictures: Sequence[Grey]) -> BoardLayout | None:
-    """The squares of a plain checkerboard, the smaller number first, where most frames show the same number; else None.
+    """Count the squares of a plain checkerboard, the smaller number first, where most frames show the same number; else
+    None.
 
-    A board that is stated too small would be found anywhere on the larger one, at unrelated poses in the frames of a pair.
+    A board that is stated too small would be found anywhere on the larger one, at unrelated poses in the frames of a
+    pair.
     """
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
     counts: list[tuple[int, int]] = []
@@ -204,7 +214,8 @@ def _plain_layout(pictures: Sequence[Grey]) -> BoardLayout | None:
 
 
 def misstated_board(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Boards whose frames fit another number of squares, or another ratio of marker to square, than stated; None where all fit.
+    """Return the boards whose frames fit another number of squares, or another ratio of marker to square, than stated;
+    None where all fit.
 
     The length of a square can't be checked: a board twice as large at twice the distance gives the same image.
     """
@@ -242,7 +253,8 @@ def misstated_board(recordings: RecordingSet, side: Side) -> Misstatement | None
         measurement=BOARDS,
         where="boards",
         shape="what is stated of a board contradicts its pictures",
-        check=f"In the pictures of the {side} camera {'; '.join(lines)}. No picture tells the length of a square: square_mm stays as stated.",
+        check=f"In the pictures of the {side} camera {'; '.join(lines)}. No picture tells the length of a square: "
+        "square_mm stays as stated.",
         chi2_stated=chi2,
         chi2_corrected=float(n),
         n=n,
@@ -252,7 +264,7 @@ def misstated_board(recordings: RecordingSet, side: Side) -> Misstatement | None
 
 
 def _contradicted(stated: CharucoCapture, layout: BoardLayout) -> tuple[dict[str, Any], list[str]]:
-    """The statements to correct, with the values that fit, and sentences about both."""
+    """Return the fields of a board that its frames contradict, and the sentences that say so."""
     update: dict[str, Any] = {}
     told = []
     same = layout.squares == stated.squares or (not stated.has_markers and layout.squares == stated.squares[::-1])
@@ -260,7 +272,8 @@ def _contradicted(stated: CharucoCapture, layout: BoardLayout) -> tuple[dict[str
         update["squares"] = layout.squares
         (rows, cols), (rows_stated, cols_stated) = layout.squares, stated.squares
         told.append(
-            f"a board has {rows} x {cols} squares and not {rows_stated} x {cols_stated}: correct squares to [{rows}, {cols}]"
+            f"a board has {rows} x {cols} squares and not {rows_stated} x {cols_stated}: correct squares to [{rows}, "
+            f"{cols}]"
         )
     if layout.marker_share is not None and layout.marker_px is not None and stated.marker_mm is not None:
         measured = layout.marker_share * stated.square_mm
@@ -268,6 +281,7 @@ def _contradicted(stated: CharucoCapture, layout: BoardLayout) -> tuple[dict[str
             update["marker_mm"] = round(measured, 2)
             told.append(
                 f"markers are {100 * layout.marker_share:.0f} % of a square's side and not "
-                f"{100 * stated.marker_mm / stated.square_mm:.0f} %: correct marker_mm to about {measured:.2g}, or square_mm"
+                f"{100 * stated.marker_mm / stated.square_mm:.0f} %: correct marker_mm to about {measured:.2g}, or "
+                "square_mm"
             )
     return update, told

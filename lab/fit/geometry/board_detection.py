@@ -35,7 +35,8 @@ from sim.sensor.mosaic import phases, planes
 
 Array = NDArray[np.floating[Any]]
 
-#: Radius of the window about a dot, over the spacing of the dots; and the share of that radius beyond which is background.
+#: Radius of the window about a dot, over the spacing of the dots; and the share of that radius beyond which is
+#: background.
 DOT_WINDOW, DOT_BACKGROUND = 0.5, 0.8
 #: Share of a dot's contrast that is subtracted from the weights; least contrast of a dot, in a picture of 0..1.
 LEAST_DOT_SHARE, LEAST_DOT_CONTRAST = 0.1, 0.1
@@ -63,7 +64,7 @@ def fit_corners(
     half_px: Array,
     clear: Callable[[Array], NDArray[np.bool_]] | None = None,
 ) -> CornerFits:
-    """Checkerboard corners by least squares (Levenberg-Marquardt, all corners at once).
+    """Fit checkerboard corners by least squares (Levenberg-Marquardt, all corners at once).
 
         I = level + gradient . r + contrast E(d1) E(d2)
 
@@ -128,7 +129,7 @@ def fit_corners(
 
 
 def _corner_model(p: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
-    """Model (n, window) and its Jacobian (n, window, 9)."""
+    """Return the model (n, window) of the picture and its Jacobian (n, window, 9)."""
     x, y = dx - p[:, :1], dy - p[:, 1:2]
     width = p[:, 4:5]
     edges, derivatives, across, along = [], [], [], []
@@ -159,7 +160,7 @@ def _corner_model(p: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
 
 
 def _residual_squares(p: Array, dx: Array, dy: Array, value: Array, weight: Array) -> Array:
-    """Weighted sum of squared residuals (n,)."""
+    """Return the weighted sums of squared residuals (n,)."""
     x, y = dx - p[:, :1], dy - p[:, 1:2]
     width = np.sqrt(2.0) * p[:, 4:5]
     one, two = (erf((np.cos(angle) * x + np.sin(angle) * y) / width) for angle in (p[:, 2:3], p[:, 3:4]))
@@ -168,7 +169,7 @@ def _residual_squares(p: Array, dx: Array, dy: Array, value: Array, weight: Arra
 
 
 def _damped_step(jacobian: Array, weight: Array, residual: Array, damping: Array | None = None) -> tuple[Array, Array]:
-    """Damped least squares of every corner: steps (n, k) and the inverse normal matrices (n, k, k)."""
+    """Solve the damped least squares of every corner: steps (n, k) and the inverse normal matrices (n, k, k)."""
     weighted = jacobian * weight[:, :, None]
     normal = np.swapaxes(weighted, 1, 2) @ jacobian
     scale = np.einsum("nkk->nk", normal)
@@ -180,7 +181,8 @@ def _damped_step(jacobian: Array, weight: Array, residual: Array, damping: Array
 
 
 def dot_grid(grey: NDArray[np.uint8], rows: int, cols: int) -> Array:
-    """First estimates of the dots' centres, (rows, cols, 2), (x, y) px. Dots are dark on light or light on dark, and all are in view.
+    """Find a grid of dots: first estimates of their centres, (rows, cols, 2), (x, y) px. Dots are dark on light or
+    light on dark, and all are in view.
 
     Raises `NotDetermined` where no grid of that size is found.
     """
@@ -195,14 +197,14 @@ def dot_grid(grey: NDArray[np.uint8], rows: int, cols: int) -> Array:
 def dot_centres(
     picture: Array, points: Array, rows: int, cols: int, index: NDArray[np.int64] | None = None
 ) -> CornerFits:
-    """Centroids of the dots at `points` (n, 2), (x, y), in a picture (rows, cols) of 0..1.
+    """Measure the centroids of the dots at `points` (n, 2), (x, y), in a picture (rows, cols) of 0..1.
 
         c = sum w r / sum w,   w = max((I - background) / (peak - background) - `LEAST_DOT_SHARE`, 0)
 
-    within half a spacing. The background is the median beyond 0.8 of that radius. A coordinate has the standard deviation
-    s sqrt(sum |r - c|^2 / 2) / sum w, with s the noise of the background over the contrast. In perspective, the centroid of the ellipse
-    isn't the image of the dot's centre: for dots of radius a at distance z and a focal length of f px they differ by about
-    f (a / z)^2 sin(2 tilt) / 2 px.
+    within half a spacing. The background is the median beyond 0.8 of that radius. A coordinate has the standard
+    deviation s sqrt(sum |r - c|^2 / 2) / sum w, with s the noise of the background over the contrast. In perspective,
+    the centroid of the ellipse isn't the image of the dot's centre: for dots of radius a at distance z and a focal
+    length of f px they differ by about f (a / z)^2 sin(2 tilt) / 2 px.
     """
     points = np.array(points, float)
     index = np.arange(rows * cols) if index is None else index
@@ -223,7 +225,9 @@ def dot_centres(
 def _centroid(
     picture: Array, start: Array, radius: float, dx: NDArray[np.int64], dy: NDArray[np.int64]
 ) -> tuple[Array, float] | None:
-    """The centroid of one dot and the standard deviation of a coordinate; None where there is no dot, or it touches the frame's border."""
+    """Measure the centroid of one dot and the standard deviation of a coordinate; None where there is no dot, or it
+    touches the frame's border.
+    """
     height, width = picture.shape
     at, std = start, np.inf
     for _ in range(CENTROID_PASSES):
@@ -253,7 +257,7 @@ def _centroid(
 
 
 def _spacing(points: Array, index: NDArray[np.int64], cols: int) -> Array:
-    """Distance of each dot to the nearest of its neighbours in the grid, px."""
+    """Return the distance of each dot to the nearest of its neighbours in the grid, px."""
     place = {int(number): k for k, number in enumerate(index)}
     found = np.full(len(points), np.inf)
     for number, k in place.items():
@@ -279,14 +283,14 @@ class BoardView:
     std_px: Array | None = None
 
     def only(self, kept: NDArray[np.bool_]) -> BoardView:
-        """The corners for which `kept` (n,) is true."""
+        """Return the view with the corners for which `kept` (n,) is true."""
         std = None if self.std_px is None else self.std_px[kept]
         return BoardView(self.capture, self.index[kept], self.board_mm[kept], self.image_px[kept], std)
 
 
 def luminance(frame: NDArray[np.generic], cfa: Any) -> Array:
-    """The mosaic (rows, cols) of a black and white scene as one picture, 0 dark .. 1 light: each plane between its 2 %
-    and 98 % quantiles.
+    """Level the mosaic (rows, cols) of a black and white scene to one picture, 0 dark .. 1 light: each plane between
+    its 2 % and 98 % quantiles.
     """
     picture = np.array(frame, dtype=float)
     for plane in planes(picture, cfa).values():  # views of the picture
@@ -296,13 +300,13 @@ def luminance(frame: NDArray[np.generic], cfa: Any) -> Array:
 
 
 def as_grey(picture: Array) -> NDArray[np.uint8]:
-    """A picture (rows, cols) of 0..1, smoothed, as detectors take it."""
+    """Convert a picture (rows, cols) of 0..1 to grey values, smoothed, as detectors take it."""
     return np.clip(255.0 * ndimage.gaussian_filter(picture, 0.7), 0, 255).astype(np.uint8)
 
 
 def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
-    """Corners of the board in a picture (rows, cols) of 0..1. Raises `NotDetermined` where it isn't found, with the
-    reason.
+    """Find the corners of the board in a picture (rows, cols) of 0..1. Raises `NotDetermined` where it isn't found,
+    with the reason.
     """
     rows, cols = capture.squares
     grey = as_grey(picture)
@@ -322,8 +326,8 @@ def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
             )
         raise NotDetermined(
             "geometry",
-            f"only {len(index)} corners found, {MIN_CORNERS} needed: light or place the board better, and check that it has "
-            f"{rows} x {cols} squares and its dictionary is {capture.dictionary}",
+            f"only {len(index)} corners found, {MIN_CORNERS} needed: light or place the board better, and check that "
+            f"it has {rows} x {cols} squares and its dictionary is {capture.dictionary}",
         )
     if len(index) < (rows - 1) * (cols - 1):
         index, points = _add_missing_corners(index, points, rows - 1, cols - 1, picture.shape)
@@ -338,7 +342,7 @@ def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
 
 
 def _charuco_corners(grey: NDArray[np.uint8], capture: CharucoCapture) -> tuple[NDArray[np.int64], Array]:
-    """Numbers and places of the inner corners of a ChArUco board, by the detector of OpenCV."""
+    """Find the numbers and places of the inner corners of a ChArUco board, by the detector of OpenCV."""
     code = getattr(cv2.aruco, capture.dictionary, None)
     if not isinstance(code, int) or not capture.dictionary.startswith("DICT_"):
         raise NotDetermined(
@@ -360,12 +364,12 @@ def _charuco_corners(grey: NDArray[np.uint8], capture: CharucoCapture) -> tuple[
 
 
 def _grid_steps(index: NDArray[np.int64], cols: int) -> Array:
-    """(x, y) of corners in squares, from the first inner corner."""
+    """Return the places (x, y) of corners in squares, from the first inner corner."""
     return np.column_stack([index % cols, index // cols]).astype(float)
 
 
 def board_points(capture: CharucoCapture, index: NDArray[np.int64]) -> Array:
-    """(x, y, 0), mm, of the inner corners of these numbers; the first square begins at 0."""
+    """Return the places (x, y, 0), mm, of the inner corners of these numbers; the first square begins at 0."""
     return np.column_stack(
         [(_grid_steps(index, capture.squares[1] - 1) + 1.0) * capture.square_mm, np.zeros(len(index))]
     )
@@ -405,7 +409,7 @@ def _add_missing_corners(
 
 
 def _plain_corners(grey: NDArray[np.uint8], rows: int, cols: int) -> tuple[NDArray[np.int64], Array]:
-    """Numbers and places of the inner corners of a plain checkerboard; all of them have to be in view."""
+    """Find the numbers and places of the inner corners of a plain checkerboard; all of them have to be in view."""
     found, corners = cv2.findChessboardCorners(
         grey, (cols, rows), flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     )
@@ -420,8 +424,9 @@ def _plain_corners(grey: NDArray[np.uint8], rows: int, cols: int) -> tuple[NDArr
 
 
 def order_grid(grid: Array, grey: NDArray[np.uint8] | None = None) -> Array:
-    """The points of a grid (rows, cols, 2) in the order of the board, (rows x cols, 2). `grey`: a checkerboard's picture, by whose dark
-    first square it is numbered."""
+    """Return the points of a grid (rows, cols, 2) in the order of the board, (rows x cols, 2). `grey`: a checkerboard's
+    picture, by whose dark first square it is numbered.
+    """
     rows, cols = grid.shape[:2]
     candidates = [np.rot90(grid, k) for k in range(4)] if rows == cols else [grid, grid[::-1, ::-1]]
     candidates += [g[:, ::-1] for g in candidates]
@@ -434,7 +439,7 @@ def order_grid(grid: Array, grey: NDArray[np.uint8] | None = None) -> Array:
 
 
 def _dot_view(picture: Array, grey: NDArray[np.uint8], capture: CharucoCapture) -> BoardView:
-    """The centres of a grid of dots."""
+    """Find the centres of a grid of dots."""
     rows, cols = capture.squares
     points = order_grid(dot_grid(grey, rows - 1, cols - 1))
     index = np.arange((rows - 1) * (cols - 1))
@@ -448,12 +453,12 @@ def _dot_view(picture: Array, grey: NDArray[np.uint8], capture: CharucoCapture) 
 
 
 def _cross(a: Array, b: Array) -> float:
-    """z of the cross product of two vectors."""
+    """Return the z component of the cross product of two vectors."""
     return float(a[0] * b[1] - a[1] * b[0])
 
 
 def _first_square_is_dark(grey: NDArray[np.uint8], grid: Array) -> bool:
-    """Whether the square between the first four inner corners, which has the colour of the first square, is darker
+    """Tell whether the square between the first four inner corners, which has the colour of the first square, is darker
     than its neighbours.
     """
     middles = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
@@ -465,7 +470,7 @@ def _first_square_is_dark(grey: NDArray[np.uint8], grid: Array) -> bool:
 def refine_corners(
     picture: Array, points: Array, board: Array, square_mm: float, marker_mm: float, rows: int, cols: int
 ) -> CornerFits:
-    """Corners (n, 2) fitted in the picture, at the pixels that no marker touches."""
+    """Fit corners (n, 2), (x, y), in the picture, at the pixels that no marker touches."""
     homography, _ = cv2.findHomography(board.astype(np.float64), points.astype(np.float64), cv2.RANSAC, 3.0)
     if homography is None:
         raise NotDetermined("geometry", "the corners found don't lie on a plane: light or place the board better")
@@ -482,7 +487,7 @@ def refine_corners(
     half = np.clip(0.42 * square_px, 2.0, WINDOW_PX)
 
     def clear(at_px: Array) -> NDArray[np.bool_]:
-        """Pixels (n, 2) that are on the board and that no marker blurs into."""
+        """Tell which pixels (n, 2) are on the board with no marker that blurs into them."""
         mm = cv2.perspectiveTransform(at_px.reshape(-1, 1, 2).astype(np.float64), inverse)[:, 0]
         inside = np.all((mm > 0) & (mm < np.array([cols, rows]) * square_mm), axis=1)
         if marker_mm <= 0:
@@ -505,8 +510,8 @@ def refine_corners(
 def _light_squares(
     picture: Array, to_image: Any, square_mm: float, marker_mm: float, rows: int, cols: int
 ) -> NDArray[np.bool_]:
-    """Which squares are light: of the two checker patterns, the one that agrees with the picture near the borders of
-    the squares.
+    """Tell which squares are light: of the two checker patterns, the one that agrees with the picture near the borders
+    of the squares.
     """
     row, col = np.indices((rows, cols))
     rim = 0.5 - 0.25 * max(1.0 - marker_mm / square_mm, 0.1)
@@ -519,8 +524,8 @@ def _light_squares(
 
 
 def channel_corners(frame: NDArray[np.generic], cfa: Any, view: BoardView) -> dict[str, CornerFits]:
-    """Corners of `view` in each colour of its own frame, on the pixels of that colour; green is the mean of its two
-    phases.
+    """Fit the corners of `view` in each colour of its own frame, on the pixels of that colour; green is the mean of its
+    two phases.
     """
     capture = view.capture
     rows, cols = capture.squares
@@ -547,7 +552,9 @@ def channel_corners(frame: NDArray[np.generic], cfa: Any, view: BoardView) -> di
 
 
 def find_boards(recordings: RecordingSet, side: Side) -> tuple[list[BoardView], list[Skipped]]:
-    """Boards of all `charuco` captures of `side`, and the captures in which none was found, with the reason."""
+    """Find the boards of all `charuco` captures of `side`, and list the captures in which there is none, with the
+    reason.
+    """
     cfa = recordings.camera(side).cfa
     views, rejected = [], []
     for capture in recordings.captures(CharucoCapture, side):

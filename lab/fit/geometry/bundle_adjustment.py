@@ -67,7 +67,8 @@ WARP = ("bend_x_mm", "bend_y_mm", "twist_mm")
 #: Standard deviation of the prior of each distortion term: share of the radius at the corner of the frame, and power of
 #: the radius. Tens of px: it only keeps terms that no view determines from growing without bound.
 DISTORTION_PRIOR = {
-    "k1": (0.3, 2), "k2": (0.1, 4), "k3": (0.03, 6), "k4": (0.3, 2), "k5": (0.1, 4), "k6": (0.03, 6), "p1": (0.03, 1), "p2": (0.03, 1)
+    "k1": (0.3, 2), "k2": (0.1, 4), "k3": (0.03, 6), "k4": (0.3, 2), "k5": (0.1, 4), "k6": (0.03, 6),
+    "p1": (0.03, 1), "p2": (0.03, 1),
 }  # fmt: skip
 WARP_PRIOR = 0.005  # standard deviation of the prior of a warp, of the diagonal of the board
 FIRST_NOISE_PX = 0.1  # of a corner, for the weight of the priors in the first solve
@@ -93,8 +94,9 @@ class PoseErrors:
 class CorrelatedErrors:
     """V, fitted.
 
-    `noise_px`: s. `amplitude_px`: s sqrt(a), before the fit absorbs a part. `length_squares`: lx, ly. `between_cameras`:
-    r; 1 of a single camera. `likelihood_ratio`: 2 log of the likelihood over that of independent corners.
+    `noise_px`: s. `amplitude_px`: s sqrt(a), before the fit absorbs a part. `length_squares`: lx, ly.
+    `between_cameras`: r; 1 of a single camera. `likelihood_ratio`: 2 log of the likelihood over that of independent
+    corners.
     """
 
     noise_px: float
@@ -104,13 +106,13 @@ class CorrelatedErrors:
     likelihood_ratio: float
 
     def covariance(self, pose: PoseErrors) -> Array:
-        """V (n, n), px^2, of one coordinate of the corners of a pose."""
+        """Return the covariance V (n, n), px^2, of one coordinate of the corners of a pose."""
         shared = correlation(pose, self.length_squares, self.between_cameras)
         return np.asarray(self.amplitude_px**2 * shared + self.noise_px**2 * np.eye(len(shared)))
 
 
 def correlation(pose: PoseErrors, length_squares: tuple[float, float], between_cameras: float) -> Array:
-    """C K (n, n) of the corners of a pose."""
+    """Return the correlations C K (n, n) of the corners of a pose."""
     at = pose.squares / np.array(length_squares)
     square = np.sum((at[:, None, :] - at[None, :, :]) ** 2, axis=2)
     same = pose.camera[:, None] == pose.camera[None, :]
@@ -118,7 +120,7 @@ def correlation(pose: PoseErrors, length_squares: tuple[float, float], between_c
 
 
 def fit_correlated_errors(poses: Sequence[PoseErrors], prior: Array) -> CorrelatedErrors | None:
-    """V from the residuals at the end of a solve; None where independent corners explain them.
+    """Fit V to the residuals at the end of a solve; None where independent corners explain them.
 
     `prior` (k,): what priors add to the diagonal of the normal matrix of the shared parameters.
     """
@@ -155,7 +157,7 @@ def fit_correlated_errors(poses: Sequence[PoseErrors], prior: Array) -> Correlat
 
 
 def sandwich_covariance(poses: Sequence[PoseErrors], errors: CorrelatedErrors, prior: Array) -> Array:
-    """Covariance (k, k) of the shared parameters: A^-1 B A^-1.
+    """Return the covariance (k, k) of the shared parameters: A^-1 B A^-1.
 
     B is sum J^T V J of the fitted V, brought to the size of the scores s = J^T r of the poses, whose covariance under V
     is known. Their mean square over all directions gives its amount; their matrix, shrunk to that amount with
@@ -185,7 +187,8 @@ def sandwich_covariance(poses: Sequence[PoseErrors], errors: CorrelatedErrors, p
 
 
 def _as_scores_say(middle: Array, middles: Array, leverage: Array, scores: Array) -> Array:
-    """B (k, k), from `middle`, that of V, and the `scores` (poses, k). `leverage` (poses, k, k): A_p A^-1.
+    """Bring B (k, k) to the size of the scores, from `middle`, that of V, and the `scores` (poses, k). `leverage`
+    (poses, k, k): A_p A^-1.
 
     The parameters have absorbed a part of the scores: s_p = e_p - A_p A^-1 sum e, with e_p ~ (0, B_p).
     """
@@ -220,6 +223,7 @@ class _EqualPoses:
 
 
 def _equal_poses(poses: Sequence[PoseErrors]) -> list[_EqualPoses]:
+    """Group the poses in which the same corners were seen."""
     groups: dict[bytes, list[PoseErrors]] = {}
     for pose in poses:
         groups.setdefault(pose.squares.tobytes() + pose.camera.tobytes(), []).append(pose)
@@ -243,7 +247,7 @@ def _deviance(
     length_squares: tuple[float, float],
     between_cameras: float,
 ) -> tuple[float, float]:
-    """-2 log of the restricted likelihood, with s^2 at its maximum, and that s^2:
+    """Return -2 log of the restricted likelihood, with s^2 at its maximum, and that s^2:
 
     (N - p) log s^2 + log |V / s^2| + log |X^T V^-1 X s^2|,      s^2 = r^T P r / (N - p).
     """
@@ -275,7 +279,7 @@ def _deviance(
 
 
 def board_key(view: BoardView) -> tuple[object, ...]:
-    """The properties of a board. Captures that agree in them show the same board."""
+    """Return the properties of a board. Captures that agree in them show the same board."""
     capture = view.capture
     return capture.dictionary, capture.squares, capture.square_mm, capture.marker_mm
 
@@ -329,34 +333,36 @@ class Solution:
 
     @property
     def model_error_px(self) -> float:
-        """Standard deviation of a coordinate beyond the independent noise of the corners; 0 where there is none."""
+        """Return the standard deviation of a coordinate beyond the independent noise of the corners; 0 where there is
+        none.
+        """
         own = 0.0 if self.errors is None else self.noise_px**2 - self.errors.noise_px**2
         return float(np.sqrt(max(own, 0.0)))
 
     @property
     def rms_px(self) -> float:
-        """Root mean square of the distances of the corners from their predictions."""
+        """Return the root mean square of the distances of the corners from their predictions."""
         return rms_px(np.concatenate(self.residuals))
 
     @property
     def determined(self) -> bool:
-        """Whether the covariance is finite and positive."""
+        """Tell whether the covariance is finite and positive."""
         diagonal = np.diag(self.covariance)
         return bool(np.isfinite(diagonal).all() and (diagonal > 0).all())
 
     def std(self, camera: int = 0) -> Array:
-        """Standard deviations (12,) of the intrinsics of a camera; 0 where they were held."""
+        """Return the standard deviations (12,) of the intrinsics of a camera; 0 where they were held."""
         found = np.zeros(COUNT)
         found[self.free[camera]] = np.sqrt(np.diag(self.covariance)[self._of_camera(camera)])
         return found
 
     @property
     def covariance_by_sampling(self) -> Array:
-        """Covariance (n, n) by the independent noise of the corners alone."""
+        """Return the covariance (n, n) by the independent noise of the corners alone."""
         return self.covariance if self.sampling_covariance is None else self.sampling_covariance
 
     def of_camera(self, camera: int = 0, *, only_sampling: bool = False) -> Array:
-        """Covariance (12, 12) of the intrinsics of a camera, 0 where they were held."""
+        """Return the covariance (12, 12) of the intrinsics of a camera, 0 where they were held."""
         found = np.zeros((COUNT, COUNT))
         part = self._of_camera(camera)
         covariance = self.covariance_by_sampling if only_sampling else self.covariance
@@ -364,17 +370,18 @@ class Solution:
         return found
 
     def _of_camera(self, camera: int) -> slice:
+        """Return the place of the intrinsics of a camera among the shared parameters."""
         start = int(self.free[:camera].sum())
         return slice(start, start + int(self.free[camera].sum()))
 
 
 def rms_px(residuals: Array) -> float:
-    """Root mean square of the length of vectors (n, 2)."""
+    """Return the root mean square of the length of vectors (n, 2)."""
     return float(np.sqrt(np.mean(np.sum(np.square(residuals), axis=1))))
 
 
 def warp_shape(view: BoardView) -> Array:
-    """Height (n, 3) of the corners of a view, mm per mm of each of the three warp parameters."""
+    """Return the height (n, 3) of the corners of a view, mm per mm of each of the three warp parameters."""
     rows, cols = view.capture.squares
     x = 2.0 * view.board_mm[:, 0] / (cols * view.capture.square_mm) - 1.0
     y = 2.0 * view.board_mm[:, 1] / (rows * view.capture.square_mm) - 1.0
@@ -382,7 +389,7 @@ def warp_shape(view: BoardView) -> Array:
 
 
 def warp_prior_mm(view: BoardView) -> float:
-    """Standard deviation of the prior of the warp of a board, mm."""
+    """Return the standard deviation of the prior of the warp of a board, mm."""
     return WARP_PRIOR * view.capture.square_mm * float(np.hypot(*view.capture.squares))
 
 
@@ -426,6 +433,7 @@ class BundleAdjustment:
             self._set_warp_priors(shape)
 
     def _set_warp_priors(self, shape: tuple[int, int]) -> None:
+        """Set the priors of the warps of all boards."""
         self.half_diagonal_px = 0.5 * float(np.hypot(*shape))
         for number in range(self.boards):
             seen = [observation.view for observation in self.observations if observation.board == number] or [
@@ -435,8 +443,8 @@ class BundleAdjustment:
             self.prior_std[at : at + 3] = warp_prior_mm(seen[0])
 
     def _set_distortion_prior(self, intrinsics: Array) -> None:
-        """The priors of the distortion terms need the focal length of the start: the radius of the corner of the frame
-        follows from it.
+        """Set the priors of the distortion terms, which need the focal length of the start: the radius of the corner of
+        the frame follows from it.
         """
         at = 0
         for camera, mask in enumerate(self.free):
@@ -449,7 +457,7 @@ class BundleAdjustment:
             at += count
 
     def names(self) -> tuple[str, ...]:
-        """Names of the shared parameters, in their order."""
+        """Return the names of the shared parameters, in their order."""
         if self.only_poses:
             return ()
         sides = [""] if self.cameras == 1 else ["left ", "right "]
@@ -464,7 +472,7 @@ class BundleAdjustment:
         return (*found, *(f"board {k + 1} {name}" if several else name for k in range(self.boards) for name in WARP))
 
     def _place_corners(self, state: RigParameters) -> tuple[Array, Array, Array]:
-        """All corners (n, 3): in the frame of their camera; rotated into that of camera 0; and placed in it."""
+        """Place all corners (n, 3): in the frame of their camera; rotated into that of camera 0; and placed in it."""
         rotated, placed = np.empty_like(self.flat), np.empty_like(self.flat)
         for observation, part in zip(self.observations, self.parts, strict=True):
             on_board = self.flat[part].copy()
@@ -479,7 +487,7 @@ class BundleAdjustment:
         return own, rotated, placed
 
     def residuals(self, state: RigParameters) -> Array:
-        """Seen less predicted (n, 2), px; infinite where a corner would be behind its camera."""
+        """Return the residuals, seen less predicted (n, 2), px; infinite where a corner would be behind its camera."""
         own = self._place_corners(state)[0]
         if np.any(own[:, 2] <= 0) or not np.isfinite(own).all():
             return np.full_like(self.seen, np.inf)
@@ -490,7 +498,7 @@ class BundleAdjustment:
         return self.seen - predicted
 
     def jacobian(self, state: RigParameters) -> tuple[Array, Array]:
-        """Jacobian of the predictions by the shared parameters (n, 2, shared) and by the pose (n, 2, 6)."""
+        """Return the Jacobian of the predictions by the shared parameters (n, 2, shared) and by the pose (n, 2, 6)."""
         own, rotated, placed = self._place_corners(state)
         count = len(own)
         shared = np.zeros((count, 2, self.size))
@@ -521,7 +529,7 @@ class BundleAdjustment:
         return shared, by_pose
 
     def _prior_values(self, state: RigParameters) -> Array:
-        """The shared parameters that have priors; 0 for the rig."""
+        """Return the shared parameters that have priors; 0 for the rig."""
         if self.only_poses:
             return np.zeros(0)
         free = [state.intrinsics[camera][mask] for camera, mask in enumerate(self.free)]
@@ -529,6 +537,7 @@ class BundleAdjustment:
         return np.concatenate([*free, rig, state.warps_mm.ravel()])
 
     def _move(self, state: RigParameters, shared: Array, poses: Array) -> RigParameters:
+        """Return the state after steps of the shared parameters (shared,) and of the poses (poses, 6)."""
         intrinsics, rotation, translation, warps = (
             state.intrinsics,
             state.rotation,
@@ -551,7 +560,7 @@ class BundleAdjustment:
         return RigParameters(intrinsics, rotation, translation, warps, rotations, state.translations_mm + poses[:, 3:])
 
     def _normal(self, state: RigParameters, residual: Array, noise_px: float) -> tuple[Array, ...]:
-        """Normal matrices of the shared parameters, shared x pose, and pose, and the right-hand sides."""
+        """Return the normal matrices of the shared parameters, shared x pose, and pose, and the right-hand sides."""
         shared, by_pose = self.jacobian(state)
         size, prior = self.size, (noise_px / self.prior_std) ** 2
         flat = shared.reshape(2 * len(shared), size)
@@ -568,6 +577,7 @@ class BundleAdjustment:
         return matrix, mixed, own, right, own_right
 
     def _cost(self, state: RigParameters, residual: Array, noise_px: float) -> float:
+        """Return the sum of squares of residuals and priors, px^2."""
         if not np.isfinite(residual).all():
             return np.inf
         prior = float(np.sum((self._prior_values(state) * noise_px / self.prior_std) ** 2))
@@ -609,8 +619,8 @@ class BundleAdjustment:
         )
 
     def with_correlated_errors(self, solution: Solution, errors: CorrelatedErrors | None = None) -> Solution:
-        """The solution with a covariance that holds the errors which neighbouring corners share: those given, or those
-        that its residuals show. The same solution where they show none.
+        """Return the solution with a covariance that holds the errors which neighbouring corners share: those given, or
+        those that its residuals show. The same solution where they show none.
         """
         if not solution.determined:
             return solution
@@ -627,6 +637,7 @@ class BundleAdjustment:
         )
 
     def _pose_errors(self, solution: Solution) -> list[PoseErrors]:
+        """Collect the residuals and Jacobians of each pose at the end of a solve."""
         self._set_distortion_prior(solution.state.intrinsics)
         shared, by_pose = self.jacobian(solution.state)
         squares = np.concatenate(
@@ -640,6 +651,7 @@ class BundleAdjustment:
         ]
 
     def _covariance(self, state: RigParameters, residual: Array, noise_px: float) -> Array:
+        """Return the covariance of the shared parameters for independent corners; infinite where it is singular."""
         if self.only_poses:
             return np.zeros((0, 0))
         matrix, mixed, own, _, _ = self._normal(state, residual, noise_px)
@@ -653,14 +665,14 @@ class BundleAdjustment:
 
 
 def _eliminate_poses(matrix: Array, mixed: Array, own: Array) -> tuple[Array, Array]:
-    """Schur complement of the poses, and mixed own^-1."""
+    """Return the Schur complement of the poses, and mixed own^-1."""
     ridge = 1e-12 * np.einsum("pkk->pk", own)
     gain = np.linalg.solve(own + ridge[:, :, None] * np.eye(6), np.swapaxes(mixed, 1, 2))  # (poses, 6, shared)
     return matrix - np.einsum("psk,pkt->st", mixed, gain), np.swapaxes(gain, 1, 2)
 
 
 def _step(parts: tuple[Array, ...], damping: float) -> tuple[Array, Array]:
-    """Steps of the shared parameters and of the poses."""
+    """Solve for the steps of the shared parameters and of the poses."""
     matrix, mixed, own, right, own_right = parts
     damped_own = own + damping * np.einsum("pkk->pk", own)[:, :, None] * np.eye(6)
     if not len(right):
@@ -675,12 +687,13 @@ def _step(parts: tuple[Array, ...], damping: float) -> tuple[Array, Array]:
 
 
 def _rotation(rotation_vector: Array) -> Array:
+    """Return the rotation matrix (3, 3) of a rotation vector (3,), rad."""
     return np.asarray(Rotation.from_rotvec(rotation_vector).as_matrix())
 
 
 def board_pose(view: BoardView, intrinsics: Array) -> tuple[Array, Array]:
-    """Rotation (3, 3) and translation (3,), mm, from the flat board to a camera, from one view. Raises `NotDetermined`
-    where none fits.
+    """Find the rotation (3, 3) and translation (3,), mm, from the flat board to a camera, from one view. Raises
+    `NotDetermined` where none fits.
     """
     matrix, distortion = matrix_of(intrinsics), distortion_of(intrinsics)
     points, seen = view.board_mm.astype(float), view.image_px.astype(float)
@@ -698,8 +711,8 @@ def board_pose(view: BoardView, intrinsics: Array) -> tuple[Array, Array]:
 
 
 def first_intrinsics(views: Sequence[BoardView], shape: tuple[int, int]) -> Array:
-    """A pinhole without distortion to begin with: the focal length of Zhang, or the width of the frame where the views
-    determine none.
+    """Return a pinhole without distortion to begin with: the focal length of Zhang, or the width of the frame where the
+    views determine none.
     """
     boards = [view.board_mm.astype(np.float32) for view in views]
     points = [view.image_px.astype(np.float32) for view in views]
@@ -717,7 +730,7 @@ def first_intrinsics(views: Sequence[BoardView], shape: tuple[int, int]) -> Arra
 
 
 def first_state(views: Sequence[BoardView], intrinsics: Array) -> RigParameters:
-    """RigParameters of one camera, each view with a pose of its own."""
+    """Return the parameters of one camera to begin with, each view with a pose of its own."""
     poses = [board_pose(view, intrinsics) for view in views]
     return RigParameters(
         intrinsics=intrinsics[None, :],
@@ -730,5 +743,5 @@ def first_state(views: Sequence[BoardView], intrinsics: Array) -> RigParameters:
 
 
 def with_boards(state: RigParameters, boards: int) -> RigParameters:
-    """The state with `boards` flat boards."""
+    """Return the state with `boards` flat boards."""
     return replace(state, warps_mm=np.zeros((boards, 3)))

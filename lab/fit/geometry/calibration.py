@@ -53,8 +53,8 @@ DIFFERENCE_SIGMA = 2.6  # significance of 1 %, above which two halves of the vie
 
 
 def free_intrinsics(coefficients: Sequence[str], *, centre: bool = True) -> NDArray[np.bool_]:
-    """Mask (12,) of the intrinsics that a distortion model fits: the pinhole and these coefficients; without `centre`
-    the principal point is held.
+    """Return the mask (12,) of the intrinsics that a distortion model fits: the pinhole and these coefficients; without
+    `centre` the principal point is held.
     """
     pinhole = ("fx", "fy", "cx", "cy") if centre else ("fx", "fy")
     return np.array([name in (*pinhole, *coefficients) for name in NAMES])
@@ -117,7 +117,7 @@ def choose_model(
 
 
 def first_view_of_boards(views: Sequence[BoardView]) -> list[BoardView]:
-    """The first view of each board."""
+    """Return the first view of each board."""
     first: dict[tuple[object, ...], BoardView] = {}
     for view in views:
         first.setdefault(board_key(view), view)
@@ -127,7 +127,7 @@ def first_view_of_boards(views: Sequence[BoardView]) -> list[BoardView]:
 def _held_out_square(
     view: BoardView, trained: RigParameters, board: int, solution: Solution, pose: int, shape: tuple[int, int]
 ) -> float:
-    """Sum of squared residuals, px^2, of a view that the camera `trained` has not seen."""
+    """Return the sum of squared residuals, px^2, of a view that the camera `trained` has not seen."""
     state = replace(
         trained,
         warps_mm=trained.warps_mm[board : board + 1],
@@ -154,27 +154,31 @@ class Calibration:
 
     @property
     def intrinsics(self) -> Array:
-        """Intrinsics (12,), see `lab.fit.geometry.pinhole`."""
+        """Return the intrinsics (12,); see `lab.fit.geometry.pinhole`."""
         return np.asarray(self.solution.state.intrinsics[0])
 
     @property
     def covariance(self) -> Array:
-        """Covariance (12, 12) of the intrinsics."""
+        """Return the covariance (12, 12) of the intrinsics."""
         return self.solution.of_camera(0)
 
     @property
     def points(self) -> Array:
-        """Corners (n, 3), mm, in the frame of the camera; they determine the motion that two calibrations imply."""
+        """Return the corners (n, 3), mm, in the frame of the camera; they determine the motion that two calibrations
+        imply.
+        """
         return points_in_camera(self.views, self.solution)
 
     def projection_std(self, image: Array, distance_mm: float | None) -> Array:
-        """Standard deviation (n,), px, of projecting to `image` (n, 2) from a distance; NaN where nothing projects."""
+        """Return the standard deviation (n,), px, of projecting to `image` (n, 2) from a distance; NaN where nothing
+        projects.
+        """
         points = points_at(image, self.intrinsics, distance_mm)
         return projection_std(self.intrinsics, self.covariance, self.points, points)
 
 
 def points_in_camera(views: Sequence[BoardView], solution: Solution, camera: int = 0) -> Array:
-    """Corners (n, 3), mm, of `views`, one pose each, in the frame of the first camera."""
+    """Return the corners (n, 3), mm, of `views`, one pose each, in the frame of the first camera."""
     state = solution.state
     return np.concatenate(
         [view.board_mm @ state.rotations[k].T + state.translations_mm[k] for k, view in enumerate(views)]
@@ -182,7 +186,7 @@ def points_in_camera(views: Sequence[BoardView], solution: Solution, camera: int
 
 
 def observations_of(views: Sequence[BoardView]) -> list[Observation]:
-    """Views of one camera as observations, each with its own pose; views of equal boards share the board."""
+    """Make observations of the views of one camera, each with its own pose; views of equal boards share the board."""
     keys = list(dict.fromkeys(board_key(view) for view in views))
     return [Observation(view, pose=k, board=keys.index(board_key(view))) for k, view in enumerate(views)]
 
@@ -204,15 +208,15 @@ def calibrate(views: Sequence[BoardView], shape: tuple[int, int], coefficients: 
 def with_model_error(
     views: Sequence[BoardView], shape: tuple[int, int], solution: Solution, errors: CorrelatedErrors | None = None
 ) -> Solution:
-    """The solution of `calibrate` with the errors that neighbouring corners share in its covariance: `errors`, or those
-    that its residuals show.
+    """Return the solution of `calibrate` with the errors that neighbouring corners share in its covariance: `errors`,
+    or those that its residuals show.
     """
     return BundleAdjustment(observations_of(views), solution.free, shape).with_correlated_errors(solution, errors)
 
 
 def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side: Side | None = None) -> Calibration:
-    """`calibrate` without the corners and views that don't fit, with the distortion model that predicts unseen views
-    best. The errors that neighbouring corners share are in its covariance.
+    """Calibrate without the corners and views that don't fit, with the distortion model that predicts unseen views
+    best. The errors that neighbouring corners share are in the covariance.
 
     A corner is left out beyond 5 standard deviations of the others. A view is left out where its rms is beyond 3 times
     the median, or where a quarter of its corners would go. Raises `NotDetermined` where too few views are left, where
@@ -258,7 +262,7 @@ def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side:
 
 
 def _outlying_view(views: Sequence[BoardView], solution: Solution) -> tuple[int, str] | None:
-    """The view that fits worst and the reason to leave it out; None where all fit."""
+    """Find the view that fits worst and the reason to leave it out; None where all fit."""
     squares = [np.sum(residual**2, axis=1) for residual in solution.residuals]
     rms = np.array([np.sqrt(np.mean(one)) for one in squares])
     # The median of a view: a single outlying corner is no reason to leave out the others
@@ -274,14 +278,14 @@ def _outlying_view(views: Sequence[BoardView], solution: Solution) -> tuple[int,
 
 
 def coordinate_std_px(solution: Solution) -> float:
-    """Standard deviation of one coordinate, px, by the median modulus: outliers do not widen it."""
+    """Return the standard deviation of one coordinate, px, by the median modulus: outliers do not widen it."""
     return 1.4826 * float(np.median(np.abs(np.concatenate(solution.residuals))))
 
 
 def _remove_outlying_corners(
     kept: list[BoardView], solution: Solution, outliers: dict[str, list[tuple[int, float]]]
 ) -> bool:
-    """Remove the outlying corners from `kept`, record them in `outliers`; whether there were any."""
+    """Remove the outlying corners from `kept` and record them in `outliers`. Returns whether there were any."""
     std = max(coordinate_std_px(solution), 1e-3)
     found = False
     for k, (view, residual) in enumerate(zip(kept, solution.residuals, strict=True)):
@@ -299,12 +303,13 @@ def _remove_outlying_corners(
 
 
 def _corner_reason(numbers: list[tuple[int, float]], noise_px: float) -> str:
+    """Say which corners were left out and why."""
     which = ", ".join(f"{index} ({px:.2f} px)" for index, px in sorted(numbers))
     return f"corners {which} lie off, where the others have a standard deviation of {noise_px:.3f} px"
 
 
 def list_reasons(rejected: Sequence[Skipped]) -> str:
-    """What was left out and why, for the end of a sentence: the first three, and how many more."""
+    """Say what was left out and why, for the end of a sentence: the first three, and how many more."""
     more = f"; and {len(rejected) - MOST_LISTED} more" if len(rejected) > MOST_LISTED else ""
     return "".join(f"; {one.step}: {one.reason}" for one in rejected[:MOST_LISTED]) + more
 
@@ -345,7 +350,9 @@ def _check_focal_length(solution: Solution) -> None:
 
 
 def cross_validation(calibration: Calibration) -> CrossValidation | None:
-    """`compare_halves` as a result: the error of the model apart from that of the sampling."""
+    """Return the difference of two halves (`compare_halves`) as a result: the error of the model apart from that of the
+    sampling.
+    """
     found = compare_halves(calibration)
     if found is None:
         return None
@@ -362,8 +369,9 @@ def cross_validation(calibration: Calibration) -> CrossValidation | None:
 
 
 def compare_halves(calibration: Calibration) -> tuple[Difference, float] | None:
-    """Difference of two cameras, each calibrated from every other view, at the places of the corners, and its expected
-    rms, px, by the independent noise of the corners alone; None where the halves are too small.
+    """Compare two cameras, each calibrated from every other view, at the places of the corners. Returns their
+    difference and its expected rms, px, by the independent noise of the corners alone; None where the halves are too
+    small.
 
     The errors that neighbouring corners share are those of all views.
     """
@@ -394,8 +402,8 @@ def compare_halves(calibration: Calibration) -> tuple[Difference, float] | None:
 
 
 def widen_covariance(calibration: Calibration, validation: CrossValidation | None) -> Calibration:
-    """The calibration, with its covariance multiplied by the square of what its halves differ by beyond their
-    uncertainties; as it is where they agree.
+    """Multiply the covariance by the square of what the halves differ by beyond their uncertainties; it stays where
+    they agree.
     """
     if validation is None or validation.significance_sigma <= DIFFERENCE_SIGMA:
         return calibration
@@ -412,5 +420,5 @@ def widen_covariance(calibration: Calibration, validation: CrossValidation | Non
 
 
 def distortion_coefficients(solution: Solution) -> tuple[str, ...]:
-    """Names of the distortion coefficients that were fitted."""
+    """Return the names of the distortion coefficients that were fitted."""
     return tuple(name for name, free in zip(NAMES[4:], solution.free[0, 4:], strict=True) if free)

@@ -1,4 +1,5 @@
-"""The pinhole camera of OpenCV with its Jacobian, the uncertainty of its projections, and the difference of two of them.
+"""The pinhole camera of OpenCV with its Jacobian, the uncertainty of its projections, and the difference of two of
+them.
 
 Radial (also rational) and tangential distortion:
 
@@ -43,7 +44,7 @@ FLOOR_PX = 1e-3  # differences below this are rounding
 
 
 def intrinsics_of(camera_matrix: Any, distortion: Any) -> Array:
-    """Vector (12,) of a camera matrix (3, 3) and up to eight distortion coefficients in the order of OpenCV."""
+    """Return the vector (12,) of a camera matrix (3, 3) and up to eight distortion coefficients in OpenCV's order."""
     matrix = np.asarray(camera_matrix, dtype=float)
     coefficients = np.zeros(8)
     coefficients[: len(distortion)] = distortion
@@ -51,23 +52,23 @@ def intrinsics_of(camera_matrix: Any, distortion: Any) -> Array:
 
 
 def intrinsics_of_fit(fit: GeometryFit) -> Array:
-    """Vector (12,) of a fitted camera."""
+    """Return the vector (12,) of a fitted camera."""
     return intrinsics_of(fit.camera_matrix, fit.distortion)
 
 
 def matrix_of(intrinsics: Array) -> Array:
-    """Camera matrix (3, 3)."""
+    """Return the camera matrix (3, 3)."""
     fx, fy, cx, cy = intrinsics[:4]
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def distortion_of(intrinsics: Array) -> Array:
-    """Distortion coefficients in the order of OpenCV: five, or eight where a rational one is used."""
+    """Return the distortion coefficients in the order of OpenCV: five, or eight where a rational one is used."""
     return np.asarray(intrinsics[4:] if np.any(intrinsics[9:]) else intrinsics[4:9])
 
 
 def _distort(x: Array, y: Array, k: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Distorted x, y; g; dg/dr2; and the denominator of g."""
+    """Return the distorted x, y; g; dg/dr2; and the denominator of g."""
     r2 = x * x + y * y
     above = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
     below = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
@@ -81,7 +82,7 @@ def _distort(x: Array, y: Array, k: Array) -> tuple[Array, Array, Array, Array, 
 
 
 def _distortion_jacobian(x: Array, y: Array, k: Array, g: Array, derivative: Array) -> tuple[Array, Array, Array]:
-    """dxd/dx, dxd/dy (= dyd/dx) and dyd/dy."""
+    """Return dxd/dx, dxd/dy (= dyd/dx) and dyd/dy."""
     cross = 2.0 * (x * y * derivative + k[2] * x + k[3] * y)
     return (
         g + 2.0 * (x * x * derivative + k[2] * y + 3.0 * k[3] * x),
@@ -98,7 +99,9 @@ def project(points: Array, intrinsics: Array) -> Array:
 
 
 def project_with_jacobian(points: Array, intrinsics: Array) -> tuple[Array, Array, Array]:
-    """Projected points, px (n, 2), and their Jacobians by the point (n, 2, 3) and by the intrinsics (n, 2, 12)."""
+    """Project points (n, 3) to px (n, 2). Returns these and their Jacobians by the point (n, 2, 3) and by the
+    intrinsics (n, 2, 12).
+    """
     fx, fy, cx, cy = intrinsics[:4]
     k = intrinsics[4:]
     depth = points[:, 2]
@@ -123,7 +126,7 @@ def project_with_jacobian(points: Array, intrinsics: Array) -> tuple[Array, Arra
 
 
 def unproject(image: Array, intrinsics: Array) -> Array:
-    """Rays (n, 3) with z = 1 of px (n, 2), by Newton iterations; NaN where the distortion has no inverse."""
+    """Find the rays (n, 3) with z = 1 of px (n, 2), by Newton iterations; NaN where the distortion has no inverse."""
     k = intrinsics[4:]
     wanted_x = (image[:, 0] - intrinsics[2]) / intrinsics[0]
     wanted_y = (image[:, 1] - intrinsics[3]) / intrinsics[1]
@@ -144,7 +147,7 @@ def unproject(image: Array, intrinsics: Array) -> Array:
 
 
 def cross_matrices(points: Array) -> Array:
-    """Cross-product matrices [p]x (n, 3, 3) of points (n, 3): [p]x q = p x q."""
+    """Return the cross-product matrices [p]x (n, 3, 3) of points (n, 3): [p]x q = p x q."""
     found = np.zeros((len(points), 3, 3))
     found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -points[:, 2], points[:, 1], -points[:, 0]
     return found - np.swapaxes(found, 1, 2)
@@ -163,22 +166,22 @@ class Difference:
 
     @property
     def rms_px(self) -> float:
-        """Root mean square of the length of the vectors."""
+        """Return the root mean square of the length of the vectors."""
         return float(np.sqrt(np.mean(np.sum(self.vectors_px**2, axis=1))))
 
     @property
     def expected_px(self) -> float:
-        """Value of `rms_px` that the uncertainties alone let expect."""
+        """Return the value of `rms_px` that the uncertainties alone let expect."""
         return float(np.sqrt(np.sum(self.factor**2) / len(self.vectors_px)))
 
     @property
     def variances_px2(self) -> Array:
-        """Variances (n, 2) of the vectors."""
+        """Return the variances (n, 2) of the vectors."""
         return np.asarray(np.sum(self.factor**2, axis=1).reshape(-1, 2))
 
     @property
     def p_value(self) -> float:
-        """Probability of such a difference by the uncertainties alone: chi2 over the directions in which the
+        """Return the probability of such a difference by the uncertainties alone: chi2 over the directions in which the
         calibrations can differ.
         """
         directions, spread, _ = np.linalg.svd(self.factor, full_matrices=False)
@@ -190,22 +193,22 @@ class Difference:
 
     @property
     def significance_sigma(self) -> float:
-        """`p_value` as standard deviations of a normal distribution, two-sided."""
+        """Return `p_value` as standard deviations of a normal distribution, two-sided."""
         return -float(special.ndtri(max(self.p_value, 1e-300) / 2.0))
 
 
 def grid(shape: tuple[int, int]) -> tuple[Array, Array]:
-    """x of the columns and y of the rows of the maps, px, from edge to edge of a frame of `shape` (rows, cols)."""
+    """Return x of the columns and y of the rows of the maps, px, from edge to edge of a frame (rows, cols)."""
     return np.linspace(0, shape[1] - 1, GRID_COLS), np.linspace(0, shape[0] - 1, GRID_ROWS)
 
 
 def grid_points(x: Array, y: Array) -> Array:
-    """Points (n, 2) of the grid, row by row."""
+    """Return the points (n, 2) of the grid, row by row."""
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def seen_points(fit: GeometryFit) -> Array:
-    """Places (n, 3) of the corners that a calibration rests on, mm, in the frame of the camera."""
+    """Return the places (n, 3) of the corners that a calibration rests on, mm, in the frame of the camera."""
     image = np.array([(x, y) for view in fit.residuals for x, y in zip(view.x_px, view.y_px, strict=True)])
     depth = np.array([z for view in fit.residuals for z in view.depth_mm])
     if not len(image):
@@ -216,8 +219,8 @@ def seen_points(fit: GeometryFit) -> Array:
 
 
 def points_at(image: Array, intrinsics: Array, distance_mm: float | None) -> Array:
-    """Points (n, 3), mm, that project to `image` (n, 2) at a distance from the camera; None: far away. NaN where there
-    are none.
+    """Return the points (n, 3), mm, that project to `image` (n, 2) at a distance from the camera; None: far away. NaN
+    where there are none.
     """
     rays = unproject(image, intrinsics)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
@@ -225,13 +228,15 @@ def points_at(image: Array, intrinsics: Array, distance_mm: float | None) -> Arr
 
 
 def _motion_jacobian(points: Array, by_point: Array, unit_mm: float) -> Array:
-    """Jacobian (n, 2, 6) of the projection by a rotation of the camera, and by a translation in units of `unit_mm`."""
+    """Return the Jacobian (n, 2, 6) of the projection by a rotation of the camera, and by a translation in units of
+    `unit_mm`.
+    """
     return np.concatenate([-by_point @ cross_matrices(points), by_point * unit_mm], axis=2)
 
 
 def error_operator(intrinsics: Array, gauge: Array, points: Array) -> Array:
-    """E (n, 2, 12): Jacobian of the projections of `points` by the intrinsics, without the motion implied on `gauge`
-    (m, 3).
+    """Return E (n, 2, 12), the Jacobian of the projections of `points` by the intrinsics, without the motion implied on
+    `gauge` (m, 3).
     """
     _, by_point, by_camera = project_with_jacobian(gauge, intrinsics)
     unit_mm = float(np.median(np.linalg.norm(gauge, axis=1)))
@@ -242,7 +247,9 @@ def error_operator(intrinsics: Array, gauge: Array, points: Array) -> Array:
 
 
 def projection_std(intrinsics: Array, covariance: Array, gauge: Array, points: Array) -> Array:
-    """Standard deviation (n,) of the projections of `points` in the worst direction, px; NaN where a point is NaN."""
+    """Return the standard deviation (n,) of the projections of `points` in the worst direction, px; NaN where a point
+    is NaN.
+    """
     found = np.full(len(points), np.nan)
     there = np.isfinite(points).all(axis=1)
     operator = error_operator(intrinsics, gauge, points[there])
@@ -252,7 +259,7 @@ def projection_std(intrinsics: Array, covariance: Array, gauge: Array, points: A
 
 
 def implied_motion(first: Array, second: Array, gauge: Array) -> tuple[Array, Array]:
-    """Rotation and translation from the frame of the first camera to that of the second.
+    """Find the rotation and translation from the frame of the first camera to that of the second.
 
     With it `second` projects `gauge` (m, 3), points in the frame of the first, to where `first` does; by Gauss-Newton.
     """
@@ -277,7 +284,7 @@ def difference(
     gauge: Array,
     points: Array,
 ) -> Difference:
-    """How `second` (12,) projects `points` (n, 3), in the frame of the first camera, other than `first`.
+    """Compare how `second` (12,) projects `points` (n, 3), in the frame of the first camera, with `first`.
 
     `covariance` (12, 12): of the difference of the two intrinsics; `gauge`: see `implied_motion`.
     """

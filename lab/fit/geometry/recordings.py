@@ -58,7 +58,7 @@ LARGEST_WARP_STD = 0.5  # of the standard deviation of the prior; above it, the 
 
 
 def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, CornerFits]]) -> tuple[ChannelGeometry, ...]:
-    """The camera of each colour from its corners, one entry of `corners` for each view.
+    """Fit the camera of each colour to its corners, one entry of `corners` for each view.
 
     Poses and boards are the same for all colours, so that only differences count: scale, principal point, k1 and k2 of
     each colour by least squares, dq = J dtheta. The radial shift of a colour is its own less that of green, against
@@ -111,7 +111,7 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
 
 
 def _colour_parameters(intrinsics: Array) -> Array:
-    """Directions (12, 5) of the intrinsics for scale, cx, cy, k1 and k2."""
+    """Return the directions (12, 5) of the intrinsics for scale, cx, cy, k1 and k2."""
     parameters = np.zeros((COUNT, 5))
     parameters[0, 0], parameters[1, 0] = intrinsics[0], intrinsics[1]
     for column, row in ((1, 2), (2, 3), (3, 4), (4, 5)):
@@ -120,11 +120,13 @@ def _colour_parameters(intrinsics: Array) -> Array:
 
 
 def _fit_shift(shift: Array, jacobian: Array, trusted: NDArray[np.bool_]) -> tuple[Array, Array, float, int] | None:
-    """Robust least squares of shift (n, 2) = jacobian (n, 2, p) values: Huber's, with the spread of the residuals by their median.
+    """Solve shift (n, 2) = jacobian (n, 2, p) values by robust least squares: Huber's, with the spread of the residuals
+    by their median.
 
-    Corners have errors by the demosaicing that aren't normal. Cut off at some residual, another set of them counts in each session, and
-    the values jump by more than their standard deviation; Huber's weights change smoothly. Returns values (p,), covariance (p, p) by
-    Huber's sandwich formula, rms (px) and number of corners, outliers left out; None where too few corners are trusted.
+    Corners have errors by the demosaicing that aren't normal. Cut off at some residual, another set of them counts in
+    each session, and the values jump by more than their standard deviation; Huber's weights change smoothly. Returns
+    values (p,), covariance (p, p) by Huber's sandwich formula, rms (px) and number of corners, outliers left out; None
+    where too few corners are trusted.
     """
     if trusted.sum() < 4 * MIN_CORNERS:
         return None
@@ -155,7 +157,8 @@ def _fit_shift(shift: Array, jacobian: Array, trusted: NDArray[np.bool_]) -> tup
 
 @one_blas_thread
 def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
-    """Camera matrix and distortion of `side` from its `charuco` captures (plain checkerboards: see `board_detection`).
+    """Fit the camera matrix and distortion of `side` to its `charuco` captures (plain checkerboards: see
+    `board_detection`).
 
     Raises `NotDetermined` below 3 good views, where the board isn't what the captures say, or where all views are
     parallel to each other: without perspective, focal length and distance can't be separated.
@@ -182,7 +185,7 @@ def geometry_result(
     missed: Sequence[Skipped] = (),
     channels: tuple[ChannelGeometry, ...] = (),
 ) -> GeometryFit:
-    """A calibration with its errors as a result; `missed`: captures in which no board was found."""
+    """State a calibration with its errors as a result; `missed`: captures in which no board was found."""
     validation = cross_validation(calibration)
     calibration = widen_covariance(calibration, validation)
     solution = calibration.solution
@@ -218,7 +221,7 @@ def geometry_result(
 
 
 def corner_errors(solution: Solution) -> CornerErrors:
-    """The errors of the corners of a solve as a result: sampling and model apart."""
+    """State the errors of the corners of a solve as a result: sampling and model apart."""
     errors = solution.errors
     return CornerErrors(
         noise_px=solution.noise_px if errors is None else errors.noise_px,
@@ -230,7 +233,9 @@ def corner_errors(solution: Solution) -> CornerErrors:
 
 
 def projection_maps(calibration: Calibration) -> tuple[ProjectionUncertainty, ...]:
-    """Standard deviation of the projection over the frame, at the median distance of the boards and at infinity."""
+    """Map the standard deviation of the projection over the frame, at the median distance of the boards and at
+    infinity.
+    """
     x, y = grid(calibration.shape)
     image = grid_points(x, y)
     distances = (float(np.median(np.linalg.norm(calibration.points, axis=1))), None)
@@ -247,7 +252,7 @@ def projection_maps(calibration: Calibration) -> tuple[ProjectionUncertainty, ..
 
 
 def board_warps(views: Sequence[BoardView], warps_mm: Array, covariance: Array) -> tuple[BoardWarp, ...]:
-    """The warps (boards, 3), mm, as results, with their joint `covariance`; None where the views don't determine
+    """State the warps (boards, 3), mm, as results, with their joint `covariance`; None where the views don't determine
     them.
     """
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(-1, 3)
@@ -265,7 +270,7 @@ def board_warps(views: Sequence[BoardView], warps_mm: Array, covariance: Array) 
 
 
 def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
-    """Where the corners of each view were seen, and their distances from the predictions."""
+    """List where the corners of each view were seen, and their distances from the predictions."""
     state = calibration.solution.state
     found = []
     for k, (view, rest) in enumerate(zip(calibration.views, calibration.solution.residuals, strict=True)):
@@ -286,25 +291,29 @@ def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
 
 
 def _remarks(solution: Solution, validation: CrossValidation | None, of_pictures: float | None) -> list[str]:
+    """Say where corners depart from the model together, or by more than the pictures' noise, and what two halves of the
+    views tell.
+    """
     remarks = []
     if solution.errors is not None:
         along_x, along_y = solution.errors.length_squares
         remarks.append(
-            f"Corners depart from the model together: {solution.model_error_px:.3f} px (standard deviation) over about "
-            f"{along_x:.1f} x {along_y:.1f} squares of a view, beside {solution.errors.noise_px:.3f} px of each by itself. The "
-            "standard uncertainties include it, as an error that is new in every view."
+            f"Corners depart from the model together: {solution.model_error_px:.3f} px (standard deviation) over "
+            f"about {along_x:.1f} x {along_y:.1f} squares of a view, beside {solution.errors.noise_px:.3f} px of each "
+            "by itself. The standard uncertainties include it, as an error that is new in every view."
         )
     if of_pictures is not None and solution.noise_px > 2.0 * max(of_pictures, 1e-3):
         remarks.append(
-            f"The corners depart from the model by {solution.noise_px:.3f} px (standard deviation), where the pictures' noise accounts for "
+            f"The corners depart from the model by {solution.noise_px:.3f} px (standard deviation), where the "
+            "pictures' noise accounts for "
             f"{of_pictures:.3f} px: the rest is the board's print and shape, motion, or the lens model."
         )
     if validation is None:
         remarks.append(f"Fewer than {2 * MIN_VIEWS} views: the model's own error can't be told from the sampling's.")
     elif validation.significance_sigma > DIFFERENCE_SIGMA:
         remarks.append(
-            f"Two halves of the views differ by {validation.difference_px:.3f} px over the frame, where the corners let them "
-            f"differ by {validation.expected_px:.3f} px: the model is off by about {validation.model_error_px:.3f} px. The standard "
-            "uncertainties are widened by as much."
+            f"Two halves of the views differ by {validation.difference_px:.3f} px over the frame, where the corners "
+            f"let them differ by {validation.expected_px:.3f} px: the model is off by about "
+            f"{validation.model_error_px:.3f} px. The standard uncertainties are widened by as much."
         )
     return remarks

@@ -48,20 +48,20 @@ class EdgeCurve:
 
     @property
     def tilt(self) -> float:
-        """Slope of the edge at its middle, px across per px along."""
+        """Return the slope of the edge at its middle, px across per px along."""
         return float(self.poly[1]) / self.half_length
 
     @property
     def slope(self) -> Array:
-        """Coefficients (EDGE_ORDER,) of the slope of the edge, px across per px along."""
+        """Return the coefficients (EDGE_ORDER,) of the slope of the edge, px across per px along."""
         return self.poly[1:] * ORDERS / self.half_length
 
     def shift(self, change: Array) -> EdgeCurve:
-        """The edge with `change` (EDGE_ORDER + 1,) added to its coefficients."""
+        """Return the edge with `change` (EDGE_ORDER + 1,) added to its coefficients."""
         return EdgeCurve(self.transposed, self.centre, self.half_length, self.poly + change, self.sign)
 
     def distance(self, along: Array, across: Array) -> tuple[Array, Array, Array]:
-        """Signed distance of points from the curve (px, positive on the light side), and the foot of the
+        """Measure the signed distance of points from the curve (px, positive on the light side), and the foot of the
         perpendicular.
 
         `along` (n,) in half lengths and `across` (n,) in px. Returns (distance, foot, slope), each (n,): the foot in
@@ -89,7 +89,7 @@ class EdgeCurve:
 
 
 def polynomial_value(x: Array, coefficients: Array) -> Array:
-    """Value of a polynomial at `x` (n,); coefficients lowest power first (Horner)."""
+    """Evaluate a polynomial at `x` (n,); coefficients lowest power first (Horner)."""
     value = np.full_like(x, coefficients[-1])
     for c in coefficients[-2::-1]:
         value *= x
@@ -98,7 +98,7 @@ def polynomial_value(x: Array, coefficients: Array) -> Array:
 
 
 def powers(x: Array, order: int) -> Array:
-    """(order + 1, n): 1, x, x^2, ..."""
+    """Return the powers 1, x, x^2, ... of `x` (n,), (order + 1, n)."""
     rows = np.empty((order + 1, len(x)))
     rows[0] = 1.0
     for k in range(order):
@@ -107,7 +107,7 @@ def powers(x: Array, order: int) -> Array:
 
 
 def angle_from_vertical_deg(slope: float, transposed: bool) -> float:
-    """Angle of an edge of given `slope` (px across per px along) from the vertical.
+    """Return the angle of an edge of given `slope` (px across per px along) from the vertical.
 
     Positive where the top turns to the right; -90 < angle <= 90 deg.
     """
@@ -131,7 +131,8 @@ class Plane:
 def region_planes(
     frame: NDArray[np.generic], region: Region, cfa: Cfa, channel: str, black_level_dn: float
 ) -> list[Plane]:
-    """Planes of a channel (two for green) within `region` of a raw frame (rows, cols), in DN above `black_level_dn`.
+    """Cut the planes of a channel (two for green) within `region` out of a raw frame (rows, cols), in DN above
+    `black_level_dn`.
 
     `region`: (row0, col0, row1, col1), end excluded. The planes keep their coordinates on the sensor.
     """
@@ -169,13 +170,13 @@ class Samples:
     count: int
 
     def where(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> Samples:
-        """The samples that `kept` selects, a mask or indices."""
+        """Return the samples that `kept` selects, a mask or indices."""
         return Samples(self.along[kept], self.across[kept], self.value[kept], self.plane[kept], self.step, self.count)
 
     @staticmethod
     def near(planes: Sequence[Plane], edge: EdgeCurve, reach_px: float, every: int = 1) -> Samples:
-        """The samples within `reach_px` of the edge, measured across it; with `every` > 1 only every so many lines
-        along the edge.
+        """Collect the samples within `reach_px` of the edge, measured across it; with `every` > 1 only every so many
+        lines along the edge.
         """
         found = []
         band = reach_px * np.sqrt(1.0 + edge.tilt**2)
@@ -194,8 +195,8 @@ class Samples:
 
 
 def level_planes(samples: Samples, distance: Array, inner: float, outer: float) -> tuple[Array, float, float]:
-    """Values with the mean levels of each plane mapped to 0 (dark) and 1 (light); and these two levels, averaged over
-    the planes.
+    """Level the values: the mean levels of each plane become 0 (dark) and 1 (light). Returns the values, and these two
+    levels averaged over the planes.
 
     The levels are means over `inner` < |distance| < `outer`, px. Raises `NotDetermined` where a side has no room, or
     where both are alike.
@@ -218,8 +219,8 @@ def level_planes(samples: Samples, distance: Array, inner: float, outer: float) 
 
 
 def illumination_gradients(distance: Array, along_px: Array, light: Array, room: bool) -> Array:
-    """Columns (1 or 2, n) of a planar gradient of the illumination, per 100 px: along the edge, and across it if
-    `room`.
+    """Return the columns (1 or 2, n) of a planar gradient of the illumination, per 100 px: along the edge, and across
+    it if `room`.
 
     `light` (n,) is the profile that the gradient multiplies. Without an outer zone (`room` False) a gradient across
     the edge can't be told from the tails of the profile.
@@ -231,7 +232,7 @@ def illumination_gradients(distance: Array, along_px: Array, light: Array, room:
 
 
 def first_line(plane: Plane) -> EdgeCurve:
-    """Straight edge from the gradients of the smoothed plane: their common direction, then their weighted line.
+    """Find a straight edge from the gradients of the smoothed plane: their common direction, then their weighted line.
 
     Good to about a pixel. Raises `NotDetermined` where the plane is uniform or its gradients have no common line.
     """
@@ -273,7 +274,7 @@ def first_line(plane: Plane) -> EdgeCurve:
 
 
 def refine_edge(samples: Samples, edge: EdgeCurve, widest: float) -> EdgeCurve:
-    """The polynomial of the edge by Gauss-Newton on the profile, coarse and wide first.
+    """Refine the polynomial of the edge by Gauss-Newton on the profile, coarse and wide first.
 
     Model: v = E(d), d the distance from the edge, E a free spline profile; dE/d(coefficients) = -E'(d) sign powers /
     sqrt(1 + slope^2). `widest`: the reach of the samples, px.
@@ -333,7 +334,7 @@ def refine_edge(samples: Samples, edge: EdgeCurve, widest: float) -> EdgeCurve:
 def angle_std_deg(
     steepness: Array, distance: Array, foot: Array, variance: Array, gradients: Array, edge: EdgeCurve
 ) -> float:
-    """Standard deviation of the angle of the edge, deg, for noise of given `variance` (n,) of the samples.
+    """Return the standard deviation of the angle of the edge, deg, for noise of given `variance` (n,) of the samples.
 
     Error propagation through the unweighted least squares of `refine_edge`. `steepness` (n,): derivative of the
     profile per px; `distance`, `foot`: see `EdgeCurve.distance`; `gradients`: see `illumination_gradients`.
@@ -348,14 +349,16 @@ def angle_std_deg(
 
 
 def widest_gap_px(samples: Samples, edge: EdgeCurve, part: NDArray[np.bool_]) -> float:
-    """Widest gap between neighbouring distances within 3 px of the edge, over the samples of `part` (n,), px."""
+    """Return the widest gap between neighbouring distances within 3 px of the edge, over the samples of `part` (n,),
+    px.
+    """
     distance, _, _ = edge.distance(samples.along[part], samples.across[part])
     return float(np.diff(np.sort(np.append(distance[np.abs(distance) < 3.0], [-3.0, 3.0]))).max())
 
 
 def half_way_px(distance: Array, rising: Array) -> float:
-    """Distance at which a profile `rising` from 0 to 1 crosses one half; the crossing nearest to 0, and 0 where there
-    is none.
+    """Find the distance at which a profile `rising` from 0 to 1 crosses one half; the crossing nearest to 0, and 0
+    where there is none.
     """
     i = np.flatnonzero((rising[:-1] < 0.5) & (rising[1:] >= 0.5))
     if not len(i):
@@ -365,8 +368,8 @@ def half_way_px(distance: Array, rising: Array) -> float:
 
 
 def usable_reach_px(planes: Sequence[Plane], edge: EdgeCurve) -> float:
-    """Distance from the edge, px, up to which both sides hold at least half as many samples as there are beside the
-    edge; 60 px at most.
+    """Find the distance from the edge, px, up to which both sides hold at least half as many samples as there are
+    beside the edge; 60 px at most.
 
     Raises `NotDetermined` below 4 px.
     """

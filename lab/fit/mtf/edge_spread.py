@@ -53,32 +53,33 @@ class Spline:
 
     @property
     def size(self) -> int:
-        """Number of coefficients."""
+        """Return the number of coefficients."""
         return len(self.knot_px) + 2
 
     @property
     def _all_knots(self) -> Array:
+        """Return the knots with both ends fourfold."""
         return np.concatenate([[self.knot_px[0]] * 3, self.knot_px, [self.knot_px[-1]] * 3])
 
     def design(self, distance_px: Array) -> sparse.csr_array:
-        """Matrix (n, size) from the coefficients to the values at `distance_px` (n,)."""
+        """Return the matrix (n, size) from the coefficients to the values at `distance_px` (n,)."""
         inside = np.clip(distance_px, self.knot_px[0], self.knot_px[-1])
         return BSpline.design_matrix(inside, self._all_knots, 3)
 
     def values(self, coefficients: Array, distance_px: Array) -> Array:
-        """Values (n,) at `distance_px` (n,): `design(distance_px) @ coefficients`, without the matrix."""
+        """Evaluate the spline at `distance_px` (n,): `design(distance_px) @ coefficients`, without the matrix."""
         inside = np.clip(distance_px, self.knot_px[0], self.knot_px[-1])
         return np.asarray(BSpline(self._all_knots, coefficients, 3)(inside))
 
     def derivative(self, coefficients: Array, distance_px: Array) -> Array:
-        """First derivative (n,), per px, at `distance_px`; 0 beyond the ends."""
+        """Return the first derivative (n,), per px, at `distance_px`; 0 beyond the ends."""
         value = BSpline(self._all_knots, coefficients, 3)(distance_px, nu=1, extrapolate=True)
         outside = (distance_px < self.knot_px[0]) | (distance_px > self.knot_px[-1])
         return np.where(outside, 0.0, value)
 
     @cached_property
     def pieces(self) -> Array:
-        """Polynomials of the basis, (intervals, 4, 4).
+        """Return the polynomials of the basis, (intervals, 4, 4).
 
         In each interval four basis functions differ from zero. `pieces[i, k, j]` is the coefficient of t^k, t = 0..1
         within interval i, of basis function i + j.
@@ -105,14 +106,14 @@ class Spline:
         return lower
 
     def roughness(self, strength: float) -> Array:
-        """Penalty matrix (size, size), `strength` times the sum of squared third differences. It bridges knots without
-        samples.
+        """Return the penalty matrix (size, size), `strength` times the sum of squared third differences. It bridges
+        knots without samples.
         """
         differences = np.diff(np.eye(self.size), 3, axis=0)
         return np.asarray(strength * differences.T @ differences)
 
     def transfer_operator(self, frequency_cy_per_px: Array) -> NDArray[np.complex128]:
-        """Matrix (frequencies, size) from the coefficients to the Fourier transform of the derivative.
+        """Return the matrix (frequencies, size) from the coefficients to the Fourier transform of the derivative.
 
         Exact: between knots the derivative is a parabola in t = 0..1. Its transform is a sum of the moments of exp(-2
         pi i f width t).
@@ -128,7 +129,7 @@ class Spline:
 
 
 def _exponential_moments(z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Integrals of t^k exp(z t) over t = 0..1 for k = 0, 1, 2: (3, ...).
+    """Integrate t^k exp(z t) over t = 0..1 for k = 0, 1, 2: (3, ...).
 
     By a power series where |z| < 1, else by integration by parts.
     """
@@ -178,12 +179,12 @@ class SortedSamples:
         return SortedSamples(spline, order, starts, powers)
 
     def _local(self, coefficients: Array) -> Array:
-        """Polynomial coefficients (4, intervals) of a spline in each interval, lowest power first."""
+        """Return the polynomial coefficients (4, intervals) of a spline in each interval, lowest power first."""
         windows = np.lib.stride_tricks.sliding_window_view(coefficients, 4)
         return np.einsum("ikl,il->ki", self.spline.pieces, windows)
 
     def values(self, coefficients: Array) -> Array:
-        """Values (n,) of a spline at the samples, in sorted order."""
+        """Return the values (n,) of a spline at the samples, in sorted order."""
         counts, t = np.diff(self.starts), self.powers[1]
         value, *rest = (np.repeat(c, counts) for c in self._local(coefficients)[::-1])
         for c in rest:
@@ -192,7 +193,7 @@ class SortedSamples:
         return value
 
     def derivatives(self, coefficients: Array) -> Array:
-        """First derivatives (n,) at the samples, per px, in sorted order."""
+        """Return the first derivatives (n,) at the samples, per px, in sorted order."""
         counts = np.diff(self.starts)
         _, b, c, d = self._local(coefficients) / np.diff(self.spline.knot_px)
         value, t = np.repeat(3.0 * d, counts), self.powers[1]
@@ -202,8 +203,8 @@ class SortedSamples:
         return value
 
     def gram(self, columns: Array, weight: Array | None = None) -> Array:
-        """Gram matrix A^T W A, (size + g, size + g): A holds the basis functions, then `columns` (g, n), at the sorted
-        samples.
+        """Return the Gram matrix A^T W A, (size + g, size + g): A holds the basis functions, then `columns` (g, n), at
+        the sorted samples.
 
         `weight` (n,) is the diagonal of W, the identity where it is None.
         """
@@ -243,7 +244,7 @@ class LineSpreadPriors:
 
     @staticmethod
     def of(spline: Spline, coefficients: Array, width: float, reach: float) -> LineSpreadPriors:
-        """The priors for a spline whose `coefficients` are the current estimate.
+        """Make the priors for a spline whose `coefficients` are the current estimate.
 
         `width`: blur width, px, the standard deviation of a Gaussian with the same 10 % to 90 % distance; `reach`: of
         the samples, px.
@@ -276,24 +277,24 @@ class LineSpreadPriors:
         )
 
     def near(self, smoothness: int, length: int) -> Array:
-        """E K E of unit strength, by the indices of smoothness and length."""
+        """Return E K E of unit strength, by the indices of smoothness and length."""
         apart = np.abs(self.warped[:, None] - self.warped) / PRIOR_LENGTHS[length]
         return np.outer(self.envelope, self.envelope) * CORRELATIONS[smoothness](apart)
 
     def at(self, point: PriorIndex) -> Array:
-        """The whole covariance C at a point of the grid of hyperparameters."""
+        """Return the whole covariance C at a point of the grid of hyperparameters."""
         smoothness, length, strength, amplitude = point
         near = PRIOR_STRENGTHS[strength] ** 2 * self.near(smoothness, length)
         return near + TAIL_AMPLITUDES_PX[amplitude] ** 2 * self.tails + self.gaussian
 
 
 def _matern_3_2(apart: Array) -> Array:
-    """Matern correlation of order 3/2 at distances in units of its length: once differentiable."""
+    """Return the Matern correlation of order 3/2 at distances in units of its length: once differentiable."""
     return np.asarray((1.0 + np.sqrt(3.0) * apart) * np.exp(-np.sqrt(3.0) * apart))
 
 
 def _matern_5_2(apart: Array) -> Array:
-    """Matern correlation of order 5/2: twice differentiable."""
+    """Return the Matern correlation of order 5/2: twice differentiable."""
     return np.asarray((1.0 + np.sqrt(5.0) * apart + 5.0 / 3.0 * apart * apart) * np.exp(-np.sqrt(5.0) * apart))
 
 
@@ -358,7 +359,7 @@ def posterior(
 def _prior_weights(
     priors: LineSpreadPriors, design: Array, data: Array, start: PriorIndex, log_likelihood_range: float
 ) -> tuple[dict[PriorIndex, float], PriorIndex]:
-    """Weights of the hyperparameters by marginal likelihood, sum 1, and the best ones; data = design @ masses + noise
+    """Weigh the hyperparameters by marginal likelihood, sum 1, and find the best ones; data = design @ masses + noise
     of unit variance.
 
     Coordinate ascent on the grid from `start`, then all connected points whose log marginal likelihood is within
@@ -369,7 +370,7 @@ def _prior_weights(
     tried: dict[PriorIndex, float] = {}
 
     def log_likelihood(at: PriorIndex) -> float:
-        """Log marginal likelihood, up to a constant; minus infinity beside the grid."""
+        """Return the log marginal likelihood, up to a constant; minus infinity beside the grid."""
         if at in tried:
             return tried[at]
         if not all(0 <= i < count for i, count in zip(at, PRIOR_GRID, strict=True)):
@@ -411,7 +412,7 @@ def _prior_weights(
 
 
 def _neighbours(at: PriorIndex) -> list[PriorIndex]:
-    """The eight neighbours on the grid of hyperparameters."""
+    """Return the eight neighbours on the grid of hyperparameters."""
     a, b, c, d = at
     return [
         (a + 1, b, c, d), (a, b + 1, c, d), (a, b, c + 1, d), (a, b, c, d + 1),
@@ -420,7 +421,7 @@ def _neighbours(at: PriorIndex) -> list[PriorIndex]:
 
 
 def _covariance_root(covariance: Array) -> Array:
-    """R with covariance = R R^T."""
+    """Return a root R of a covariance R R^T."""
     scale = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(scale, scale)
     correlation.flat[:: len(correlation) + 1] += 1e-12

@@ -37,8 +37,8 @@ MOST_REFUSED = 72  # edges of a frame that are too little tilted, after which no
 def check_phases(step: str, cfa: Cfa, channel: str, region: Region, angle_deg: float) -> None:
     """Raise `NotDetermined` of `step` where the edge in a region crosses less than one sample period of its channel.
 
-    Aliasing makes the position at which a row or column crosses the edge err periodically, by its phase to the samples. Over less than a
-    period this error doesn't average out, and biases the angle.
+    Aliasing makes the position at which a row or column crosses the edge err periodically, by its phase to the samples.
+    Over less than a period this error doesn't average out, and biases the angle.
     """
     tilt_deg = abs((angle_deg + 45.0) % 90.0 - 45.0)
     lines = region[2] - region[0] if abs((angle_deg + 90.0) % 180.0 - 90.0) < 45.0 else region[3] - region[1]
@@ -52,14 +52,15 @@ def check_phases(step: str, cfa: Cfa, channel: str, region: Region, angle_deg: f
         )
         raise NotDetermined(
             step,
-            f"an edge at {tilt_deg:.2g} deg over {lines} lines crosses {crossed_px:.2g} of the {period_px:g} px between samples of {channel}: {wanted}",
+            f"an edge at {tilt_deg:.2g} deg over {lines} lines crosses {crossed_px:.2g} of the {period_px:g} px "
+            f"between samples of {channel}: {wanted}",
         )
 
 
 @dataclass(frozen=True)
 class FoundEdge:
-    """An edge: a region (row0, col0, row1, col1) about its middle, its angle from the vertical, the length that is used, and why it can't be
-    used ("": it can), as it crosses less than a period of the samples.
+    """An edge: a region (row0, col0, row1, col1) about its middle, its angle from the vertical, the length that is
+    used, and why it can't be used ("": it can), as it crosses less than a period of the samples.
     """
 
     region: Region
@@ -69,13 +70,13 @@ class FoundEdge:
 
 
 def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None = None) -> tuple[FoundEdge, ...]:
-    """Edges of a raw frame (rows, cols) from which an MTF can be taken, the longest first, none twice.
+    """Find the edges of a raw frame (rows, cols) from which an MTF can be taken, the longest first, none twice.
 
     Line segments (LSD, von Gioi et al. 2010) of the frame binned to the pitch of a channel. About the middle of each
     segment a region is laid that holds no other edge. It is kept where both sides are uniform and unsaturated, and the
     MTF of the green (or only) channel can be determined. Edges that cross less than a period of the samples come with
-    the reason why they can't be used, after the others. Raises `NotDetermined` where none can be used, with the reason of the last one
-    refused.
+    the reason why they can't be used, after the others. Raises `NotDetermined` where none can be used, with the reason
+    of the last one refused.
     """
     values = np.asarray(frame, dtype=float)
     if values.ndim != 2 or not np.isfinite(values).all():
@@ -142,14 +143,16 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
 
 
 def _region_about(middle: tuple[float, float], room: NDArray[np.float64], shape: tuple[int, ...]) -> Region:
-    """The region that reaches `room` (rows, columns), px, to both sides of a place, within a frame of that shape."""
+    """Return the region that reaches `room` (rows, columns), px, to both sides of a place, within a frame of that
+    shape.
+    """
     start = np.maximum(np.ceil(np.array(middle) - room), 0).astype(int)
     stop = np.minimum(np.floor(np.array(middle) + room) + 1, shape).astype(int)
     return int(start[0]), int(start[1]), int(stop[0]), int(stop[1])
 
 
 def _refusal(cfa: Cfa, channel: str, region: Region, angle_deg: float) -> str:
-    """Why an edge crosses too few phases of the samples; empty where it crosses enough."""
+    """Say why an edge crosses too few phases of the samples; empty where it crosses enough."""
     try:
         check_phases("mtf", cfa, channel, region, angle_deg)
     except NotDetermined as refused:
@@ -167,7 +170,7 @@ def measure_edge(
     frequency_cy_per_px: ArrayLike | None = None,
     region: Region | None = None,
 ) -> EdgeMtf:
-    """MTF of one slanted edge in one channel (R, G, B or Y).
+    """Measure the MTF of one slanted edge in one channel (R, G, B or Y).
 
     `captures` are repeats of the same settings; their mean is analysed. The edge is the one in `region` (row0, col0,
     row1, col1). Without it, it is the one in the region of the capture, or else the longest that `find_edges` finds.
@@ -198,7 +201,7 @@ def measure_edge(
 
 
 def _edges_of(recordings: RecordingSet, capture: SlantedEdgeCapture) -> tuple[FoundEdge, ...]:
-    """Edges of the frame of a capture, those that can be used first; see `find_edges`."""
+    """Find the edges of the frame of a capture, those that can be used first; see `find_edges`."""
     camera = recordings.camera(capture.side)
     return find_edges(recordings.frame(capture), camera.cfa, camera.saturation_dn)
 
@@ -206,13 +209,13 @@ def _edges_of(recordings: RecordingSet, capture: SlantedEdgeCapture) -> tuple[Fo
 def fit_mtf(
     recordings: RecordingSet, side: Side, noise: NoiseFit | None = None, left_out: list[str] | None = None
 ) -> tuple[MtfCurve, ...]:
-    """One MTF curve for every slanted-edge capture of `side` and every channel (R, G, B; or Y), captures in their
+    """Fit one MTF curve for every slanted-edge capture of `side` and every channel (R, G, B; or Y), captures in their
     order.
 
     A capture without a region gives the curves of all edges found in its frame, each with its region. The black level
-    is that of `noise` where it was fitted, else the stated one. The angle is given in the half turn next to the
-    nominal one of the capture. Edges that can't be used are left out, among them those that cross less than one sample period of their
-    channel; `left_out` gets a line for each. Raises `NotDetermined` where none can be used.
+    is that of `noise` where it was fitted, else the stated one. The angle is given in the half turn next to the nominal
+    one of the capture. Edges that can't be used are left out, among them those that cross less than one sample period
+    of their channel; `left_out` gets a line for each. Raises `NotDetermined` where none can be used.
     """
     captures = recordings.captures(SlantedEdgeCapture, side)
     if not captures:

@@ -89,29 +89,30 @@ class EdgeGeometry:
 
     @property
     def reach_px(self) -> float:
-        """Largest distance of a sample from the edge, px."""
+        """Return the largest distance of a sample from the edge, px."""
         return float(np.abs(self.distance_px).max())
 
     @cached_property
     def basis(self) -> sparse.csr_array:
-        """Basis functions of the spline at the samples, (n, k)."""
+        """Return the basis functions of the spline at the samples, (n, k)."""
         return self.spline.design(self.distance_px)
 
     def coefficients(self, values: Array) -> Array:
-        """Coefficients (k,) of the ESF that the estimator finds for `values` (n,) at the samples."""
+        """Return the coefficients (k,) of the ESF that the estimator finds for `values` (n,) at the samples."""
         weighted = values * self.weight
         right = np.concatenate([self.basis.T @ weighted, self.gradients @ weighted])
         return np.asarray(self.inverse @ right)[: self.basis.shape[1]]
 
     def optical_transfer(self, coefficients: Array, frequency_cy_per_px: Array) -> NDArray[np.complex128]:
-        """Complex transfer function (frequencies,) of an ESF with these coefficients: 1 at frequency 0, phase about
-        the edge.
+        """Return the complex transfer function (frequencies,) of an ESF with these coefficients: 1 at frequency 0,
+        phase about the edge.
         """
         step = coefficients[-1] - coefficients[0]
         return np.asarray(self.spline.transfer_operator(frequency_cy_per_px) @ coefficients / step)
 
     def predict(self, profile: Callable[[Array], Array], frequency_cy_per_px: ArrayLike) -> Array:
-        """MTF (frequencies,) that the estimator reports, at this very geometry, for a noise-free edge profile.
+        """Predict the MTF (frequencies,) that the estimator reports, at this very geometry, for a noise-free edge
+        profile.
 
         `profile(distance_px)` gives the ESF at signed distances from the edge, rising towards positive distances, with
         any two levels and any shift: the edge is put where the profile is half way. It is called once, on an even grid
@@ -128,7 +129,7 @@ class EdgeGeometry:
 
 
 def _cubic_interpolation(grid: Array, values: Array, at: Array) -> Array:
-    """Catmull-Rom interpolation of `values` on the even `grid` at the places `at`: its error is of fourth order in the
+    """Interpolate `values` on the even `grid` at the places `at` (Catmull-Rom): the error is of fourth order in the
     spacing.
     """
     step = grid[1] - grid[0]
@@ -172,7 +173,7 @@ class EdgeMtf:
     geometry: EdgeGeometry
 
     def predict(self, profile: Callable[[Array], Array]) -> Array:
-        """MTF at `frequency_cy_per_px` that this estimator reports for a predicted edge profile; see
+        """Predict the MTF at `frequency_cy_per_px` that this estimator reports for an edge profile; see
         `EdgeGeometry.predict`.
         """
         return self.geometry.predict(profile, self.frequency_cy_per_px)
@@ -188,7 +189,8 @@ def edge_result(
     noise: tuple[float, float],
     chi2: float,
 ) -> EdgeMtf:
-    """Transfer function, its covariance, MTF50 and MTF10 from the coefficients `esf` (k,) and their covariance (k, k).
+    """Derive the transfer function, its covariance, MTF50 and MTF10 from the coefficients `esf` (k,) and their
+    covariance (k, k).
 
     `levels`, `noise`: (dark, light), in the unit of the region; `chi2`: of the residual per degree of freedom.
     """
@@ -239,7 +241,7 @@ def edge_result(
 def transfer_and_jacobian(
     geometry: EdgeGeometry, esf: Array, frequency: Array
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Transfer function F (frequencies,) and its Jacobian dF/d(esf) (frequencies, k).
+    """Return the transfer function F (frequencies,) and its Jacobian dF/d(esf) (frequencies, k).
 
     F = T esf / (esf[-1] - esf[0]), T the transfer operator of the spline.
     """
@@ -255,7 +257,7 @@ def transfer_and_jacobian(
 def _falling_frequencies(
     geometry: EdgeGeometry, esf: Array, covariance: Array, levels: Sequence[float]
 ) -> list[tuple[float | None, float | None]]:
-    """First frequency at which the MTF falls to each level, and its standard deviation, cy/px.
+    """Find the first frequency at which the MTF falls to each level, and its standard deviation, cy/px.
 
     None where it doesn't fall so far up to 1.5 cy/px, or where the standard deviation of the MTF there is above 0.3 of
     the level.
@@ -291,13 +293,13 @@ class Quantisation:
     frames: int
 
     def with_rounding(self, std: float) -> float:
-        """Standard deviation of the mean of rounded values, from the one before rounding."""
+        """Return the standard deviation of the mean of rounded values, from the one before rounding."""
         if not self.size:
             return std
         return float(np.hypot(std, self.size * rounding_std_dn(self.frames * (std / self.size) ** 2)))
 
     def covariance(self, geometry: EdgeGeometry, level: Array, variance: Array) -> Array:
-        """Covariance (k, k) of the spline coefficients by rounding errors, which repeats don't average out.
+        """Return the covariance (k, k) of the spline coefficients by rounding errors, which repeats don't average out.
 
         `level`, `variance` (n,): mean and temporal variance of the values at the samples.
         """
@@ -319,7 +321,7 @@ def measure_mtf(
     noise_std: float | None,
     quantisation: Quantisation,
 ) -> EdgeMtf:
-    """MTF of an edge that has been found.
+    """Measure the MTF of an edge that has been found.
 
     `near`: samples close to the edge; `reach`: usable distance, px; `frequency`: cy/px; `noise_std`: of the values, or
     None to take it from the residuals on both sides.
@@ -408,7 +410,7 @@ def measure_mtf(
 
 
 def _knots_px(width: float, reach: float, step: int) -> Array:
-    """Knots: evenly spaced within `width` of the edge, then ever wider apart up to `FAR_PX`."""
+    """Place the knots: evenly spaced within `width` of the edge, then ever wider apart up to `FAR_PX`."""
     core = min(width, max(reach - 2.0 * step, 2.0))
     count = max(int(np.ceil(core / KNOT_SPACING_PX)), 6)
     side = list(np.arange(count + 1) * KNOT_SPACING_PX)
@@ -421,7 +423,7 @@ def _knots_px(width: float, reach: float, step: int) -> Array:
 
 
 def _blur_width_px(samples: Samples, distance: Array, reach: float) -> float:
-    """Standard deviation of the Gaussian with the 10 % to 90 % distance of the profile, px."""
+    """Return the standard deviation of the Gaussian with the 10 % to 90 % distance of the profile, px."""
     kept = np.abs(distance) < reach
     value, _, _ = level_planes(samples.where(kept), distance[kept], 0.75 * reach, reach)
     count = max(int(reach / 0.5), 4)
@@ -439,7 +441,8 @@ def _blur_width_px(samples: Samples, distance: Array, reach: float) -> float:
 
 
 def _robust_std(residual: Array, code: float = 0.0) -> float:
-    """Standard deviation without outliers: 1.4826 times the median modulus, then the rms of what is within 4 of it.
+    """Return the standard deviation without outliers: 1.4826 times the median modulus, then the rms of what is within 4
+    of it.
 
     `code`: step of the rounded values. Most of them may be equal, and the next code is no outlier: the first estimate
     is at least code / 2.
@@ -482,7 +485,7 @@ def _refuse_clipped(light: Array, noise_std: float, contrast: float) -> None:
 def edge_mtf(
     region: ArrayLike, frequency_cy_per_px: ArrayLike | None = None, noise_std: float | None = None
 ) -> EdgeMtf:
-    """MTF of a linear region (rows, cols) that holds one straight or gently bent edge at any angle.
+    """Estimate the MTF of a linear region (rows, cols) that holds one straight or gently bent edge at any angle.
 
     `frequency_cy_per_px` (frequencies,) defaults to 0..1 by 0.01. `noise_std`, in the unit of the region, is estimated
     from the residuals on both sides of the edge where it isn't given. The angle is from the vertical, -90 to 90 deg,
@@ -503,7 +506,8 @@ def planes_mtf(
     code: float = 0.0,
     frames: int = 1,
 ) -> EdgeMtf:
-    """As `edge_mtf`, from one or more planes that see the same edge with the same blur (the two green ones).
+    """Estimate the MTF as `edge_mtf`, from one or more planes that see the same edge with the same blur (the two green
+    ones).
 
     Each plane is levelled by itself, so that unequal gains don't matter. `code`: the values were rounded to multiples
     of it (0: not at all) before a mean of `frames` was taken; where the noise is below the step, the error of rounding

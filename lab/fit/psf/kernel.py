@@ -64,11 +64,11 @@ class NormalEquations:
 
 
 def normal_equations(sharp: Array, blurred: Array, support: int) -> NormalEquations:
-    """Exact normal equations over the pixels for which the whole kernel (support, support) sees `sharp`; both pictures
-    (rows, cols).
+    """Sum the exact normal equations over the pixels for which the whole kernel (support, support) sees `sharp`; both
+    pictures (rows, cols).
 
-    The sums over the windows of all elements are those over the window of the last element, updated by the rows and columns that enter and
-    leave: O(support^2 pixels) instead of O(support^4 pixels).
+    The sums over the windows of all elements are those over the window of the last element, updated by the rows and
+    columns that enter and leave: O(support^2 pixels) instead of O(support^4 pixels).
     """
     s, h = support, support // 2
     rows, cols = sharp.shape
@@ -79,7 +79,8 @@ def normal_equations(sharp: Array, blurred: Array, support: int) -> NormalEquati
     i, j = np.arange(s)[:, None, None], np.arange(s)[:, None]
     gram = np.zeros((s, s, s, s))
     for down in range(s):
-        # Element (i, j) sees the window that begins at (2 h - i, 2 h - j), element (i + down, j') the one `down` rows above
+        # Element (i, j) sees the window that begins at (2 h - i, 2 h - j), element (i + down, j') the one `down` rows
+        # above
         sums = _lagged_sums(u, padded[s - 1 - down : s - 1 - down + rows], tall, wide)
         part = sums[s - 1 - i[: s - down], s - 1 - j, s - 1 + j - j.T]
         at = np.arange(s - down)
@@ -93,17 +94,18 @@ def normal_equations(sharp: Array, blurred: Array, support: int) -> NormalEquati
 
 
 def _window_sums(picture: Array, tall: int, wide: int) -> Array:
-    """Sums (s, s) of a picture (rows, cols) over all its windows of `tall` x `wide`, s = rows - tall + 1."""
+    """Sum a picture (rows, cols) over all its windows of `tall` x `wide`: (s, s), s = rows - tall + 1."""
     cumulative = np.pad(picture.cumsum(axis=0), ((1, 0), (0, 0)))
     by_row = np.pad((cumulative[tall:] - cumulative[: len(cumulative) - tall]).cumsum(axis=1), ((0, 0), (1, 0)))
     return np.asarray(by_row[:, wide:] - by_row[:, : by_row.shape[1] - wide])
 
 
 def _lagged_sums(u: Array, other: Array, tall: int, wide: int) -> Array:
-    """Sums (s, s, 2 s - 1) of u[r, c] other[r, c + lag] over the windows of `tall` x `wide` that begin at (row, col).
+    """Sum u[r, c] other[r, c + lag] over the windows of `tall` x `wide` that begin at (row, col): (s, s, 2 s - 1).
 
-    `u` (rows, cols), `other` (rows, cols + 2 s - 2), s = cols - wide + 1. Over the first window by matrix products of blocks of columns, of
-    which the diagonals are the lags; over the others by what their rows and columns add and leave out.
+    `u` (rows, cols), `other` (rows, cols + 2 s - 2), s = cols - wide + 1. Over the first window by matrix products of
+    blocks of columns, of which the diagonals are the lags; over the others by what their rows and columns add and leave
+    out.
     """
     cols = u.shape[1]
     s = cols - wide + 1
@@ -116,7 +118,8 @@ def _lagged_sums(u: Array, other: Array, tall: int, wide: int) -> Array:
         by_column[first:last] = np.lib.stride_tricks.as_strided(products, (last - first, lags), (row + item, item))
     views = np.lib.stride_tricks.sliding_window_view(other, lags, axis=1)  # (rows, cols, lags)
     enters, leaves = np.arange(tall, tall + s - 1), np.arange(s - 1)
-    # Down the rows: over the first `wide` columns together, and each column that a window further right leaves out or adds
+    # Down the rows: over the first `wide` columns together, and each column that a window further right leaves out or
+    # adds
     within = np.empty((s, lags))
     within[0] = by_column[:wide].sum(axis=0)
     row_sums = _row_products(u[:, :wide], other[:, : wide + lags - 1], np.concatenate([enters, leaves]))
@@ -133,13 +136,13 @@ def _lagged_sums(u: Array, other: Array, tall: int, wide: int) -> Array:
 
 
 def _row_products(u: Array, other: Array, rows: NDArray[np.int64]) -> Array:
-    """Sums (rows, lags) of u[r, c] other[r, c + lag] over the columns, for chosen `rows`."""
+    """Sum u[r, c] other[r, c + lag] over the columns, for chosen `rows`: (rows, lags)."""
     views = np.lib.stride_tricks.sliding_window_view(other, u.shape[1], axis=1)  # (rows, lags, cols)
     return np.array([views[r] @ u[r] for r in rows]).reshape(len(rows), views.shape[1])
 
 
 def normal_equations_right(sharp: Array, blurred: Array, support: int) -> tuple[Array, float]:
-    """The parts that depend on `blurred`: the right side (support^2,) and the power."""
+    """Sum the parts that depend on `blurred`: the right side (support^2,) and the power."""
     s, h = support, support // 2
     tall, wide = sharp.shape[0] - 2 * h, sharp.shape[1] - 2 * h
     seen = blurred[h : h + tall, h : h + wide]
@@ -155,7 +158,7 @@ def normal_equations_right(sharp: Array, blurred: Array, support: int) -> tuple[
 
 
 def on_simplex(quadratic: Array, linear: Array, start: Array, solves: int = MOST_SOLVES) -> Array:
-    """argmin 1/2 x^T Q x - c^T x over x >= 0, sum x = 1, from `start` (n,): `quadratic` Q (n, n), `linear` c (n,).
+    """Minimise 1/2 x^T Q x - c^T x over x >= 0, sum x = 1, from `start` (n,): `quadratic` Q (n, n), `linear` c (n,).
 
     Accelerated projected gradients with restarts (O'Donoghue and Candes 2015), then an exact active-set step. `solves`
     limits that step, each iteration of which costs one factorisation; it ends by itself at the optimum.
@@ -183,14 +186,14 @@ def on_simplex(quadratic: Array, linear: Array, start: Array, solves: int = MOST
 
 
 def _project_on_simplex(x: Array) -> Array:
-    """Nearest point with x >= 0, sum x = 1."""
+    """Project on x >= 0, sum x = 1: the nearest point."""
     ordered = np.sort(x)[::-1]
     excess = (np.cumsum(ordered) - 1.0) / np.arange(1, len(x) + 1)
     return np.asarray(np.maximum(x - excess[np.flatnonzero(ordered > excess)[-1]], 0.0))
 
 
 def _polish(q: Array, c: Array, x: Array, solves: int) -> Array:
-    """Exact optimum from a nearby point by block principal pivoting (Portugal, Judice and Vicente 1994).
+    """Find the exact optimum from a nearby point by block principal pivoting (Portugal, Judice and Vicente 1994).
 
     Solve on the support, then exchange all elements that violate the optimality conditions. Where this stops to gain,
     exchange only the last of them, which terminates.
@@ -235,11 +238,11 @@ class KernelPrior:
 
     @property
     def support(self) -> int:
-        """Width of the kernel."""
+        """Return the width of the kernel."""
         return int(np.sqrt(len(self.envelope)))
 
     def _eigen(self) -> tuple[Array, Array]:
-        """Eigenvalues (support^2,) and the eigenvectors of one axis (support, support)."""
+        """Return the eigenvalues (support^2,) and the eigenvectors of one axis (support, support)."""
         x = np.arange(self.support)
         if self.length <= 0.0:
             return np.ones(self.support**2), np.eye(self.support)
@@ -247,27 +250,27 @@ class KernelPrior:
         return np.clip(np.kron(power, power), 0.0, None) + 1e-4, vectors
 
     def precision(self) -> Array:
-        """Inverse of the covariance, (k, k)."""
+        """Return the inverse of the covariance, (k, k)."""
         power, vectors = self._eigen()
         inverse = _both_axes(vectors.T, np.diag(1.0 / power))
         envelope = self.strength * self.envelope
         return np.asarray(inverse / np.outer(envelope, envelope))
 
     def whiten(self, information: Array) -> Array:
-        """R^T information R, (k, k), where covariance = R R^T."""
+        """Whiten the information of the data: R^T information R, (k, k), where covariance = R R^T."""
         power, vectors = self._eigen()
         envelope = self.strength * self.envelope
         inner = _both_axes(vectors, information * np.outer(envelope, envelope))
         return np.asarray(inner * np.sqrt(np.outer(power, power)))
 
     def whiten_right(self, weighted: Array) -> Array:
-        """R^T weighted, (k,)."""
+        """Whiten the right side of the normal equations: R^T weighted, (k,)."""
         power, vectors = self._eigen()
         scaled = (self.strength * self.envelope * weighted).reshape(self.support, self.support)
         return np.asarray((vectors.T @ scaled @ vectors).ravel() * np.sqrt(power))
 
     def posterior(self, information: Array) -> Array:
-        """Covariance (k, k) of the kernel, given the data and that its sum is 1."""
+        """Return the covariance (k, k) of the kernel, given the data and that its sum is 1."""
         factor = _cholesky_of_one_more(self.whiten(information))
         lower, failed = linalg.lapack.dpotri(factor, lower=1, overwrite_c=1)
         if failed:
@@ -281,8 +284,8 @@ class KernelPrior:
 
 
 def log_likelihood(inner: Array, right: Array) -> float:
-    """Log marginal likelihood of the data under a prior, up to a constant, from R^T information R (overwritten) and
-    R^T weighted.
+    """Return the log marginal likelihood of the data under a prior, up to a constant, from R^T information R
+    (overwritten) and R^T weighted.
     """
     factor = _cholesky_of_one_more(inner)
     half = linalg.solve_triangular(factor, right, lower=True, check_finite=False)
@@ -290,7 +293,9 @@ def log_likelihood(inner: Array, right: Array) -> float:
 
 
 def _cholesky_of_one_more(matrix: Array) -> Array:
-    """The lower triangular root of `matrix` + 1, (k, k) and symmetric, which is overwritten; above it stands anything."""
+    """Return the lower triangular root of `matrix` + 1, (k, k) and symmetric, which is overwritten; above it stands
+    anything.
+    """
     matrix.flat[:: len(matrix) + 1] += 1.0
     # LAPACK's columns are the rows of a symmetric matrix: nothing is copied
     factor, failed = linalg.lapack.dpotrf(matrix.T, lower=1, clean=0, overwrite_a=1)
@@ -300,14 +305,14 @@ def _cholesky_of_one_more(matrix: Array) -> Array:
 
 
 def _both_axes(vectors: Array, matrix: Array) -> Array:
-    """(W x W)^T matrix (W x W) of a symmetric `matrix`, x the Kronecker product."""
+    """Multiply a symmetric `matrix` from both sides: (W x W)^T matrix (W x W), x the Kronecker product."""
     s = len(vectors)
     half = (vectors.T @ matrix.reshape(-1, s, s) @ vectors).reshape(matrix.shape)  # matrix (W x W)
     return np.asarray((vectors.T @ half.T.reshape(-1, s, s) @ vectors).reshape(matrix.shape))
 
 
 def envelope_of(kernel: Array) -> Array:
-    """Local mean of a kernel over about a pixel, at least 5e-4 of its maximum; the largest is 1."""
+    """Return the local mean of a kernel over about a pixel, at least 5e-4 of its maximum; the largest is 1."""
     local = ndimage.gaussian_filter(kernel, 0.6, mode="constant")
     return np.asarray(np.maximum(local / local.max(), 5e-4).ravel())
 
@@ -315,8 +320,8 @@ def envelope_of(kernel: Array) -> Array:
 def most_likely_prior(
     information: Array, weighted: Array, kernel: Array, start: tuple[int, int]
 ) -> tuple[KernelPrior, tuple[int, int]]:
-    """The prior whose length and strength maximise the marginal likelihood, by coordinate ascent on their grid from
-    the index `start`.
+    """Find the prior whose length and strength maximise the marginal likelihood, by coordinate ascent on their grid
+    from the index `start`.
 
     `information` (k, k), `weighted` (k,): normal equations over the noise variance; `kernel`: the current estimate,
     for envelope and scale. Returns the prior and its index.
@@ -326,7 +331,7 @@ def most_likely_prior(
     unit_problem: dict[int, tuple[Array, Array]] = {}  # by length: the strength only scales it
 
     def likelihood(at: tuple[int, int]) -> float:
-        """Log marginal likelihood at an index of the grid; minus infinity beside it."""
+        """Return the log marginal likelihood at an index of the grid; minus infinity beside it."""
         if not (0 <= at[0] < len(PRIOR_LENGTHS_PX) and 0 <= at[1] < len(PRIOR_STRENGTHS)):
             return -np.inf
         if at not in tried:
@@ -379,7 +384,7 @@ def solve_kernel(
     start_from: KernelEstimate | None = None,
     solves: int = MOST_SOLVES,
 ) -> KernelEstimate:
-    """The kernel (support, support) of given normal equations; see `estimate_kernel`.
+    """Solve for the kernel (support, support) of given normal equations; see `estimate_kernel`.
 
     With `outside` the last element of the normal equations is the light from beyond the support, which is part of the
     sum. The prior maximises the marginal likelihood over `rounds` of envelope and kernel in turn; or it is that of the
@@ -448,9 +453,7 @@ def solve_kernel(
 
 
 def displace(picture: Array, field: Array) -> Array:
-    """`picture` (rows, cols) read at the place of each pixel plus `field` (2, rows, cols), px, by splines of order
-    5.
-    """
+    """Read `picture` (rows, cols) at each pixel's place plus `field` (2, rows, cols), px, by splines of order 5."""
     rows, cols = np.indices(picture.shape, dtype=float)
     return np.asarray(ndimage.map_coordinates(picture, [rows + field[0], cols + field[1]], order=5, mode="nearest"))
 
@@ -464,7 +467,7 @@ def displacement(predicted: Array, seen: Array, border: int) -> Array | None: ..
 
 
 def displacement(predicted: Array, seen: Array, border: int, start: Array | None = None) -> Array | None:
-    """Field (2, rows, cols), px, such that `predicted` read at the displaced places agrees with `seen`.
+    """Find the field (2, rows, cols), px, such that `predicted` read at the displaced places agrees with `seen`.
 
     Bilinear between the nodes of a grid of about `GRID_PX`, with mean 0. Gauss-Newton on the residual beyond `border`
     px of the frame; the nodes have a Gaussian prior of `NODE_STD_PX`, and of second differences whose size maximises
@@ -503,12 +506,12 @@ def displacement(predicted: Array, seen: Array, border: int, start: Array | None
 
 
 def _pinv(hats: Array) -> Array:
-    """Pseudo-inverse of the basis of one axis."""
+    """Return the pseudo-inverse of the basis of one axis."""
     return np.asarray(np.linalg.pinv(hats))
 
 
 def _node_precision(shape: tuple[int, int], curvature_px: float) -> Array:
-    """Precision (nodes, nodes) of a grid whose second differences, along both axes and mixed, are about
+    """Return the precision (nodes, nodes) of a grid whose second differences, along both axes and mixed, are about
     `curvature_px`.
     """
     down, across = (np.eye(n) for n in shape)
@@ -518,7 +521,7 @@ def _node_precision(shape: tuple[int, int], curvature_px: float) -> Array:
 
 
 def _log_bayes_factor(gram: Array, right: Array, precision: Array) -> float:
-    """Log Bayes factor of a displacement with given `precision` (of one axis) against none."""
+    """Return the log Bayes factor of a displacement with given `precision` (of one axis) against none."""
     factor = linalg.cholesky(gram + linalg.block_diag(precision, precision), lower=True, check_finite=False)
     half = linalg.solve_triangular(factor, right, lower=True, check_finite=False)
     prior = linalg.cholesky(precision, lower=True, check_finite=False)
@@ -526,13 +529,15 @@ def _log_bayes_factor(gram: Array, right: Array, precision: Array) -> float:
 
 
 def _hats(count: int, nodes: int) -> Array:
-    """Basis (count, nodes) of linear interpolation between evenly spaced nodes: hat functions."""
+    """Return the basis (count, nodes) of linear interpolation between evenly spaced nodes: hat functions."""
     at = np.linspace(0.0, nodes - 1.0, count)
     return np.clip(1.0 - np.abs(at[:, None] - np.arange(nodes)), 0.0, None)
 
 
 def _hat_gram(hats: Sequence[Array], weight: Array) -> Array:
-    """Gram matrix (nodes, nodes) of the products of row and column hat functions under a `weight` (rows, cols)."""
+    """Return the Gram matrix (nodes, nodes) of the products of row and column hat functions under a `weight` (rows,
+    cols).
+    """
     down, across = hats
     # By rows first, then by columns
     row_products = np.einsum("ri,rj->rij", down, down).reshape(len(down), -1)  # (rows, a a')
@@ -551,7 +556,7 @@ def estimate_kernel(
     *,
     register: bool = True,
 ) -> KernelEstimate:
-    """The kernel that blurs `sharp` into `blurred`, both (rows, cols); `support` is odd.
+    """Estimate the kernel that blurs `sharp` into `blurred`, both (rows, cols); `support` is odd.
 
         blurred[r, c] = sum_ij kernel[i, j] sharp[r - i + support // 2, c - j + support // 2] + noise
 
@@ -616,13 +621,15 @@ def _refuse_unrelated(predicted: Array, seen: Array) -> None:
     if not agreement**2 > 0.25:
         raise NotDetermined(
             "psf",
-            f"the sharp picture explains {100 * max(agreement, 0.0) ** 2:.0f} % of the blurred one: is it that pattern?",
+            f"the sharp picture explains {100 * max(agreement, 0.0) ** 2:.0f} % of the blurred one: is it that "
+            "pattern?",
         )
     contrast = agreement * float(seen.std() / predicted.std())
     if not 0.5 < contrast < 2.0:
         raise NotDetermined(
             "psf",
-            f"the blurred picture has {contrast:.2g} times the contrast of the sharp one: level it between white and black, or widen the support",
+            f"the blurred picture has {contrast:.2g} times the contrast of the sharp one: level it between white and "
+            "black, or widen the support",
         )
     for name, end in (("lowest", seen.min()), ("highest", seen.max())):
         standing = seen == end
@@ -631,5 +638,6 @@ def _refuse_unrelated(predicted: Array, seen: Array) -> None:
         if share > 0.02 and float(predicted[standing].std()) > 0.1 * float(predicted.std()):
             raise NotDetermined(
                 "psf",
-                f"{100 * share:.0f} % of the blurred picture stand at its {name} value, {end:g}: it is clipped, expose it anew",
+                f"{100 * share:.0f} % of the blurred picture stand at its {name} value, {end:g}: it is clipped, "
+                "expose it anew",
             )

@@ -51,8 +51,8 @@ def estimate_from_photograph(
     oversample: int = 4,
     corners: ArrayLike | None = None,
 ) -> PhotographedKernel:
-    """Kernel from a single photograph (rows, cols), linear, one channel, of a printed or shown `pattern` (0 dark, 1
-    lit).
+    """Estimate the kernel from a single photograph (rows, cols), linear, one channel, of a printed or shown `pattern`
+    (0 dark, 1 lit).
 
     Dark level and contrast are planes in the frame, fitted with the kernel. The place is found by the pattern itself:
     where the picture has most fine structure, in any quarter turn; or at `corners` (4, 2), (x, y) of the corners of
@@ -108,8 +108,8 @@ def estimate_from_photograph(
 
 
 def busiest_quadrilateral(picture: Array) -> Array:
-    """Corners (4, 2), (x, y), clockwise from the top left, of the largest part of a picture that is full of fine
-    structure.
+    """Find the corners (4, 2), (x, y), clockwise from the top left, of the largest part of a picture that is full of
+    fine structure.
     """
     fine = np.abs(picture - ndimage.gaussian_filter(picture, 1.0))
     # A pattern has fine structure everywhere, a marker or an edge only along lines: the lower quartile separates them
@@ -134,8 +134,8 @@ def busiest_quadrilateral(picture: Array) -> Array:
 def _fit_levels(
     seen: Array, predicted: Array, row: NDArray[np.int64], col: NDArray[np.int64], shape: tuple[int, ...]
 ) -> tuple[Array, Array]:
-    """Dark level and contrast, (rows, cols), as planes in the frame, by least squares of seen = dark level + contrast
-    x predicted.
+    """Fit dark level and contrast, (rows, cols), as planes in the frame, by least squares of seen = dark level +
+    contrast x predicted.
     """
 
     def plane(r: Array, c: Array) -> Array:
@@ -153,7 +153,9 @@ def _fit_levels(
 def _align(
     seen: Array, target: NDArray[np.uint8], warp: ScreenWarp, blurs_px: Sequence[float]
 ) -> tuple[ScreenWarp, float]:
-    """The warp improved by Gauss-Newton on the picture blurred by ever less, and the correlation at the last step."""
+    """Improve the warp by Gauss-Newton on the picture blurred by ever less. Returns it and the correlation at the last
+    step.
+    """
     correlation = -1.0
     for blur in blurs_px:
         smooth = ndimage.gaussian_filter(seen, blur)
@@ -180,7 +182,7 @@ def _align(
 
 
 def _share_of_pixel_box(seen: Array, target: NDArray[np.uint8], warp: ScreenWarp) -> float:
-    """Share of the variance that the pattern averaged over the square of a pixel explains, with free levels."""
+    """Return the share of the variance that the pattern explains, averaged over a pixel's square, with free levels."""
     drawn = DrawnPattern.of(seen, target, warp, [(0, 0)], 1, 1, 2)
     pixel = ndimage.correlate1d(drawn.picture, [0.25, 0.5, 0.25], axis=0)
     pixel = ndimage.correlate1d(pixel, [0.25, 0.5, 0.25], axis=1)[2 * drawn.row, 2 * drawn.col]

@@ -77,8 +77,8 @@ def radial_symmetry(parts: Sequence[ScreenKernel], axis_px: tuple[float, float])
 
 
 def _windowed_moments(kernel: ScreenKernel) -> tuple[Array, Array]:
-    """Second moments (row row, row col, col col) of a kernel under a Gaussian window about its centroid, px^2, and
-    their covariance (3, 3).
+    """Measure the second moments (row row, row col, col col) of a kernel under a Gaussian window about its centroid,
+    px^2, and their covariance (3, 3).
     """
     half = len(kernel.kernel) // 2
     row, col = np.meshgrid(*(np.arange(-half, half + 1.0),) * 2, indexing="ij")
@@ -107,8 +107,8 @@ class PsfFit:
 
 
 def fit_psf_field(recordings: RecordingSet, side: Side, patches: int = 3) -> PsfFit:
-    """Kernels of every pose of the screen, Bernoulli target and channel of `side`; of `patches` x `patches` parts of
-    every pattern; and the test of radial symmetry.
+    """Fit the kernels of every pose of the screen, Bernoulli target and channel of `side`; those of `patches` x
+    `patches` parts of every pattern; and test their radial symmetry.
 
     `field_mm` of a kernel is the middle of the pattern from the middle of the frame. The noise is the residual of the
     levelled picture, which includes the photo response non-uniformity of all four captures. Raises `NotDetermined`
@@ -138,7 +138,7 @@ def fit_psf_field(recordings: RecordingSet, side: Side, patches: int = 3) -> Psf
 
 
 def _result(camera: DataSheet, capture: str, found: ScreenKernel) -> PsfKernel:
-    """A kernel as it stands in the results."""
+    """State a kernel as it stands in the results."""
     return PsfKernel(
         capture=capture,
         channel=found.channel,

@@ -35,14 +35,14 @@ SHIFT_STD_PX = 0.005  # common to all corners, beside their noise: shading diffe
 
 
 def on_pixels(fine: Array, oversample: int) -> Array:
-    """A kernel from samples of 1 / `oversample` px to pixels, sum 1."""
+    """Bring a kernel from samples of 1 / `oversample` px to pixels, sum 1."""
     matrix = pixel_matrix(len(fine), oversample)
     kernel = matrix @ fine @ matrix.T
     return np.asarray(kernel / kernel.sum())
 
 
 def pixel_matrix(size: int, oversample: int) -> Array:
-    """One axis of `on_pixels`, (pixels, size).
+    """Return the matrix (pixels, size) of one axis of `on_pixels`.
 
     Light spread over a pixel is light spread over `oversample` adjacent samples: a filter with the response sinc(f) /
     sinc(f / oversample).
@@ -58,7 +58,7 @@ def pixel_matrix(size: int, oversample: int) -> Array:
 
 
 def symmetric_taps(response: Callable[[Array], Array], highest_cy_per_px: float, oversample: int, reach: int) -> Array:
-    """2 reach + 1 symmetric filter taps on samples of 1 / `oversample` px, sum 1.
+    """Design 2 reach + 1 symmetric filter taps on samples of 1 / `oversample` px, sum 1.
 
     Their frequency response is the least-squares fit of `response` (cy/px) up to `highest_cy_per_px`.
     """
@@ -145,7 +145,9 @@ class DrawnPattern:
         return DrawnPattern(warp, picture, surroundings, row, col, seen[row, col], support, oversample)
 
     def parts(self, count: int) -> list[DrawnPattern]:
-        """The pattern in `count` x `count` parts of about equal rows and columns, without parts of too few pixels."""
+        """Split the pattern into `count` x `count` parts of about equal rows and columns, without parts of too few
+        pixels.
+        """
         across = [np.linspace(v.min(), v.max() + 1, count + 1) for v in (self.row, self.col)]
         found = []
         for top, bottom in zip(across[0][:-1], across[0][1:], strict=True):
@@ -156,11 +158,11 @@ class DrawnPattern:
         return found
 
     def within(self, chosen: NDArray[np.bool_]) -> DrawnPattern:
-        """Only the pixels `chosen`, (n,)."""
+        """Return the pattern with the pixels `chosen`, (n,), alone."""
         return replace(self, row=self.row[chosen], col=self.col[chosen], value=self.value[chosen])
 
     def normal(self) -> NormalEquations:
-        """Normal equations of the elements of the kernel and, last, of the light from beyond its support."""
+        """Sum the normal equations of the elements of the kernel and, last, of the light from beyond its support."""
         s, h = self.support, self.support // 2
         size = s * s + 1
         gram, right = np.zeros((size, size)), np.zeros(size)
@@ -178,7 +180,7 @@ class DrawnPattern:
         return NormalEquations(gram, right, float(self.value @ self.value), len(self.row))
 
     def blur(self, estimate: KernelEstimate) -> Array:
-        """The drawing blurred by the estimate, on its own samples."""
+        """Blur the drawing by the estimate, on its own samples."""
         from scipy.signal import fftconvolve  # here: the library takes a while to load
 
         return np.asarray(
@@ -187,7 +189,7 @@ class DrawnPattern:
         )
 
     def refine_warp(self, estimate: KernelEstimate) -> ScreenWarp:
-        """The warp after one Gauss-Newton step of its displacement, without a common shift, which belongs to the
+        """Refine the warp by one Gauss-Newton step of its displacement, without a common shift, which belongs to the
         kernel.
         """
         blurred, at = self.blur(estimate), (self.oversample * self.row, self.oversample * self.col)
@@ -204,7 +206,7 @@ class DrawnPattern:
 
 
 def draw_by_area(target: Array, cell_x: Array, cell_y: Array) -> Array:
-    """Mean of `target` (cells) over squares the size of a sample about the points `cell_x`, `cell_y`; dark outside.
+    """Average `target` (cells) over squares the size of a sample about the points `cell_x`, `cell_y`; dark outside.
 
     The squares are aligned with the cells: the error is of second order in their rotation. A square may hold any
     number of cells.
@@ -238,8 +240,8 @@ class ScreenKernel:
     centre_px: tuple[float, float]  # (row, col) of the samples' middle
 
     def predict(self, fine_kernel: Array) -> Array:
-        """Kernel on the pixels of the sensor that this estimator reports, noise-free and at this very place, for a
-        predicted one.
+        """Predict the kernel on the pixels of the sensor that this estimator reports, noise-free and at this very
+        place, for a given one.
 
         `fine_kernel` is on the grid of `fine.kernel`: `sim.point.kernel(..., support=len(fine.kernel),
         oversample=oversample)`.
@@ -264,7 +266,7 @@ class ScreenField:
 def measure_field(
     pictures: ScreenPictures, cfa: Cfa, support_px: int = 9, oversample: int = 2, patches: int = 3
 ) -> ScreenField:
-    """Kernels of all channels of one pose, `support_px` (odd) wide, and of parts of the pattern.
+    """Measure the kernels of all channels of one pose, `support_px` (odd) wide, and of parts of the pattern.
 
     The support is doubled once where a kernel doesn't fit. The registration from the corners is refined with the
     kernel, except a common shift, by Gauss-Newton on the residual: first on the green (or only) channel, then on each.
@@ -310,14 +312,14 @@ def measure_field(
 
 
 def _rim_share(kernel: Array, oversample: int) -> float:
-    """Share of a kernel in its outermost pixel."""
+    """Return the share of a kernel in its outermost pixel."""
     inside = slice(oversample, -oversample)
     return float(1.0 - kernel[inside, inside].sum() / kernel.sum())
 
 
 def screen_kernel(drawn: DrawnPattern, channel: str, estimate: KernelEstimate) -> ScreenKernel:
-    """The estimate on the pixels of the sensor, with the covariance of the estimate, of a common shift of the corners,
-    and of the grid.
+    """Bring the estimate to the pixels of the sensor, with the covariance of the estimate, of a common shift of the
+    corners, and of the grid.
     """
     matrix = pixel_matrix(drawn.support, drawn.oversample)
     pixels = np.kron(matrix, matrix)
@@ -346,7 +348,7 @@ def screen_kernel(drawn: DrawnPattern, channel: str, estimate: KernelEstimate) -
 def expected_kernel(
     transfer: Callable[[Array, Array], NDArray[np.complex128]], support_px: int, cell_px: float, oversample: int = 2
 ) -> Array:
-    """Kernel on the pixels of the sensor, (support, support), sum 1, that `measure_field` converges to for a
+    """Return the kernel on the pixels of the sensor, (support, support), sum 1, that `measure_field` converges to for a
     transfer function of lens and pixel.
 
     `transfer(fx, fy)`, in cy/px, broadcasts over both. `cell_px`: size of a cell of the pattern. The kernel is the

@@ -1,4 +1,5 @@
-"""The pictures of a screen, levelled between black and white, and where a pattern on it lies in the frame of the camera.
+"""The pictures of a screen, levelled between black and white, and where a pattern on it lies in the frame of the
+camera.
 
 The corners of the checkerboard are found and fitted in the levelled mosaic (`lab.fit.geometry`). They are
 numbered by growing a grid from one of them, and matched to the target by the Bernoulli pattern, which unlike a
@@ -51,7 +52,7 @@ class ScreenPictures:
 
 
 def screen_pictures(recordings: RecordingSet, side: Side) -> list[ScreenPictures]:
-    """Levelled pictures (p - black) / (white - black) for every pose and Bernoulli target of `side`.
+    """Level the pictures, (p - black) / (white - black), for every pose and Bernoulli target of `side`.
 
     A pose that lacks one of the four kinds of captures is left out. Raises `NotDetermined` where none is left.
     """
@@ -98,7 +99,7 @@ def screen_pictures(recordings: RecordingSet, side: Side) -> list[ScreenPictures
 
 
 def _mean_rate(recordings: RecordingSet, captures: Sequence[Any]) -> Array:
-    """Mean of the frames above black, DN/s. Raises `NotDetermined` where one is saturated."""
+    """Average the frames above black, DN/s. Raises `NotDetermined` where one is saturated."""
     camera = recordings.camera(captures[0].side)
     total = np.zeros((camera.rows, camera.cols))
     for capture in captures:
@@ -129,7 +130,7 @@ class ScreenWarp:
 
     @staticmethod
     def of_corners(corners: Array, shape: tuple[int, ...]) -> ScreenWarp:
-        """The homography that takes four points (x, y), clockwise from top left, to the corners of a target of
+        """Return the homography that takes four points (x, y), clockwise from top left, to the corners of a target of
         `shape`.
         """
         cells = np.array([[0, 0], [shape[1], 0], [shape[1], shape[0]], [0, shape[0]]], dtype=np.float32)
@@ -138,22 +139,22 @@ class ScreenWarp:
         return ScreenWarp(homography, np.zeros((2, 10)), centre, float(np.ptp(corners, axis=0).max()) / 2.0, 0.0, 0.0)
 
     def basis(self, points: Array) -> Array:
-        """Polynomial terms (terms, n) at `points` (n, 2); the first is constant."""
+        """Return the polynomial terms (terms, n) at `points` (n, 2); the first is constant."""
         x, y = ((points - self.centre) / self.scale).T
         return np.array([x**i * y**j for n in range(ORDER + 1) for i, j in ((n - k, k) for k in range(n + 1))])
 
     def cells(self, points: Array) -> Array:
-        """Cells (n, 2), (x, y), of points (n, 2) in px."""
+        """Map points (n, 2) in px to cells (n, 2), (x, y)."""
         moved = points + (self.displacement @ self.basis(points)).T
         return np.asarray(cv2.perspectiveTransform(moved[:, None, :].astype(np.float64), self.homography)[:, 0])
 
     def shift_origin(self, origin: Array) -> ScreenWarp:
-        """The same map for a picture of which this one is the part that begins at `origin`, (x, y)."""
+        """Return the same map for a picture of which this one is the part that begins at `origin`, (x, y)."""
         shift = np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, 1.0]])
         return replace(self, homography=self.homography @ shift, centre=self.centre + origin)
 
     def displace(self, change: Array) -> ScreenWarp:
-        """The map with `change` (2, terms) added to the displacement."""
+        """Return the map with `change` (2, terms) added to the displacement."""
         return replace(self, displacement=self.displacement + change)
 
 
@@ -164,7 +165,7 @@ def register(
     bernoulli_target: NDArray[np.uint8],
     cell_px: float | None,
 ) -> ScreenWarp:
-    """The warp from pictures of a checkerboard and a Bernoulli pattern to their targets.
+    """Register pictures of a checkerboard and a Bernoulli pattern: the warp to their targets.
 
     The pictures (rows, cols) are levelled, 0 dark .. 1 lit, NaN where the screen isn't; the targets (rows, cols) hold
     a value per cell. `cell_px`: nominal size of a cell in camera px; None where the whole target is in view. Raises
@@ -191,7 +192,7 @@ def register(
 
 
 def target_corners(target: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns, in cells, of the inner corners of a checkerboard target."""
+    """Return the rows and columns, in cells, of the inner corners of a checkerboard target."""
     t = target.astype(bool)
     corner = (t[:-1, :-1] == t[1:, 1:]) & (t[:-1, 1:] == t[1:, :-1]) & (t[:-1, :-1] != t[:-1, 1:])
     rows = np.flatnonzero(corner.any(axis=1)) + 1
@@ -204,7 +205,7 @@ def target_corners(target: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArra
 def _number_corners(
     picture: Array, seen: NDArray[np.bool_], square_px: float
 ) -> tuple[Array, NDArray[np.int64], Array, Array]:
-    """Corners numbered by their steps along two directions: points (n, 2), steps (n, 2), and the two step vectors (n,
+    """Number the corners by their steps along two directions: points (n, 2), steps (n, 2), and the two step vectors (n,
     2) at each.
 
     Candidates are the maxima of the saddle strength Ixy^2 - Ixx Iyy.
@@ -243,7 +244,7 @@ def _number_corners(
 def _grow_grid(
     points: Array, tree: spatial.cKDTree, seed: int
 ) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], tuple[Array, Array]]]:
-    """Grid numbers grown from `seed` by nearest neighbours, and the step vectors at each number."""
+    """Grow grid numbers from `seed` by nearest neighbours. Returns them and the step vectors at each number."""
     near = points[tree.query(points[seed], k=min(9, len(points)))[1][1:]] - points[seed]
     first = near[0]
     turned = near @ np.array([-first[1], first[0]]) / (np.linalg.norm(near, axis=1) * np.linalg.norm(first))
@@ -278,8 +279,8 @@ def _match_cells(
     bernoulli: Array,
     target: NDArray[np.uint8],
 ) -> Array:
-    """Cells (x, y) of the corners (n, 2), NaN where unknown: of all rotations and shifts of the grid, the one with the
-    highest correlation of the Bernoulli picture with its target.
+    """Find the cells (x, y) of the corners (n, 2), NaN where unknown: of all rotations and shifts of the grid, the one
+    with the highest correlation of the Bernoulli picture with its target.
     """
     some = np.argwhere(np.isfinite(bernoulli))
     some = some[np.random.default_rng(0).integers(0, len(some), 4000)]
@@ -321,7 +322,7 @@ def _match_cells(
 
 
 def _fit_warp(points: Array, cells: Array) -> ScreenWarp:
-    """Homography and cubic displacement through the corners, without outliers beyond 5 standard deviations."""
+    """Fit homography and cubic displacement through the corners, without outliers beyond 5 standard deviations."""
     used = np.isfinite(cells[:, 0])
     points, cells = points[used], cells[used]
     homography, _ = cv2.findHomography(points, cells, 0)

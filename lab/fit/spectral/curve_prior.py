@@ -23,7 +23,7 @@ FINE_LENGTH_NM = 5.0  # correlation length of the fine structure
 
 
 def averaging_matrix(wave: FloatArray) -> FloatArray:
-    """Gaussian averages (m, m) over `LOCAL_WIDTH_NM`."""
+    """Return the matrix (m, m) of Gaussian averages over `LOCAL_WIDTH_NM`."""
     distance = (wave[:, None] - wave) / LOCAL_WIDTH_NM
     average = np.exp(-0.5 * distance**2)
     average /= average.sum(axis=1, keepdims=True)
@@ -31,8 +31,8 @@ def averaging_matrix(wave: FloatArray) -> FloatArray:
 
 
 def local_roughness(wave: FloatArray, curve: FloatArray, average: FloatArray) -> FloatArray | None:
-    """Roughness (m,) of a curve, maximum 1: the geometric mean of its curvature and its height, both averaged by
-    `average` (m, m). None for a straight line.
+    """Return the roughness (m,) of a curve, maximum 1: the geometric mean of its curvature and its height, both
+    averaged by `average` (m, m). None for a straight line.
     """
     if wave.size < 5:
         return None
@@ -43,14 +43,14 @@ def local_roughness(wave: FloatArray, curve: FloatArray, average: FloatArray) ->
 
 
 def smooth_root(wave: FloatArray, roughness: FloatArray) -> FloatArray:
-    """Root (m, m) of curves whose second difference is white with standard deviation `roughness`, up to straight
-    lines.
+    """Return the root (m, m) of curves whose second difference is white with standard deviation `roughness`, up to
+    straight lines.
     """
     return np.clip(wave[:, None] - wave, 0.0, None) * (np.sqrt(np.gradient(wave)) * roughness)
 
 
 def rough_root(wave: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
-    """As `smooth_root`, with fine structure added (`fine_covariance`)."""
+    """Return the root (m, m) of `smooth_root` with fine structure added (`fine_covariance`)."""
     smooth = smooth_root(wave, roughness)
     if fine_share == 0.0:
         return smooth
@@ -58,8 +58,8 @@ def rough_root(wave: FloatArray, roughness: FloatArray, fine_share: float) -> Fl
 
 
 def fine_covariance(wave: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
-    """Covariance (m, m) of fine structure: exponential correlation over 5 nm, as high as `fine_share` of what the curvature amounts to over
-    10 nm.
+    """Return the covariance (m, m) of fine structure: exponential correlation over 5 nm, as high as `fine_share` of
+    what the curvature amounts to over 10 nm.
 
     The lights hardly determine it; the uncertainty has to include it.
     """
@@ -68,7 +68,9 @@ def fine_covariance(wave: FloatArray, roughness: FloatArray, fine_share: float) 
 
 
 def signal_covariance(wave: FloatArray, operator: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
-    """Covariance (n, n) of the signals `operator` S of curves S with the prior of `rough_root`, up to straight lines."""
+    """Return the covariance (n, n) of the signals `operator` S of curves S with the prior of `rough_root`, up to
+    straight lines.
+    """
     smooth = operator @ smooth_root(wave, roughness)
     covariance = smooth @ smooth.T
     if fine_share > 0.0:
@@ -77,13 +79,15 @@ def signal_covariance(wave: FloatArray, operator: FloatArray, roughness: FloatAr
 
 
 def straight_lines(wave: FloatArray) -> FloatArray:
-    """The constant and the slope, (m, 2): the curves without a second difference."""
+    """Return the constant and the slope, (m, 2): the curves without a second difference."""
     return np.stack([np.ones_like(wave), 2.0 * (wave - wave.mean()) / np.ptp(wave)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class CurvePrior:
-    """The prior of a curve: roughness `shape` (m,) times `strength`, and `fine_share` of fine structure (`fine_covariance`)."""
+    """The prior of a curve: roughness `shape` (m,) times `strength`, and `fine_share` of fine structure
+    (`fine_covariance`).
+    """
 
     shape: FloatArray
     strength: float
@@ -94,8 +98,8 @@ class CurvePrior:
 class Posterior:
     """Posterior `mean` (m,) and `covariance` (m, m) of a curve.
 
-    `gain` (m, n): Jacobian of the mean by the signals; `precision` (n, n): inverse covariance of the signals under the prior, whose curves
-    aren't known.
+    `gain` (m, n): Jacobian of the mean by the signals; `precision` (n, n): inverse covariance of the signals under the
+    prior, whose curves aren't known.
     """
 
     mean: FloatArray
@@ -112,8 +116,8 @@ def likeliest_prior(
     shapes: Sequence[FloatArray],
     fine_share: float = 0.0,
 ) -> CurvePrior:
-    """Of the prior roughnesses `shapes`, (m,) each, the one with the largest marginal likelihood at its best strength, for value = operator S +
-    noise, straight lines free.
+    """Choose, of the prior roughnesses `shapes`, (m,) each, the one with the largest marginal likelihood at its best
+    strength, for value = operator S + noise, straight lines free.
     """
     line = operator @ straight_lines(wave)
     misfits = [least_misfit(signal_covariance(wave, operator, s, fine_share), line, value, std) for s in shapes]
@@ -124,7 +128,7 @@ def likeliest_prior(
 def posterior_under_prior(
     wave: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray, prior: CurvePrior
 ) -> Posterior:
-    """Posterior of S with value = operator S + noise under `prior`, straight lines free."""
+    """Return the posterior of S with value = operator S + noise under `prior`, straight lines free."""
     line = straight_lines(wave)
     rough = rough_root(wave, prior.shape, prior.fine_share)
     rough = rough - line @ np.linalg.lstsq(line, rough, rcond=None)[0]  # straight lines are free
@@ -142,7 +146,8 @@ def posterior_under_prior(
 
 
 def least_misfit(covariance: FloatArray, line: FloatArray, value: FloatArray, std: FloatArray) -> tuple[float, float]:
-    """Least negative log marginal likelihood of value = line a + strength u + noise over the strength, and that strength.
+    """Minimise the negative log marginal likelihood of value = line a + strength u + noise over the strength. Returns
+    it and that strength.
 
     u is normal with `covariance` (n, n), a (2,) is free and integrated out. `line` (n, 2), `value`, `std` (n,).
     """
@@ -174,8 +179,8 @@ class LowerBounds:
 
 
 def within_bounds(mean: FloatArray, covariance: FloatArray, bounds: LowerBounds) -> FloatArray:
-    """The most probable curve (m,) within bounds, of a normal distribution: an active set on its dual, S = mean + V
-    G^T multiplier.
+    """Find the most probable curve (m,) within bounds, of a normal distribution: an active set on its dual, S = mean +
+    V G^T multiplier.
     """
     cross = covariance @ bounds.operator.T
     inner = bounds.operator @ cross

@@ -28,7 +28,7 @@ STATED_DIGITS = 1e-3  # of the maximum: precision of a stated curve
 def solve_with_maker(
     wave: FloatArray, signals: Sequence[ChannelSignals], maker: Sequence[FloatArray]
 ) -> list[Sensitivity]:
-    """Sensitivities S_c = M_c (1 + a + b_c) + d_c, with the curves M_c of the maker.
+    """Solve for the sensitivities S_c = M_c (1 + a + b_c) + d_c, with the curves M_c of the maker.
 
     a: common to the channels (filters in the lens, scale of the radiometer); b_c: that of a channel (a line of 2 %);
     both smooth by their second difference; d_c: small and local. The three strengths maximise the marginal likelihood
@@ -112,7 +112,8 @@ def solve_with_maker(
 def compare_curves(
     wavelength_nm: FloatArray, channels: Sequence[str], value: FloatArray, covariance: FloatArray, stated: FloatArray
 ) -> tuple[float, tuple[MakerDeparture, ...]]:
-    """Wavelength bands in which fitted curves differ from stated ones, up to one factor that all channels share.
+    """Find the wavelength bands in which fitted curves differ from stated ones, up to one factor that all channels
+    share.
 
     `value`, `stated` (channels x wavelengths,), channel after channel; `covariance` of `value` without what is common
     to all. The factor is the median of value / stated where `stated` is above a fifth of its maximum: bands that

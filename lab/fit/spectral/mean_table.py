@@ -55,11 +55,11 @@ from lab.formats.results import CameraFit, FitResult, Skipped, SpectralFit
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.spectrum import FloatArray, Spectrum
 
-#: Of the stated width: halves of it first, and where these are likelier, what lies between. Wider light isn't tried, since it can't be told
-#: from curves that are smoother than their prior.
+#: Of the stated width: halves of it first, and where these are likelier, what lies between. Wider light isn't tried,
+#: since it can't be told from curves that are smoother than their prior.
 HALVES = (1.0, 0.5, 0.25, 0.125)
 BETWEEN = tuple(0.5**0.5 * factor for factor in HALVES)
-#: ln of the likelihood ratio of the likeliest width to the stated one from which on the stated one isn't used: odds of 1,000.
+#: ln of the likelihood ratio of the likeliest width to the stated one from which on that isn't used: odds of 1,000.
 BANDWIDTH_LOG_RATIO = 6.9
 LEAST_WIDTH_SHARE = 0.02  # of the probability: curves at widths below it are left out
 Signals = Callable[[float], tuple[FloatArray, Mapping[str, ChannelSignals]]]
@@ -77,8 +77,9 @@ CLIPPED_SHARE = 0.95  # of the range above black: a mean above it may be of a cl
 
 @dataclass(frozen=True)
 class LikelyWidths:
-    """Factors on the stated bandwidth. `share`: the probabilities of those that count; `widest`: the largest that isn't excluded by the odds by
-    which the stated width is. How narrow light is below that hardly matters, and roughness of the curves themselves looks like narrower light.
+    """Factors on the stated bandwidth. `share`: the probabilities of those that count; `widest`: the largest that isn't
+    excluded by the odds by which the stated width is. How narrow light is below that hardly matters, and roughness of
+    the curves themselves looks like narrower light.
     """
 
     share: Mapping[float, float]
@@ -86,9 +87,10 @@ class LikelyWidths:
 
 
 def likely_widths(signals_of: Signals, scatter: Scatter, fine_share: float) -> LikelyWidths | None:
-    """The widths of narrowband light that fit; None unless the signals contradict the stated one.
+    """Find the widths of narrowband light that fit; None unless the signals contradict the stated one.
 
-    `signals_of`: wavelengths and signals by channel with the operators of a factor on the stated width. `scatter`: what was found at that.
+    `signals_of`: wavelengths and signals by channel with the operators of a factor on the stated width. `scatter`: what
+    was found at that.
     """
     found = {factor: bandwidth_evidence(*signals_of(factor), scatter, fine_share) for factor in HALVES}
     if max(found.values()) - found[1.0] < BANDWIDTH_LOG_RATIO:
@@ -107,9 +109,10 @@ def likely_widths(signals_of: Signals, scatter: Scatter, fine_share: float) -> L
 def bandwidth_evidence(
     wave: FloatArray, signals: Mapping[str, ChannelSignals], scatter: Scatter, fine_share: float
 ) -> float:
-    """ln of the marginal likelihood of `signals` under their lights, up to what all lights share.
+    """Return ln of the marginal likelihood of `signals` under their lights, up to what all lights share.
 
-    The local scale of the curvature prior is that of the signals over the light's power, which doesn't depend on the width.
+    The local scale of the curvature prior is that of the signals over the light's power, which doesn't depend on the
+    width.
     """
     average, line = averaging_matrix(wave), straight_lines(wave)
     priors, start = [], []
@@ -133,9 +136,11 @@ def bandwidth_evidence(
 
 @dataclass(frozen=True)
 class _TableLight:
-    """One row of the table: narrowband light of a relative `power`, and a channel's mean in it, `rate` +- `rate_std` (DN/s above dark).
+    """One row of the table: narrowband light of a relative `power`, and a channel's mean in it, `rate` +- `rate_std`
+    (DN/s above dark).
 
-    `spectrum`: the light's power per nm, up to a factor, where it was measured; None: a line of `bandwidth_nm` at `wavelength_nm`.
+    `spectrum`: the light's power per nm, up to a factor, where it was measured; None: a line of `bandwidth_nm` at
+    `wavelength_nm`.
     """
 
     channel: str
@@ -157,10 +162,11 @@ class _MeasuredLine:
 
 
 def fit_mean_table(file: Path, camera: DataSheet) -> FitResult:
-    """Relative sensitivities of all channels from the table `file`, of a camera whose `cfa`, `bit_depth` and levels `camera` states.
+    """Fit the relative sensitivities of all channels to the table `file`, of a camera whose `cfa`, `bit_depth` and
+    levels `camera` states.
 
-    Raises InputError with one line where a column is missing or unknown (another unit, above all) or a cell is no number, and `NotDetermined`
-    where a channel has fewer than three lights.
+    Raises InputError with one line where a column is missing or unknown (another unit, above all) or a cell is no
+    number, and `NotDetermined` where a channel has fewer than three lights.
     """
     rows = table_rows(file, NEEDED, KNOWN)
     darks = [row for row in rows if row.cells["kind"] == "dark"]
@@ -176,7 +182,10 @@ def fit_mean_table(file: Path, camera: DataSheet) -> FitResult:
         clipped += light is None
         lights += [light] if light is not None else []
     remarks = [
-        "of a table of means: the sensitivities are relative, as nothing says which share of the light reaches a pixel and how many DN an electron makes"
+        (
+            "of a table of means: the sensitivities are relative, as nothing says which share of the light reaches a "
+            "pixel and how many DN an electron makes"
+        )
     ]
     if clipped:
         remarks.append(f"{clipped} means near the highest code are left out")
@@ -192,16 +201,20 @@ def fit_mean_table(file: Path, camera: DataSheet) -> FitResult:
 
 
 def _channel(row: TableRow, camera: DataSheet) -> str:
+    """Return the channel of a row. Raises InputError where the sensor has none of that name."""
     channel = row.cells.get("channel") or ("Y" if camera.cfa == "MONO" else "")
     if channel not in camera.channels:
         raise InputError(
-            f"{row.file}: row {row.number}: channel '{channel}' of a {camera.cfa} sensor; write {', '.join(camera.channels)}"
+            f"{row.file}: row {row.number}: channel '{channel}' of a {camera.cfa} sensor; write "
+            f"{', '.join(camera.channels)}"
         )
     return channel
 
 
 def _line(row: TableRow) -> _MeasuredLine:
-    """The light of a row. Raises InputError where neither what was set nor what was measured says its centre and width."""
+    """Return the light of a row. Raises InputError where neither what was set nor what was measured says its centre and
+    width.
+    """
     if name := row.cells.get(SPECTRUM):
         spectrum = _measured_spectrum(row.file, name)
         wavelength_nm, value = spectrum.arrays
@@ -213,14 +226,15 @@ def _line(row: TableRow) -> _MeasuredLine:
     width = row.known("bandwidth_nm", 0.1) if width is None else width
     if centre is None or width is None:
         raise InputError(
-            f"{row.file}: row {row.number}: no {'centre' if centre is None else 'width'} of the line; write wavelength_nm and bandwidth_nm, {CENTRE} "
+            f"{row.file}: row {row.number}: no {'centre' if centre is None else 'width'} of the line; write "
+            f"wavelength_nm and bandwidth_nm, {CENTRE} "
             f"and {WIDTH}, or a {SPECTRUM}"
         )
     return _MeasuredLine(centre, width)
 
 
 def _measured_spectrum(table: Path, name: str) -> Spectrum:
-    """The spectrum in the file `name` beside the table, with light in it. Raises InputError."""
+    """Read the spectrum in the file `name` beside the table, with light in it. Raises InputError."""
     try:
         spectrum = parse_spectrum(read_foreign_csv(locate(table.parent, name)).text)
     except InputError as error:
@@ -231,14 +245,17 @@ def _measured_spectrum(table: Path, name: str) -> Spectrum:
     if value.min() < -NEGATIVE_LIGHT * value.max():
         at = wavelength_nm[np.argmin(value)]
         raise InputError(
-            f"{table.parent / name}: {value.min():.3g} at {at:g} nm, below the limit of {-NEGATIVE_LIGHT * value.max():.3g} for noise; take "
+            f"{table.parent / name}: {value.min():.3g} at {at:g} nm, below the limit of "
+            f"{-NEGATIVE_LIGHT * value.max():.3g} for noise; take "
             "the dark off"
         )
     return spectrum
 
 
 def _lines_off_their_names(lit: Sequence[TableRow]) -> list[str]:
-    """The remark on lights whose measured centre isn't the wavelength set, as `lab.formats.recording_set.checks` tells it of spectra."""
+    """Remark on lights whose measured centre isn't the wavelength set, as `lab.formats.recording_set.checks` does for
+    spectra.
+    """
     off: dict[float, float] = {}
     for row in lit:
         line, stated_nm = _line(row), row.known("wavelength_nm")
@@ -248,31 +265,37 @@ def _lines_off_their_names(lit: Sequence[TableRow]) -> list[str]:
         return []
     told, most = next(iter(off.items())), max(abs(measured - stated) for stated, measured in off.items())
     return [
-        f"{len(off)} lines are centred elsewhere than they are set, by {most:.1f} nm at most ({told[0]:g} nm: {told[1]:.1f} nm): the measured lines are used"
+        (
+            f"{len(off)} lines are centred elsewhere than they are set, by {most:.1f} nm at most ({told[0]:g} nm: "
+            f"{told[1]:.1f} nm): the measured lines are used"
+        )
     ]
 
 
 def _power(row: TableRow) -> float:
+    """Return the power of a row's light, up to a factor. Raises InputError where it is stated twice or not at all."""
     radiance, current = row.known(RADIANCE), row.known(PHOTODIODE)
     if radiance is None and current is None and (name := row.cells.get(SPECTRUM)):
         wavelength_nm, value = _measured_spectrum(row.file, name).arrays
         return float(np.trapezoid(value, wavelength_nm))
     if (radiance is None) == (current is None):
         raise InputError(
-            f"{row.file}: row {row.number}: give the light's power once, as {RADIANCE} or as {PHOTODIODE} with {RESPONSIVITY}, or a {SPECTRUM}"
+            f"{row.file}: row {row.number}: give the light's power once, as {RADIANCE} or as {PHOTODIODE} with "
+            f"{RESPONSIVITY}, or a {SPECTRUM}"
         )
     if radiance is not None:
         return radiance
     responsivity = row.known(RESPONSIVITY)
     if not responsivity:
         raise InputError(
-            f"{row.file}: row {row.number}: {PHOTODIODE} without {RESPONSIVITY}; give the photodiode's responsivity at this wavelength"
+            f"{row.file}: row {row.number}: {PHOTODIODE} without {RESPONSIVITY}; give the photodiode's responsivity "
+            "at this wavelength"
         )
     return (current or 0.0) / responsivity
 
 
 def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _TableLight | None:
-    """The row's rate; None where its mean may be clipped."""
+    """Return the light of a row with its rate; None where its mean may be clipped."""
     channel, power = _channel(row, camera), _power(row)
     exposure_s, mean = row.value("exposure_s", 1e-9), row.value("mean_dn")
     if power <= 0.0:
@@ -299,6 +322,7 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Tabl
 
 
 def _fit_curves(lights: Sequence[_TableLight], channels: Sequence[str], remarks: list[str]) -> SpectralFit:
+    """Fit the curves of `channels` to the lights; `remarks` gets what is to be told. Raises `NotDetermined`."""
     by_channel = {c: [one for one in lights if one.channel == c] for c in channels}
     for channel, own in by_channel.items():
         if len({one.wavelength_nm for one in own}) < MIN_SPECTRA:
@@ -330,8 +354,10 @@ def _fit_curves(lights: Sequence[_TableLight], channels: Sequence[str], remarks:
     if widths is not None:
         stated = float(np.median([one.bandwidth_nm for one in lights]))
         remarks.append(
-            f"the stated bandwidth of {stated:g} nm contradicts the means, by odds above {round(np.exp(BANDWIDTH_LOG_RATIO), -2):.0f}: light "
-            f"of at most {widths.widest * stated:.1f} nm fits, and the sensitivities are fitted with it; measure the width of a line"
+            f"the stated bandwidth of {stated:g} nm contradicts the means, by odds above "
+            f"{round(np.exp(BANDWIDTH_LOG_RATIO), -2):.0f}: light "
+            f"of at most {widths.widest * stated:.1f} nm fits, and the sensitivities are fitted with it; measure the "
+            "width of a line"
         )
         parts = [(share, *solved_on(factor)) for factor, share in widths.share.items()]
         value = np.sum([share * curves for share, curves, *_ in parts], axis=0)
@@ -359,7 +385,9 @@ def _fit_curves(lights: Sequence[_TableLight], channels: Sequence[str], remarks:
 
 
 def _measured_photons(light: _TableLight, spectrum: Spectrum, wave: FloatArray) -> FloatArray:
-    """Photons per nm, up to a factor, of a light whose spectrum was measured, averaged over the steps of the grid."""
+    """Return the photons per nm, up to a factor, of a light whose spectrum was measured, averaged over the steps of the
+    grid.
+    """
     inner = GRID_NM * ((np.arange(FINE_POINTS) + 0.5) / FINE_POINTS - 0.5)
     shape = np.interp(wave[:, None] + inner, *spectrum.arrays, left=0.0, right=0.0).mean(axis=1)
     return np.asarray(shape * wave * light.power / np.trapezoid(spectrum.arrays[1], spectrum.arrays[0]))
@@ -368,7 +396,9 @@ def _measured_photons(light: _TableLight, spectrum: Spectrum, wave: FloatArray) 
 def _signals(
     by_channel: Mapping[str, Sequence[_TableLight]], factor: float
 ) -> tuple[FloatArray, dict[str, ChannelSignals]]:
-    """Wavelengths (m,), and the signals of each channel in lights of `factor` times the stated bandwidth; photons and rates are relative."""
+    """Return the wavelengths (m,), and the signals of each channel in lights of `factor` times the stated bandwidth;
+    photons and rates are relative.
+    """
     lights = [one for own in by_channel.values() for one in own]
     low = min(one.wavelength_nm - factor * one.bandwidth_nm for one in lights)
     high = max(one.wavelength_nm + factor * one.bandwidth_nm for one in lights)
@@ -391,8 +421,8 @@ def _signals(
 
 
 def _photons(light: _TableLight, wave: FloatArray, factor: float) -> FloatArray:
-    """Photons per nm, up to a factor: a triangle of `factor` times the light's bandwidth, as a monochromator with equal slits has, or as it was
-    measured.
+    """Return the photons per nm, up to a factor: a triangle of `factor` times the light's bandwidth, as a monochromator
+    with equal slits has, or as it was measured.
     """
     if light.spectrum is not None:
         return _measured_photons(light, light.spectrum, wave)

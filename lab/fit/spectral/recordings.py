@@ -73,8 +73,8 @@ class SpectralCaptures:
             if not self.narrowband:
                 raise NotDetermined(
                     "spectral",
-                    "no narrowband captures and no flats of known radiance: capture narrowband light over the visible by "
-                    "10 nm or finer",
+                    "no narrowband captures and no flats of known radiance: capture narrowband light over the "
+                    "visible by 10 nm or finer",
                 )
         self.gain, self.gain_std = self._conversion_gain()
         self.region = self._central_region()
@@ -85,11 +85,11 @@ class SpectralCaptures:
 
     @staticmethod
     def path(capture: NarrowbandCapture | FlatCapture) -> str:
-        """Path of the radiance of a capture."""
+        """Return the path of the radiance of a capture."""
         return cast(str, capture.radiance)
 
     def _conversion_gain(self) -> tuple[float, float]:
-        """Conversion gain, DN/e, and its standard deviation: fitted, or else stated."""
+        """Return the conversion gain, DN/e, and its standard deviation: fitted, or else stated."""
         if self.noise is not None and self.noise.conversion_gain_dn_per_e is not None:
             return self.noise.conversion_gain_dn_per_e, self.noise.conversion_gain_dn_per_e_std or 0.0
         if self.camera.conversion_gain_dn_per_e is not None:
@@ -102,8 +102,8 @@ class SpectralCaptures:
         )
 
     def _photons_per_radiance(self) -> float:
-        """Photons s^-1 at a pixel on axis per radiance in photons s^-1 m^-2 sr^-1, with the mean cos^4 of the
-        region.
+        """Return the photons s^-1 at a pixel on axis per radiance in photons s^-1 m^-2 sr^-1, with the mean cos^4 of
+        the region.
         """
         camera = self.camera
         missing = [key for key in ("f_number", "pixel_pitch_um") if getattr(camera, key) is None]
@@ -127,7 +127,7 @@ class SpectralCaptures:
         )
 
     def _central_region(self) -> tuple[slice, slice]:
-        """Rows and columns of the region, whole periods of the mosaic."""
+        """Return the rows and columns of the region, whole periods of the mosaic."""
         period = step(self.camera.cfa)
         spans = []
         for size in (self.camera.rows, self.camera.cols):
@@ -137,7 +137,7 @@ class SpectralCaptures:
         return spans[0], spans[1]
 
     def _fall_off(self) -> float:
-        """Mean cos^4 over the region, about the centre of the frame."""
+        """Return the mean cos^4 over the region, about the centre of the frame."""
         if self.camera.focal_length_mm is None or self.camera.pixel_pitch_um is None:
             return 1.0
         scale = self.camera.pixel_pitch_um * 1e-3 / self.camera.focal_length_mm
@@ -147,7 +147,7 @@ class SpectralCaptures:
         return float(np.mean(1.0 / (1.0 + y[:, None] ** 2 + x**2) ** 2))
 
     def _pixel_values(self, capture: Capture) -> dict[str, FloatArray]:
-        """DN of the pixels of each channel in the region."""
+        """Return the values, DN, of the pixels of each channel in the region."""
         frame = self.recordings.frame(capture)[self.region]
         period = step(self.camera.cfa)  # the region starts on whole periods
         return {
@@ -156,11 +156,12 @@ class SpectralCaptures:
         }
 
     def _pixel_count(self, channel: str) -> int:
+        """Count the pixels of a channel in the region."""
         rows, cols = (s.stop - s.start for s in self.region)
         return rows * cols // step(self.camera.cfa) ** 2 * len(phases(self.camera.cfa)[channel])
 
     def _dark(self, gain_db: float, channel: str, exposure_s: float) -> tuple[float, float]:
-        """Dark mean in the region, DN, and its standard deviation."""
+        """Return the dark mean in the region, DN, and its standard deviation."""
         if not self.darks:
             self._read_darks()
         line = self.darks.get((gain_db, channel))
@@ -177,6 +178,7 @@ class SpectralCaptures:
         return black + rate * exposure_s * self._dn_per_e(gain_db), 0.0
 
     def _read_darks(self) -> None:
+        """Fit the dark means of the region against exposure, by gain and channel."""
         found: dict[tuple[float, str], list[tuple[float, float, float]]] = {}
         for dark in self.recordings.captures(DarkCapture, self.side):
             for channel, values in self._pixel_values(dark).items():
@@ -188,10 +190,11 @@ class SpectralCaptures:
             self.darks[key] = dark_line(*np.array(rows).T)
 
     def _dn_per_e(self, gain_db: float | None) -> float:
+        """Return the conversion gain, DN/e, at a gain in dB."""
         return self.gain * 10.0 ** ((gain_db or 0.0) / 20.0)
 
     def _electron_rate(self, capture: Capture, channel: str, values: FloatArray) -> tuple[float, float, bool, float]:
-        """Electrons per second, their standard deviation, whether the capture saturates, and its share of
+        """Return the electrons per second, their standard deviation, whether the capture saturates, and its share of
         saturation.
         """
         gain = self._dn_per_e(capture.gain_db)
@@ -209,7 +212,7 @@ class SpectralCaptures:
         return signal * scale, std * scale, clipped, signal / limit
 
     def _lights(self) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """Wavelengths at which the lights shine, and the photon rates of the usable lights on them."""
+        """Return the wavelengths at which the lights shine, and the photon rates of the usable lights on them."""
         paths = dict.fromkeys(self.path(capture) for capture in self.narrowband)
         spectra = {path: self.recordings.spectrum(path) for path in paths}
         for path in paths:
@@ -232,16 +235,17 @@ class SpectralCaptures:
         return grid, {path: self._photon_rate_on(grid, path) for path in spectra}
 
     def photon_rate(self, path: str) -> FloatArray:
-        """Photons on axis (m,), photons s^-1 nm^-1 a pixel, of the radiance at `path`."""
+        """Return the photons on axis (m,), photons s^-1 nm^-1 a pixel, of the radiance at `path`."""
         return self._photon_rate_on(self.wave, path)
 
     def _photon_rate_on(self, wave: FloatArray, path: str) -> FloatArray:
+        """Return the photon rate on axis (m,) at the wavelengths `wave`, photons s^-1 nm^-1 a pixel."""
         spectrum = self.recordings.spectrum(path)
         return self.photons * photons_from_energy(wave, np.clip(spectrum.at(wave), 0.0, None))
 
     def signals(self) -> dict[str, ChannelSignals]:
-        """Signals of each channel: one for every light, lower limits where it saturates. Raises `NotDetermined` where
-        too few lights are left.
+        """Measure the signals of each channel: one for every light, lower limits where it saturates. Raises
+        `NotDetermined` where too few lights are left.
         """
         lights = self.lights
         weights = trapezoid_weights(self.wave)
@@ -272,16 +276,18 @@ class SpectralCaptures:
                     high.append((light * weights, 0.99 * max(rate for rate, *_ in found)))
             if len(good) < MIN_LIGHTS:
                 found_so_many = (
-                    f"only {len(good)} of {len(lights)} lights leave channel {channel} unsaturated, {MIN_LIGHTS} needed: expose shorter"
+                    f"only {len(good)} of {len(lights)} lights leave channel {channel} unsaturated, {MIN_LIGHTS} "
+                    "needed: expose shorter"
                     if high
-                    else f"{len(good)} different lights, {MIN_LIGHTS} needed: capture narrowband light over the visible by 10 nm or finer"
+                    else f"{len(good)} different lights, {MIN_LIGHTS} needed: capture narrowband light over the "
+                    "visible by 10 nm or finer"
                 )
                 raise NotDetermined("spectral", found_so_many)
             if (different := different_spectra(np.array([g[0] for g in good]))) < MIN_LIGHTS:
                 raise NotDetermined(
                     "spectral",
-                    f"the {len(good)} lights are of {different} different spectra, {MIN_LIGHTS} needed: capture narrowband light over "
-                    "the visible by 10 nm or finer",
+                    f"the {len(good)} lights are of {different} different spectra, {MIN_LIGHTS} needed: capture "
+                    "narrowband light over the visible by 10 nm or finer",
                 )
             size = self.wave.size
             result[channel] = ChannelSignals(
@@ -295,7 +301,7 @@ class SpectralCaptures:
         return result
 
     def with_flats(self, signals: dict[str, ChannelSignals]) -> dict[str, ChannelSignals]:
-        """The signals with those of the flats of known radiance: one for each spectrum."""
+        """Add the signals of the flats of known radiance: one for each spectrum."""
         rates: dict[tuple[str, str], list[tuple[float, float]]] = {}
         used: dict[str, list[FlatCapture]] = {}
         for flat in self.recordings.captures(FlatCapture, self.side):
@@ -337,7 +343,7 @@ class SpectralCaptures:
         return result
 
     def maker_curves(self) -> dict[str, FloatArray] | None:
-        """Curves (m,) of the maker by channel; None where one is missing or 0."""
+        """Return the curves (m,) of the maker by channel; None where one is missing or 0."""
         stated = self.camera.quantum_efficiency or {}
         if not all(channel in stated for channel in phases(self.camera.cfa)):
             return None
@@ -349,7 +355,8 @@ class SpectralCaptures:
 
 @one_blas_thread
 def fit_spectral(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None) -> SpectralFit:
-    """Absolute quantum efficiency of every channel from the narrowband captures, electrons per photon at the pixel.
+    """Fit the absolute quantum efficiency of every channel to the narrowband captures, electrons per photon at the
+    pixel.
 
     Irradiance on axis: pi T L / (1 + 4 N^2). The stated transmittance of the lens T and the fill factor are divided
     out, and the mean cos^4 of the region. Signals are means over the central quarter of rows and columns. Saturated
@@ -388,8 +395,8 @@ def fit_spectral(recordings: RecordingSet, side: Side, noise: NoiseFit | None = 
 
 
 def _span(captures: SpectralCaptures) -> tuple[float, float]:
-    """First and last wavelength that the lights determine: narrowband by the centroids of their measured spectra
-    (their nominal ones may be some nm off), broadband wholly.
+    """Return the first and last wavelength that the lights determine: narrowband by the centroids of their measured
+    spectra (their nominal ones may be some nm off), broadband wholly.
     """
     if any(isinstance(capture, FlatCapture) for capture in captures.narrowband):
         return float(captures.wave[0]), float(captures.wave[-1])
@@ -409,7 +416,7 @@ def _result(
     *,
     maker_is_prior: bool,
 ) -> SpectralFit:
-    """The curves every 10 nm, with their standard deviations, where they are determined, and beside those of the
+    """State the curves every 10 nm, with their standard deviations, where they are determined, and beside those of the
     maker.
     """
     low, high = _span(captures)
@@ -422,21 +429,22 @@ def _result(
     if highest < SEEN_SIGMA and not any(own.has_gaps for own in signals.values()):
         raise NotDetermined(
             "spectral",
-            f"the captures show no light: the strongest signal is {highest:.1f} standard uncertainties above the dark, {SEEN_SIGMA:g} "
-            "needed: open the shutter, or expose longer",
+            f"the captures show no light: the strongest signal is {highest:.1f} standard uncertainties above the "
+            f"dark, {SEEN_SIGMA:g} needed: open the shutter, or expose longer",
         )
     if out.size < 2:
         raise NotDetermined(
             "spectral",
-            f"the lights within {low:.0f}..{high:.0f} nm don't span the spectrum: capture narrowband light over the visible by "
-            "10 nm or finer",
+            f"the lights within {low:.0f}..{high:.0f} nm don't span the spectrum: capture narrowband light over the "
+            "visible by 10 nm or finer",
         )
     gaps = {c: _intervals(out, ~k[inside]) for c, k in known.items()}
     for channel, runs in gaps.items():
         if runs:
             where = ", ".join(f"{a:g}..{b:g} nm" for a, b in runs)
             captures.remarks.append(
-                f"{channel} isn't identifiable at {where}: no light that was measured tells it there; capture narrowband light there"
+                f"{channel} isn't identifiable at {where}: no light that was measured tells it there; capture "
+                "narrowband light there"
             )
     channels = list(solved)
     at = np.stack([np.interp(out, captures.wave, row) for row in np.eye(captures.wave.size)], axis=1)
@@ -477,7 +485,8 @@ def _result(
 def _integrals(
     out: FloatArray, value: FloatArray, joint: FloatArray, gain_error: float
 ) -> tuple[list[float], list[float]]:
-    """Integrals over wavelength of the curves `value` (channels x k,) at `out` (k,), nm, and their standard deviations, by channel.
+    """Integrate the curves `value` (channels x k,) at `out` (k,), nm, over wavelength. Returns the integrals and their
+    standard deviations, by channel.
 
     `joint`: covariance of `value` without the relative error of the gain, `gain_error`.
     """
@@ -490,7 +499,7 @@ def _integrals(
 def _departures(
     captures: SpectralCaptures, out: FloatArray, channels: Sequence[str], value: FloatArray, joint: FloatArray
 ) -> tuple[float | None, tuple[MakerDeparture, ...]]:
-    """The fitted curves beside those of the maker; None where there are none."""
+    """Compare the fitted curves with those of the maker; None where there are none."""
     maker = captures.maker_curves()
     if maker is None:
         return None, ()
@@ -506,6 +515,6 @@ def _departures(
 
 
 def _intervals(wave: FloatArray, where: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
-    """First and last wavelength of each run of True."""
+    """Return the first and last wavelength of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(int), [0]])))
     return tuple((float(wave[a]), float(wave[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))

@@ -32,13 +32,16 @@ from sim.spectrum import FloatArray
 RADIOMETER_RELATIVE_STD = 0.003  # repeatability of a measured spectrum
 LEAST_OWN_SHARE = 1e-6  # of a channel's highest signal: the least standard deviation that is its own
 
-#: ln of the likelihood ratio from which on scatter of several channels is counted (Akaike's for one parameter; what the channels share
-#: shows what isn't structure of a curve), and from which on it is told, or counted for a channel alone: twice it is chi2 of two parameters at
-#: their bounds at most, which exceeds 13.8 in one recording of a thousand that has none.
+#: ln of the likelihood ratio from which on scatter of several channels is counted (Akaike's for one parameter; what the
+#: channels share shows what isn't structure of a curve), and from which on it is told, or counted for a channel alone:
+#: twice it is chi2 of two parameters at their bounds at most, which exceeds 13.8 in one recording of a thousand that
+#: has none.
 COUNTED_LOG_RATIO, CLEAR_LOG_RATIO = 1.0, 6.9
-#: Largest relative scatter. Its variance goes with the measured signals; above it, a curve of zero would explain them all by scatter.
+#: Largest relative scatter. Its variance goes with the measured signals; above it, a curve of zero would explain them
+#: all by scatter.
 MOST_SCATTER = 0.2
-#: Prior of ln(relative scatter), normal: one per cent, within a factor of ten. It bounds what the signals don't determine.
+#: Prior of ln(relative scatter), normal: one per cent, within a factor of ten. It bounds what the signals don't
+#: determine.
 _PRIOR_LOG, _PRIOR_STD = np.log(0.01), np.log(10.0)
 _STRENGTH_RANGE = 8.0  # of ln(strength^2) about the start
 
@@ -53,8 +56,9 @@ DETERMINED_SHARE = 0.25  # of the maximum of the curve: largest standard deviati
 
 @dataclass(frozen=True)
 class Scatter:
-    """Relative standard deviations of signals beyond the stated ones: `common` to the channels in one light, as the lamp and the
-    reading of its power are, and `own`, independent from channel to channel. `log_ratio`: ln of the likelihood ratio to none.
+    """Relative standard deviations of signals beyond the stated ones: `common` to the channels in one light, as the
+    lamp and the reading of its power are, and `own`, independent from channel to channel. `log_ratio`: ln of the
+    likelihood ratio to none.
     """
 
     common: float = 0.0
@@ -63,7 +67,7 @@ class Scatter:
 
     @property
     def total(self) -> float:
-        """Relative standard deviation of one signal by both."""
+        """Return the relative standard deviation of one signal by both."""
         return float(np.hypot(self.common, self.own))
 
 
@@ -71,8 +75,8 @@ class Scatter:
 class ChannelSignals:
     """Signals of one channel and the operator on its sensitivity.
 
-    `operator` (n, m), `value`, `std` (n,): e/s, or relative. `light` (n,): names of the lights; two channels share the error of a light.
-    `saturated` (k, m), `limit` (k,): operator and lower limits of saturated signals.
+    `operator` (n, m), `value`, `std` (n,): e/s, or relative. `light` (n,): names of the lights; two channels share the
+    error of a light. `saturated` (k, m), `limit` (k,): operator and lower limits of saturated signals.
     """
 
     operator: FloatArray
@@ -84,29 +88,31 @@ class ChannelSignals:
 
     @property
     def has_gaps(self) -> bool:
-        """Whether lights saturate."""
+        """Tell whether lights saturate."""
         return self.limit.size > 0
 
     def with_scatter(self, scatter: Scatter) -> ChannelSignals:
-        """The signals with the standard deviation that `scatter` adds."""
+        """Return the signals with the standard deviation that `scatter` adds."""
         return replace(self, std=np.hypot(self.std, scatter.total * self.value))
 
     def without_shared_error(self, scatter: Scatter) -> ChannelSignals:
-        """The signals with `scatter`, and without the radiometer's repeatability, which the channels share."""
+        """Return the signals with `scatter`, and without the radiometer's repeatability, which the channels share."""
         square = self.std**2 - (RADIOMETER_RELATIVE_STD * self.value) ** 2
         least = LEAST_OWN_SHARE * float(np.max(np.abs(self.value)))
         return replace(self, std=np.sqrt(np.maximum(square, least**2))).with_scatter(scatter)
 
 
 def light_errors(signals: Mapping[str, ChannelSignals]) -> dict[str, FloatArray]:
-    """Changes (n, lights) of each channel's signals by the relative errors of all lights, which the channels share."""
+    """Return the changes (n, lights) of each channel's signals by the relative errors of all lights, which the channels
+    share.
+    """
     lights = np.array(list(dict.fromkeys(name for one in signals.values() for name in one.light)))
     return {c: (np.array(one.light)[:, None] == lights) * one.value[:, None] for c, one in signals.items()}
 
 
 def joint_covariance(at: FloatArray, solved: Mapping[str, Sensitivity]) -> FloatArray:
-    """Covariance (channels x k, channels x k) of the curves of all channels, channel after channel, at the wavelengths to which `at` (k, m)
-    interpolates. Between channels it is that of what they share.
+    """Return the covariance (channels x k, channels x k) of the curves of all channels, channel after channel, at the
+    wavelengths to which `at` (k, m) interpolates. Between channels it is that of what they share.
     """
     return np.block(
         [
@@ -118,8 +124,8 @@ def joint_covariance(at: FloatArray, solved: Mapping[str, Sensitivity]) -> Float
 
 @dataclass(frozen=True)
 class ScatterEvidence:
-    """`log_evidence`: ln of the marginal likelihood at the likeliest `scatter`. `strength` (channels,): ln of the squared strengths of the
-    priors there. The likelihood of no scatter is taken at strengths of its own.
+    """`log_evidence`: ln of the marginal likelihood at the likeliest `scatter`. `strength` (channels,): ln of the
+    squared strengths of the priors there. The likelihood of no scatter is taken at strengths of its own.
     """
 
     log_evidence: float
@@ -134,10 +140,11 @@ def scatter_evidence(
     start: FloatArray,
     scatter: Scatter,
 ) -> ScatterEvidence:
-    """The likeliest scatter of `signals`, all channels at once, from a `start` of ln(strength^2) (channels,) and a first `scatter`.
+    """Find the likeliest scatter of `signals`, all channels at once, from a `start` of ln(strength^2) (channels,) and a
+    first `scatter`.
 
-    `prior`: of each channel the covariance (n, n) of its signals by the curvature of its curve, at strength 1. Of one channel all scatter
-    is its own and stands as `common`.
+    `prior`: of each channel the covariance (n, n) of its signals by the curvature of its curve, at strength 1. Of one
+    channel all scatter is its own and stands as `common`.
     """
     rest = [linalg.qr(s.operator @ straight_lines(wave))[0][:, 2:] for s in signals]  # lines are integrated out
     turn = linalg.block_diag(*rest)
@@ -181,12 +188,12 @@ def scatter_evidence(
 
 
 def _scatter_of(log: FloatArray) -> Scatter:
-    """Scatter of the logarithms of common and own."""
+    """Return the scatter of the logarithms of `common` and `own`."""
     return Scatter(*np.exp(np.minimum(log, np.log(MOST_SCATTER))).tolist())
 
 
 def _least(loss: Callable[[FloatArray], float], start: FloatArray) -> tuple[float, FloatArray]:
-    """Least `loss` and its place, by a simplex about `start`."""
+    """Minimise `loss` by a simplex about `start`. Returns the least value and its place."""
     simplex = np.concatenate([start[None], start + np.eye(start.size)])
     found = optimize.minimize(
         loss,
@@ -199,7 +206,7 @@ def _least(loss: Callable[[FloatArray], float], start: FloatArray) -> tuple[floa
 
 
 def scatter_remarks(scatter: Scatter) -> list[str]:
-    """What is told of scatter: a line where it is clear."""
+    """Say in a line what scatter there is, where it is clear."""
     if scatter.log_ratio < CLEAR_LOG_RATIO:
         return []
     shares = [
@@ -208,7 +215,10 @@ def scatter_remarks(scatter: Scatter) -> list[str]:
         if part > 0.1 * scatter.total
     ]
     return [
-        f"signals scatter beyond their stated standard deviations, by {' and '.join(shares)}: it is in those of the curves; repeat the light's readings"
+        (
+            f"signals scatter beyond their stated standard deviations, by {' and '.join(shares)}: it is in those of "
+            "the curves; repeat the light's readings"
+        )
     ]
 
 
@@ -217,8 +227,8 @@ class Sensitivity:
     """A sensitivity on the wavelengths (m,) of the lights.
 
     `std`: its standard deviation; `coverage_factor` times it is a band of about 95 %. `covariance` (m, m): before
-    positivity, which only reduces it. `common` (m, lights): the curve's change by a standard deviation of each error that
-    the channels share.
+    positivity, which only reduces it. `common` (m, lights): the curve's change by a standard deviation of each error
+    that the channels share.
     """
 
     sensitivity: FloatArray
@@ -229,14 +239,14 @@ class Sensitivity:
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """(m,): where the lights determine the curve, with a standard deviation below a quarter of its maximum."""
+        """Tell (m,) where the lights determine the curve, with a standard deviation below a quarter of its maximum."""
         return self.std < DETERMINED_SHARE * max(float(self.sensitivity.max()), 1e-300)
 
 
 def estimate_sensitivity(
     wavelength_nm: ArrayLike, lights: ArrayLike, signal: ArrayLike, signal_std: ArrayLike
 ) -> Sensitivity:
-    """Sensitivity S(w) from signals C_i = integral L_i(w) S(w) dw + noise.
+    """Estimate the sensitivity S(w) from signals C_i = integral L_i(w) S(w) dw + noise.
 
     `wavelength_nm` (m,), ascending; `lights` (n, m), photons (or power) per nm; `signal`, `signal_std` (n,). S is in
     signal per photon (or energy), on `wavelength_nm`; integrals are by the trapezoidal rule. Where no light shines,
@@ -281,7 +291,7 @@ def _refuse_unusable(wave: FloatArray, light: FloatArray, value: FloatArray, std
 
 
 def different_spectra(light: FloatArray) -> int:
-    """Number of spectra (n, wavelengths) that differ by more than the repeatability of the radiometer.
+    """Count the spectra (n, wavelengths) that differ by more than the repeatability of the radiometer.
 
     It is the number of singular values of the normalised lights above it. A light taken twice, or at two levels,
     counts once.
@@ -291,7 +301,7 @@ def different_spectra(light: FloatArray) -> int:
 
 
 def trapezoid_weights(wave: FloatArray) -> FloatArray:
-    """Weights (m,) of the trapezoidal rule."""
+    """Return the weights (m,) of the trapezoidal rule."""
     half = np.diff(wave) / 2.0
     return np.append(half, 0.0) + np.append(0.0, half)
 
@@ -299,11 +309,12 @@ def trapezoid_weights(wave: FloatArray) -> FloatArray:
 def solve_sensitivities(
     wave: FloatArray, signals: Mapping[str, ChannelSignals], fine_share: float = 0.0
 ) -> tuple[dict[str, Sensitivity], Scatter]:
-    """The sensitivities of all channels, and the scatter of their signals beyond the stated standard deviations, which is in theirs.
+    """Solve for the sensitivities of all channels, and the scatter of their signals beyond the stated standard
+    deviations, which is in theirs.
 
-    Where there is none to be seen (`scatter_evidence`), channels are solved one by one. Else curves and scatter are found in turn, since the
-    prior's local scale follows from a curve, and a curve from its signals' standard deviations; and what the channels share of it is
-    estimated light by light, from all channels at once.
+    Where there is none to be seen (`scatter_evidence`), channels are solved one by one. Else curves and scatter are
+    found in turn, since the prior's local scale follows from a curve, and a curve from its signals' standard
+    deviations; and what the channels share of it is estimated light by light, from all channels at once.
     """
     scatter = Scatter()
     priors = {c: _prior(wave, s, fine_share) for c, s in signals.items()}
@@ -339,10 +350,11 @@ def solve_sensitivities(
 def _solve_together(
     wave: FloatArray, signals: Mapping[str, ChannelSignals], priors: Mapping[str, CurvePrior], scatter: Scatter
 ) -> dict[str, Sensitivity]:
-    """The sensitivities of channels that share a relative error of each light.
+    """Solve for the sensitivities of channels that share a relative error of each light.
 
-    With errors g of the lights and curves S_c = S_c(0) - G_c D_c g, the channels' signals D_c g + (what the priors and their own noise allow, of
-    precision R_c) give g the precision sum(D_c^T R_c D_c) + 1 / std^2. D_c: signals by lights; G_c: curve by signals.
+    With errors g of the lights and curves S_c = S_c(0) - G_c D_c g, the channels' signals D_c g + (what the priors and
+    their own noise allow, of precision R_c) give g the precision sum(D_c^T R_c D_c) + 1 / std^2. D_c: signals by
+    lights; G_c: curve by signals.
     """
     errors = light_errors(signals)
     own = {c: s.without_shared_error(Scatter(own=scatter.own)) for c, s in signals.items()}
@@ -361,7 +373,7 @@ def _solve_together(
 
 
 def _prior(wave: FloatArray, signals: ChannelSignals, fine_share: float) -> CurvePrior:
-    """The prior of a curve in two passes: with uniform roughness, then with the local one and fine structure."""
+    """Find the prior of a curve in two passes: with uniform roughness, then with the local one and fine structure."""
     data = signals.operator, signals.value, signals.std
     prior = likeliest_prior(wave, *data, [np.ones_like(wave)])
     average = averaging_matrix(wave)
@@ -376,7 +388,7 @@ def _prior(wave: FloatArray, signals: ChannelSignals, fine_share: float) -> Curv
 def _within(
     wave: FloatArray, signals: ChannelSignals, mean: FloatArray, covariance: FloatArray, common: FloatArray
 ) -> Sensitivity:
-    """The most probable curve that isn't below zero nor below what saturated signals say."""
+    """Find the most probable curve that isn't below zero nor below what saturated signals say."""
     bounds = LowerBounds(
         np.concatenate([np.eye(wave.size), signals.saturated]), np.append(np.zeros(wave.size), signals.limit)
     )
