@@ -77,7 +77,7 @@ MAX_STEPS = 300  # a long lens of a small frame takes 60 to 200: its centre and 
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """What the corners of one pose say of V.
+    """Residuals and Jacobians of the corners of one pose, which determine V.
 
     `squares` (n, 2): places on the board, in squares. `camera` (n,): 0 or 1. `residuals` (n, 2), px. `shared` (n, 2,
     k), `by_pose` (n, 2, 6): Jacobians of both coordinates by the shared parameters and by the pose.

@@ -1,4 +1,6 @@
-"""Corners of a board as known cameras see them, by OpenCV's projection: truths for the calibration's tests and benchmarks."""
+"""Corners of a board as known cameras see them, by OpenCV's projection: truths for the calibration's tests and
+benchmarks.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Comparison of two calibrations: no change is reported without one, changes are found, and a motion of the camera is no change."""
+"""Comparison of two calibrations: no change is reported without one, changes are found, and a motion of the camera is
+no change.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,8 @@ def test_an_unchanged_rig_is_unchanged():
     result = compare(made(1), made(2))
     assert not result.changed
     assert {row.name for row in result.changes} >= {
-        "noise read_noise_e", "spectral quantum_efficiency G", "mtf edge-1 G mtf", "stereo translation_mm", "stereo rotation_mrad",
+        "noise read_noise_e", "spectral quantum_efficiency G", "mtf edge-1 G mtf",
+        "stereo translation_mm", "stereo rotation_mrad",
     }  # fmt: skip
     # an edge's angle belongs to the set-up, not to the camera
     assert not any("angle" in row.name for row in result.changes)
@@ -107,7 +110,8 @@ def known(number: int, dark_e_per_s: float = 5.0, temperature_c: float | None = 
     gain, total, mtf50 = (change.get(name, 1.0) for name in ("gain", "sensitivity", "mtf50"))
     edges = tuple(
         MtfCurve(
-            capture=f"edge-{k}", channel="G", angle_deg=5.0, frequency_cy_per_px=(0.0, 0.5), mtf=(1.0, 0.2), mtf_std=(0.0, 0.01),
+            capture=f"edge-{k}", channel="G", angle_deg=5.0, frequency_cy_per_px=(0.0, 0.5), mtf=(1.0, 0.2),
+            mtf_std=(0.0, 0.01),
             mtf50_cy_per_px=drawn(0.3 * mtf50, 0.008), mtf50_cy_per_px_std=0.0024,
         )
         for k in range(8)
@@ -115,10 +119,12 @@ def known(number: int, dark_e_per_s: float = 5.0, temperature_c: float | None = 
     camera = CameraFit(
         noise=NoiseFit(
             conversion_gain_dn_per_e=drawn(0.4 * gain, 0.0008), conversion_gain_dn_per_e_std=0.00032,
-            dark_current_e_per_s=drawn(dark_e_per_s, 0.001), dark_current_e_per_s_std=0.005, dark_temperature_c=temperature_c,
+            dark_current_e_per_s=drawn(dark_e_per_s, 0.001), dark_current_e_per_s_std=0.005,
+            dark_temperature_c=temperature_c,
         ),
         spectral=SpectralFit(
-            wavelength_nm=(400.0, 700.0), quantum_efficiency={"G": (0.5, 0.5)}, quantum_efficiency_std={"G": (0.01, 0.01)},
+            wavelength_nm=(400.0, 700.0), quantum_efficiency={"G": (0.5, 0.5)},
+            quantum_efficiency_std={"G": (0.01, 0.01)},
             integrated_efficiency_nm={"G": drawn(64.0 * total, 0.0025)}, integrated_efficiency_nm_std={"G": 0.16},
         ),
         mtf=edges,
@@ -179,7 +185,8 @@ def test_bands_that_each_fit_chooses_are_not_compared():
     for bands in ([(400.0, 450.0, -0.02)], [(400.0, 500.0, -0.04), (600.0, 700.0, -0.45)]):
         departures = tuple(
             MakerDeparture(
-                channel="R", from_nm=low, to_nm=high, difference=value, difference_std=3e-4, difference_percent=-5.0, significance_sigma=9.0,
+                channel="R", from_nm=low, to_nm=high, difference=value, difference_std=3e-4, difference_percent=-5.0,
+                significance_sigma=9.0,
             )
             for low, high, value in bands
         )  # fmt: skip
@@ -350,7 +357,9 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
 def test_a_check_fails_on_the_named_figures_only(
     tmp_path: Path, rule: str, code: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A read noise of 2.3 e became 2.4 e: by 0.1 or 4.3 %, 35 sigma. A rule that concerns no figure is an error, not a pass."""
+    """A read noise of 2.3 e became 2.4 e: by 0.1 or 4.3 %, 35 sigma. A rule that concerns no figure is an error, not a
+    pass.
+    """
     for name, fit in (("a", made(1)), ("b", made(2, read_noise_e=2.4))):
         (tmp_path / name).write_text(fit.model_dump_json())
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--fail-on", rule]) == code

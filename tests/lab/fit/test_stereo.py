@@ -58,7 +58,9 @@ def drawn_pairs(noise_px: float = 0.1):
 
 
 def test_depth_of_the_map_is_that_of_the_formula():
-    """Two parallel cameras: sigma_Z = Z^2 / (f B) times the disparity's uncertainty, sqrt 2 of a corner's, plus calibration."""
+    """Two parallel cameras: sigma_Z = Z^2 / (f B) times the disparity's uncertainty, sqrt 2 of a corner's, plus
+    calibration.
+    """
     pairs, left, right = drawn_pairs()
     fit = fit_pairs(pairs, left, right, (SHAPE, SHAPE), depths_mm=(500.0, 1000.0))
     for depth in fit.depth:
@@ -73,7 +75,9 @@ def test_depth_of_the_map_is_that_of_the_formula():
 
 
 def test_rectified_pairs_have_equal_rows():
-    """Maps from the fit, applied to both cameras' corners: rows agree to the corners' noise, and columns differ by f B / Z."""
+    """Maps from the fit, applied to both cameras' corners: rows agree to the corners' noise, and columns differ by f B
+    / Z.
+    """
     pairs, left, right = drawn_pairs(noise_px=0.05)
     fit = fit_pairs(pairs, left, right, (SHAPE, SHAPE))
     # rows differ by sqrt 2 of a corner's noise, magnified by about the ratio of focal lengths

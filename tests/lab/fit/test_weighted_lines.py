@@ -50,8 +50,10 @@ def test_the_linearity_errors_uncertainty_holds_what_noise_adds(
         # 95 % of 300 draws within two standard deviations, less 3 sqrt(0.95 0.05 / 300) = 3.8 %
         assert np.mean(np.abs(score) < 2.0) > 0.91
         # The rms of 300 scores is known to 1 / sqrt(600) where they are normal; what noise adds has one sign and hardly
-        # scatters, and the departure is taken one standard deviation low: up to a third too cautious, a seventh too bold
+        # scatters, and the departure is taken one standard deviation low: up to a third too cautious, a seventh too
+        # bold
         assert 0.66 < np.sqrt(np.mean(score**2)) < 1.15 + 3.0 / np.sqrt(2 * draws)
-        # From draw to draw: a standard deviation of 300 is known to 4.1 %; that of the nearest smaller departure may differ by a sixth
+        # From draw to draw: a standard deviation of 300 is known to 4.1 %; that of the nearest smaller departure may
+        # differ by a sixth
         stated = np.sqrt(np.mean([each.error_noise_percent**2 for each in found]))
         assert stated == pytest.approx(error.std(), rel=1 / 6 + 3.0 / np.sqrt(2 * draws))

@@ -156,7 +156,9 @@ def pulls(draw: int, *, with_ripple: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_stated_uncertainties_hold_the_error_that_neighbours_share():
-    """24 draws x 4 figures that are correlated in pairs: 48 independent squares have a mean of 1 +- 0.20; three of these."""
+    """24 draws x 4 figures that are correlated in pairs: 48 independent squares have a mean of 1 +- 0.20; three of
+    these.
+    """
     whole, alone = (np.array(one) for one in zip(*(pulls(draw, with_ripple=True) for draw in range(24)), strict=True))
     assert np.mean(whole**2) == pytest.approx(1.0, abs=0.6)
     assert np.mean(alone**2) > 2.0  # corners taken as independent
@@ -212,9 +214,10 @@ def public_views():
 def test_halves_of_the_public_boards_differ_by_what_is_stated():
     """Random halves (6 and 7 views) of the 13 boards of both cameras: the mean square of the pulls of nine intrinsics.
 
-    8 splits are 8 degrees of freedom for each direction in which the intrinsics differ, about four a camera (focal lengths;
-    centre and p, twice; k). The stated variances have 9 + 3 from the fitted V and 5 from the scores of 6 boards, so that the
-    mean of an F distribution is expected: 17 / 15 = 1.13, +- 1.13 sqrt(2 / 64) = 0.20; three of these.
+    8 splits are 8 degrees of freedom for each direction in which the intrinsics differ, about four a camera (focal
+    lengths; centre and p, twice; k). The stated variances have 9 + 3 from the fitted V and 5 from the scores of 6
+    boards, so that the mean of an F distribution is expected: 17 / 15 = 1.13, +- 1.13 sqrt(2 / 64) = 0.20; three of
+    these.
     """
     rng = np.random.default_rng(1)
     whole, alone = [], []
@@ -234,7 +237,9 @@ def test_halves_of_the_public_boards_differ_by_what_is_stated():
 @pytest.mark.slow
 @pytest.mark.skipif(not PAIRS.is_dir(), reason="the public stereo pairs aren't here")
 def test_many_halves_of_the_public_boards() -> None:
-    """40 splits, each camera alone and the pair: the pulls of every parameter, for the eye; their mean square, judged."""
+    """40 splits, each camera alone and the pair: the pulls of every parameter, for the eye; their mean square,
+    judged.
+    """
     rng, views = np.random.default_rng(1), public_views()
     fits = [geometry_result(calibrate_robustly(views[side], FRAME)) for side in ("left", "right")]
     pulls_of: dict[str, list[np.ndarray]] = {"left": [], "right": [], "pair": []}

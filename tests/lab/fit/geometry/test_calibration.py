@@ -54,7 +54,9 @@ def test_a_view_of_something_else_is_left_out_and_named():
 
 
 def test_a_decentred_long_lens_is_solved_to_the_noise_of_its_corners():
-    """Tangential distortion of 10 px at the corner of 10 half diagonals' focal length: an off centre of k1 alone looks like it."""
+    """Tangential distortion of 10 px at the corner of 10 half diagonals' focal length: an off centre of k1 alone looks
+    like it.
+    """
     lens = Truth(
         left=np.array([[8070.0, 0, 642.0], [0, 8070.0, 475.0], [0, 0, 1]]),
         distortion_left=np.array([0.03, 0.0, 0.027, 0.2, 0.0]),
@@ -75,7 +77,9 @@ def test_a_decentred_long_lens_is_solved_to_the_noise_of_its_corners():
 
 
 def test_a_model_that_overfits_is_refused():
-    """Six views of twelve noisy corners in the middle of the frame: the coefficients beyond k1 predict unseen views worse."""
+    """Six views of twelve noisy corners in the middle of the frame: the coefficients beyond k1 predict unseen views
+    worse.
+    """
     refused = 0
     for draw in range(2):
         views = seen(np.random.default_rng(draw), poses(6, squares=(4, 5)), noise_px=0.3, squares=(4, 5))
@@ -97,8 +101,8 @@ def test_a_model_that_is_too_simple_is_not_chosen():
 
 
 def test_an_error_of_the_model_is_told_from_the_samplings():
-    """A board that takes another shape in every view: the halves differ by more than the corners' noise lets them, and by
-    no more than is stated.
+    """A board that takes another shape in every view: the halves differ by more than the corners' noise lets them, and
+    by no more than is stated.
     """
     rng = np.random.default_rng(3)
     at = poses(14)

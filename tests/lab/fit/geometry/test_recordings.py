@@ -212,9 +212,11 @@ def test_colours_of_a_camera_without_lateral_colour_agree(charuco_fits):
 
 
 def test_corners_with_large_errors_move_the_shift_by_no_more_than_its_uncertainty():
-    """A quarter of the corners has errors of 0.05 +- 0.02 px to the right, the same in every session, as demosaicing makes them.
+    """A quarter of the corners has errors of 0.05 +- 0.02 px to the right, the same in every session, as demosaicing
+    makes them.
 
-    From session to session only noise of 0.007 px is new. Over 60 sessions, a standard deviation is known to 1 / sqrt(120) = 9 %: 3 sigma is 28 %.
+    From session to session only noise of 0.007 px is new. Over 60 sessions, a standard deviation is known to 1 /
+    sqrt(120) = 9 %: 3 sigma is 28 %.
     """
     rng = np.random.default_rng(1)
     x, y = rng.uniform(-1, 1, (2, 300))

@@ -34,7 +34,9 @@ def noisy(mean, rng):
 
 
 def squares(shape, boxes, sigma_px):
-    """Dark squares (row, col, half side, degrees) on light, blurred: products of normal distribution functions but for the corners."""
+    """Dark squares (row, col, half side, degrees) on light, blurred: products of normal distribution functions but for
+    the corners.
+    """
     r, c = np.indices(shape, dtype=float)
     light = np.ones(shape)
     for row, col, half, angle_deg in boxes:

@@ -126,7 +126,9 @@ def test_fit_looks_for_edges_where_no_region_is_stated():
 
 
 def test_edges_that_cross_less_than_a_period_of_their_channel_are_left_out():
-    """A side at 0.8 deg over 108 lines crosses 1.5 px: a period of green (1 px), less than one of red and blue (2 px)."""
+    """A side at 0.8 deg over 108 lines crosses 1.5 px: a period of green (1 px), less than one of red and blue (2
+    px).
+    """
     light = squares((220, 220), [(110, 110, 60, 0.8)], 0.6)
     raw = (64 + np.round(0.4 * np.random.default_rng(0).poisson(8000 * light))).astype(np.uint16)
     stated = capture("edge-1", region=None, angle_deg=None, field_mm=None)

@@ -98,8 +98,10 @@ def test_standard_deviation_is_as_predicted_and_near_the_bound():
 
 @pytest.mark.parametrize("dark_dn", [0.06, 0.5])
 def test_standard_deviation_is_as_predicted_where_the_dark_side_has_one_code(dark_dn):
-    """Eight bits, 120 DN of contrast, 50 e/DN: noise of 0.05 to 0.15 DN on the dark side leaves one code there, or two. 40 edges, so
-    that a sum of squares has a standard deviation of 0.22; held to 4 of them above, as rounding's error is no normal one."""
+    """Eight bits, 120 DN of contrast, 50 e/DN: noise of 0.05 to 0.15 DN on the dark side leaves one code there, or two.
+    40 edges, so that a sum of squares has a standard deviation of 0.22; held to 4 of them above, as rounding's error is
+    no normal one.
+    """
     rng = np.random.default_rng(31)
     frequency = np.array([0.05, 0.1, 0.2, 0.3, 0.5])
     pulls = []
@@ -126,8 +128,8 @@ def test_covariance_covers_the_whole_curve():
         np.testing.assert_allclose(found.mtf_std, np.sqrt(np.diag(found.covariance)))
         pulls.append(gap / found.mtf_std)
     n = len(frequency)
-    # mean of 40 chi2 of n degrees of freedom: n +- sqrt(2 n / 40), 4 of these; less where the truth is smoother than the
-    # prior has to allow for, but not by more than half
+    # mean of 40 chi2 of n degrees of freedom: n +- sqrt(2 n / 40), 4 of these; less where the truth is smoother than
+    # the prior has to allow for, but not by more than half
     assert 0.5 * n < np.mean(chi2) < n + 4 * np.sqrt(2 * n / 40)
     # neighbouring frequencies move together: some 3 independent numbers an edge, 120 in all: 95 % +- 2 %, 4 of these
     assert np.mean(np.abs(pulls) < 2) > 0.87
@@ -211,7 +213,9 @@ def test_edges_along_the_pixels_rows_and_diagonals(angle_deg):
 
 @pytest.mark.parametrize("offset_px", [-1.7, 0.0, 0.3, 2.6])
 def test_the_edge_lies_half_way_where_its_samples_fall_on_few_distances(offset_px):
-    """At atan(3/4) the distances of one colour's pixels are multiples of 0.4 px, and few are as far out as the last of them."""
+    """At atan(3/4) the distances of one colour's pixels are multiples of 0.4 px, and few are as far out as the last of
+    them.
+    """
     rng = np.random.default_rng(5)
     for _ in range(10):
         image = noisy(edge(60, np.degrees(np.arctan2(3, 4)), 0.7, offset_px=offset_px, step=2), rng)

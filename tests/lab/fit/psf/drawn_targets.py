@@ -58,7 +58,9 @@ def psnr_db(estimate, kernel):
 
 
 def misplaced_target(kernel, corner_px, size=256, square=32, seed=0):
-    """A target drawn with errors of the checkerboard's corners, bilinear between them, of the size of `blurred_target`."""
+    """A target drawn with errors of the checkerboard's corners, bilinear between them, of the size of
+    `blurred_target`.
+    """
     return misplacement(kernel, corner_px, size, square, seed)[:2]
 
 

@@ -1,4 +1,6 @@
-"""The estimated kernel against known ones, its parts against direct sums and whole matrices, targets that are refused."""
+"""The estimated kernel against known ones, its parts against direct sums and whole matrices, targets that are
+refused.
+"""
 
 from __future__ import annotations
 
@@ -171,7 +173,8 @@ def test_the_displacement_of_a_target_is_found():
     predicted = fftconvolve(sharp, gaussian(15, 1.6, 1.3, 30), mode="same")
     found = displacement(predicted, blurred, 7)
     inner = np.s_[:, 7:-7, 7:-7]
-    # slopes of some 0.1 a pixel: 121 pixels a node know its place to 0.01 / 0.1 / 11 px; kinks within a cell double that
+    # slopes of some 0.1 a pixel: 121 pixels a node know its place to 0.01 / 0.1 / 11 px; kinks within a cell double
+    # that
     assert truth[inner].std() > 0.15
     assert (found - truth)[inner].std() < 0.02
 

@@ -24,7 +24,9 @@ def _truth(channel: str, wavelength_nm: np.ndarray) -> np.ndarray:
 
 
 def _table(path: Path, seed: int = 0, *, photodiode: bool = False, change: tuple[str, str] = ("", "")) -> Path:
-    """Lines of 10 nm every 10 nm through triangles of that width, whose power falls to the blue by half; DN a photon as `CURVES`."""
+    """Lines of 10 nm every 10 nm through triangles of that width, whose power falls to the blue by half; DN a photon as
+    `CURVES`.
+    """
     rng = np.random.default_rng(seed)
     rows = [f"{HEADER},{'photodiode_a,photodiode_a_per_w' if photodiode else 'radiance_w_per_sr_m2'}"]
     for channel in CURVES:
@@ -73,8 +75,9 @@ def test_the_relative_sensitivities_of_the_table_s_camera(tmp_path: Path, photod
 
 
 def _measured(path: Path, *, files: bool) -> Path:
-    """The same lights with nominal wavelengths that are 4 nm too long and widths that are twice too large, and the lines as measured: centre and
-    width, or files whose integral is the power."""
+    """The same lights with nominal wavelengths that are 4 nm too long and widths that are twice too large, and the
+    lines as measured: centre and width, or files whose integral is the power.
+    """
     lines = _table(path).read_text().splitlines()
     made = [lines[0] + (",spectrum" if files else ",measured_wavelength_nm,measured_bandwidth_nm")]
     for line in lines[1:]:
@@ -102,8 +105,9 @@ def _measured(path: Path, *, files: bool) -> Path:
 
 @pytest.mark.parametrize("files", [False, True])
 def test_measured_lines_stand_for_those_that_were_set(tmp_path: Path, files: bool) -> None:
-    """With the measured lines the curves are those of `test_the_relative_sensitivities_of_the_table_s_camera`; with the stated ones they are moved by
-    4 nm, which is 8 % of the peak on the flanks."""
+    """With the measured lines the curves are those of `test_the_relative_sensitivities_of_the_table_s_camera`; with the
+    stated ones they are moved by 4 nm, which is 8 % of the peak on the flanks.
+    """
     file = _measured(tmp_path, files=files)
     file.write_text(file.read_text().replace(",404,20,", ",414,20,"))  # one is far off, which is told
     found = _spectral(file)
@@ -134,7 +138,9 @@ def test_spectra_of_lines_that_cannot_be_used(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_standard_deviations_of_relative_sensitivities_are_true(tmp_path: Path) -> None:
-    """20 draws, all values above a tenth of the peak: the mean square pull is within 1 +- 3 sqrt(2 / 20), as neighbours share their noise."""
+    """20 draws, all values above a tenth of the peak: the mean square pull is within 1 +- 3 sqrt(2 / 20), as neighbours
+    share their noise.
+    """
     pulls = []
     for seed in range(20):
         found = _spectral(_table(tmp_path, seed))

@@ -1,4 +1,6 @@
-"""Sweeps whose readings scatter by more than is stated, or whose light is narrower: a real one, and measured curves in light of known width."""
+"""Sweeps whose readings scatter by more than is stated, or whose light is narrower: a real one, and measured curves in
+light of known width.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def fitted(rows: Sequence[dict[str, str]], folder: Path) -> SpectralFit:
 
 
 def divided(rows: Sequence[dict[str, str]], wavelength_nm: np.ndarray) -> np.ndarray:
-    """Plain division (channels, wavelengths): DN/s over radiance and wavelength, at the lights' centres, its highest value 1."""
+    """Plain division (channels, wavelengths): DN/s over radiance and wavelength, at the lights' centres, its highest
+    value 1.
+    """
     curves, highest = [], 0.0
     for channel in "RGB":
         own = [
@@ -67,8 +71,8 @@ def test_a_real_sweep_agrees_with_division_and_all_rows_are_surer_than_half(tmp_
     plain = divided(rows, wave)
     assert plain[0, at] == pytest.approx(0.49, abs=0.005)
     assert abs(value[0, at] - plain[0, at]) < std[0, at] < 0.03
-    # Division holds the scatter of single readings and of its highest one, 2.3 % each: 3.3 % in the ratio, of which 0.12 is 3.7 sd. It
-    # doesn't take the 8 nm out, which matters less where the curves are high.
+    # Division holds the scatter of single readings and of its highest one, 2.3 % each: 3.3 % in the ratio, of which
+    # 0.12 is 3.7 sd. It doesn't take the 8 nm out, which matters less where the curves are high.
     high = (plain > 0.2) & (wave >= 400) & (wave <= 780)
     assert np.all(np.abs(value / plain - 1.0)[high] < 0.12)
     assert np.sqrt(np.mean((value / plain - 1.0)[high] ** 2)) < 0.04
@@ -91,15 +95,17 @@ def test_a_real_sweep_agrees_with_division_and_all_rows_are_surer_than_half(tmp_
 
 @pytest.mark.slow
 def test_the_nominal_wavelengths_of_the_sweep_get_no_false_name(tmp_path: Path) -> None:
-    """They are 3.3 nm off, which a table without a maker's curves can't show: neither a width nor a departure is told."""
+    """They are 3.3 nm off, which a table without a maker's curves can't show: neither a width nor a departure is
+    told.
+    """
     found = fitted(rows_of("nominal"), tmp_path)
     assert [line for line in found.remarks if "bandwidth" in line or "wavelength" in line] == []
     assert found.maker_departures == ()
 
 
 def sweep(true_nm: float, stated_nm: float, scatter: float, seed: int) -> tuple[list[dict[str, str]], np.ndarray]:
-    """A Canon 5D Mark III in triangles of `true_nm` every 5 nm, 400..720 nm; readings scatter by `scatter`, which all channels share. Also its
-    curves every 10 nm.
+    """A Canon 5D Mark III in triangles of `true_nm` every 5 nm, 400..720 nm; readings scatter by `scatter`, which all
+    channels share. Also its curves every 10 nm.
     """
     file = DATA / "rawtoaces_sensitivities" / "Canon_EOS_5D_Mark_III_380_780_5.json"
     if not file.exists():
@@ -119,8 +125,10 @@ def sweep(true_nm: float, stated_nm: float, scatter: float, seed: int) -> tuple[
             std = float(np.hypot(0.001 * clean, 3.0))
             rows.append(
                 {
-                    "kind": "narrowband", "channel": channel, "wavelength_nm": f"{centre:g}", "bandwidth_nm": f"{stated_nm:g}",
-                    "exposure_s": "0.1", "mean_dn": f"{clean * light + std * rng.standard_normal():.3f}", "mean_std_dn": f"{std:.3f}",
+                    "kind": "narrowband", "channel": channel, "wavelength_nm": f"{centre:g}",
+                    "bandwidth_nm": f"{stated_nm:g}",
+                    "exposure_s": "0.1", "mean_dn": f"{clean * light + std * rng.standard_normal():.3f}",
+                    "mean_std_dn": f"{std:.3f}",
                     "radiance_w_per_sr_m2": "0.001",
                 }
             )  # fmt: skip
@@ -145,8 +153,8 @@ def test_light_that_is_narrower_than_stated_is_told_and_taken_as_it_is(tmp_path:
 
 @pytest.mark.slow
 def test_the_bandwidth_stated_rightly_is_kept_and_scatter_is_found_as_large_as_it_is(tmp_path: Path) -> None:
-    """20 sweeps of 2 % of scatter: bands of two standard deviations hold 93 to 97 %. Each sweep has some 30 independent values; of 600 the
-    share has a standard deviation of 0.9 %, which is allowed for thrice.
+    """20 sweeps of 2 % of scatter: bands of two standard deviations hold 93 to 97 %. Each sweep has some 30 independent
+    values; of 600 the share has a standard deviation of 0.9 %, which is allowed for thrice.
     """
     scores, told = [], []
     for seed in range(20):
@@ -163,5 +171,6 @@ def test_the_bandwidth_stated_rightly_is_kept_and_scatter_is_found_as_large_as_i
     covered = float(np.mean(np.abs(np.concatenate(scores)) <= 2.0))
     print(f"covered {100 * covered:.1f} %, scatter {np.mean(told):.2f} +- {np.std(told):.2f} %")
     assert 0.90 < covered < 0.997
-    # 65 readings know their scatter to 1 / sqrt(2 * 65) = 9 %, the mean of 20 sweeps to 2 %; curves take a part of it up
+    # 65 readings know their scatter to 1 / sqrt(2 * 65) = 9 %, the mean of 20 sweeps to 2 %; curves take a part of it
+    # up
     assert np.mean(told) == pytest.approx(2.0, abs=0.3)

@@ -48,7 +48,8 @@ def test_the_bandwidth_is_taken_out() -> None:
     signal = np.trapezoid(light * truth, wave, axis=1)
     divided = signal / np.trapezoid(light, wave, axis=1)
     found = estimate_sensitivity(wave, light, signal, np.full(centre.size, 1e-4 * signal.max()))
-    # Division widens the variance of the peak by that of the light: its height falls by 1 - 15 / sqrt(15^2 + 8.5^2) = 13 %.
+    # Division widens the variance of the peak by that of the light: its height falls by 1 - 15 / sqrt(15^2 + 8.5^2) =
+    # 13 %.
     assert divided.max() < 0.88
     assert found.sensitivity.max() == pytest.approx(1.0, abs=0.01)
 
@@ -79,8 +80,8 @@ def test_it_scales_with_signal_and_light() -> None:
 @pytest.mark.parametrize(("width_nm", "step_nm", "target"), [(5.0, 5.0, 0.45), (10.0, 10.0, 1.0)])
 def test_measured_curves_are_recovered_within_their_bands(width_nm: float, step_nm: float, target: float) -> None:
     rng = np.random.default_rng(3)
-    # 1 nm: the RMS is an integral over wavelength. Coarser grids weigh the kinks that the curves, linear between their samples
-    # of 5 nm, have there: 0.36 % become 0.46 % on 2.5 nm.
+    # 1 nm: the RMS is an integral over wavelength. Coarser grids weigh the kinks that the curves, linear between their
+    # samples of 5 nm, have there: 0.36 % become 0.46 % on 2.5 nm.
     wave = np.arange(380.0, 781.0, 1.0)
     centre = np.arange(400.0, 721.0, step_nm)
     light = lights(wave, centre, width_nm)
@@ -95,7 +96,8 @@ def test_measured_curves_are_recovered_within_their_bands(width_nm: float, step_
         errors.append(100.0 * np.sqrt(np.mean(rest**2) / np.mean(truth[inside] ** 2)))
         covered.append(np.mean(np.abs(rest) <= found.coverage_factor * found.std[inside]))
     assert np.median(errors) <= target
-    # 93..97 % is the goal over many draws; 12 curves of some 30 independent wavelengths have a standard deviation of 1 %.
+    # 93..97 % is the goal over many draws; 12 curves of some 30 independent wavelengths have a standard deviation of 1
+    # %.
     assert 0.92 < np.mean(covered) < 0.99
 
 
