@@ -314,7 +314,10 @@ def depth_std(solution: Solution, points: Array, corner_px_std: float) -> tuple[
 
 
 def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tuple[int, int]]) -> DepthUncertainty:
-    """Map `depth_std` over the frame of the left camera at one depth, where the right camera sees the point."""
+    """Map `depth_std` over the frame of the left camera at one depth, where the right camera sees the point.
+
+    `depth_mm`: of the points, along the axis of the left camera; `shapes`: (rows, cols) of the left and right frames.
+    """
     x, y = grid(shapes[0])
     state = solution.state
     points = unproject(grid_points(x, y), state.intrinsics[0]) * depth_mm
@@ -343,7 +346,10 @@ def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tupl
 
 
 def rectification(state: RigParameters, pairs: Sequence[StereoPair], shape: tuple[int, int]) -> Rectification:
-    """Compute the rectification of OpenCV, with the rms difference of the rows of the corners that both cameras saw."""
+    """Compute the rectification of OpenCV, with the rms difference of the rows of the corners that both cameras saw.
+
+    `shape`: (rows, cols) of the frames.
+    """
     one, two = (matrix_of(camera) for camera in state.intrinsics)
     of_one, of_two = (distortion_of(camera) for camera in state.intrinsics)
     found = cv2.stereoRectify(

@@ -26,7 +26,10 @@ class DarkLine:
 
 
 def dark_line(exposure_s: FloatArray, mean: FloatArray, std: FloatArray) -> DarkLine:
-    """Fit a weighted line through dark means `mean` +- `std` (n,); the covariance is scaled by `chi2_factor`."""
+    """Fit a weighted line through dark means `mean` +- `std` (n,); the covariance is scaled by `chi2_factor`.
+
+    `exposure_s`, `mean`, `std` (n,): s, DN, DN.
+    """
     if np.ptp(exposure_s) <= 1e-6 * np.max(exposure_s, initial=1e-12):
         weight = 1.0 / std**2
         value = float(np.sum(weight * mean) / np.sum(weight))

@@ -129,7 +129,11 @@ def fit_corners(
 
 
 def _corner_model(p: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
-    """Return the model (n, window) of the picture and its Jacobian (n, window, 9)."""
+    """Return the model (n, window) of the picture and its Jacobian (n, window, 9).
+
+    `p` (n, 9): parameters of the corners, see `fit_corners`. `dx`, `dy` (window,): places of the pixels from the
+    pixel of the corner, px.
+    """
     x, y = dx - p[:, :1], dy - p[:, 1:2]
     width = p[:, 4:5]
     edges, derivatives, across, along = [], [], [], []
@@ -160,7 +164,11 @@ def _corner_model(p: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
 
 
 def _residual_squares(p: Array, dx: Array, dy: Array, value: Array, weight: Array) -> Array:
-    """Return the weighted sums of squared residuals (n,)."""
+    """Return the weighted sums of squared residuals (n,).
+
+    `p`, `dx`, `dy`: see `_corner_model`. `value`, `weight` (n, window): the picture, and 1 where a pixel is used, else
+    0.
+    """
     x, y = dx - p[:, :1], dy - p[:, 1:2]
     width = np.sqrt(2.0) * p[:, 4:5]
     one, two = (erf((np.cos(angle) * x + np.sin(angle) * y) / width) for angle in (p[:, 2:3], p[:, 3:4]))
@@ -169,7 +177,11 @@ def _residual_squares(p: Array, dx: Array, dy: Array, value: Array, weight: Arra
 
 
 def _damped_step(jacobian: Array, weight: Array, residual: Array, damping: Array | None = None) -> tuple[Array, Array]:
-    """Solve the damped least squares of every corner: steps (n, k) and the inverse normal matrices (n, k, k)."""
+    """Solve the damped least squares of every corner: steps (n, k) and the inverse normal matrices (n, k, k).
+
+    `jacobian` (n, window, k), `weight`, `residual` (n, window), `damping` (n,): share of the diagonal that is added to
+    it.
+    """
     weighted = jacobian * weight[:, :, None]
     normal = np.swapaxes(weighted, 1, 2) @ jacobian
     scale = np.einsum("nkk->nk", normal)
@@ -227,6 +239,9 @@ def _centroid(
 ) -> tuple[Array, float] | None:
     """Measure the centroid of one dot and the standard deviation of a coordinate; None where there is no dot, or it
     touches the frame's border.
+
+    `picture` (rows, cols), `start` (2,), (x, y), and `radius` of the window in px; `dx`, `dy`: places of its pixels
+    from the middle.
     """
     height, width = picture.shape
     at, std = start, np.inf
@@ -291,6 +306,8 @@ class BoardView:
 def luminance(frame: NDArray[np.generic], cfa: Any) -> Array:
     """Level the mosaic (rows, cols) of a black and white scene to one picture, 0 dark .. 1 light: each plane between
     its 2 % and 98 % quantiles.
+
+    `frame` (rows, cols), DN; `cfa`: pattern of its colours.
     """
     picture = np.array(frame, dtype=float)
     for plane in planes(picture, cfa).values():  # views of the picture
@@ -342,7 +359,11 @@ def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
 
 
 def _charuco_corners(grey: NDArray[np.uint8], capture: CharucoCapture) -> tuple[NDArray[np.int64], Array]:
-    """Find the numbers and places of the inner corners of a ChArUco board, by the detector of OpenCV."""
+    """Find the numbers and places of the inner corners of a ChArUco board, by the detector of OpenCV.
+
+    `grey` (rows, cols). Returns numbers (n,) and places (n, 2), (x, y), px. Raises `NotDetermined` for an unknown
+    dictionary.
+    """
     code = getattr(cv2.aruco, capture.dictionary, None)
     if not isinstance(code, int) or not capture.dictionary.startswith("DICT_"):
         raise NotDetermined(
@@ -380,6 +401,9 @@ def _add_missing_corners(
 ) -> tuple[NDArray[np.int64], Array]:
     """Add the corners between markers that couldn't be read, where a homography and a quadratic correction predict
     them.
+
+    `index` (n,): numbers of the corners found at `points` (n, 2), (x, y), px; `rows`, `cols`: inner corners of the
+    board; `shape` of the frame.
     """
     homography, _ = cv2.findHomography(_grid_steps(index, cols), points, cv2.RANSAC, 3.0)
     if homography is None:
@@ -409,7 +433,11 @@ def _add_missing_corners(
 
 
 def _plain_corners(grey: NDArray[np.uint8], rows: int, cols: int) -> tuple[NDArray[np.int64], Array]:
-    """Find the numbers and places of the inner corners of a plain checkerboard; all of them have to be in view."""
+    """Find the numbers and places of the inner corners of a plain checkerboard; all of them have to be in view.
+
+    `grey` (rows, cols) of the frame; `rows`, `cols`: inner corners of the board. Raises `NotDetermined` where it isn't
+    found.
+    """
     found, corners = cv2.findChessboardCorners(
         grey, (cols, rows), flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     )
@@ -470,7 +498,11 @@ def _first_square_is_dark(grey: NDArray[np.uint8], grid: Array) -> bool:
 def refine_corners(
     picture: Array, points: Array, board: Array, square_mm: float, marker_mm: float, rows: int, cols: int
 ) -> CornerFits:
-    """Fit corners (n, 2), (x, y), in the picture, at the pixels that no marker touches."""
+    """Fit corners (n, 2), (x, y), in the picture, at the pixels that no marker touches.
+
+    `points` (n, 2): first guess, (x, y), px; `board` (n, 2): places on the board, mm; `marker_mm`: side of a marker, 0
+    without; `rows`, `cols`: squares of the board. Raises `NotDetermined` where the points don't lie on a plane.
+    """
     homography, _ = cv2.findHomography(board.astype(np.float64), points.astype(np.float64), cv2.RANSAC, 3.0)
     if homography is None:
         raise NotDetermined("geometry", "the corners found don't lie on a plane: light or place the board better")
@@ -512,6 +544,8 @@ def _light_squares(
 ) -> NDArray[np.bool_]:
     """Tell which squares are light: of the two checker patterns, the one that agrees with the picture near the borders
     of the squares.
+
+    `to_image` maps places on the board (n, 2), mm, to px. Returns a mask (rows, cols) of the squares.
     """
     row, col = np.indices((rows, cols))
     rim = 0.5 - 0.25 * max(1.0 - marker_mm / square_mm, 0.1)
@@ -526,6 +560,8 @@ def _light_squares(
 def channel_corners(frame: NDArray[np.generic], cfa: Any, view: BoardView) -> dict[str, CornerFits]:
     """Fit the corners of `view` in each colour of its own frame, on the pixels of that colour; green is the mean of its
     two phases.
+
+    `frame` (rows, cols), DN. Returns the fits by channel, in px of the frame.
     """
     capture = view.capture
     rows, cols = capture.squares

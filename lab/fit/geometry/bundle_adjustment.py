@@ -560,7 +560,10 @@ class BundleAdjustment:
         return RigParameters(intrinsics, rotation, translation, warps, rotations, state.translations_mm + poses[:, 3:])
 
     def _normal(self, state: RigParameters, residual: Array, noise_px: float) -> tuple[Array, ...]:
-        """Return the normal matrices of the shared parameters, shared x pose, and pose, and the right-hand sides."""
+        """Return the normal matrices of the shared parameters, shared x pose, and pose, and the right-hand sides.
+
+        `residual` (n, 2), px; `noise_px`: standard deviation of a coordinate, for the weight of the priors.
+        """
         shared, by_pose = self.jacobian(state)
         size, prior = self.size, (noise_px / self.prior_std) ** 2
         flat = shared.reshape(2 * len(shared), size)
@@ -665,14 +668,20 @@ class BundleAdjustment:
 
 
 def _eliminate_poses(matrix: Array, mixed: Array, own: Array) -> tuple[Array, Array]:
-    """Return the Schur complement of the poses, and mixed own^-1."""
+    """Return the Schur complement of the poses, and mixed own^-1.
+
+    `matrix` (shared, shared), `mixed` (poses, shared, 6), `own` (poses, 6, 6): see `BundleAdjustment._normal`.
+    """
     ridge = 1e-12 * np.einsum("pkk->pk", own)
     gain = np.linalg.solve(own + ridge[:, :, None] * np.eye(6), np.swapaxes(mixed, 1, 2))  # (poses, 6, shared)
     return matrix - np.einsum("psk,pkt->st", mixed, gain), np.swapaxes(gain, 1, 2)
 
 
 def _step(parts: tuple[Array, ...], damping: float) -> tuple[Array, Array]:
-    """Solve for the steps of the shared parameters and of the poses."""
+    """Solve for the steps of the shared parameters and of the poses.
+
+    `parts`: see `BundleAdjustment._normal`; `damping`: share of the diagonals that is added to them.
+    """
     matrix, mixed, own, right, own_right = parts
     damped_own = own + damping * np.einsum("pkk->pk", own)[:, :, None] * np.eye(6)
     if not len(right):
@@ -713,6 +722,8 @@ def board_pose(view: BoardView, intrinsics: Array) -> tuple[Array, Array]:
 def first_intrinsics(views: Sequence[BoardView], shape: tuple[int, int]) -> Array:
     """Return a pinhole without distortion to begin with: the focal length of Zhang, or the width of the frame where the
     views determine none.
+
+    `shape`: (rows, cols) of the frames. Returns a vector (12,), see `lab.fit.geometry.pinhole`.
     """
     boards = [view.board_mm.astype(np.float32) for view in views]
     points = [view.image_px.astype(np.float32) for view in views]

@@ -127,7 +127,11 @@ def first_view_of_boards(views: Sequence[BoardView]) -> list[BoardView]:
 def _held_out_square(
     view: BoardView, trained: RigParameters, board: int, solution: Solution, pose: int, shape: tuple[int, int]
 ) -> float:
-    """Return the sum of squared residuals, px^2, of a view that the camera `trained` has not seen."""
+    """Return the sum of squared residuals, px^2, of a view that the camera `trained` has not seen.
+
+    `board`: number of the board of `view`; `solution`, `pose`: where its pose is begun from; `shape`: (rows, cols) of
+    the frame.
+    """
     state = replace(
         trained,
         warps_mm=trained.warps_mm[board : board + 1],

@@ -68,7 +68,10 @@ def distortion_of(intrinsics: Array) -> Array:
 
 
 def _distort(x: Array, y: Array, k: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the distorted x, y; g; dg/dr2; and the denominator of g."""
+    """Return the distorted x, y; g; dg/dr2; and the denominator of g.
+
+    `x`, `y` (n,): rays with z = 1; `k` (8,): distortion coefficients.
+    """
     r2 = x * x + y * y
     above = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
     below = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
@@ -249,6 +252,8 @@ def error_operator(intrinsics: Array, gauge: Array, points: Array) -> Array:
 def projection_std(intrinsics: Array, covariance: Array, gauge: Array, points: Array) -> Array:
     """Return the standard deviation (n,) of the projections of `points` in the worst direction, px; NaN where a point
     is NaN.
+
+    `covariance` (12, 12) of the `intrinsics` (12,); `gauge` (m, 3), `points` (n, 3), mm, in the frame of the camera.
     """
     found = np.full(len(points), np.nan)
     there = np.isfinite(points).all(axis=1)

@@ -185,7 +185,10 @@ def geometry_result(
     missed: Sequence[Skipped] = (),
     channels: tuple[ChannelGeometry, ...] = (),
 ) -> GeometryFit:
-    """State a calibration with its errors as a result; `missed`: captures in which no board was found."""
+    """State a calibration with its errors as a result; `missed`: captures in which no board was found.
+
+    `channels`: the cameras of the colours.
+    """
     validation = cross_validation(calibration)
     calibration = widen_covariance(calibration, validation)
     solution = calibration.solution

@@ -359,6 +359,8 @@ def widest_gap_px(samples: Samples, edge: EdgeCurve, part: NDArray[np.bool_]) ->
 def half_way_px(distance: Array, rising: Array) -> float:
     """Find the distance at which a profile `rising` from 0 to 1 crosses one half; the crossing nearest to 0, and 0
     where there is none.
+
+    `distance`, `rising` (n,), ascending distances in px.
     """
     i = np.flatnonzero((rising[:-1] < 0.5) & (rising[1:] >= 0.5))
     if not len(i):

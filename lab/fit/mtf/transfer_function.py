@@ -410,7 +410,10 @@ def measure_mtf(
 
 
 def _knots_px(width: float, reach: float, step: int) -> Array:
-    """Place the knots: evenly spaced within `width` of the edge, then ever wider apart up to `FAR_PX`."""
+    """Place the knots: evenly spaced within `width` of the edge, then ever wider apart up to `FAR_PX`.
+
+    `reach` of the samples, px; `step`: their pitch, px.
+    """
     core = min(width, max(reach - 2.0 * step, 2.0))
     count = max(int(np.ceil(core / KNOT_SPACING_PX)), 6)
     side = list(np.arange(count + 1) * KNOT_SPACING_PX)

@@ -142,7 +142,10 @@ def _row_products(u: Array, other: Array, rows: NDArray[np.int64]) -> Array:
 
 
 def normal_equations_right(sharp: Array, blurred: Array, support: int) -> tuple[Array, float]:
-    """Sum the parts that depend on `blurred`: the right side (support^2,) and the power."""
+    """Sum the parts that depend on `blurred`: the right side (support^2,) and the power.
+
+    `sharp`, `blurred` (rows, cols): see `normal_equations`.
+    """
     s, h = support, support // 2
     tall, wide = sharp.shape[0] - 2 * h, sharp.shape[1] - 2 * h
     seen = blurred[h : h + tall, h : h + wide]
@@ -286,6 +289,8 @@ class KernelPrior:
 def log_likelihood(inner: Array, right: Array) -> float:
     """Return the log marginal likelihood of the data under a prior, up to a constant, from R^T information R
     (overwritten) and R^T weighted.
+
+    `inner` (k, k), `right` (k,): see `KernelPrior.whiten`, `KernelPrior.whiten_right`.
     """
     factor = _cholesky_of_one_more(inner)
     half = linalg.solve_triangular(factor, right, lower=True, check_finite=False)
@@ -305,7 +310,10 @@ def _cholesky_of_one_more(matrix: Array) -> Array:
 
 
 def _both_axes(vectors: Array, matrix: Array) -> Array:
-    """Multiply a symmetric `matrix` from both sides: (W x W)^T matrix (W x W), x the Kronecker product."""
+    """Multiply a symmetric `matrix` from both sides: (W x W)^T matrix (W x W), x the Kronecker product.
+
+    `vectors` W (s, s), `matrix` (s^2, s^2).
+    """
     s = len(vectors)
     half = (vectors.T @ matrix.reshape(-1, s, s) @ vectors).reshape(matrix.shape)  # matrix (W x W)
     return np.asarray((vectors.T @ half.T.reshape(-1, s, s) @ vectors).reshape(matrix.shape))
@@ -521,7 +529,10 @@ def _node_precision(shape: tuple[int, int], curvature_px: float) -> Array:
 
 
 def _log_bayes_factor(gram: Array, right: Array, precision: Array) -> float:
-    """Return the log Bayes factor of a displacement with given `precision` (of one axis) against none."""
+    """Return the log Bayes factor of a displacement with given `precision` (of one axis) against none.
+
+    `gram` (2 nodes, 2 nodes), `right` (2 nodes,): normal equations over the noise variance; `precision` (nodes, nodes).
+    """
     factor = linalg.cholesky(gram + linalg.block_diag(precision, precision), lower=True, check_finite=False)
     half = linalg.solve_triangular(factor, right, lower=True, check_finite=False)
     prior = linalg.cholesky(precision, lower=True, check_finite=False)

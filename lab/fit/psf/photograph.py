@@ -136,6 +136,9 @@ def _fit_levels(
 ) -> tuple[Array, Array]:
     """Fit dark level and contrast, (rows, cols), as planes in the frame, by least squares of seen = dark level +
     contrast x predicted.
+
+    `seen`, `predicted`, `row`, `col` (n,): values and places of the pixels; `shape`: (rows, cols). Raises
+    `NotDetermined` where the contrast isn't positive.
     """
 
     def plane(r: Array, c: Array) -> Array:
@@ -155,6 +158,8 @@ def _align(
 ) -> tuple[ScreenWarp, float]:
     """Improve the warp by Gauss-Newton on the picture blurred by ever less. Returns it and the correlation at the last
     step.
+
+    `seen` (rows, cols), `target` (cells), `blurs_px`: standard deviations of the blurs.
     """
     correlation = -1.0
     for blur in blurs_px:

@@ -150,7 +150,7 @@ def _result(camera: DataSheet, capture: str, found: ScreenKernel) -> PsfKernel:
 
 
 def _field_mm(camera: DataSheet, at_px: tuple[float, float]) -> tuple[float, float] | None:
-    """Place on the sensor, (row, col) from the middle of the frame, mm; None without a pixel pitch."""
+    """Return the place on the sensor, (row, col) from the middle of the frame, mm; None without a pixel pitch."""
     if camera.pixel_pitch_um is None:
         return None
     pitch_mm = 1e-3 * camera.pixel_pitch_um

@@ -35,7 +35,10 @@ SHIFT_STD_PX = 0.005  # common to all corners, beside their noise: shading diffe
 
 
 def on_pixels(fine: Array, oversample: int) -> Array:
-    """Bring a kernel from samples of 1 / `oversample` px to pixels, sum 1."""
+    """Bring a kernel from samples of 1 / `oversample` px to pixels, sum 1.
+
+    `fine` (size, size), size = 2 n + 1 samples.
+    """
     matrix = pixel_matrix(len(fine), oversample)
     kernel = matrix @ fine @ matrix.T
     return np.asarray(kernel / kernel.sum())

@@ -244,7 +244,10 @@ def _number_corners(
 def _grow_grid(
     points: Array, tree: spatial.cKDTree, seed: int
 ) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], tuple[Array, Array]]]:
-    """Grow grid numbers from `seed` by nearest neighbours. Returns them and the step vectors at each number."""
+    """Grow grid numbers from `seed` by nearest neighbours. Returns them and the step vectors at each number.
+
+    `points` (n, 2), (x, y), px, and their `tree`.
+    """
     near = points[tree.query(points[seed], k=min(9, len(points)))[1][1:]] - points[seed]
     first = near[0]
     turned = near @ np.array([-first[1], first[0]]) / (np.linalg.norm(near, axis=1) * np.linalg.norm(first))
@@ -281,6 +284,9 @@ def _match_cells(
 ) -> Array:
     """Find the cells (x, y) of the corners (n, 2), NaN where unknown: of all rotations and shifts of the grid, the one
     with the highest correlation of the Bernoulli picture with its target.
+
+    `points` (n, 2), px, with their steps `grid` (n, 2); `rows`, `cols`: inner corners of the checkerboard target,
+    cells; `bernoulli` (rows, cols): its levelled picture; `target`: its cells. Raises `NotDetermined` where none fits.
     """
     some = np.argwhere(np.isfinite(bernoulli))
     some = some[np.random.default_rng(0).integers(0, len(some), 4000)]
@@ -322,7 +328,10 @@ def _match_cells(
 
 
 def _fit_warp(points: Array, cells: Array) -> ScreenWarp:
-    """Fit homography and cubic displacement through the corners, without outliers beyond 5 standard deviations."""
+    """Fit homography and cubic displacement through the corners, without outliers beyond 5 standard deviations.
+
+    `points` (n, 2), px; `cells` (n, 2), NaN where unknown.
+    """
     used = np.isfinite(cells[:, 0])
     points, cells = points[used], cells[used]
     homography, _ = cv2.findHomography(points, cells, 0)

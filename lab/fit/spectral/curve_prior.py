@@ -33,6 +33,8 @@ def averaging_matrix(wave: FloatArray) -> FloatArray:
 def local_roughness(wave: FloatArray, curve: FloatArray, average: FloatArray) -> FloatArray | None:
     """Return the roughness (m,) of a curve, maximum 1: the geometric mean of its curvature and its height, both
     averaged by `average` (m, m). None for a straight line.
+
+    `wave` (m,), nm; `curve` (m,).
     """
     if wave.size < 5:
         return None
@@ -45,6 +47,8 @@ def local_roughness(wave: FloatArray, curve: FloatArray, average: FloatArray) ->
 def smooth_root(wave: FloatArray, roughness: FloatArray) -> FloatArray:
     """Return the root (m, m) of curves whose second difference is white with standard deviation `roughness`, up to
     straight lines.
+
+    `wave`, `roughness` (m,): wavelengths, nm, and standard deviations.
     """
     return np.clip(wave[:, None] - wave, 0.0, None) * (np.sqrt(np.gradient(wave)) * roughness)
 
@@ -70,6 +74,8 @@ def fine_covariance(wave: FloatArray, roughness: FloatArray, fine_share: float) 
 def signal_covariance(wave: FloatArray, operator: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
     """Return the covariance (n, n) of the signals `operator` S of curves S with the prior of `rough_root`, up to
     straight lines.
+
+    `operator` (n, m); `roughness`, `fine_share`: see `rough_root`.
     """
     smooth = operator @ smooth_root(wave, roughness)
     covariance = smooth @ smooth.T
@@ -118,6 +124,8 @@ def likeliest_prior(
 ) -> CurvePrior:
     """Choose, of the prior roughnesses `shapes`, (m,) each, the one with the largest marginal likelihood at its best
     strength, for value = operator S + noise, straight lines free.
+
+    `operator` (n, m), `value`, `std` (n,) of the signals; `fine_share`: see `fine_covariance`.
     """
     line = operator @ straight_lines(wave)
     misfits = [least_misfit(signal_covariance(wave, operator, s, fine_share), line, value, std) for s in shapes]
@@ -128,7 +136,10 @@ def likeliest_prior(
 def posterior_under_prior(
     wave: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray, prior: CurvePrior
 ) -> Posterior:
-    """Return the posterior of S with value = operator S + noise under `prior`, straight lines free."""
+    """Return the posterior of S with value = operator S + noise under `prior`, straight lines free.
+
+    `operator` (n, m), `value`, `std` (n,) of the signals.
+    """
     line = straight_lines(wave)
     rough = rough_root(wave, prior.shape, prior.fine_share)
     rough = rough - line @ np.linalg.lstsq(line, rough, rcond=None)[0]  # straight lines are free
@@ -181,6 +192,8 @@ class LowerBounds:
 def within_bounds(mean: FloatArray, covariance: FloatArray, bounds: LowerBounds) -> FloatArray:
     """Find the most probable curve (m,) within bounds, of a normal distribution: an active set on its dual, S = mean +
     V G^T multiplier.
+
+    `mean` (m,), `covariance` (m, m) of the normal distribution.
     """
     cross = covariance @ bounds.operator.T
     inner = bounds.operator @ cross

@@ -196,6 +196,8 @@ class SpectralCaptures:
     def _electron_rate(self, capture: Capture, channel: str, values: FloatArray) -> tuple[float, float, bool, float]:
         """Return the electrons per second, their standard deviation, whether the capture saturates, and its share of
         saturation.
+
+        `values` (pixels,), DN.
         """
         gain = self._dn_per_e(capture.gain_db)
         dark, dark_std = self._dark(capture.gain_db or 0.0, channel, capture.exposure_s)
@@ -499,7 +501,10 @@ def _integrals(
 def _departures(
     captures: SpectralCaptures, out: FloatArray, channels: Sequence[str], value: FloatArray, joint: FloatArray
 ) -> tuple[float | None, tuple[MakerDeparture, ...]]:
-    """Compare the fitted curves with those of the maker; None where there are none."""
+    """Compare the fitted curves with those of the maker; None where there are none.
+
+    `out` (k,), nm; `value` (channels x k,), channel after channel, with covariance `joint`.
+    """
     maker = captures.maker_curves()
     if maker is None:
         return None, ()

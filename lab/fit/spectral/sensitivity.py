@@ -388,7 +388,10 @@ def _prior(wave: FloatArray, signals: ChannelSignals, fine_share: float) -> Curv
 def _within(
     wave: FloatArray, signals: ChannelSignals, mean: FloatArray, covariance: FloatArray, common: FloatArray
 ) -> Sensitivity:
-    """Find the most probable curve that isn't below zero nor below what saturated signals say."""
+    """Find the most probable curve that isn't below zero nor below what saturated signals say.
+
+    `mean` (m,), `covariance` (m, m) without bounds; `common` (m, lights): see `Sensitivity`.
+    """
     bounds = LowerBounds(
         np.concatenate([np.eye(wave.size), signals.saturated]), np.append(np.zeros(wave.size), signals.limit)
     )
