@@ -286,7 +286,7 @@ def simulated_camera() -> tuple[np.ndarray, np.ndarray]:
     board = (np.indices((60, 70)) // 5).sum(axis=0).astype(np.uint8) % 2
     corners = np.array([(6.0, 5.0), (8.0, 272.0), (235.0, 274.0), (232.0, 7.0)])
     light = Spectrum.of(np.array([500.0, 550.0, 600.0]), np.array([1.0, 1.0, 1.0]))
-    dark = light.scaled(0.01)
+    dark = light.scale(0.01)
     pixels = FixedPattern.draw(camera, rng)
     rate = None
     frames = {}

@@ -37,7 +37,7 @@ from sim.sensor.electrons import FixedPattern
 from sim.spectrum import FloatArray, blackbody_radiance
 
 PRESCRIPTION = Path(__file__).parents[2] / "shared" / "data" / "lenses" / "7558005a.zmx"
-LAMP = blackbody_radiance(3000.0, np.arange(380.0, 781.0, 5.0)).scaled(3e-7)
+LAMP = blackbody_radiance(3000.0, np.arange(380.0, 781.0, 5.0)).scale(3e-7)
 #: Published by the peers' makers and users on other machines; not measured here.
 PYISETCAM_S, ISETCAM_S = 3.8, 9.7
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -117,7 +117,7 @@ def screen(rows: int, cols: int) -> ScreenPattern:
     """Random cells of 2 px, a little askew."""
     pattern = np.random.default_rng(0).integers(0, 2, (rows // 2, cols // 2)).astype(np.uint8)
     corners = [(3.0, 2.0), (2.0, cols - 5.0), (rows - 3.0, cols - 3.0), (rows - 5.0, 4.0)]
-    return ScreenPattern(pattern, Warp.from_corners(cols // 2, rows // 2, corners), LAMP.scaled(0.005), LAMP)
+    return ScreenPattern(pattern, Warp.from_corners(cols // 2, rows // 2, corners), LAMP.scale(0.005), LAMP)
 
 
 @pytest.mark.skipif(not PRESCRIPTION.is_file(), reason="the lens prescriptions are not beside the repository")

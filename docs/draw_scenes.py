@@ -57,7 +57,7 @@ def main(file: str) -> None:
         (name, scene_by_name(name, camera, white, parameters=PARAMETERS.get(name))) for name in SCENES
     ]
     tiles.append(("picture (PNG) on a screen", PictureOnScreen().show(_picture(), view, white)))
-    near = PictureOnScreen.chosen({"stripes": 1, "fill": 6.0}).show(_picture()[20:35, 30:50], view, white)
+    near = PictureOnScreen.choose({"stripes": 1, "fill": 6.0}).show(_picture()[20:35, 30:50], view, white)
     tiles.append(("its sub-pixels", near))
     tiles.append(("cube: black bodies, 2000 to 10000 K", Cube(fill=0.9).show(_cube(), view)))
     to_rgb = _to_rgb(white)

@@ -51,9 +51,9 @@ from sim.frame import (
     SceneLight,
     collected_electrons,
     dark_electrons,
+    pair_gain_factor,
     read_electrons,
     read_out,
-    right_over_left,
     scene_light,
     unsteady_source,
 )
@@ -267,13 +267,13 @@ class Bench:
     def compile_loops(self) -> None:
         """Those that patterns, charts, moved light and shot noise are drawn with: on a new installation that takes as long as a camera's driver waits
         for its first frame. No frame changes by it."""
-        from sim.scene.displace import displaced
+        from sim.scene.displace import displace_drawing
 
         square = np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 1.0, 0.0])
         cells(np.ones((2, 2)), SCREEN_POSE.warp(self._truth.cameras["left"]), Grid(4, 4, 1, 0), 0.0)
         quadrilateral(np.arange(2.0), np.arange(2.0), 1.0, *square)
         draw_poisson(np.ones((2, 2), np.float32), np.random.default_rng(0))
-        displaced(np.ones((2, 2)), np.zeros((4, 4)), np.zeros((4, 4)), 1)
+        displace_drawing(np.ones((2, 2)), np.zeros((4, 4)), np.zeros((4, 4)), 1)
 
     def expose(self, side: Side, exposure_s: float, gain_db: float = 0.0, start_s: float | None = None) -> UInt16Array:
         """One raw frame, (rows, cols) DN, of what stands in front now.
@@ -288,7 +288,7 @@ class Bench:
         seen, light = self._seen(side)
         source = self._drift(begin_s + 0.5 * exposure_s)
         if side == "right" and not (isinstance(seen, UniformField) and seen.kind != "black"):
-            source *= right_over_left(camera.model, camera.acting)
+            source *= pair_gain_factor(camera.model, camera.acting)
         exposure = Exposure(
             seen,
             exposure_s,

@@ -23,7 +23,7 @@ def misread(camera: CameraModel, radiance: Spectrum, effects: Sequence[Effect], 
     """
     for effect in reversed([e for e in effects if e.name in OF_THE_RADIOMETER]):
         if isinstance(effect, WavelengthOffset):
-            back = effect.having(offset_nm=-effect.offset_nm)
+            back = effect.replace_fields(offset_nm=-effect.offset_nm)
             radiance = radiance_at_lens(camera, radiance, [back], kind)
             continue
         wavelength_nm, value = radiance.arrays

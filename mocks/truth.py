@@ -53,7 +53,7 @@ class DispersingLowPassFilter(OpticalLowPassFilter):
             factor = birefringence(wavelength_nm) / birefringence(SODIUM_NM)
             return split[0](fx * factor, fy * factor, wavelength_nm)
 
-        return image.adding(transfer=transfer) if split else image
+        return image.add_laws(transfer=transfer) if split else image
 
 
 class RipplingInfraredCutFilter(InfraredCutFilter):
@@ -63,7 +63,7 @@ class RipplingInfraredCutFilter(InfraredCutFilter):
         def rippled(wavelength_nm: FloatArray, sin_theta: FloatArray) -> FloatArray:
             return np.asarray(1.0 - 0.0015 * (1.0 + np.cos(2 * np.pi * wavelength_nm / 60.0)))
 
-        return super().on_image(image).adding(transmittance=rippled)
+        return super().on_image(image).add_laws(transmittance=rippled)
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,11 +58,12 @@ class Geometry(Frozen):
 
 
 class CameraModel(Frozen):
-    """What calibench knows of one camera. Fits fill it, `sim.frame` predicts with it.
+    """One camera's parameters. Fits fill it, `sim.frame` predicts with it.
 
-    `quantum_efficiency` is the sensor's with its colour filters, electrons a photon, per channel (`R`, `G`, `B`, or `Y` of
-    a MONO sensor), without the lens's transmittance and without any infrared filter that the maker left out. `shutter`: None
-    where nobody says. `std` holds one standard uncertainty by field name; `quantum_efficiency_std` the same on the wavelengths of the curve.
+    `quantum_efficiency` is the sensor's with its colour filters, electrons a photon, per channel (`R`, `G`, `B`, or `Y`
+    of a MONO sensor), without the lens's transmittance and without any infrared filter that the maker left out.
+    `shutter`: None where nobody says. `std` holds one standard uncertainty by field name; `quantum_efficiency_std` the
+    same on the wavelengths of the curve.
     """
 
     rows: Annotated[int, Quantity("px", "rows of the frame", lower=1)]

@@ -32,7 +32,7 @@ def responsivity(
     """
     wavelength_nm = np.asarray(wavelength_nm, float)
     value = efficiency(camera, channel).at(wavelength_nm) * camera.lens.transmittance
-    return np.asarray(value * image_of(camera, effects).transmitted(wavelength_nm, np.asarray(sin_theta, float)))
+    return np.asarray(value * image_of(camera, effects).transmit(wavelength_nm, np.asarray(sin_theta, float)))
 
 
 def efficiency(camera: CameraModel, channel: str) -> Spectrum:
@@ -49,7 +49,7 @@ def collection_m2_sr(camera: CameraModel, magnification: float = 0.0) -> float:
     return irradiance_factor(camera.lens.f_number, magnification) * area_m2
 
 
-def detected(
+def detect_light(
     camera: CameraModel,
     channel: str,
     lights: Sequence[LitSurface],
@@ -123,7 +123,7 @@ def otf_weight(
     total = float(np.sum(weight))
     if not total > 0:
         # No light: any transfer function will do, and that of equal energy is the natural one.
-        wavelength_nm, equal = detected(camera, channel, [(None, None)], (), "flat")
+        wavelength_nm, equal = detect_light(camera, channel, [(None, None)], (), "flat")
         weight, total = equal[0], float(np.sum(equal))
     if not total > 0:
         raise ValueError(

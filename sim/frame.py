@@ -116,8 +116,8 @@ def scene_light(
     before_lens, image_state = light_of(camera, effects), image_of(camera, effects)
     x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
     y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
-    shade = Uniform(camera, effects).illuminated(shade, x_um, y_um)
-    images = {channel: _scattered(image, image_state, shade) for channel, image in images.items()}
+    shade = Uniform(camera, effects).shade_light(shade, x_um, y_um)
+    images = {channel: _scatter_light(image, image_state, shade) for channel, image in images.items()}
     if not before_lens.ambient_e_per_s:
         return SceneLight(mosaic.assemble(images, camera.cfa))
     room = {channel: np.full(shape, before_lens.ambient(channel)) for channel in camera.channels}
@@ -142,29 +142,35 @@ def collected_electrons(
     if isinstance(light.room, np.ndarray) or light.room:
         mean += light.room
     mean *= charge.collected_s(exposure.exposure_s)
-    np.add(charge.lit(mean), dark_electrons(camera, exposure, effects), out=mean)
-    return charge.overflown(charge.moved(mean))
+    np.add(charge.collect_light(mean), dark_electrons(camera, exposure, effects), out=mean)
+    return charge.overflow_wells(charge.move_charge(mean))
 
 
 def read_electrons(
     collected: FloatArray, camera: CameraModel, effects: Sequence[Effect] = ()
 ) -> tuple[FloatArray, FloatArray | float]:
-    """Of the mean electrons that a frame holds, those that are read, and those that stay in the pixels for the next frame."""
+    """Split the electrons that a frame collects into those that are read and those that lag behind.
+
+    collected : mean electrons a pixel (rows, cols)
+
+    Returns the electrons that this frame reads, and those that stay in the pixels for the next frame; 0 without image
+    lag.
+    """
     charge = charge_of(camera, effects)
     if not charge.lag:
         return collected, 0.0
-    left = charge.staying(np.minimum(collected, camera.full_well_e))
+    left = charge.hold_lag(np.minimum(collected, camera.full_well_e))
     return collected - left, left
 
 
 def is_steady(camera: CameraModel, effects: Sequence[Effect]) -> bool:
-    """Whether the light is the same in all frames of one setting, whenever they are taken."""
+    """Return whether the light is the same in all frames of one setting, whenever they are taken."""
     light = light_of(camera, effects)
     return not light.level and not light.rows
 
 
 def grows_with_exposure(camera: CameraModel, effects: Sequence[Effect]) -> bool:
-    """Whether mean electrons are in proportion to the exposure that is asked for."""
+    """Return whether mean electrons are in proportion to the exposure that is asked for."""
     return not laws_of(camera, effects) & {"charge.exposure_s", "light.rows", "charge.overflow", "light.unsteadiness"}
 
 
@@ -173,7 +179,7 @@ def screen_light(
 ) -> FloatArray:
     """Light of a screen, 0..1 of its lit state, where a pattern asks for `share` (rows, cols); places on the sensor in equal steps (um
     from its centre)."""
-    return light_of(camera, effects).shown(share, x_um, y_um)
+    return light_of(camera, effects).show_share(share, x_um, y_um)
 
 
 def with_reflections(camera: CameraModel, image: FloatArray, effects: Sequence[Effect]) -> FloatArray:
@@ -187,17 +193,17 @@ def collected_mosaic(
     """Mean electrons (rows, cols) of light, in frames of any size, as pixels collect and share them."""
     rows = light_of(camera, effects).row_factors(len(electrons), exposure_s, elapsed_s)
     charge = charge_of(camera, effects)
-    return charge.moved(charge.lit(electrons if rows is None else electrons * rows[:, None]))
+    return charge.move_charge(charge.collect_light(electrons if rows is None else electrons * rows[:, None]))
 
 
 def charge_response(camera: CameraModel, shape: tuple[int, int], effects: Sequence[Effect]) -> FloatArray:
     """Where one electron of the middle pixel of a frame (rows, cols) ends up."""
     single = np.zeros(shape)
     single[shape[0] // 2, shape[1] // 2] = 1.0
-    return charge_of(camera, effects).moved(single)
+    return charge_of(camera, effects).move_charge(single)
 
 
-def right_over_left(camera: CameraModel, effects: Sequence[Effect]) -> float:
+def pair_gain_factor(camera: CameraModel, effects: Sequence[Effect]) -> float:
     """Factor on the right camera's signal over the left one's in a scene that both see, against what their own captures of uniform light
     say."""
     return float(np.prod(light_of(camera, effects).pair_gain))
@@ -265,7 +271,7 @@ def moments(
     return sensor.dn_moments(electrons, camera, exposure.gain_db, read_out(camera, exposure, effects))
 
 
-def expected(
+def predict_frame(
     camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 3, margin_px: int = 32
 ) -> FloatArray:
     """Mean frame (rows, cols) in DN of a camera whose pixels are all alike; clipping and rounding are averaged over noise."""
@@ -368,13 +374,13 @@ def sample_sequence(
 
 
 def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect]) -> ReadOut:
-    """What the effects make of the read-out: their responses, noise and offsets, one after the other."""
+    """Collect the effects' laws of read-out and converter: responses, noise and offsets, one after the other."""
     if not effects:
         return sensor.LINEAR
     charge, signal, codes = charge_of(camera, effects), signal_of(camera, effects), codes_of(camera, effects)
     disturbances = signal.random
 
-    def added(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+    def draw_disturbances(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         return sum((one.draw(shape, rng) for one in disturbances), np.zeros((1, 1)))
 
     # Only where there is a law something acts, so that effects elsewhere leave the read-out the baseline's to the last bit.
@@ -383,16 +389,16 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         signal.read if signal.response else None,
         charge.shot_e2 if charge.variance_e2 else None,
         signal.shift_dn(exposure.elapsed_s, exposure.temperature_c),
-        added if disturbances else None,
+        draw_disturbances if disturbances else None,
         sum((one.mean_e(shape) for one in disturbances), 0.0),
         sum((one.variance_e2(shape) for one in disturbances), 0.0),
-        codes.converted if codes.codes else None,
-        (lambda electrons: np.asarray(charge.shared(electrons))) if charge.correlation else None,
+        codes.convert if codes.codes else None,
+        (lambda electrons: np.asarray(charge.neighbour_correlation(electrons))) if charge.correlation else None,
         signal.filter_kernel(),
     )
 
 
-def _scattered(image: FloatArray, state: Image, shade: FloatArray) -> FloatArray:
+def _scatter_light(image: FloatArray, state: Image, shade: FloatArray) -> FloatArray:
     """A channel's irradiance with its reflections, the fall-off, and what is scattered evenly. A traced lens's image is a mosaic already:
     colour by colour."""
     traced = isinstance(state.camera.lens.imaging, TracedLens)
@@ -405,5 +411,5 @@ def _scattered(image: FloatArray, state: Image, shade: FloatArray) -> FloatArray
         plane[:] = state.with_copies(plane)
     shaded = reflected * shade
     for plane in colours(shaded):
-        plane[:] = state.veiled(plane)
+        plane[:] = state.add_veil(plane)
     return shaded

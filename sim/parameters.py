@@ -84,7 +84,7 @@ class Quantity:
         return described | limits
 
 
-def declared(model: type[BaseModel]) -> dict[str, Quantity]:
+def read_quantities(model: type[BaseModel]) -> dict[str, Quantity]:
     """Field name -> its `Quantity`, for every field of `model` that declares one, in the order of declaration."""
     found: dict[str, Quantity] = {}
     for name, field in model.model_fields.items():

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
 
 from sim.camera import CameraModel
-from sim.detection import collection_m2_sr, detected, otf_wavelengths
+from sim.detection import collection_m2_sr, detect_light, otf_wavelengths
 from sim.effects.base import Effect
 from sim.optics.diffraction import aperture_otf
 from sim.optics.illumination import sin_theta as sin_theta_at
@@ -44,7 +44,7 @@ class KeptTransfers:
         self._most = most
 
     def get(self, key: Hashable, make: Callable[[], list[NDArray[np.complex64]]]) -> list[NDArray[np.complex64]]:
-        """What is kept for `key`, else what `make` makes."""
+        """Return the transfers that are kept for `key`; without any, call `make` and keep its result."""
         if key not in self._kept:
             self._kept[key] = make()
             while len(self._kept) > self._most:
@@ -88,7 +88,7 @@ def _field_of_rates(
         camera, np.array([0, 0, camera.rows - 1, camera.rows - 1]), np.array([0, camera.cols - 1] * 2)
     )
     square = np.linspace(0.0, float(np.max(corners)) ** 2, 17)
-    _, weight = detected(camera, channel, lights, effects, kind, np.sqrt(square))
+    _, weight = detect_light(camera, channel, lights, effects, kind, np.sqrt(square))
     rate = np.sum(weight, axis=-1)
     if np.all(rate == rate[0]):
         return None
@@ -203,7 +203,7 @@ def _posed_edge_images(camera: CameraModel, scene: PosedEdges, effects: Sequence
                 place_um=(float(from_centre_um[1]), float(from_centre_um[0])),
             )  # fmt: skip
             profiles = [profile(radiance=scene.light_radiance, effects=effects)]
-            if not _alike(*spectra):
+            if not _have_same_colour(*spectra):
                 profiles.append(profile(radiance=scene.dark_radiance, effects=effects))
             dark, light = rates[0] * np.ones(1), rates[1] * np.ones(1)
             if field is not None:
@@ -214,15 +214,20 @@ def _posed_edge_images(camera: CameraModel, scene: PosedEdges, effects: Sequence
 
 
 def _bent_edge(distance: FloatArray, at_px: tuple[float, float]) -> tuple[FloatArray, float]:
-    """Of an edge that the lens bends: every pixel's distance (px), to first order, and the edge's angle (degrees) at a place, given what
-    the straight edge's distance is where each pixel's light comes from, (rows, cols)."""
+    """Compute distances from an edge that the lens bends, to first order.
+
+    distance : distance (px) from the straight edge of the place where each pixel's light comes from (rows, cols)
+    at_px : (row, col) of the place at which the angle is wanted
+
+    Returns each pixel's distance from the bent edge (px), and the edge's angle at the place (degrees).
+    """
     down, across = (np.asarray(part) for part in np.gradient(distance))
     near = tuple(int(np.clip(np.rint(v), 0, n - 1)) for v, n in zip(at_px, distance.shape, strict=True))
     return distance / np.hypot(down, across), float(np.rad2deg(np.arctan2(down[near], across[near])))
 
 
-def _alike(one: Spectrum, other: Spectrum) -> bool:
-    """Whether two lights have the same colour."""
+def _have_same_colour(one: Spectrum, other: Spectrum) -> bool:
+    """Return whether two lights have the same colour."""
     (w, a), (x, b) = one.arrays, other.arrays
     return (
         w.shape == x.shape and bool(np.all(w == x)) and np.allclose(a * np.sum(b), b * np.sum(a), rtol=1e-9, atol=0.0)
@@ -240,7 +245,7 @@ def _blurred_images(
     """
     drawing = draw(scene, grid)
     if isinstance(scene, ScreenPattern):
-        drawing = _shown(drawing, grid, camera, effects)
+        drawing = _show_on_screen(drawing, grid, camera, effects)
     lights: list[LitSurface] = [drawing.ground, *(layer.light for layer in drawing.layers)]
     m = grid.margin_px
     ny, nx = grid.shape
@@ -250,7 +255,7 @@ def _blurred_images(
     blur = Blur(camera, effects, collected=True)
     transformed: list[NDArray[np.complex64]] = []
     for channel in camera.channels:
-        wavelength_nm, weight = detected(camera, channel, lights, effects, scene.kind)
+        wavelength_nm, weight = detect_light(camera, channel, lights, effects, scene.kind)
         weight = weight * collection_m2_sr(camera)
         nodes, _ = otf_wavelengths(camera, channel, wavelength_nm, np.sum(weight, axis=0), FRAME_WAVELENGTHS)
         shares = lagrange_shares(wavelength_nm, weight, nodes)
@@ -296,7 +301,13 @@ def _blurred_images(
 
 
 def _layer_transfers(blur: Blur, nodes: FloatArray, over: FloatArray, grid: Grid) -> list[NDArray[np.complex64]]:
-    """What the transform of each layer's picture is multiplied with: sum_k over_lk OTF_k at the nodes (nm), with the pixel."""
+    """Compute the factor on the transform of each layer's picture: sum_k over_lk OTF_k with the pixel's aperture.
+
+    nodes : wavelengths (K,) in nm
+    over : weights of the nodes in each layer (L, K)
+
+    Returns L arrays over the frequencies of `grid`.
+    """
     fy, fx, pixel_y, pixel_x = pixel_on_grid(blur.camera, grid)
     total = np.zeros((len(over), fy.size, fx.size))
     for node, factors in zip(nodes, over.T, strict=True):
@@ -309,7 +320,7 @@ def _layer_transfers(blur: Blur, nodes: FloatArray, over: FloatArray, grid: Grid
     return [part.astype(single) * pixel for part in total]
 
 
-def _shown(drawing: Drawing, grid: Grid, camera: CameraModel, effects: Sequence[Effect]) -> Drawing:
+def _show_on_screen(drawing: Drawing, grid: Grid, camera: CameraModel, effects: Sequence[Effect]) -> Drawing:
     """A screen's pattern as the screen shows it, given what was asked for."""
     light = light_of(camera, effects)
     if not light.screen:
@@ -318,7 +329,7 @@ def _shown(drawing: Drawing, grid: Grid, camera: CameraModel, effects: Sequence[
     y_um = (row[:, None] - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
     x_um = (col[None, :] - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
     (lit,) = drawing.layers
-    return replace(drawing, layers=(replace(lit, coverage=light.shown(lit.coverage, x_um, y_um)),))
+    return replace(drawing, layers=(replace(lit, coverage=light.show_share(lit.coverage, x_um, y_um)),))
 
 
 def _cube_images(
@@ -368,7 +379,7 @@ def _node_pictures(
 ) -> tuple[FloatArray, NDArray[np.float32]]:
     """Wavelengths (nm) of the frame's rule, and the electrons a second that the cube's samples give at each: (nodes, rows, cols)."""
     lights: list[LitSurface] = [(band, None) for band in scene.bands()]
-    wavelength_nm, weight = detected(camera, channel, lights, effects, scene.kind)
+    wavelength_nm, weight = detect_light(camera, channel, lights, effects, scene.kind)
     weight = weight * collection_m2_sr(camera)
     nodes, _ = otf_wavelengths(camera, channel, wavelength_nm, np.sum(weight, axis=0), FRAME_WAVELENGTHS)
     shares = lagrange_shares(wavelength_nm, weight, nodes)
@@ -388,13 +399,13 @@ def _node_pictures(
 
 def _folded_transfer(blur: Blur, wavelength_nm: float, shape: tuple[int, int]) -> FloatArray | ComplexArray:
     """The transfer of lens and effects with the pixel's aperture and a picture's square of one pixel, folded onto samples of one pixel."""
-    from sim.optics.fold import folded, folded_diffraction  # here: the compiler's library takes a while to load
+    from sim.optics.fold import fold_diffraction, fold_transfer  # here: the compiler's library takes a while to load
 
     camera, imaging = blur.camera, blur.camera.lens.imaging
     cutoff = camera.pixel_pitch_um * imaging.cutoff_cy_per_um(wavelength_nm, camera.lens.f_number)
     if isinstance(imaging, DiffractionLimited) and blur.is_lens_alone:
-        return folded_diffraction(shape, camera.fill_factor, cutoff)
-    return folded(
+        return fold_diffraction(shape, camera.fill_factor, cutoff)
+    return fold_transfer(
         lambda fx, fy: blur.at(wavelength_nm, fx, fy),
         shape,
         camera.fill_factor,
@@ -436,7 +447,7 @@ def _mean_wavelength(
     camera: CameraModel, channel: str, radiance: Spectrum | None, effects: Sequence[Effect], kind: str
 ) -> float:
     """Mean wavelength (nm) of the light that a channel detects."""
-    wavelength_nm, weight = detected(camera, channel, [(radiance, None)], effects, kind)
+    wavelength_nm, weight = detect_light(camera, channel, [(radiance, None)], effects, kind)
     nodes, share = otf_wavelengths(camera, channel, wavelength_nm, weight[0], 1)
     return float(nodes @ share)
 
@@ -474,10 +485,10 @@ def _margin_for(camera: CameraModel, effects: Sequence[Effect], margin_px: int) 
 
 
 class _Moved:
-    """What is drawn on a grid as the lens's geometry lets it land, before anything blurs it.
+    """Drawing on a grid, moved by the lens's geometry before anything blurs it.
 
-    A sample is taken where its light would be without the effects' shifts; between the drawing's samples by splines of the third
-    order: 3e-3 of the contrast up to 1/2 cy/px and 3 samples a pixel.
+    A sample is taken where its light would be without the effects' shifts; between the drawing's samples by splines of
+    the third order: 3e-3 of the contrast up to 1/2 cy/px and 3 samples a pixel.
     """
 
     def __init__(self, camera: CameraModel, grid: Grid, effects: Sequence[Effect]) -> None:
@@ -492,10 +503,10 @@ class _Moved:
 
     def picture(self, drawn: NDArray[np.floating[Any]], wavelength_nm: float = MIDDLE_NM) -> NDArray[np.float32]:
         """A picture on the grid, moved as light of a wavelength is."""
-        from sim.scene.displace import displaced  # here: the compiler's library takes a while to load
+        from sim.scene.displace import displace_drawing  # here: the compiler's library takes a while to load
 
         row, col = (part + self._grid.margin_px for part in self._from_px(wavelength_nm))
-        return displaced(drawn, row, col, self._grid.oversample).astype(np.float32)
+        return displace_drawing(drawn, row, col, self._grid.oversample).astype(np.float32)
 
     def _from_px(self, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
         row, col = np.meshgrid(self._rows, self._cols, indexing="ij")

@@ -17,7 +17,7 @@ from scipy import fft
 from scipy.interpolate import CubicSpline
 
 from sim.camera import CameraModel
-from sim.detection import check_finite, detected, otf_wavelengths, otf_weight
+from sim.detection import check_finite, detect_light, otf_wavelengths, otf_weight
 from sim.optics.diffraction import aperture_otf
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
@@ -64,7 +64,7 @@ class Blur:
         for a mosaic."""
         self.camera = camera
         image = image_of(camera, effects)
-        self.image: Image = image.unveiled() if collected else image
+        self.image: Image = image.remove_veil() if collected else image
         self.charge: Charge = charge_of(camera, effects)
         self.signal = Signal(camera) if collected else signal_of(camera, effects)
         self.kernels = self.charge.kernels if moving and not collected else ()
@@ -95,8 +95,8 @@ class Blur:
 
     @property
     def is_lens_alone(self) -> bool:
-        """Whether no effect blurs."""
-        states = (*self.image.changed(), *self.charge.changed(), *self.signal.changed())
+        """Return whether no effect blurs."""
+        states = (*self.image.list_laws(), *self.charge.list_laws(), *self.signal.list_laws())
         return not TRANSFER.intersection(states)
 
     def _in_pixels(
@@ -120,7 +120,7 @@ def times(transfer: FloatArray | ComplexArray, factor: FloatArray | ComplexArray
 
 
 def varies_over_field(camera: CameraModel, effects: Sequence[Acts]) -> bool:
-    """Whether any effect's path error, or how far it lets wavelengths land apart, changes with the place."""
+    """Return whether any effect's path error, or how far it lets wavelengths land apart, changes with the place."""
     image = image_of(camera, effects)
     return bool(image.pupil_at) or image.moves
 
@@ -189,11 +189,11 @@ def detected_transfer(
 
 
 def mixes_colours(camera: CameraModel, effects: Sequence[Acts]) -> bool:
-    """Whether effects move charge between pixels of different colours."""
+    """Return whether effects move charge between pixels of different colours."""
     return camera.cfa != "MONO" and bool(charge_of(camera, effects).kernels)
 
 
-def mixed(
+def mix_channels(
     camera: CameraModel,
     transfers: ComplexArray,
     signals: FloatArray,
@@ -230,7 +230,7 @@ def mixed(
 
 
 def even_share(camera: CameraModel, effects: Sequence[Acts]) -> float:
-    """Of the light: what effects spread evenly over the frame."""
+    """Return the share of the light that effects spread evenly over the frame."""
     return 1.0 - float(np.prod([1.0 - veil.even_share for veil in image_of(camera, effects).veils]))
 
 
@@ -276,7 +276,7 @@ def optical_transfer(
     blur = Blur(camera, effects, collected=collected, moving=not mixing)
     transfers, signals = [], []
     for name in camera.channels if mixing else (channel,):
-        wavelength_nm, weight = detected(camera, name, [(radiance, reflectance)], effects, kind)
+        wavelength_nm, weight = detect_light(camera, name, [(radiance, reflectance)], effects, kind)
         nodes, share = otf_wavelengths(camera, name, wavelength_nm, weight[0], OTF_WAVELENGTHS)
         total: FloatArray | ComplexArray = np.zeros(fx.shape)
         apart = dispersal(camera, nodes, share[None], fx, fy, effects, [place_um])
@@ -287,7 +287,7 @@ def optical_transfer(
         signals.append(float(np.sum(weight)))
     if not mixing:
         return transfers[0]
-    return mixed(camera, np.array(transfers), np.array(signals), fx, fy, effects)[camera.channels.index(channel)]
+    return mix_channels(camera, np.array(transfers), np.array(signals), fx, fy, effects)[camera.channels.index(channel)]
 
 
 def common_wavelengths(
@@ -339,10 +339,13 @@ def wavelength_shares(
 def _seen_light(
     camera: CameraModel, sights: Sequence[tuple[str, Spectrum | None]], effects: Sequence[Acts], kind: str
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Of each sight, wavelengths (nm) and how much each counts, sum 1; a sight without light is that of equal energy."""
+    """Compute the spectrum that each sight detects.
+
+    Returns for each sight wavelengths (nm) and their weights, of sum 1. A sight without light has that of equal energy.
+    """
     found = []
     for channel, radiance in sights:
-        wavelength_nm, weight = detected(camera, channel, [(radiance, None)], effects, kind)
+        wavelength_nm, weight = detect_light(camera, channel, [(radiance, None)], effects, kind)
         found.append(otf_weight(camera, channel, wavelength_nm, weight[0]))
     return found
 
@@ -376,10 +379,14 @@ def edge_profile(
     place_um: tuple[float, float] = (0.0, 0.0),
     collected: bool = False,
 ) -> FloatArray:
-    """What a pixel at signed perpendicular distance d (px, positive on the light side) from a straight edge sees: 0..1.
+    """Compute the edge spread function of a straight edge as pixels see it: 0 on the dark side, 1 on the light side.
 
-    ESF(d) = 1/2 + integral_0^inf [Re H sin(2 pi f d) + Im H cos(2 pi f d)] / (pi f) df, H the optical transfer function along
-    the edge's normal (fx, fy) = f (cos angle, sin angle); angle from the vertical, positive turns the top to the right.
+    distance_px : signed perpendicular distance d of the pixels from the edge (px), positive on the light side
+    angle_deg : from the vertical; positive turns the top to the right
+    place_um : the edge's place on the sensor, for path errors that change over the field
+
+    ESF(d) = 1/2 + integral_0^inf [Re H sin(2 pi f d) + Im H cos(2 pi f d)] / (pi f) df, H the optical transfer function
+    along the edge's normal (fx, fy) = f (cos angle, sin angle).
     """
     distance_px = np.asarray(distance_px, float)
     check_finite("distance from the edge", distance_px, "px")
@@ -453,7 +460,7 @@ def _highest_cy_per_px(
     camera: CameraModel, channel: str, radiance: Spectrum | None, effects: Sequence[Acts], kind: str
 ) -> float:
     """The lens's cutoff at the shortest wavelength that counts."""
-    wavelength_nm, weight = detected(camera, channel, [(radiance, None)], effects, kind)
+    wavelength_nm, weight = detect_light(camera, channel, [(radiance, None)], effects, kind)
     nodes, _ = otf_wavelengths(camera, channel, wavelength_nm, weight[0], OTF_WAVELENGTHS)
     cutoff = camera.pixel_pitch_um * camera.lens.imaging.cutoff_cy_per_um(float(np.min(nodes)), camera.lens.f_number)
     return min(cutoff, HIGHEST_CY_PER_PX)

@@ -74,12 +74,12 @@ class Spectrum(Frozen):
         grid = np.concatenate([[lower], inside, [upper]])
         return float(np.trapezoid(np.interp(grid, knots, value), grid))
 
-    def scaled(self, factor: float) -> Spectrum:
+    def scale(self, factor: float) -> Spectrum:
         """The same curve times a number."""
         wavelength_nm, value = self.arrays
         return Spectrum.of(wavelength_nm, value * factor)
 
-    def resampled(self, wavelength_nm: ArrayLike) -> Spectrum:
+    def resample(self, wavelength_nm: ArrayLike) -> Spectrum:
         """The curve on other wavelengths (at least two, ascending), conserving what it integrates to.
 
         v_i = integral S hat_i / integral hat_i with the triangles hat_i of the new grid: as they add up to 1 and to the

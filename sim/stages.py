@@ -37,12 +37,12 @@ class State:
 
     camera: CameraModel
 
-    def adding(self, **laws: Any) -> Self:
+    def add_laws(self, **laws: Any) -> Self:
         """This state with one more law in each field that is named. Raises TypeError for a field that the stage doesn't have."""
         changed: dict[str, Any] = {name: (*getattr(self, name), law) for name, law in laws.items()}
         return replace(self, **changed)
 
-    def changed(self) -> frozenset[str]:
+    def list_laws(self) -> frozenset[str]:
         """Names of the fields that hold a law, as `stage.field`."""
         stage = type(self).__name__.lower()
         return frozenset(f"{stage}.{f.name}" for f in fields(self) if f.name != "camera" and getattr(self, f.name))
@@ -56,7 +56,7 @@ class Unsteadiness:
     seed: int
 
     def factor(self, elapsed_s: float) -> float:
-        """Of the frame that is taken `elapsed_s` after the first capture."""
+        """Draw the factor on the source of the frame that is taken `elapsed_s` after the first capture."""
         rng = np.random.default_rng([self.seed, 3, round(1e3 * max(elapsed_s, 0.0))])
         return 1.0 + self.relative_std * float(rng.standard_normal())
 
@@ -72,13 +72,14 @@ class RowLight:
 
 @dataclass(frozen=True)
 class Light(State):
-    """What reaches the lens, given what the radiometer and the screen were told.
+    """State of the light that reaches the lens, given what the radiometer measured and the screen was asked to show.
 
-    `spectrum`: (wavelength_nm, radiance, kind of capture) -> radiance. `level`: elapsed_s -> factor on the source. `rows`: factors on
-    the source's light by row of one frame. `shading`: (x_um, y_um) -> factor by place on the sensor. `ambient_e_per_s`: channel -> electrons a second of
-    light beside the source. `screen`: (share asked for, x_um, y_um) -> share of the lit state that is shown. `pair_gain`: factors
-    on the right camera's signal over the left one's in one scene. `pair_delay_s`: by how much the right camera captures later.
-    `unsteadiness`: random factors on the source, one a frame.
+    `spectrum`: (wavelength_nm, radiance, kind of capture) -> radiance. `level`: elapsed_s -> factor on the source.
+    `rows`: factors on the source's light by row of one frame. `shading`: (x_um, y_um) -> factor by place on the sensor.
+    `ambient_e_per_s`: channel -> electrons a second of light beside the source. `screen`: (share asked for, x_um, y_um)
+    -> share of the lit state that is shown. `pair_gain`: factors on the right camera's signal over the left one's in
+    one scene. `pair_delay_s`: by how much the right camera captures later. `unsteadiness`: random factors on the
+    source, one a frame.
     """
 
     spectrum: tuple[Callable[[FloatArray, FloatArray, str], FloatArray], ...] = ()
@@ -113,8 +114,14 @@ class Light(State):
         """Electrons a second that reach a pixel of a channel beside the source while the shutter is open."""
         return sum((law(channel) for law in self.ambient_e_per_s), 0.0)
 
-    def shown(self, share: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
-        """What a screen shows of `share` (rows, cols), 0..1 of its lit state, at places in equal steps."""
+    def show_share(self, share: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+        """Apply the screen's laws.
+
+        share : share of the screen's lit state that is asked for, 0..1 (rows, cols)
+        x_um, y_um : places in equal steps
+
+        Returns the share that is shown (rows, cols).
+        """
         return reduce(lambda value, law: law(value, x_um, y_um), self.screen, share)
 
 
@@ -148,7 +155,7 @@ class Image(State):
     shift: tuple[Callable[[FloatArray, FloatArray, float], tuple[FloatArray, FloatArray]], ...] = ()
     copies: tuple[Callable[[FloatArray], FloatArray], ...] = ()
 
-    def transmitted(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
+    def transmit(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
         """Factor on the light by wavelength and sine of the chief ray's angle at the sensor, which broadcast."""
         sine = np.asarray(sin_theta, float)
         none = np.ones(np.broadcast_shapes(np.shape(wavelength_nm), sine.shape))
@@ -174,7 +181,7 @@ class Image(State):
             self.camera.lens.f_number,
             self.wavefront(wavelength_nm, place_um),
         )
-        return self._blurred(value, fx_cy_per_um, fy_cy_per_um, wavelength_nm)
+        return self._apply_blur(value, fx_cy_per_um, fy_cy_per_um, wavelength_nm)
 
     def otf_beside_lens(
         self,
@@ -188,9 +195,9 @@ class Image(State):
         path = self.wavefront(wavelength_nm, place_um)
         if path.terms:
             value = pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, self.camera.lens.f_number, path)
-        return self._blurred(value, fx_cy_per_um, fy_cy_per_um, wavelength_nm)
+        return self._apply_blur(value, fx_cy_per_um, fy_cy_per_um, wavelength_nm)
 
-    def _blurred(
+    def _apply_blur(
         self, value: FloatArray | ComplexArray, fx: FloatArray, fy: FloatArray, wavelength_nm: float
     ) -> FloatArray | ComplexArray:
         for law in self.transfer:
@@ -202,7 +209,7 @@ class Image(State):
 
     @property
     def moves(self) -> bool:
-        """Whether any law lets light land elsewhere."""
+        """Return whether any law lets light land elsewhere."""
         return bool(self.shift)
 
     def shifted_um(
@@ -216,11 +223,11 @@ class Image(State):
             right, down = right + dx, down + dy
         return right, down
 
-    def unveiled(self) -> Image:
+    def remove_veil(self) -> Image:
         """This without the light that is scattered evenly over a frame."""
         return replace(self, veils=tuple(replace(veil, even_share=0.0) for veil in self.veils))
 
-    def veiled(self, image: FloatArray) -> FloatArray:
+    def add_veil(self, image: FloatArray) -> FloatArray:
         """A channel's irradiance (rows, cols) with what is scattered evenly over the frame: (1 - s) I + s <I>. Scattered light has met
         the lens's fall-off already and has none of its own."""
         return reduce(lambda v, veil: v + veil.even_share * (np.mean(v) - v), self.veils, image)
@@ -238,7 +245,7 @@ class Charge(State):
     pixel. `dark_current`: (e/s, sensor temperature) -> e/s, of all
     pixels or of each (rows, cols). `defects`: pixels with additional dark current. `transfer`: (fx, fy in cy/um, wavelength_nm) ->
     factor on the transfer function, alike for all colours. `kernels`: where the charge of a pixel ends up, (odd, odd) of sum 1: they
-    act on whole frames, and on transfer functions (`sim.point.mixed` for a mosaic). `exchange`: mean electrons (rows, cols) -> the same after
+    act on whole frames, and on transfer functions (`sim.point.mix_channels` for a mosaic). `exchange`: mean electrons (rows, cols) -> the same after
     neighbours have exchanged charge by how much they hold. `overflow`: mean electrons (rows, cols) -> the same
     after full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame. `variance_e2`: (mean electrons,
     shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of the shot noise with each of the four next pixels.
@@ -260,7 +267,7 @@ class Charge(State):
         """The time in which light is collected, given the time that was asked for."""
         return reduce(lambda value, law: law(value), self.exposure_s, exposure_s)
 
-    def lit(self, electrons: FloatArray) -> FloatArray:
+    def collect_light(self, electrons: FloatArray) -> FloatArray:
         """Mean electrons of light (rows, cols) as the pixels collect them."""
         return reduce(lambda value, law: law(value), self.collected, electrons)
 
@@ -281,7 +288,7 @@ class Charge(State):
             value = value * law(fx_cy_per_um, fy_cy_per_um, wavelength_nm)
         return value
 
-    def moved(self, electrons: FloatArray) -> FloatArray:
+    def move_charge(self, electrons: FloatArray) -> FloatArray:
         """Electrons of a whole frame (rows, cols) where they end up. The frame goes on as its mirror image about the outermost pixels'
         centres, which keeps the mosaic's phases."""
         mixed = reduce(
@@ -291,14 +298,14 @@ class Charge(State):
 
     @property
     def mixes(self) -> bool:
-        """Whether charge moves between neighbouring pixels."""
+        """Return whether charge moves between neighbouring pixels."""
         return bool(self.kernels or self.exchange)
 
-    def overflown(self, electrons: FloatArray) -> FloatArray:
+    def overflow_wells(self, electrons: FloatArray) -> FloatArray:
         """Mean electrons of a whole frame after what is above the full well has run over."""
         return reduce(lambda value, law: law(value), self.overflow, electrons)
 
-    def staying(self, electrons: FloatArray) -> FloatArray | float:
+    def hold_lag(self, electrons: FloatArray) -> FloatArray | float:
         """How many of a frame's electrons aren't read but stay for the next frame: image lag."""
         return sum((law(electrons) for law in self.lag), 0.0)
 
@@ -306,13 +313,13 @@ class Charge(State):
         """Variance of the shot noise at mean signals, in e^2."""
         return reduce(lambda value, law: law(electrons, value), self.variance_e2, electrons)
 
-    def shared(self, electrons: FloatArray) -> FloatArray | float:
+    def neighbour_correlation(self, electrons: FloatArray) -> FloatArray | float:
         """Correlation of a pixel's shot noise with each of its four next pixels', between 0 and 1/4."""
         return sum((law(electrons) for law in self.correlation), 0.0)
 
 
 class Disturbance(Protocol):
-    """What read-out adds to the pixels of a frame, anew in each: how it is drawn, and its moments."""
+    """Signal that read-out adds to the pixels of a frame, drawn anew in each: how it is drawn, and its moments."""
 
     def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         """Electrons of one frame; they broadcast to `shape`."""
@@ -326,11 +333,12 @@ class Disturbance(Protocol):
 
 @dataclass(frozen=True)
 class Signal(State):
-    """What read-out makes of the electrons, up to the converter.
+    """State of the electrons' read-out, up to the converter.
 
-    `response`: electrons -> electrons, point by point. `offset_dn`: (elapsed_s, sensor temperature) -> DN added to the black level.
-    `lines`: noise that rows or columns share. `telegraph`: pixels that jump between two levels. `disturbances`: whatever else is added at
-    random. `filters`: kernels (odd, odd) of sum 1 that the chip runs over each colour's plane, signal and noise alike, before rounding.
+    `response`: electrons -> electrons, point by point. `offset_dn`: (elapsed_s, sensor temperature) -> DN added to the
+    black level. `lines`: noise that rows or columns share. `telegraph`: pixels that jump between two levels.
+    `disturbances`: signals that are added at random. `filters`: kernels (odd, odd) of sum 1 that the chip runs over
+    each colour's plane, signal and noise alike, before rounding.
     """
 
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
@@ -341,7 +349,7 @@ class Signal(State):
     filters: tuple[FloatArray, ...] = ()
 
     def read(self, electrons: FloatArray) -> FloatArray:
-        """What the read-out makes of signals in electrons."""
+        """Apply the read-out's responses to signals in electrons, point by point."""
         return reduce(lambda value, law: law(value), self.response, electrons)
 
     def shift_dn(self, elapsed_s: float, temperature_c: float | None) -> float:
@@ -391,7 +399,7 @@ class Codes(State):
 
     codes: tuple[Callable[[FloatArray], FloatArray], ...] = ()
 
-    def converted(self, dn: FloatArray) -> FloatArray:
+    def convert(self, dn: FloatArray) -> FloatArray:
         """Levels in DN after the converter, before rounding."""
         return reduce(lambda value, law: law(value), self.codes, dn)
 
@@ -412,7 +420,7 @@ def kernel_otf(kernel: FloatArray, fx_cy_per_px: FloatArray, fy_cy_per_px: Float
 
 
 class Acts(Protocol):
-    """What the chain asks of an effect: `sim.effects.base.Effect` says when to write which."""
+    """Interface of an effect to the chain: `sim.effects.base.Effect` says when to write which method."""
 
     def on_light(self, light: Light) -> Light: ...
 
@@ -454,4 +462,4 @@ def laws_of(camera: CameraModel, effects: Iterable[Acts]) -> frozenset[str]:
     """Which quantities effects change, as `stage.field`."""
     acting = tuple(effects)
     states = (f(camera, acting) for f in (light_of, image_of, charge_of, signal_of, codes_of))
-    return frozenset().union(*(state.changed() for state in states))
+    return frozenset().union(*(state.list_laws() for state in states))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from sim.camera import CameraModel
-from sim.detection import collection_m2_sr, detected
+from sim.detection import collection_m2_sr, detect_light
 from sim.effects.base import Effect
 from sim.optics.illumination import optical_axis_px
 from sim.optics.table import LensTable
@@ -146,7 +146,7 @@ def _table_light(
     sine = radius_mm / np.hypot(radius_mm, table.focal_length_mm)
     out = np.empty((len(lights), len(camera.channels), sine.size, table.wavelength_nm.size))
     for k, channel in enumerate(camera.channels):
-        wavelength_nm, weight = detected(camera, channel, lights, effects, kind, sine)
+        wavelength_nm, weight = detect_light(camera, channel, lights, effects, kind, sine)
         hats = [np.interp(wavelength_nm, table.wavelength_nm, unit) for unit in np.eye(table.wavelength_nm.size)]
         light = (weight @ np.stack(hats, axis=1)) * collection_m2_sr(camera)
         # An angle makes a difference only where an effect says so: (F, lights, W), or (lights, W) for all fields.

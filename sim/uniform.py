@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from sim.camera import CameraModel
-from sim.detection import collection_m2_sr, detected
+from sim.detection import collection_m2_sr, detect_light
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
@@ -96,7 +96,7 @@ def electron_rate(
     `sim.optics.illumination.relative_illumination` for the fall-off. `reflectance` stands for a chart's patch under a light
     whose radiance on a perfect diffuser is `radiance`. Raises ValueError for radiance below 0.
     """
-    _, weight = detected(camera, channel, [(radiance, reflectance)], effects, kind, sin_theta)
+    _, weight = detect_light(camera, channel, [(radiance, reflectance)], effects, kind, sin_theta)
     return float(np.sum(weight)) * collection_m2_sr(camera, magnification)
 
 
@@ -107,7 +107,9 @@ def radiance_at_lens(camera: CameraModel, radiance: Spectrum, effects: Sequence[
 
 
 class Uniform:
-    """What a camera with effects makes of uniform light. Electrons and DN are means of many pixels unless a method says otherwise."""
+    """Response of a camera with effects to uniform light. Electrons and DN are means of many pixels unless a method
+    says otherwise.
+    """
 
     def __init__(self, camera: CameraModel, effects: Sequence[Acts] = ()) -> None:
         self.camera, self._effects = camera, tuple(effects)
@@ -139,14 +141,14 @@ class Uniform:
         return self._light.radiance(wavelength_nm, radiance, kind)
 
     def transmittance(self, wavelength_nm: FloatArray) -> FloatArray:
-        """Of what effects put into the light's way, on axis."""
-        return self._image.transmitted(wavelength_nm, 0.0)
+        """Return the transmittance of what effects put into the light's way, on axis, at `wavelength_nm`."""
+        return self._image.transmit(wavelength_nm, 0.0)
 
     def field(self, points: FieldPoints) -> FieldPoints:
         """The same points in the light that the effects leave there."""
-        return replace(points, light=self.illuminated(points.light, points.x_um, points.y_um))
+        return replace(points, light=self.shade_light(points.light, points.x_um, points.y_um))
 
-    def illuminated(self, light: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+    def shade_light(self, light: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
         """Light at places (um from the sensor's centre) with the effects' shading."""
         for law in (*self._light.shading, *self._image.shading):
             light = light * np.maximum(law(x_um, y_um), 0.0)
@@ -163,7 +165,7 @@ class Uniform:
 
     @property
     def varies_by_row(self) -> bool:
-        """Whether the source's light varies while a frame is taken."""
+        """Return whether the source's light varies while a frame is taken."""
         return bool(self._light.rows)
 
     def collected_s(self, exposure_s: float) -> float:
@@ -201,7 +203,7 @@ class Uniform:
         collected_s = _of_each(self._charge.collected_s, exposure_s)
         source_s = _of_each(self._light.source, elapsed_s) * collected_s
         typical_s = source_s * float(np.mean(field.light))
-        mixed = self._mixed({c: np.asarray(rates.get(c, 1.0)) * typical_s for c in self.camera.channels})
+        mixed = self._mix_captures({c: np.asarray(rates.get(c, 1.0)) * typical_s for c in self.camera.channels})
         dark = self.camera.dark_current_e_per_s * np.asarray(exposure_s)[..., None]
         found = {}
         for channel, rate in rates.items():
@@ -210,23 +212,23 @@ class Uniform:
             found[channel] = (light + ambient) * mixed.get(channel, np.ones(()))[..., None] + dark
         return found
 
-    def _mixed(self, electrons: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    def _mix_captures(self, electrons: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """`mixing` of every capture."""
         if not self._charge.mixes:
             return {}
         level = dict(zip(electrons, np.broadcast_arrays(*electrons.values()), strict=True))
         shape = next(iter(level.values())).shape
-        each = [self.mixing({c: float(v[at]) for c, v in level.items()}) for at in np.ndindex(shape)]
+        each = [self.mixing_factors({c: float(v[at]) for c, v in level.items()}) for at in np.ndindex(shape)]
         return {c: np.array([one[c] for one in each]).reshape(shape) for c in electrons}
 
-    def mixing(self, electrons: Mapping[str, float]) -> dict[str, float]:
+    def mixing_factors(self, electrons: Mapping[str, float]) -> dict[str, float]:
         """Factor on each channel's mean by charge that moves between neighbouring pixels, from a small uniform mosaic of these electrons;
         empty where none moves."""
         if not self._charge.mixes:
             return {}
         cfa, size, inner = self.camera.cfa, 12, slice(4, 8)
         tile = mosaic.assemble({c: np.full((size, size), level) for c, level in electrons.items()}, cfa)
-        after = self._charge.moved(tile)
+        after = self._charge.move_charge(tile)
         factors = {}
         for channel, level in electrons.items():
             where = np.zeros((size, size), bool)
@@ -245,12 +247,12 @@ class Uniform:
 
     @property
     def exchanges_charge(self) -> bool:
-        """Whether unequal neighbours exchange charge."""
+        """Return whether unequal neighbours exchange charge."""
         return bool(self._charge.exchange)
 
     @property
     def changes_dark_current(self) -> bool:
-        """Whether effects change the dark current of pixels that aren't defective."""
+        """Return whether effects change the dark current of pixels that aren't defective."""
         return bool(self._charge.dark_current)
 
     def dark_e_per_s(self, temperature_c: float | None) -> FloatArray:
@@ -265,12 +267,12 @@ class Uniform:
 
     @property
     def mean_hot_e_per_s(self) -> float:
-        """What defective pixels add to the frame's mean dark current."""
+        """Compute the defective pixels' part of the frame's mean dark current (electrons a second)."""
         return sum(float(np.mean(hot.sizes((self.camera.rows, self.camera.cols)))) for hot in self.hot)
 
     def lag_e(self, electrons: FloatArray) -> FloatArray | float:
         """How many of a frame's electrons stay for the next."""
-        return self._charge.staying(electrons)
+        return self._charge.hold_lag(electrons)
 
     def shot_e2(self, electrons: FloatArray) -> FloatArray:
         """Variance of the shot noise (e^2) at mean signals."""
@@ -278,22 +280,22 @@ class Uniform:
 
     @property
     def shares_shot_noise(self) -> bool:
-        """Whether neighbouring pixels' shot noise is correlated."""
+        """Return whether neighbouring pixels' shot noise is correlated."""
         return bool(self._charge.correlation)
 
-    def shared(self, electrons: FloatArray) -> FloatArray:
+    def neighbour_correlation(self, electrons: FloatArray) -> FloatArray:
         """Correlation of a pixel's shot noise with each of its four next pixels' at mean signals."""
-        return np.asarray(self._charge.shared(electrons) * np.ones(np.shape(electrons)))
+        return np.asarray(self._charge.neighbour_correlation(electrons) * np.ones(np.shape(electrons)))
 
     # --- read-out ----------------------------------------------------------------------------------------------------
 
     @property
     def is_linear(self) -> bool:
-        """Whether the read-out's response is a straight line."""
+        """Return whether the read-out's response is a straight line."""
         return not self._signal.response
 
     def response(self, electrons: FloatArray) -> FloatArray:
-        """What the read-out makes of signals in electrons."""
+        """Apply the read-out's responses to signals in electrons."""
         return self._signal.read(electrons)
 
     def offset_dn(self, elapsed_s: float, temperature_c: float | None) -> float:
@@ -302,7 +304,7 @@ class Uniform:
 
     @property
     def adds_signal(self) -> bool:
-        """Whether read-out adds signals of its own to the pixels (`Signal.disturbances`)."""
+        """Return whether read-out adds signals of its own to the pixels (`Signal.disturbances`)."""
         return bool(self._signal.disturbances)
 
     @cached_property
@@ -327,12 +329,12 @@ class Uniform:
 
     @property
     def has_even_codes(self) -> bool:
-        """Whether the converter is ideal."""
+        """Return whether the converter is ideal."""
         return not self._codes.codes
 
     def codes(self, dn: FloatArray) -> FloatArray:
-        """What the converter makes of levels in DN before it rounds."""
-        return self._codes.converted(dn)
+        """Convert levels in DN to the converter's, before it rounds."""
+        return self._codes.convert(dn)
 
     def mean_dn(self, electrons: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Mean DN (...) above the black level over the points, by channel, after read-out of (..., points); codes are averaged over

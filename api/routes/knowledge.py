@@ -13,7 +13,7 @@ from api.security import Demand
 from api.service import READ
 from lab.diagnose.effect_list import EffectDescription, ParameterDescription, effect_description, effect_list
 from sim.camera import CameraModel, Lens
-from sim.parameters import declared
+from sim.parameters import read_quantities
 
 router = APIRouter()
 
@@ -27,8 +27,10 @@ def me(key: Annotated[StoredKey, Depends(Demand(Permission.READ))]) -> Me:
 @router.get("/parameters", tags=["knowledge"], dependencies=[READ], responses=answers(401))
 def list_parameters() -> list[ParameterDescription]:
     """The parameters of the camera model with unit, bounds and prior; those of its lens are called `lens.NAME`."""
-    camera = [ParameterDescription.of(name, quantity) for name, quantity in declared(CameraModel).items()]
-    return camera + [ParameterDescription.of(f"lens.{name}", quantity) for name, quantity in declared(Lens).items()]
+    camera = [ParameterDescription.of(name, quantity) for name, quantity in read_quantities(CameraModel).items()]
+    return camera + [
+        ParameterDescription.of(f"lens.{name}", quantity) for name, quantity in read_quantities(Lens).items()
+    ]
 
 
 @router.get("/effects", tags=["knowledge"], dependencies=[READ], responses=answers(401))

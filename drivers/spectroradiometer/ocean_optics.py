@@ -153,7 +153,7 @@ class OceanOptics(Spectroradiometer):
             signal = np.mean([self._signal(scan) for scan in scans], axis=0)
             rate = Spectrum.of(self._wavelength_nm, signal / integration_s)
             # The mean over every nanometre, so that the pixels' noise averages and no light is lost between the samples.
-            mean_rate = np.asarray(rate.resampled(self._grid_nm).value)
+            mean_rate = np.asarray(rate.resample(self._grid_nm).value)
             radiance = Spectrum.of(self._grid_nm, mean_rate / self._response.at(self._grid_nm))
             return RadianceMeasurement(radiance, integration_s, str(self._open.serial_number))
 

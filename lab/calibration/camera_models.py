@@ -27,7 +27,7 @@ from lab.formats.camera_file import CameraFile, fitted_camera, read_camera, writ
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
 from sim.camera import Side
-from sim.parameters import Frozen, declared
+from sim.parameters import Frozen, read_quantities
 
 log = logging.getLogger(__name__)
 Kind = Literal["fitted", "improved", "sent"]
@@ -205,7 +205,7 @@ def _camera(content: CameraFile) -> ModelOfCamera:
 
 def _parameters(model: BaseModel, std: Mapping[str, float]) -> Iterator[ModelParameter]:
     """The declared quantities of a model that are set."""
-    for name, quantity in declared(type(model)).items():
+    for name, quantity in read_quantities(type(model)).items():
         value = getattr(model, name)
         if isinstance(value, int | float | tuple):
             yield ModelParameter(

@@ -21,7 +21,7 @@ from lab.capture.store import Store
 from lab.capture.tables import SessionRow, StepRow
 from lab.capture_kinds.base import CAPTURES, SEQUENCES, FindExposure, FixedExposure, Sequence, Step
 from lab.errors import InputError
-from sim.parameters import Frozen, declared
+from sim.parameters import Frozen, read_quantities
 
 #: What a step does, in seconds where a station hasn't shown it yet: a search takes some six test frames and a change of the light, a
 #: spectroradiometer 3 to 12 s at the levels of a monochromator, a pair of frames its read-out and its files.
@@ -100,7 +100,7 @@ def _described(kind: type[Sequence]) -> SequenceDescription:
                 upper=quantity.upper,
                 several=get_origin(kind.model_fields[name].annotation) is tuple,
             )
-            for name, quantity in declared(kind).items()
+            for name, quantity in read_quantities(kind).items()
         ),
     )
 
@@ -208,7 +208,7 @@ def estimate(plan: CapturePlan, station: Station, times: StepTimes) -> PlanEstim
         planned.append(
             PlannedSequence(
                 name=sequence.name,
-                parameters={name: getattr(sequence, name) for name in declared(type(sequence))},
+                parameters={name: getattr(sequence, name) for name in read_quantities(type(sequence))},
                 steps=len(steps),
                 captures=sum(len(step.captures) for step in steps),
                 estimated_s=round(sum(seconds for seconds, _ in each), 1),

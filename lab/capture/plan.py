@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from lab.capture_kinds.base import SEQUENCES, Cells, Equipment, Sequence, Step, name_of
 from lab.errors import InputError
-from sim.parameters import declared
+from sim.parameters import read_quantities
 
 #: Values of sequences' parameters: sequence -> parameter -> a number, or several.
 Parameters = Mapping[str, Mapping[str, Any]]
@@ -71,7 +71,7 @@ def full_plan(
 
 def _with(sequence: Sequence, values: Mapping[str, Any]) -> Sequence:
     """The sequence with other values of its parameters. Raises InputError."""
-    known = declared(type(sequence))
+    known = read_quantities(type(sequence))
     if unknown := values.keys() - known.keys():
         raise InputError(f"{sequence.name}.{min(unknown)}: isn't a parameter; {sequence.name} has {', '.join(known)}")
     if not values:

@@ -134,13 +134,13 @@ class Station(Frozen):
         found |= {f"cameras.{side}": self.cameras[side] for side in self.sides}
         return {name: entry for name, entry in found.items() if entry is not None}
 
-    def having(self, kind: type[TargetT]) -> dict[str, TargetT]:
+    def list_targets(self, kind: type[TargetT]) -> dict[str, TargetT]:
         """Targets of one kind by name, in the station file's order."""
         return {name: target for name, target in self.targets.items() if isinstance(target, kind)}
 
     def one(self, kind: type[Target]) -> str:
         """Name of the first target of one kind. Raises InputError if the station has none."""
-        for name in self.having(kind):
+        for name in self.list_targets(kind):
             return name
         wanted = get_args(kind.model_fields["kind"].annotation)[0]
         raise InputError(f"station: no target of kind {wanted!r}; add one under [targets] of the station file")

@@ -65,7 +65,7 @@ class ChartSequence(Sequence):
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
         name = station.one(ChartTarget)
-        target = station.having(ChartTarget)[name]
+        target = station.list_targets(ChartTarget)[name]
         lit = Setting(target=name, wavelength_nm=0.0)
         made = [exposure_step("colorchecker", "ColorChecker", lit, self.level)]
         light = spectrum_path(made[0].id)

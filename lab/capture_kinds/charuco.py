@@ -64,7 +64,7 @@ class StereoSequence(Sequence):
         self.check_instruments(station)
         station.one(BoardTarget)
         made: list[Step] = []
-        for target, board in list(station.having(BoardTarget).items())[: self.poses]:
+        for target, board in list(station.list_targets(BoardTarget).items())[: self.poses]:
             lit = Setting(target=target, wavelength_nm=0.0)
             if not made:
                 made.append(exposure_step("stereo", "ChArUco board", lit, self.level, measures_light=False))

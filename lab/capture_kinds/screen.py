@@ -105,7 +105,7 @@ class ScreenSequence(Sequence):
         """The largest grid of whole checkerboard squares that all cameras see. Raises InputError if that is less than 2 x 2 squares, and
         where no camera's view of the screen is given."""
         name = station.one(ScreenTarget)
-        screen = station.having(ScreenTarget)[name]
+        screen = station.list_targets(ScreenTarget)[name]
         layouts = [layout for side in station.sides if (layout := getattr(screen, side)) is not None]
         if not layouts:
             raise InputError(
@@ -126,7 +126,7 @@ class ScreenSequence(Sequence):
 
     def patterns(self, station: Equipment) -> dict[str, Cells]:
         grid = self.grid(station)
-        screen = station.having(ScreenTarget)[station.one(ScreenTarget)]
+        screen = station.list_targets(ScreenTarget)[station.one(ScreenTarget)]
         whole = whole_screen(screen)
         drawn = {
             name: kind.cells(whole if kind.fills_screen else grid, self.seed) for name, kind in self.kinds().items()
@@ -136,7 +136,7 @@ class ScreenSequence(Sequence):
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
         name = station.one(ScreenTarget)
-        screen = station.having(ScreenTarget)[name]
+        screen = station.list_targets(ScreenTarget)[name]
         grid, shown = self.grid(station), self.patterns(station)
         settings = {
             pattern: Setting(

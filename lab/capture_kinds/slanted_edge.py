@@ -70,7 +70,7 @@ class EdgeSequence(Sequence):
         self.check_instruments(station)
         station.one(EdgeTarget)
         made: list[Step] = []
-        for name, edge in station.having(EdgeTarget).items():
+        for name, edge in station.list_targets(EdgeTarget).items():
             lit = Setting(target=name, wavelength_nm=0.0)
             found = exposure_step(f"edge/{name}", f"slanted edge {name}", lit, self.level)
             light = spectrum_path(found.id)

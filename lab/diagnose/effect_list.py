@@ -152,7 +152,7 @@ def _family(family: Family) -> FamilyDescription:
         words=family.words,
         sentence=family.sentence,
         members=library.members(family),
-        told_apart_by=family.told_apart_by,
+        told_apart_by=family.separating_capture,
     )
 
 

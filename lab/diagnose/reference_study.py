@@ -135,7 +135,7 @@ class _SideSession:
         for level in (*LEVELS, *LEVELS[::-1]):
             self.take("flat", flat, level * full_s, 2, radiance=lamp)
         self.sweep()
-        light = self.lamp.scaled(0.3)
+        light = self.lamp.scale(0.3)
         corners = ((30.0, 40.0), (30.0, 280.0), (210.0, 280.0), (210.0, 40.0))
         scene = ReflectanceChart(corners, light)
         self.take(
@@ -170,19 +170,19 @@ class _SideSession:
             (self.lamp, EDGE_PLACES[1]),
             *((one, EDGE_PLACES[0]) for one in line.values()),
         ]
-        for light, (down, across) in [*lights, (self.lamp.scaled(4.0), EDGE_PLACES[0])]:
+        for light, (down, across) in [*lights, (self.lamp.scale(4.0), EDGE_PLACES[0])]:
             half = EDGE_SIDE_PX // 2
             row, col = max(int(down * ROWS), half), max(int(across * COLS), half)
             region = (row - half, col - half, row + half, col + half)
             place = (row - 0.5 * ROWS) * PITCH_UM * 1e-3, (col - 0.5 * COLS) * PITCH_UM * 1e-3
             path, exposure_s = self.noted(light), self.exposure_for(light, 0.7)
             for angle in ANGLES_DEG:
-                scene = KnifeEdge((EdgeRegion(region, angle),), light.scaled(DARK_SIDE), light)
+                scene = KnifeEdge((EdgeRegion(region, angle),), light.scale(DARK_SIDE), light)
                 self.take("slanted_edge", scene, exposure_s, 2, region=region, angle_deg=angle, light_radiance=path, field_mm=place)  # fmt: skip
 
     def screen(self, targets: dict[str, Any]) -> None:
         """White, black, checkerboard and Bernoulli patterns, pixel rows along the camera's."""
-        light = self.lamp.scaled(0.2)
+        light = self.lamp.scale(0.2)
         cells = np.ones((ROWS // int(CELL_PX), COLS // int(CELL_PX)), np.uint8)
         shown = {"white": cells, "black": 0 * cells} | dict(
             zip(("checkerboard", "bernoulli"), targets.values(), strict=True)
@@ -193,7 +193,7 @@ class _SideSession:
         for kind, pattern in shown.items():
             high, wide = pattern.shape
             to_camera = Warp.of(((CELL_PX, 0, 0.5 * (COLS - 1 - wide * CELL_PX)), (0, CELL_PX, 0.5 * (ROWS - 1 - high * CELL_PX)), (0, 0, 1)))  # fmt: skip
-            scene = ScreenPattern(pattern, to_camera, light.scaled(SCREEN_BLACK), light, kind)
+            scene = ScreenPattern(pattern, to_camera, light.scale(SCREEN_BLACK), light, kind)
             more: dict[str, Any] = {"target": files[kind]} if kind in files else {}
             self.take(kind, scene, exposure_s, 3, **where, **more)
 
@@ -202,7 +202,7 @@ class _SideSession:
         board = cv2.aruco.CharucoBoard((8, 6), 9.0, 6.0, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
         texture = np.asarray(board.generateImage((8 * 18, 6 * 18), marginSize=0, borderBits=1)) / 255.0
         assert self.camera.geometry is not None
-        light = self.lamp.scaled(0.6)
+        light = self.lamp.scale(0.6)
         focal_px = self.camera.geometry.camera_matrix[0][0]
         distance = 9.0 * 8 / COLS / 0.7 * focal_px
         for k, tilt in enumerate(TILTS_DEG):
@@ -212,9 +212,9 @@ class _SideSession:
             )
             corner = middle - turn @ np.array([36.0, 27.0, 0.0])
             target = PlanarTarget(
-                texture, 0.5, _matrix(turn), _vector(corner), self.camera.geometry, light.scaled(0.05), light, 1.0
+                texture, 0.5, _matrix(turn), _vector(corner), self.camera.geometry, light.scale(0.05), light, 1.0
             )
-            scene = target.seen_by(self.rig)[self.side == "right"]
+            scene = target.pose_for_rig(self.rig)[self.side == "right"]
             self.take("charuco", scene, self.exposure_for(light, 0.6), 1, dictionary="DICT_4X4_50", squares=(6, 8), square_mm=9.0,
                       marker_mm=6.0, pose=f"b{k}")  # fmt: skip
 

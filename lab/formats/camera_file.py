@@ -40,7 +40,7 @@ from sim.effects.base import Effect
 from sim.effects.library import effect, effects
 from sim.optics.imaging import DiffractionLimited, MeasuredOtf, MeasuredPsf, TracedLens
 from sim.optics.table import LensTable
-from sim.parameters import Quantity, declared
+from sim.parameters import Quantity, read_quantities
 from sim.spectrum import Spectrum
 
 FORMAT, VERSION = "calibench-camera", 1
@@ -214,7 +214,7 @@ def _validated(file: Path, at: str, model: type[BaseModel], values: Mapping[str,
         if problem["type"] == "extra_forbidden":
             what = f"{key} isn't a key of a camera file; leave it out, or take one of {', '.join(_known(model, where[:-1]))}"
         elif problem["type"] == "missing":
-            meant = declared(model).get(where[-1])
+            meant = read_quantities(model).get(where[-1])
             what = f"{key} is missing; add it" + (f" ({meant.unit}: {meant.meaning})" if meant else "")
         else:
             value = repr(problem["input"])
@@ -360,7 +360,7 @@ def _imaging_lines(file: Path, content: CameraFile) -> Iterator[str]:
 
 def _parameters(model: BaseModel, skip: Sequence[str] = ()) -> Iterator[str]:
     """One line for each field: key, value, and its declaration as a comment. A field that isn't set is a comment as a whole."""
-    known = declared(type(model))
+    known = read_quantities(type(model))
     for key in type(model).model_fields:
         if key in skip:
             continue
@@ -393,7 +393,7 @@ def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> Camer
     """The camera that a fit found (`lab.predict.camera_model.camera_model`), with the fit's uncertainties, to be written as a file."""
     model = camera_model(recordings, side, fit)
     std = {}
-    for key in declared(CameraModel) if fit.noise is not None else ():
+    for key in read_quantities(CameraModel) if fit.noise is not None else ():
         value = getattr(fit.noise, f"{key}_std", None)
         if value is not None:
             std[key] = float(value)

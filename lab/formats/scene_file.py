@@ -163,11 +163,11 @@ def scene(
     if suffix in PICTURES:
         codes = read_picture(file)
         with _about(file):
-            return PictureOnScreen.chosen(parameters).show(codes, view, white)
+            return PictureOnScreen.choose(parameters).show(codes, view, white)
     if suffix in CUBES:
         image = read_cube(file, white)
         with _about(file):
-            return Cube.chosen(parameters).show(image, view)
+            return Cube.choose(parameters).show(image, view)
     raise InputError(
         f"scene {name!r} is not known: name one of {', '.join(SCENES)}, a picture ({' '.join(PICTURES)}) or a cube ({' '.join(CUBES)})"
     )

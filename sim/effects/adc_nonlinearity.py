@@ -68,8 +68,8 @@ class AdcNonlinearity(Effect):
         #: By the three highest bits: the number of the eighth of the range.
         off = (np.arange(8)[:, None] >> np.array([2, 1, 0]) & 1) @ np.array(errors)
 
-        def converted(dn: FloatArray) -> FloatArray:
+        def convert(dn: FloatArray) -> FloatArray:
             eighth = (np.minimum(np.maximum(dn, 0.0), full - 1.0) * (8.0 / full)).astype(np.intp)
             return np.asarray(dn * (1.0 - sum(errors) / full) + off[eighth])
 
-        return codes.adding(codes=converted)
+        return codes.add_laws(codes=convert)

@@ -67,11 +67,11 @@ class AdcRipple(Effect):
 
         amplitude_dn, phase = np.hypot(self.sine_dn, self.cosine_dn), np.arctan2(self.cosine_dn, self.sine_dn)
 
-        def converted(dn: FloatArray) -> FloatArray:
+        def convert(dn: FloatArray) -> FloatArray:
             ripple = np.multiply(dn, 2.0 * np.pi / self.period_dn)
             ripple += phase
             np.sin(ripple, out=ripple)
             ripple *= amplitude_dn
             return np.asarray(dn + ripple)
 
-        return codes.adding(codes=converted)
+        return codes.add_laws(codes=convert)

@@ -65,8 +65,8 @@ class AdcStep(Effect):
             return codes
         full = 2.0**codes.camera.bit_depth
 
-        def converted(dn: FloatArray) -> FloatArray:
+        def convert(dn: FloatArray) -> FloatArray:
             coded = np.asarray(dn * (1.0 - self.step_dn / full))
             return np.add(coded, self.step_dn, out=coded, where=dn >= self.code_dn)
 
-        return codes.adding(codes=converted)
+        return codes.add_laws(codes=convert)

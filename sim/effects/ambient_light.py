@@ -58,6 +58,6 @@ class AmbientLight(Effect):
         if self.rate_e_per_s == 0.0:
             return light
         share = {"R": 0.5, "B": -0.5}
-        return light.adding(
+        return light.add_laws(
             ambient_e_per_s=lambda channel: self.rate_e_per_s * self.red_over_blue ** share.get(channel, 0.0)
         )

@@ -64,4 +64,4 @@ class AmplifierGlow(Effect):
             distance_mm = np.hypot(down[:, None], across[None, :]) * camera.pixel_pitch_um * 1e-3
             return np.asarray(self.glow_e_per_s * np.exp(-distance_mm / self.reach_mm))
 
-        return charge.adding(dark_current=lambda e_per_s, temperature_c: e_per_s + glow())
+        return charge.add_laws(dark_current=lambda e_per_s, temperature_c: e_per_s + glow())

@@ -39,4 +39,4 @@ class Astigmatism(Effect):
             return image
         scale = 1.0 / (8.0 * image.camera.lens.f_number**2)
         path = Wavefront.of({(2, 0): self.defocus_x_um * scale, (0, 2): -self.defocus_y_um * scale})
-        return image.adding(pupil=lambda wavelength_nm: path)
+        return image.add_laws(pupil=lambda wavelength_nm: path)

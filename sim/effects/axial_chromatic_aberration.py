@@ -57,4 +57,4 @@ class AxialChromaticAberration(Effect):
             defocus_um = t * (self.slope_um + self.curvature_um * t)
             return seidel(defocus_um=defocus_um / (8.0 * image.camera.lens.f_number**2))
 
-        return image.adding(pupil=path)
+        return image.add_laws(pupil=path)

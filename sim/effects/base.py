@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 
 from sim.camera import CameraModel
 from sim.effects.families import Family
-from sim.parameters import Frozen, Quantity, declared
+from sim.parameters import Frozen, Quantity, read_quantities
 from sim.stages import Charge, Codes, Image, Light, Signal
 
 #: The stages in the order of the light, and the method by which an effect acts on each.
@@ -61,7 +61,7 @@ class Effect(Frozen):
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
         """The declared parameters, by field name."""
-        return declared(cls)
+        return read_quantities(cls)
 
     @classmethod
     def choices(cls) -> dict[str, FieldInfo]:
@@ -74,7 +74,7 @@ class Effect(Frozen):
         """Names of the stages on which it acts, in the order of the light."""
         return tuple(stage for stage, method in STAGES.items() if getattr(cls, method) is not getattr(Effect, method))
 
-    def having(self, **values: float) -> Self:
+    def replace_fields(self, **values: float) -> Self:
         """The same effect with other values of its fields, checked as any are."""
         return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | values)
 
@@ -145,21 +145,24 @@ class Effect(Frozen):
         return tuple(self.model_copy(update={name: value}) for name, value in others)
 
     def on_light(self, light: Light) -> Light:
-        """What reaches the lens, given what the radiometer and the screen were told."""
+        """Return `light` with the effect's laws of the light that reaches the lens.
+
+        The laws act on what the radiometer measured and the screen was asked to show.
+        """
         return light
 
     def on_image(self, image: Image) -> Image:
-        """Irradiance on the sensor by wavelength and place."""
+        """Return `image` with the effect's laws of the irradiance on the sensor, by wavelength and place."""
         return image
 
     def on_charge(self, charge: Charge) -> Charge:
-        """Electrons in the pixels."""
+        """Return `charge` with the effect's laws of the electrons in the pixels."""
         return charge
 
     def on_signal(self, signal: Signal) -> Signal:
-        """What read-out makes of them."""
+        """Return `signal` with the effect's laws of the read-out: electrons to DN."""
         return signal
 
     def on_codes(self, codes: Codes) -> Codes:
-        """What the converter makes of that."""
+        """Return `codes` with the effect's laws of the converter: DN to codes."""
         return codes

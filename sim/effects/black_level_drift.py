@@ -44,4 +44,4 @@ class BlackLevelDrift(Effect):
             warmer = 0.0 if temperature_c is None else temperature_c - 25.0
             return self.drift_dn_per_min * elapsed_s / 60.0 + self.drift_dn_per_c * warmer
 
-        return signal.adding(offset_dn=offset)
+        return signal.add_laws(offset_dn=offset)

@@ -14,8 +14,11 @@ from sim.stages import Charge
 
 
 class Blooming(Effect):
-    """Of what a pixel's mean is above the full well, a share runs over, half of it up and half down the column, and fills the next
-    pixels to their full wells one after the other; the rest is drained. What runs off the frame is lost."""
+    """Charge that overflows along the columns.
+
+    A share of the charge above a pixel's full well runs over, half of it up and half of it down the column. It fills
+    the next pixels to their full wells one after the other; the rest is drained. What runs off the frame is lost.
+    """
 
     name: ClassVar[str] = "blooming"
     family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
@@ -56,4 +59,4 @@ class Blooming(Effect):
                     carried += excess[row] - taken
             return filled
 
-        return charge.adding(overflow=overflow)
+        return charge.add_laws(overflow=overflow)

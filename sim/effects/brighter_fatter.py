@@ -91,20 +91,20 @@ class BrighterFatter(Effect):
     def on_charge(self, charge: Charge) -> Charge:
         full_well_e = charge.camera.full_well_e
         if self.loss_percent != 0.0:
-            charge = charge.adding(
+            charge = charge.add_laws(
                 variance_e2=lambda electrons, variance_e2: (
                     variance_e2 - electrons * (self.loss_percent / 100.0) * electrons / full_well_e
                 )
             )
         if self.shared_percent != 0.0:
-            charge = charge.adding(
+            charge = charge.add_laws(
                 correlation=lambda electrons: (
                     0.25 * (self.shared_percent / 100.0) * np.clip(electrons / full_well_e, 0.0, 1.0)
                 )
             )
         if self.exchanged_percent != 0.0:
             pair = 0.01 * self.exchanged_percent / (4.0 * full_well_e)
-            charge = charge.adding(
+            charge = charge.add_laws(
                 exchange=lambda electrons: (
                     electrons + pair * convolve(np.square(electrons), NEXT_LESS_OWN, mode="mirror")
                 )

@@ -62,4 +62,4 @@ class ChargeDiffusion(Effect):
             length = self.length_um * (wavelength_nm / 550.0) ** self.wavelength_power
             return np.asarray(np.exp(-2.0 * np.pi**2 * length**2 * (fx_cy_per_um**2 + fy_cy_per_um**2)))
 
-        return charge.adding(transfer=transfer)
+        return charge.add_laws(transfer=transfer)

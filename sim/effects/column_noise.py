@@ -65,7 +65,7 @@ class ColumnNoise(Effect):
     def on_signal(self, signal: Signal) -> Signal:
         if self.offset_e == 0.0 and self.odd_even_e == 0.0 and self.noise_e == 0.0:
             return signal
-        return signal.adding(
+        return signal.add_laws(
             lines=LineNoise(
                 "columns", self.noise_e, fixed_e=self.offset_e, odd_even_e=self.odd_even_e, seed=self.pattern_seed
             )

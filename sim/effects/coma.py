@@ -40,4 +40,4 @@ class Coma(Effect):
         if self.w131_x_um == 0.0 and self.w131_y_um == 0.0:
             return image
         path = seidel(coma_um=(self.w131_x_um, self.w131_y_um))
-        return image.adding(pupil=lambda wavelength_nm: path)
+        return image.add_laws(pupil=lambda wavelength_nm: path)

@@ -44,4 +44,4 @@ class CoverGlass(Effect):
         path = plate_wavefront(
             self.thickness_mm, self.refractive_index, image.camera.lens.f_number, refocused=self.refocused
         )
-        return image.adding(pupil=lambda wavelength_nm: path)
+        return image.add_laws(pupil=lambda wavelength_nm: path)

@@ -76,4 +76,4 @@ class Crosstalk(Effect):
         return np.array([[across, down, across], [along, own, along], [across, down, across]])
 
     def on_charge(self, charge: Charge) -> Charge:
-        return charge if self.share_percent == 0.0 else charge.adding(kernels=self.kernel())
+        return charge if self.share_percent == 0.0 else charge.add_laws(kernels=self.kernel())

@@ -33,9 +33,9 @@ class DarkCurrentTemperature(Effect):
             return charge
         reference_c = charge.camera.dark_current_reference_c
 
-        def warmed(e_per_s: FloatArray | float, temperature_c: float | None) -> FloatArray | float:
+        def warm(e_per_s: FloatArray | float, temperature_c: float | None) -> FloatArray | float:
             if temperature_c is None:
                 return e_per_s
             return e_per_s * 2.0 ** (self.doublings_per_c * (temperature_c - reference_c))
 
-        return charge.adding(dark_current=warmed)
+        return charge.add_laws(dark_current=warm)

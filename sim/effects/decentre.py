@@ -50,4 +50,4 @@ class Decentre(Effect):
             a, b = self.shift_x_um, self.shift_y_um
             return a * (3.0 * x * x + y * y) + 2.0 * b * x * y, b * (x * x + 3.0 * y * y) + 2.0 * a * x * y
 
-        return image.adding(shift=shift)
+        return image.add_laws(shift=shift)

@@ -54,4 +54,4 @@ class Defocus(Effect):
             return image
         rim_um = self.defocus_um / (8.0 * image.camera.lens.f_number**2)
         path = seidel(defocus_um=rim_um * (1.0 - self.spherical_share), spherical_um=rim_um * self.spherical_share)
-        return image.adding(pupil=lambda wavelength_nm: path)
+        return image.add_laws(pupil=lambda wavelength_nm: path)

@@ -62,4 +62,4 @@ class Distortion(Effect):
             to_col, to_row = distort(col, row, self.geometry)
             return share * x + (to_col - col) * pitch, share * y + (to_row - row) * pitch
 
-        return image.adding(shift=shift)
+        return image.add_laws(shift=shift)

@@ -63,4 +63,4 @@ class DoubleImage(Effect):
         def transfer(fx: FloatArray, fy: FloatArray, wavelength_nm: float) -> FloatArray | ComplexArray:
             return np.asarray(1.0 - share + share * np.exp(-2j * np.pi * (fx * dx + fy * dy)))
 
-        return image.adding(transfer=transfer)
+        return image.add_laws(transfer=transfer)

@@ -40,4 +40,4 @@ class ExposureOffset(Effect):
     def on_charge(self, charge: Charge) -> Charge:
         if self.offset_us == 0.0:
             return charge
-        return charge.adding(exposure_s=lambda exposure_s: max(exposure_s + self.offset_us * 1e-6, 0.0))
+        return charge.add_laws(exposure_s=lambda exposure_s: max(exposure_s + self.offset_us * 1e-6, 0.0))

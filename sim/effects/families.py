@@ -37,11 +37,11 @@ class Family(StrEnum):
 
     @property
     def sentence(self) -> str:
-        """What recordings show where the family is named."""
+        """Return the sentence that says what recordings show where the family is named."""
         return _TOLD[self].sentence
 
     @property
-    def told_apart_by(self) -> str:
+    def separating_capture(self) -> str:
         """The capture that tells its members apart, as a clause; empty for a family of one member."""
         return _TOLD[self].told_apart_by
 

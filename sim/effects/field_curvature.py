@@ -62,4 +62,4 @@ class FieldCurvature(Effect):
             away_um = self.curvature_um * (x * x + y * y) + self.tilt_x_um * x + self.tilt_y_um * y
             return seidel(defocus_um=away_um / (8.0 * f_number**2))
 
-        return image.adding(pupil_at=path)
+        return image.add_laws(pupil_at=path)

@@ -37,8 +37,8 @@ class Ghost(Effect):
         if self.share_percent == 0.0:
             return image
 
-        def reflected(irradiance: FloatArray) -> FloatArray:
+        def reflect(irradiance: FloatArray) -> FloatArray:
             copy = ndimage.gaussian_filter(np.asarray(irradiance, float)[::-1, ::-1], BLUR_PX, mode="nearest")
             return np.asarray(irradiance + 0.01 * self.share_percent * copy)
 
-        return image.adding(copies=reflected)
+        return image.add_laws(copies=reflect)

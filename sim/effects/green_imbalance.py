@@ -43,10 +43,10 @@ class GreenImbalance(Effect):
         if self.imbalance_percent == 0.0 or cfa == "MONO":
             return charge
 
-        def collected(electrons: FloatArray) -> FloatArray:
+        def collect(electrons: FloatArray) -> FloatArray:
             changed, period = electrons.copy(), step(cfa)
             for (row, col), sign in zip(phases(cfa)["G"], (1.0, -1.0), strict=True):
                 changed[row::period, col::period] *= 1.0 + sign * 0.005 * self.imbalance_percent
             return changed
 
-        return charge.adding(collected=collected)
+        return charge.add_laws(collected=collect)

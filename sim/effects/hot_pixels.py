@@ -77,6 +77,6 @@ class HotPixels(Effect):
     def on_charge(self, charge: Charge) -> Charge:
         if self.excess_e_per_s == 0.0:
             return charge
-        return charge.adding(
+        return charge.add_laws(
             defects=Defects(self.share_ppm * 1e-6, self.excess_e_per_s, self.relative_spread, self.pattern_seed)
         )

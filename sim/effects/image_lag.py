@@ -34,4 +34,4 @@ class ImageLag(Effect):
     def on_charge(self, charge: Charge) -> Charge:
         if self.lag_percent == 0.0:
             return charge
-        return charge.adding(lag=lambda electrons: self.lag_percent / 100.0 * electrons)
+        return charge.add_laws(lag=lambda electrons: self.lag_percent / 100.0 * electrons)

@@ -67,7 +67,7 @@ class InfraredCutFilter(Effect):
         )
 
     def on_image(self, image: Image) -> Image:
-        return image.adding(
+        return image.add_laws(
             transmittance=lambda wavelength_nm, sin_theta: edge_transmittance(
                 wavelength_nm, self.cut_wavelength_nm, self.width_nm, sin_theta, self.effective_index, self.steepening
             )

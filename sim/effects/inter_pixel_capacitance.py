@@ -34,7 +34,7 @@ class InterPixelCapacitance(Crosstalk):
         own, mean = kernel[1, 1], 0.5 * (kernel[0, 1] + kernel[1, 0])
         shared = float(2.0 * own * mean / (own * own + 4.0 * mean * mean))
         lost = 1.0 - float(np.sum(np.square(kernel)))
-        return charge.adding(
+        return charge.add_laws(
             kernels=kernel,
             correlation=lambda electrons: shared,
             variance_e2=lambda electrons, variance_e2: variance_e2 - electrons * lost,

@@ -51,4 +51,4 @@ class LateralChromaticAberration(Effect):
             x, y, corner = from_axis_um(x_um, y_um, image.camera)
             return corner_um / corner * x, corner_um / corner * y
 
-        return image.adding(shift=shift)
+        return image.add_laws(shift=shift)

@@ -59,7 +59,7 @@ _CAMERA = CameraModel(
 
 
 @lru_cache(maxsize=4096)
-def changed_by(effect: Effect) -> frozenset[str]:
+def list_changes(effect: Effect) -> frozenset[str]:
     """Which quantities of the stages the effect as it stands changes, as `stage.field`; none where it is absent."""
     return laws_of(_CAMERA, (effect,))
 
@@ -68,7 +68,7 @@ def changed_by(effect: Effect) -> frozenset[str]:
 def may_change(kind: type[Effect]) -> frozenset[str]:
     """Which quantities of the stages an effect changes at any of its prototypes."""
     every = (one for group in kind.prototypes(_CAMERA) for one in group)
-    return frozenset().union(*(changed_by(one) for one in every))
+    return frozenset().union(*(list_changes(one) for one in every))
 
 
 def typical(kind: type[Effect]) -> Effect:
@@ -82,4 +82,4 @@ def typical(kind: type[Effect]) -> Effect:
         for name, quantity in kind.quantities().items()
         if name not in kind.shapes and quantity.prior is not None
     }
-    return first.having(**sizes)
+    return first.replace_fields(**sizes)

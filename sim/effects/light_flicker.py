@@ -74,4 +74,4 @@ class LightFlicker(Effect):
             depth = 0.01 * self.modulation_percent * np.sinc(self.frequency_hz * exposure_s)
             return np.asarray(1.0 + depth * np.cos(2.0 * np.pi * self.frequency_hz * middle_s))
 
-        return light.adding(rows=RowLight(1.0 / self.frequency_hz, factors))
+        return light.add_laws(rows=RowLight(1.0 / self.frequency_hz, factors))

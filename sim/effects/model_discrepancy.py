@@ -66,22 +66,22 @@ class ModelDiscrepancy(Effect):
             return image
         if self.along == "frequency_cy_per_um":
             at_zero = float(self._factor(np.zeros(1))[0])
-            return image.adding(transfer=lambda fx, fy, wavelength_nm: self._factor(np.hypot(fx, fy)) / at_zero)
+            return image.add_laws(transfer=lambda fx, fy, wavelength_nm: self._factor(np.hypot(fx, fy)) / at_zero)
         if self.along == "radius_um":
 
             def shading(x_um: FloatArray, y_um: FloatArray) -> FloatArray:
                 x, y, _ = from_axis_um(x_um, y_um, image.camera)
                 return self._factor(np.hypot(x, y))
 
-            return image.adding(shading=shading)
+            return image.add_laws(shading=shading)
         return image
 
     def on_charge(self, charge: Charge) -> Charge:
         if self.strength == 0.0 or self.along != "variance_signal_e":
             return charge
-        return charge.adding(variance_e2=lambda electrons, variance_e2: variance_e2 * self._factor(electrons))
+        return charge.add_laws(variance_e2=lambda electrons, variance_e2: variance_e2 * self._factor(electrons))
 
     def on_signal(self, signal: Signal) -> Signal:
         if self.strength == 0.0 or self.along != "signal_e":
             return signal
-        return signal.adding(response=lambda electrons: electrons * self._factor(electrons))
+        return signal.add_laws(response=lambda electrons: electrons * self._factor(electrons))

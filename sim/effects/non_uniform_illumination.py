@@ -71,4 +71,4 @@ class NonUniformIllumination(Effect):
             slope = self.gradient_x_percent / 100.0 * x_um / half_x + self.gradient_y_percent / 100.0 * y_um / half_y
             return np.asarray(1.0 + slope + self.bow * slope**2 / steepest)
 
-        return light.adding(shading=shading)
+        return light.add_laws(shading=shading)

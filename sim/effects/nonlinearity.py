@@ -72,4 +72,4 @@ class Nonlinearity(Effect):
             bend = self.quadratic_percent * x + self.cubic_percent * x * x + self.toe_percent * np.exp(-np.abs(x) / TOE)
             return electrons * (1.0 + bend / 100.0)
 
-        return signal.adding(response=response)
+        return signal.add_laws(response=response)

@@ -40,4 +40,4 @@ class OnChipFilter(Effect):
             return signal
         next_, across = -0.25 * share * (1.0 - corners), -0.25 * share * corners
         kernel = np.array([[across, next_, across], [next_, 1.0 + share, next_], [across, next_, across]])
-        return signal.adding(filters=kernel)
+        return signal.add_laws(filters=kernel)

@@ -98,4 +98,4 @@ class OpticalLowPassFilter(Effect):
                 self.beam_imbalance,
             )
 
-        return image.adding(transfer=transfer)
+        return image.add_laws(transfer=transfer)

@@ -57,4 +57,4 @@ class OtherFNumber(Effect):
             stated, works = (diffraction_otf(frequency, wavelength_nm, n) for n in (f_number, f_number * self.ratio))
             return np.where(stated > LEAST_TRANSFER, works / np.maximum(stated, LEAST_TRANSFER), 1.0)
 
-        return image.adding(transfer=transfer)
+        return image.add_laws(transfer=transfer)

@@ -89,4 +89,4 @@ class PixelAperture(Effect):
             is_null = (np.abs(np.sinc(side * fx)) <= NULL) | (np.abs(np.sinc(side * fy)) <= NULL)
             return np.asarray(np.where(is_null, 1.0, own / np.where(is_null, 1.0, stated)))
 
-        return charge.adding(transfer=transfer)
+        return charge.add_laws(transfer=transfer)

@@ -59,4 +59,4 @@ class RadiometerNonlinearity(Effect):
             grown = level if self.growth == 0.0 else float(np.expm1(self.growth * level)) / self.growth
             return np.asarray(radiance * np.exp(0.01 * self.exponent_percent * grown))
 
-        return light.adding(spectrum=spectrum)
+        return light.add_laws(spectrum=spectrum)

@@ -85,7 +85,7 @@ class RandomTelegraphNoise(Effect):
     def on_signal(self, signal: Signal) -> Signal:
         if self.amplitude_e == 0.0:
             return signal
-        return signal.adding(
+        return signal.add_laws(
             telegraph=Jumps(
                 self.share_percent / 100.0, self.amplitude_e, self.relative_spread, self.pattern_seed, self.high_share
             )

@@ -66,6 +66,6 @@ class RowNoise(Effect):
     def on_signal(self, signal: Signal) -> Signal:
         if self.noise_e == 0.0 and self.offset_e == 0.0:
             return signal
-        return signal.adding(
+        return signal.add_laws(
             lines=LineNoise("rows", self.noise_e, self.correlation, fixed_e=self.offset_e, seed=self.pattern_seed)
         )

@@ -71,7 +71,7 @@ class ScreenGamma(Effect):
         if self.exponent == 1.0:
             return light
 
-        def shown(share: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+        def show(share: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
             asked = share
             if self.rim_px > 0.0:
                 steps = float(np.ptp(y_um)) / (share.shape[0] - 1), float(np.ptp(x_um)) / (share.shape[1] - 1)
@@ -80,4 +80,4 @@ class ScreenGamma(Effect):
                 )
             return np.asarray(np.clip(asked, 0.0, 1.0) ** self.exponent)
 
-        return light.adding(screen=shown)
+        return light.add_laws(screen=show)

@@ -50,9 +50,9 @@ class ScreenPixelStructure(Effect):
             return light
         turns = 2.0 * np.pi / (self.period_px * light.camera.pixel_pitch_um)
 
-        def shown(share: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+        def show(share: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
             return np.asarray(
                 share * (1.0 + 0.01 * self.amplitude_percent * np.cos(turns * x_um) * np.cos(turns * y_um))
             )
 
-        return light.adding(screen=shown)
+        return light.add_laws(screen=show)

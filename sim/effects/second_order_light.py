@@ -48,4 +48,4 @@ class SecondOrderLight(Effect):
             twice = np.interp(2.0 * wavelength_nm, wavelength_nm, radiance, left=0.0, right=0.0)
             return np.asarray(radiance + 0.02 * self.share_percent * twice)
 
-        return light.adding(spectrum=spectrum)
+        return light.add_laws(spectrum=spectrum)

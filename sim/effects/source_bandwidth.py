@@ -54,4 +54,4 @@ class SourceBandwidth(Effect):
             ]
             return np.asarray(_WEIGHTS @ np.array(shifted) / _WEIGHTS.sum())
 
-        return light.adding(spectrum=spectrum)
+        return light.add_laws(spectrum=spectrum)

@@ -67,4 +67,4 @@ class SourceDrift(Effect):
             settled = self.settling_min * -np.expm1(-elapsed_s / 60.0 / self.settling_min)
             return float(1.0 + self.drift_percent_per_min / 100.0 * settled)
 
-        return light.adding(level=level)
+        return light.add_laws(level=level)

@@ -46,4 +46,4 @@ class SourceInstability(Effect):
     def on_light(self, light: Light) -> Light:
         if self.instability_percent == 0.0:
             return light
-        return light.adding(unsteadiness=Unsteadiness(0.01 * self.instability_percent, self.draw_seed))
+        return light.add_laws(unsteadiness=Unsteadiness(0.01 * self.instability_percent, self.draw_seed))

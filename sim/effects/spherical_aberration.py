@@ -34,4 +34,4 @@ class SphericalAberration(Effect):
         if self.w040_um == 0.0:
             return image
         path = seidel(spherical_um=self.w040_um)
-        return image.adding(pupil=lambda wavelength_nm: path)
+        return image.add_laws(pupil=lambda wavelength_nm: path)

@@ -35,4 +35,4 @@ class StereoGainMismatch(Effect):
     ] = 0.0  # fmt: skip
 
     def on_light(self, light: Light) -> Light:
-        return light if self.gain_percent == 0.0 else light.adding(pair_gain=1.0 + 0.01 * self.gain_percent)
+        return light if self.gain_percent == 0.0 else light.add_laws(pair_gain=1.0 + 0.01 * self.gain_percent)

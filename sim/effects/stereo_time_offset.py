@@ -29,4 +29,4 @@ class StereoTimeOffset(Effect):
     ] = 0.0  # fmt: skip
 
     def on_light(self, light: Light) -> Light:
-        return light if self.delay_ms == 0.0 else light.adding(pair_delay_s=1e-3 * self.delay_ms)
+        return light if self.delay_ms == 0.0 else light.add_laws(pair_delay_s=1e-3 * self.delay_ms)

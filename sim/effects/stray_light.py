@@ -49,4 +49,4 @@ class StrayLight(Effect):
             mean = np.trapezoid(radiance, wavelength_nm) / (wavelength_nm[-1] - wavelength_nm[0])
             return np.asarray((1.0 - share) * radiance + share * mean)
 
-        return light.adding(spectrum=spectrum)
+        return light.add_laws(spectrum=spectrum)

@@ -49,7 +49,7 @@ class VeilingGlare(Effect):
         share = self.share_percent / 100.0
         if share == 0.0:
             return image
-        return image.adding(
+        return image.add_laws(
             veils=Veil(
                 share * (1.0 - self.halo_share),
                 share * self.halo_share,

@@ -53,4 +53,4 @@ class VibrationBlur(Effect):
                 j0(2.0 * np.pi * (self.amplitude_x_um * fx_cy_per_um + self.amplitude_y_um * fy_cy_per_um))
             )
 
-        return image.adding(transfer=transfer)
+        return image.add_laws(transfer=transfer)

@@ -66,4 +66,4 @@ class Vignetting(Effect):
             share = ((x_um**2 + y_um**2) / corner2) ** (0.5 * self.exponent)
             return np.asarray(1.0 - self.corner_loss_percent / 100.0 * share)
 
-        return image.adding(shading=shading)
+        return image.add_laws(shading=shading)

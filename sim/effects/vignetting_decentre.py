@@ -88,4 +88,4 @@ class VignettingDecentre(Effect):
             away = rho2 ** (0.5 * self.exponent) - (self.centre_x**2 + self.centre_y**2) ** (0.5 * self.exponent)
             return np.asarray(1.0 - self.fall_off_percent / 100.0 * away)
 
-        return image.adding(shading=shading)
+        return image.add_laws(shading=shading)

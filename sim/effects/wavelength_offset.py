@@ -13,7 +13,7 @@ from sim.stages import Light
 
 
 class WavelengthOffset(Effect):
-    """What was read as radiance at w lies at w + offset."""
+    """A wavelength scale that is shifted: the radiance read at w lies at w + offset."""
 
     name: ClassVar[str] = "wavelength_offset"
     family: ClassVar[Family] = Family.SOURCE_IN_WAVELENGTH
@@ -40,7 +40,7 @@ class WavelengthOffset(Effect):
     def on_light(self, light: Light) -> Light:
         if self.offset_nm == 0.0:
             return light
-        return light.adding(
+        return light.add_laws(
             spectrum=lambda wavelength_nm, radiance, kind: np.interp(
                 wavelength_nm - self.offset_nm, wavelength_nm, radiance
             )

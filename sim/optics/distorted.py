@@ -58,7 +58,7 @@ def _visible(
     """The picture with 0 outside the lens's field, where the frame reaches beyond it."""
     if not exceeds_field(frame, lens):
         return picture
-    return np.where(lens.outside(*frame.um(row[:, None], col[None, :])), 0.0, picture)
+    return np.where(lens.lies_outside(*frame.um(row[:, None], col[None, :])), 0.0, picture)
 
 
 @njit(cache=True)

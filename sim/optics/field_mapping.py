@@ -73,7 +73,7 @@ class FieldMapping:
     def real_um(self, x_um: FloatArray, y_um: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Real image points (um) of ideal ones; arrays broadcast."""
         if self.symmetric:
-            return self._scaled(x_um, y_um, *self._dense)
+            return self._scale_to_radius(x_um, y_um, *self._dense)
         x, y = np.broadcast_arrays(x_um, y_um)
         held_x, held_y = np.clip(x, self._x[0], self._x[-1]), np.clip(y, self._y[0], self._y[-1])
         return (
@@ -84,7 +84,7 @@ class FieldMapping:
     def ideal_um(self, x_um: FloatArray, y_um: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Ideal image points (um) of real ones: the inverse of `real_um`, to 1e-6 um."""
         if self.symmetric:
-            return self._scaled(x_um, y_um, *self._dense[::-1])
+            return self._scale_to_radius(x_um, y_um, *self._dense[::-1])
         x, y = np.broadcast_arrays(np.asarray(x_um, float), np.asarray(y_um, float))
         ideal_x, ideal_y = x.copy(), y.copy()
         for _ in range(40):
@@ -94,8 +94,8 @@ class FieldMapping:
                 break
         return ideal_x, ideal_y
 
-    def outside(self, x_um: FloatArray, y_um: FloatArray) -> NDArray[np.bool_]:
-        """Whether ideal points lie beyond the table's outermost fields."""
+    def lies_outside(self, x_um: FloatArray, y_um: FloatArray) -> NDArray[np.bool_]:
+        """Return whether ideal points lie beyond the table's outermost fields."""
         if self.symmetric:
             return np.asarray(np.hypot(x_um, y_um) > self.reach_um * (1.0 + 1e-9))
         within_x = (x_um >= self._x[0]) & (x_um <= self._x[-1])
@@ -125,7 +125,7 @@ class FieldMapping:
         return down, across
 
     @staticmethod
-    def _scaled(
+    def _scale_to_radius(
         x_um: FloatArray, y_um: FloatArray, radius: FloatArray, becomes: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         r = np.hypot(x_um, y_um)
@@ -158,11 +158,11 @@ def source_grid(table: LensTable, frame: ImageFrame, oversample: int, margin_px:
 
 
 def exceeds_field(frame: ImageFrame, lens: FieldMapping) -> bool:
-    """Whether the frame's corners lie more than half a pixel beyond the lens's outermost field."""
+    """Return whether the frame's corners lie more than half a pixel beyond the lens's outermost field."""
     row, col = np.array([0.0, 0.0, frame.rows - 1.0, frame.rows - 1.0]), np.array([0.0, frame.cols - 1.0] * 2)
     x, y = lens.ideal_um(*frame.um(row, col))
     shrink = 1.0 - frame.pitch_um / np.maximum(np.hypot(x, y), frame.pitch_um)
-    return bool(np.any(lens.outside(x * shrink, y * shrink)))
+    return bool(np.any(lens.lies_outside(x * shrink, y * shrink)))
 
 
 def illumination(
@@ -177,7 +177,7 @@ def illumination(
     x, y = frame.um(row[:, None], col[None, :])
     image = over_field(table, np.sum(weight * table.relative_illumination.T, axis=1), x, y)
     if exceeds_field(frame, lens):
-        image = np.where(lens.outside(*lens.ideal_um(x, y)), 0.0, image)
+        image = np.where(lens.lies_outside(*lens.ideal_um(x, y)), 0.0, image)
     return image
 
 

@@ -23,7 +23,7 @@ ComplexArray = NDArray[np.complex128]
 RADIAL_SAMPLES = 4096
 
 
-def folded(
+def fold_transfer(
     transfer: Callable[[FloatArray, FloatArray], FloatArray | ComplexArray],
     shape: tuple[int, int],
     fill_factor: float,
@@ -43,7 +43,7 @@ def folded(
     return total
 
 
-def folded_diffraction(shape: tuple[int, int], fill_factor: float, cutoff_cy_per_px: float) -> FloatArray:
+def fold_diffraction(shape: tuple[int, int], fill_factor: float, cutoff_cy_per_px: float) -> FloatArray:
     """`folded` of a perfect lens with the given cutoff (pixel pitch / (wavelength f_number)), from a table along the radius."""
     table = diffraction_otf(np.arange(RADIAL_SAMPLES + 2) / RADIAL_SAMPLES, 1e3, 1.0)
     fy, fx = fft.fftfreq(shape[0]), fft.rfftfreq(shape[1])

@@ -105,7 +105,7 @@ class ZernikePupil(Frozen):
         total = Wavefront(())
         for j, coefficient in enumerate(self.coefficients, first):
             if coefficient != 0.0:
-                total += zernike(*order(j)).scaled(coefficient * scale)
+                total += zernike(*order(j)).scale(coefficient * scale)
         return total
 
     def wavefront(self, wavelength_nm: float, f_number: float) -> Wavefront:
@@ -323,7 +323,7 @@ class TracedLens(Frozen):
         x, y = table.window_um[axis]
         value = _fourier_sum(samples, table.sample_pitch_um, fx, fy) * np.exp(-2j * np.pi * (fx * x + fy * y))
         half_um = 0.5 * len(samples) * table.sample_pitch_um
-        value = value + (1.0 - inside) * _beyond(fx, fy, half_um)
+        value = value + (1.0 - inside) * _transfer_beyond(fx, fy, half_um)
         return value * pupil_ratio(fx, fy, wavelength_nm, f_number, aberration)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
@@ -390,7 +390,7 @@ def _fourier_sum(samples: FloatArray, pitch_um: float, fx: FloatArray, fy: Float
     return np.where(passed, total.reshape(shape), 0.0)
 
 
-def _beyond(fx: FloatArray, fy: FloatArray, half_um: float) -> FloatArray:
+def _transfer_beyond(fx: FloatArray, fy: FloatArray, half_um: float) -> FloatArray:
     """Transfer function of light that falls as 1/r^3 outside a square of half-width `half_um`, as an edge of the
     aperture diffracts it; 1 at f = 0.
 

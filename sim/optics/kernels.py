@@ -123,7 +123,7 @@ class Kernels:
         self.channels = len(light)
         self.samples = np.zeros((len(psf), n * refine + 4, n * refine + 4, 4), np.float32)
         for field, functions in enumerate(psf.astype(np.float32)):
-            spectrum = _padded(fft.rfft2(functions), n, refine)
+            spectrum = _pad_spectrum(fft.rfft2(functions), n, refine)
             spectrum *= spline
             self.samples[field, 2:-2, 2:-2, : self.channels] = np.moveaxis(
                 fft.irfft2(spectrum, (n * refine, n * refine)), 0, -1
@@ -229,7 +229,7 @@ def lagrange(t: FloatArray) -> FloatArray:
     return np.stack([np.prod([(t - b) / (a - b) for b in NODES if b != a], axis=0) for a in NODES])
 
 
-def _padded(spectrum: NDArray[np.complex64], n: int, refine: int) -> NDArray[np.complex64]:
+def _pad_spectrum(spectrum: NDArray[np.complex64], n: int, refine: int) -> NDArray[np.complex64]:
     """Real FFT of n x n samples, zero-padded to `refine` times as many frequencies; sample 0 keeps its position."""
     if refine == 1:
         return spectrum

@@ -74,7 +74,7 @@ class PupilRays:
         return self.path_mm + self.index * (self.cosine_x * (x_mm - self.x_mm) + self.cosine_y * (y_mm - self.y_mm))
 
 
-def interpolated(
+def interpolate_rays(
     traced: Sequence[PupilRays], wavelength_nm: Sequence[float] | FloatArray, index: Sequence[float]
 ) -> list[PupilRays]:
     """The rays at wavelengths that weren't traced, at the same relative positions in the open pupil.

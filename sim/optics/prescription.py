@@ -21,7 +21,7 @@ class PrescriptionError(ValueError):
 
 
 class Aperture(Frozen):
-    """What a surface lets through: a circle or a rectangle, centred at (x, y) from the vertex."""
+    """The opening of a surface: a circle or a rectangle, centred at (x, y) from the vertex."""
 
     shape: Literal["circle", "rectangle"]
     half_width_mm: float
@@ -87,8 +87,8 @@ class Prescription(Frozen):
     warnings: tuple[str, ...] = ()
 
     @property
-    def centred(self) -> bool:
-        """Whether the lens has one axis of rotation: no shift, no tilt, no aperture that isn't a circle about the axis."""
+    def is_centred(self) -> bool:
+        """Return whether the lens has one axis of rotation: no shift, no tilt, no aperture that isn't a circle about the axis."""
         return not any(
             any(surface.decentre_mm)
             or any(surface.tilt_deg)

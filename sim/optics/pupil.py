@@ -83,7 +83,7 @@ class Wavefront:
     def __add__(self, other: Wavefront) -> Wavefront:
         return self.plus(dict(other.coefficients))
 
-    def scaled(self, factor: float) -> Wavefront:
+    def scale(self, factor: float) -> Wavefront:
         """Times a number."""
         return Wavefront(tuple((i, j, um * factor) for i, j, um in self.terms if factor != 0.0))
 
@@ -115,7 +115,7 @@ class Wavefront:
 
     @cached_property
     def is_isotropic(self) -> bool:
-        """Whether W depends on the radius only: the binomials of (x^2 + y^2)^k, to rounding."""
+        """Return whether W depends on the radius only: the binomials of (x^2 + y^2)^k, to rounding."""
         degrees = {i + j for i, j, _ in self.terms}
         if any(i % 2 or j % 2 for i, j, _ in self.terms):
             return False
@@ -247,7 +247,7 @@ def pupil_ratio(
     """
     fx, fy = np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float)
     wavelength_um = wavelength_nm * 1e-3
-    ratio = _bent(fx, fy, wavelength_um, f_number, wavefront.bend)
+    ratio = _bend_ratio(fx, fy, wavelength_um, f_number, wavefront.bend)
     if any(wavefront.tilt_um):
         ax, ay = wavefront.tilt_um
         inside = np.hypot(fx, fy) * (wavelength_um * f_number) < 1.0
@@ -255,7 +255,7 @@ def pupil_ratio(
     return ratio
 
 
-def _bent(
+def _bend_ratio(
     fx: FloatArray, fy: FloatArray, wavelength_um: float, f_number: float, bend: Wavefront
 ) -> FloatArray | ComplexArray:
     shape = np.broadcast_shapes(fx.shape, fy.shape)
@@ -263,7 +263,7 @@ def _bent(
         return np.ones(shape)
     share = np.hypot(fx, fy) * (wavelength_um * f_number)
     if bend.is_isotropic:
-        return _along(share, 0.0, wavelength_um, bend)
+        return _ratio_along(share, 0.0, wavelength_um, bend)
     if share.size <= FEW:
         safe = np.where(share > 0, share, 1.0) / (wavelength_um * f_number)
         cos, sin = np.where(share > 0, fx / safe, 1.0).ravel(), np.broadcast_to(fy / safe, shape).ravel()
@@ -276,7 +276,7 @@ def _bent(
             which = which.reshape(shape)
             total = np.empty(shape, complex)
             for k, angle in enumerate(directions):
-                total[which == k] = _along(share[which == k], float(angle), wavelength_um, bend)
+                total[which == k] = _ratio_along(share[which == k], float(angle), wavelength_um, bend)
             return np.asarray(total if bend.part(1).terms else np.real(total))
     from sim.optics.polar import look_up  # here, as the compiler takes a second to import
 
@@ -286,7 +286,7 @@ def _bent(
     return np.asarray(ratio if bend.part(1).terms else np.real(ratio))
 
 
-def _along(share: FloatArray, angle: float, wavelength_um: float, bend: Wavefront) -> FloatArray | ComplexArray:
+def _ratio_along(share: FloatArray, angle: float, wavelength_um: float, bend: Wavefront) -> FloatArray | ComplexArray:
     """The ratio at shares of the cutoff in one direction."""
     odd = bool(bend.part(1).terms)
     if share.size > SOME:
@@ -410,7 +410,7 @@ def _series(angle: float, wavelength_um: float, bend: Wavefront) -> ComplexArray
     octave = max(int(np.ceil(np.log2(waves / FIRST_WAVES))), 0)
     table = _octave(angle, bend.shape, octave) if octave <= LAST_OCTAVE else None
     if table is None:
-        return _expanded(angle, bend.shape, waves)
+        return _expand(angle, bend.shape, waves)
     low, high = _waves_of(octave)
     return np.asarray(chebyshev.chebval(2.0 * (waves - low) / (high - low) - 1.0, table), complex)
 
@@ -428,7 +428,7 @@ def _octave(angle: float, shape: Wavefront, octave: int) -> ComplexArray | None:
     count = 8
     while count <= SIZES:
         node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
-        series = [_expanded(angle, shape, float(low + 0.5 * (at + 1.0) * (high - low))) for at in node]
+        series = [_expand(angle, shape, float(low + 0.5 * (at + 1.0) * (high - low))) for at in node]
         table = np.zeros((count, max(len(one) for one in series)), complex)
         for k, one in enumerate(series):
             table[k, : len(one)] = one
@@ -439,9 +439,9 @@ def _octave(angle: float, shape: Wavefront, octave: int) -> ComplexArray | None:
     return None
 
 
-def _expanded(angle: float, shape: Wavefront, waves: float) -> ComplexArray:
+def _expand(angle: float, shape: Wavefront, waves: float) -> ComplexArray:
     """The expansion over the share, of `waves` times a shape."""
-    bend, count = shape.scaled(waves), 16
+    bend, count = shape.scale(waves), 16
     while True:
         node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
         cos, sin = np.full(count, np.cos(angle)), np.full(count, np.sin(angle))
@@ -487,7 +487,7 @@ def _polar_table(bend: Wavefront, wavelength_um: float) -> ComplexArray:
     dense = chebyshev.chebvander(np.linspace(-1.0, 1.0, rows), radii - 1) @ (np.fft.ifft(wide, axis=1) * columns)
     # a spline takes what lies beyond its ends for a mirror image: continue the table, so that this happens further out
     steps = np.arange(1, PAD + 1, dtype=float)
-    low, high = (_continued(edge, steps) for edge in (dense[:4], dense[:-5:-1]))
+    low, high = (_extrapolate(edge, steps) for edge in (dense[:4], dense[:-5:-1]))
     dense = np.concatenate([low[::-1], dense, high])
 
     from scipy.ndimage import spline_filter1d
@@ -496,7 +496,7 @@ def _polar_table(bend: Wavefront, wavelength_um: float) -> ComplexArray:
     return np.asarray(spline_filter1d(along, axis=1, mode="grid-wrap", output=complex))
 
 
-def _continued(edge: ComplexArray, steps: FloatArray) -> ComplexArray:
+def _extrapolate(edge: ComplexArray, steps: FloatArray) -> ComplexArray:
     """A cubic through four rows (the outermost first), 1, 2, ... rows beyond the first."""
     x = -steps[:, None]
     basis = np.ones((steps.size, 4))

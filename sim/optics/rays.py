@@ -228,7 +228,7 @@ def _turn(r: Any, a: float, b: float, c: float) -> Any:
 
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _carried(p: Any, d: Any, t: float, direction: Any, gradient: Any) -> Any:
+def _propagate_derivative(p: Any, d: Any, t: float, direction: Any, gradient: Any) -> Any:
     """A ray's derivative after propagation by t to a surface of the given gradient."""
     qx, qy, qz = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
     across = gradient[0] * direction[0] + gradient[1] * direction[1] + gradient[2] * direction[2]
@@ -237,7 +237,7 @@ def _carried(p: Any, d: Any, t: float, direction: Any, gradient: Any) -> Any:
 
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _refracted(p: Any, d: Any, bend: Any, direction: Any, normal: Any, length: float, optics: Any) -> Any:
+def _refract_derivative(p: Any, d: Any, bend: Any, direction: Any, normal: Any, length: float, optics: Any) -> Any:
     """The derivative of the refracted direction: D' = mu D + gamma n, gamma = cos T - mu cos I."""
     sxx, sxy, syy = bend
     mu, cos_i, cos_t = optics
@@ -334,8 +334,8 @@ def trace_ray(  # noqa: PLR0912, PLR0915  (one loop, compiled as one)
         gradient = (-2.0 * x * s1, -2.0 * y * s1, 1.0)
         direction = (dl, dm, dn)
         if with_slopes:
-            p1 = _carried(p1, d1, t, direction, gradient)
-            p2 = _carried(p2, d2, t, direction, gradient)
+            p1 = _propagate_derivative(p1, d1, t, direction, gradient)
+            p2 = _propagate_derivative(p2, d2, t, direction, gradient)
         if points.size:
             points[i, 0], points[i, 1], points[i, 2] = x, y, z
         if i == surfaces.stop:
@@ -362,8 +362,8 @@ def trace_ray(  # noqa: PLR0912, PLR0915  (one loop, compiled as one)
             if with_slopes:
                 bend = (2.0 * s1 + 4.0 * x * x * s2, 4.0 * x * y * s2, 2.0 * s1 + 4.0 * y * y * s2)
                 optics = (mu, cos_i, cos_t)
-                d1 = _refracted(p1, d1, bend, direction, normal, length, optics)
-                d2 = _refracted(p2, d2, bend, direction, normal, length, optics)
+                d1 = _refract_derivative(p1, d1, bend, direction, normal, length, optics)
+                d2 = _refract_derivative(p2, d2, bend, direction, normal, length, optics)
             gamma = cos_t - mu * cos_i
             dl, dm, dn = mu * dl + gamma * normal[0], mu * dm + gamma * normal[1], mu * dn + gamma * normal[2]
             if dn <= 0.0:

@@ -150,7 +150,7 @@ class OpticalSystem:
             return self.prescription.aperture_value
         if self.prescription.paraxial_stop:
             return float(abs(self._matrices(self.primary_nm)[0][0, 0]) * 0.5 * pupil_mm)
-        surfaces = rt.compiled_surfaces(_centred(self.prescription), 1.0)
+        surfaces = rt.compiled_surfaces(_remove_decentres(self.prescription), 1.0)
         out, nowhere = np.zeros(rt.ROW), np.zeros((0, 3))
         rt.trace_ray(surfaces, self.index(self.primary_nm), self._axis(), 0.0, 0.5 * pupil_mm, False, out, nowhere)
         radius = math.hypot(out[rt.STOP_X], out[rt.STOP_Y])
@@ -314,7 +314,7 @@ class OpticalSystem:
             centre = self.open_centre(tangent, [wavelength_nm])
         if centre is None:
             return None
-        mirrored = self.prescription.centred and tangent[0] == 0.0
+        mirrored = self.prescription.is_centred and tangent[0] == 0.0
         radial = math.ceil(0.4 * span) + 8
         around = max(2 * (math.ceil(0.6 * span) + 14), 96)
         half = around // 2
@@ -410,7 +410,7 @@ class OpticalSystem:
         px, py = (values.ravel() for values in np.meshgrid(x0 + grid, y0 + grid))
         rows = rt.trace_rays(self.surfaces, index, field, px, py)
         room = np.where(rows[:, rt.STATUS] == rt.ARRIVED, -rows[:, rt.CLIP], -np.inf)
-        if self.prescription.centred and field[1] == 0.0:
+        if self.prescription.is_centred and field[1] == 0.0:
             room[np.abs(px) > 1e-9 * self.pupil_radius_mm] = -np.inf
         best = int(np.argmax(room))
         return (float(px[best]), float(py[best])) if room[best] > 1e-6 else None
@@ -508,9 +508,9 @@ def _gauss(count: int) -> tuple[FloatArray, FloatArray]:
     return 0.5 * (t + 1.0), 0.5 * weight
 
 
-def _centred(prescription: Prescription) -> Prescription:
+def _remove_decentres(prescription: Prescription) -> Prescription:
     """The lens without its decentres and tilts, to which first-order quantities belong."""
-    if prescription.centred:
+    if prescription.is_centred:
         return prescription
     surfaces = tuple(
         surface.model_copy(update={"decentre_mm": (0.0, 0.0), "tilt_deg": (0.0, 0.0, 0.0), "aperture": None})

@@ -21,14 +21,14 @@ TABLE_VERSION = 4
 
 @dataclass(frozen=True, eq=False)
 class LensTable:
-    """What a traced lens does. Arrays can't be written to; two tables are equal where their `content_hash` is.
+    """Table of a traced lens. Arrays can't be written to; two tables are equal where their `content_hash` is.
 
-    W wavelengths, F field points, n x n samples of the point spread function. Field angles are (theta_x, theta_y) of the
-    object's direction (tan theta_x, tan theta_y, 1) in degrees; the image lies at `chief_mm` in the frame of the field: an
-    object at +theta has its image at +y (Zemax's signs, that is at about +f tan theta), so that the frame's rows run with y.
-    `psf` is the intensity per sample (not per area): rows are y (down in the image), columns x (right); its window's centre
-    (between the middle four samples where n is even) lies at chief_mm + window_um; it sums to `encircled_share`, 1 being all
-    that leaves the lens from that field point at that wavelength.
+    W wavelengths, F field points, n x n samples of the point spread function. Field angles are (theta_x, theta_y) of
+    the object's direction (tan theta_x, tan theta_y, 1) in degrees; the image lies at `chief_mm` in the frame of the
+    field: an object at +theta has its image at +y (Zemax's signs, that is at about +f tan theta), so that the frame's
+    rows run with y. `psf` is the intensity per sample (not per area): rows are y (down in the image), columns x
+    (right); its window's centre (between the middle four samples where n is even) lies at chief_mm + window_um; it sums
+    to `encircled_share`, 1 being all that leaves the lens from that field point at that wavelength.
     """
 
     wavelength_nm: FloatArray

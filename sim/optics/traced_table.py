@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.optics import rays as rt
-from sim.optics.planewaves import PupilRays, interpolated, point_spread
+from sim.optics.planewaves import PupilRays, interpolate_rays, point_spread
 from sim.optics.prescription import Prescription, PrescriptionError
 from sim.optics.system import Focus, OpticalSystem, field_angles
 from sim.optics.table import TABLE_VERSION, LensTable, load_cached, store_cached
@@ -34,8 +34,11 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class TracedField:
-    """What is traced of one field point, by wavelength (w): `chief_mm` (2,) of the reference wavelength, middle of the windows `window_um` (2,) from there,
-    `solid_angle` (w,), `centroid_um` (w, 2), `psf` (w, samples, samples)."""
+    """Trace of one field point at w wavelengths.
+
+    `chief_mm` (2,): the chief ray's place at the reference wavelength. `window_um` (2,): middle of the windows from
+    there. `solid_angle` (w,), `centroid_um` (w, 2), `psf` (w, samples, samples).
+    """
 
     chief_mm: FloatArray
     window_um: FloatArray
@@ -112,7 +115,7 @@ class OpticalTable:
             raise PrescriptionError(f"wavelengths {settings.wavelength_nm[:4]} don't ascend; sort them")
         system.prepare(self.wavelengths)
         self._nodes = _spectral_nodes(self.wavelengths)
-        self.symmetric = system.prescription.centred
+        self.symmetric = system.prescription.is_centred
         self._line_only = self.symmetric or settings.line
         self.tangents = self._field_points()
         self.pitch_um = settings.sample_pitch_um or self._pitch()
@@ -146,14 +149,14 @@ class OpticalTable:
             raise PrescriptionError("a table needs two field points at least; ask for more")
         checked = sorted({self._nodes[0], self._nodes[-1], self.system.reference_nm})
         for spoke in self._spokes():
-            outermost = self._limited(outermost, spoke, checked)
+            outermost = self._find_limit(outermost, spoke, checked)
         if self._line_only:
             return [(0.0, t) for t in self._line(outermost, settings.fields)]
         half = self._line(outermost * math.sqrt(0.5), (settings.grid + 1) // 2)
         line = [-t for t in reversed(half[1:])] + half
         return [(tx, ty) for ty in line for tx in line]
 
-    def _limited(self, outermost: float, spoke: tuple[float, float], wavelengths_nm: list[float]) -> float:
+    def _find_limit(self, outermost: float, spoke: tuple[float, float], wavelengths_nm: list[float]) -> float:
         """Largest tangent along a direction that the lens images, `outermost` at most; found by bisection."""
 
         def points(end: float) -> list[tuple[float, float]]:
@@ -304,7 +307,7 @@ class OpticalTable:
         """
         traced = [self._pupil(tangent, w, centre, span) for w in self._nodes]
         if len({rays.area.size for rays in traced}) == 1 and len({rays.rim_cosine_x.size for rays in traced}) == 1:
-            found = interpolated(traced, self.wavelengths, [self.system.index(w)[-2] for w in self.wavelengths])
+            found = interpolate_rays(traced, self.wavelengths, [self.system.index(w)[-2] for w in self.wavelengths])
             if all(
                 abs(p.solid_angle / s - 1.0) < _SOLID_ANGLE_TOLERANCE for p, s in zip(found, solid_angle, strict=True)
             ):

@@ -137,7 +137,7 @@ def mapped_means(pattern, u, v, divide, lit, surround, out):  # type: ignore[no-
 
 
 @njit(cache=True, inline="always")
-def _within(place, limit):  # type: ignore[no-untyped-def]
+def _limit_index(place, limit):  # type: ignore[no-untyped-def]
     """Clip to 0..limit; NaN becomes 0, as it must not be used as an index."""
     return min(place, limit) if place > 0.0 else 0.0
 
@@ -162,8 +162,8 @@ def aligned_means(table, u, v, wide, high):  # type: ignore[no-untyped-def]
     out = np.empty(u.shape)
     for i in range(u.shape[0]):
         for j in range(u.shape[1]):
-            left, right = _within(u[i, j] - 0.5 * wide, cols), _within(u[i, j] + 0.5 * wide, cols)
-            top, bottom = _within(v[i, j] - 0.5 * high, rows), _within(v[i, j] + 0.5 * high, rows)
+            left, right = _limit_index(u[i, j] - 0.5 * wide, cols), _limit_index(u[i, j] + 0.5 * wide, cols)
+            top, bottom = _limit_index(v[i, j] - 0.5 * high, rows), _limit_index(v[i, j] + 0.5 * high, rows)
             total = _integral(table, bottom, right) - _integral(table, bottom, left)
             out[i, j] = (total - _integral(table, top, right) + _integral(table, top, left)) / (wide * high)
     return out

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from sim.camera import CameraModel, Geometry
-from sim.parameters import Frozen, Quantity, declared
+from sim.parameters import Frozen, Quantity, read_quantities
 from sim.scene import colorchecker
 from sim.scene.light import luminance_cd_m2, screen
 from sim.scene.scenes import (
@@ -93,7 +93,7 @@ class View:
         row, col = self.centre
         return Geometry(camera_matrix=((focal_px, 0.0, col), (0.0, focal_px, row), (0.0, 0.0, 1.0)))
 
-    def upright(self, rows: float, cols: float, cell_px: float) -> Warp:
+    def centre_pattern(self, rows: float, cols: float, cell_px: float) -> Warp:
         """A pattern of rows x cols cells of `cell_px`, centred in the frame."""
         row, col = self.centre
         return Warp.of(
@@ -119,10 +119,10 @@ class Declared(Frozen):
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
         """The declared parameters, by field name."""
-        return declared(cls)
+        return read_quantities(cls)
 
     @classmethod
-    def chosen(cls, parameters: Mapping[str, object] | None) -> Self:
+    def choose(cls, parameters: Mapping[str, object] | None) -> Self:
         """The declaration with some parameters set. Raises ValueError, in one line, for an unknown one or a value outside its
         bounds."""
         try:
@@ -151,7 +151,7 @@ Cell = Annotated[float, Quantity("px", "a cell's side on the camera", lower=0.1)
 
 
 def _dark(white: Spectrum, contrast: float) -> Spectrum:
-    return white.scaled((1.0 - contrast) / (1.0 + contrast))
+    return white.scale((1.0 - contrast) / (1.0 + contrast))
 
 
 class UniformScene(NamedScene):
@@ -174,7 +174,7 @@ class _Chart(NamedScene):
     def place(self, view: View, white: Spectrum) -> Scene:
         rows, cols = (n - self.gap for n in colorchecker.grid(self.chart))
         cell = self.fill * min(view.rows / rows, view.cols / cols)
-        row, col = view.upright(rows, cols, cell).to_camera([0.0, cols, cols, 0.0], [0.0, 0.0, rows, rows])
+        row, col = view.centre_pattern(rows, cols, cell).to_camera([0.0, cols, cols, 0.0], [0.0, 0.0, rows, rows])
         a, b, c, d = zip(row.tolist(), col.tolist(), strict=True)
         return ReflectanceChart((a, b, c, d), white, self.chart, self.gap)
 
@@ -212,7 +212,7 @@ class Checkerboard(NamedScene):
     def place(self, view: View, white: Spectrum) -> Scene:
         rows, cols = _cells_to_cover(view, self.cell_px)
         pattern = (np.add.outer(np.arange(rows), np.arange(cols)) % 2).astype(np.uint8)
-        warp = view.upright(rows, cols, self.cell_px)
+        warp = view.centre_pattern(rows, cols, self.cell_px)
         return ScreenPattern(pattern, warp, _dark(white, self.contrast), white, "checkerboard")
 
 
@@ -226,7 +226,7 @@ class Bernoulli(NamedScene):
     def place(self, view: View, white: Spectrum) -> Scene:
         rows, cols = _cells_to_cover(view, self.cell_px)
         pattern = np.random.default_rng(self.pattern_seed).integers(0, 2, (rows, cols), dtype=np.uint8)
-        warp = view.upright(rows, cols, self.cell_px)
+        warp = view.centre_pattern(rows, cols, self.cell_px)
         return ScreenPattern(pattern, warp, _dark(white, self.contrast), white, "bernoulli")
 
 
@@ -366,7 +366,7 @@ class Cube(Declared):
         rows, cols = image.radiance.shape[:2]
         if self.fill == 1.0 and (rows, cols) == (view.rows, view.cols):
             return replace(image, to_camera=None)
-        return replace(image, to_camera=view.upright(rows, cols, self.fill * view.cell_px_to_fill(rows, cols)))
+        return replace(image, to_camera=view.centre_pattern(rows, cols, self.fill * view.cell_px_to_fill(rows, cols)))
 
 
 #: Texels to a square of a board's texture: a multiple of a marker's cells when markers take 3/4 of a square, 7 cells wide.
@@ -429,4 +429,4 @@ def scene_by_name(
     """
     if name not in SCENES:
         raise ValueError(f"scene {name!r} is not known: name one of {', '.join(SCENES)}, or a file")
-    return SCENES[name].chosen(parameters).place(View.of(camera, distance_mm), illuminant)
+    return SCENES[name].choose(parameters).place(View.of(camera, distance_mm), illuminant)

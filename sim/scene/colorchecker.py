@@ -56,16 +56,16 @@ def reflectances(chart: str = "ColorChecker24") -> dict[str, Spectrum]:
     colour = colour_science()
     if chart == "ColorChecker24":
         return {
-            name: _held(curve.wavelengths, curve.values)
+            name: _hold_ends(curve.wavelengths, curve.values)
             for name, curve in zip(PATCHES, colour.SDS_COLOURCHECKERS["BabelColor Average"].values(), strict=True)
         }
     data = colour.CCS_COLOURCHECKERS["ColorCheckerSG - After November 2014"].data
     xyz = np.array([colour.xyY_to_XYZ(xyy) for xyy in data.values()])
-    wavelength_nm, curves = recovered(xyz)
-    return {name: _held(wavelength_nm, curve) for name, curve in zip(data, curves, strict=True)}
+    wavelength_nm, curves = recover_reflectances(xyz)
+    return {name: _hold_ends(wavelength_nm, curve) for name, curve in zip(data, curves, strict=True)}
 
 
-def recovered(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+def recover_reflectances(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Wavelengths (nm) and reflectances (n, wavelengths) of surfaces with CIE 1931 `xyz` (n, 3) under D50, Y of white
     1.
 
@@ -99,5 +99,5 @@ def recovered(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(observer.wavelengths), np.array(curves)
 
 
-def _held(wavelength_nm: FloatArray, value: FloatArray) -> Spectrum:
+def _hold_ends(wavelength_nm: FloatArray, value: FloatArray) -> Spectrum:
     return Spectrum.of((300.0, *wavelength_nm, 1100.0), (value[0], *value, value[-1]))

@@ -16,7 +16,7 @@ from sim.optics.bspline import spline_weights
 from sim.spectrum import FloatArray
 
 
-def displaced(
+def displace_drawing(
     drawn: NDArray[np.floating[Any]], from_row_px: FloatArray, from_col_px: FloatArray, oversample: int
 ) -> FloatArray:
     """A drawing's samples taken at other places, (n oversample, m oversample) as `drawn`.

@@ -48,7 +48,7 @@ def at_luminance(curve: Spectrum, wanted_cd_m2: float) -> Spectrum:
         raise ValueError(
             f"a light of {has:g} cd/m^2 between {curve.wavelength_nm[0]:g} and {curve.wavelength_nm[-1]:g} nm can't be scaled to {wanted_cd_m2:g} cd/m^2: it needs visible light above 0; state its radiance instead"
         )
-    return curve.scaled(wanted_cd_m2 / has)
+    return curve.scale(wanted_cd_m2 / has)
 
 
 def illuminant_names() -> tuple[str, ...]:
@@ -90,7 +90,7 @@ def screen(
     red, green, blue = (Spectrum.of(measured.wavelengths, curve * lit) for curve in curves)
     return Screen(
         primaries=(red, green, blue),
-        black_radiance=total.scaled(factor / contrast_ratio),
+        black_radiance=total.scale(factor / contrast_ratio),
         gamma=gamma,
         falloff_exponent=falloff_exponent,
         sub_pixels=sub_pixels,

@@ -152,7 +152,7 @@ def cell_means(
 ) -> FloatArray:
     """`cells` for cells of any finite value. `lit` (u0, u1, v0, v1): the part of every cell that has its value, the
     rest having `surround`; None: all of it."""
-    if warp.upright:
+    if warp.is_upright:
         return _upright_means(pattern, warp, grid, surround, lit)
     from sim.scene.area import mapped_means, project_means  # here: the compiler's library takes a while to load
 
@@ -165,7 +165,7 @@ def cell_means(
     row, col = grid.axes_px()
     step = 1.0 / grid.oversample
     out = np.empty(grid.shape)
-    if warp.straight:
+    if warp.is_straight:
         back = np.linalg.inv(np.asarray(warp.homography))
         project_means(pattern, back, row, col, step, divide, lit, surround, out)
         return out
@@ -261,7 +261,7 @@ def _screen(scene: ScreenImage, grid: Grid) -> Drawing:
         if screen.sub_pixels is None:
             pictures.append((primary, drive, None))
         else:
-            pictures.append((primary, drive / screen.sub_pixels.share, screen.sub_pixels.lit(channel)))
+            pictures.append((primary, drive / screen.sub_pixels.share, screen.sub_pixels.locate_stripe(channel)))
     drawn = tuple(
         Layer((light, None), EVERYWHERE, cell_means(picture, warp, grid, 0.0, lit)) for light, picture, lit in pictures
     )

@@ -134,7 +134,7 @@ class Posed:
         pose = np.column_stack([turn[:, 0] * unit_mm, turn[:, 1] * unit_mm, np.asarray(self.translation_mm, float)])
         return Warp.of(np.asarray(self.geometry.camera_matrix, float) @ pose, self.geometry)
 
-    def seen_by(self, rig: StereoRig) -> tuple[Self, Self]:
+    def pose_for_rig(self, rig: StereoRig) -> tuple[Self, Self]:
         """The same thing before both cameras of a rig, this pose being that in the left one's frame: what stands at x before the
         left camera stands at rotation x + translation_mm before the right one. Geometries are the cameras'."""
         pair = rig.left.geometry, rig.right.geometry
@@ -337,7 +337,7 @@ class ScreenImage(Posed):
         turn = np.asarray(self.rotation, float)
         eye = -turn.T @ np.asarray(self.translation_mm, float)  # the camera in the screen's frame
         warp = self.warp()
-        if warp.upright:  # a sum of a term a row and one a column
+        if warp.is_upright:  # a sum of a term a row and one a column
             u, v = warp.to_pattern(row[0], col)[0][None, :], warp.to_pattern(row, col[0])[1][:, None]
         else:
             u, v = warp.grid_to_pattern(row, col)

@@ -26,7 +26,7 @@ class SubPixels(Frozen):
         """Share of the pixel's area that one stripe fills."""
         return self.width * self.height
 
-    def lit(self, channel: int) -> tuple[float, float, float, float]:
+    def locate_stripe(self, channel: int) -> tuple[float, float, float, float]:
         """(u0, u1, v0, v1) of the stripe of channel 0, 1 or 2 (red, green, blue), in pixels of the screen."""
         middle = (self.order.index("RGB"[channel]) + 0.5) / 3.0
         return (

@@ -51,15 +51,15 @@ class Warp:
         return cls.of(np.append(np.linalg.solve(system, right), 1.0).reshape(3, 3), geometry)
 
     @property
-    def straight(self) -> bool:
-        """Whether there is no distortion."""
+    def is_straight(self) -> bool:
+        """Return whether there is no distortion."""
         return self.geometry is None or not any(self.geometry.distortion)
 
     @property
-    def upright(self) -> bool:
-        """Whether rows and columns of the pattern are rows and columns of the camera, in the same order."""
+    def is_upright(self) -> bool:
+        """Return whether rows and columns of the pattern are rows and columns of the camera, in the same order."""
         (a, b, _), (c, d, _), (e, f, w) = self.homography
-        return self.straight and b == c == e == f == 0.0 and a * w > 0 and d * w > 0
+        return self.is_straight and b == c == e == f == 0.0 and a * w > 0 and d * w > 0
 
     def to_camera(self, u: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Camera (row, col) in px of pattern points."""
@@ -88,7 +88,7 @@ class Warp:
         (1e-5 px).
         """
         back = np.linalg.inv(np.asarray(self.homography))
-        if self.straight:
+        if self.is_straight:
             return lambda row: _project(back, col[None, :], row[:, None])
         assert self.geometry is not None
         y0, x0 = (np.linspace(low, high, max(8, int((high - low) / 8) + 2)) for low, high in (rows, (col[0], col[-1])))

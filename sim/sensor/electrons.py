@@ -58,9 +58,11 @@ LINEAR = ReadOut()
 
 @dataclass(frozen=True, eq=False)
 class FixedPattern:
-    """What one camera's pixels keep from frame to frame, all of mean 0: relative deviation of the response `prnu` and
-    deviation of the dark signal `dsnu_e` (electrons, the same at every exposure), both (rows, cols), and column
-    offsets `column_e` (cols,) or None."""
+    """Fixed pattern of one camera: what its pixels keep from frame to frame, each part of mean 0.
+
+    `prnu`: relative deviation of the response. `dsnu_e`: deviation of the dark signal (electrons, the same at every
+    exposure). Both (rows, cols). `column_e`: offsets of the columns (cols,), or None.
+    """
 
     prnu: FloatArray
     dsnu_e: FloatArray
@@ -174,7 +176,7 @@ def coded_moments(
         out_variance[near] = np.maximum(out_variance[near] + more - shift**2, 0.0)
     smooth = narrow & ~clipped & (variance > 0.1)
     if np.any(smooth):
-        out_mean[smooth], out_variance[smooth] = _rounded(mean[smooth], variance[smooth])
+        out_mean[smooth], out_variance[smooth] = _round_moments(mean[smooth], variance[smooth])
     summed = (narrow & ~smooth) | (clipped & (variance < 1.0))
     if np.any(summed):
         m, sigma = mean[summed], np.maximum(s[summed], 1e-9)
@@ -193,7 +195,7 @@ def coded_moments(
     return out_mean, out_variance
 
 
-def _rounded(mean: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _round_moments(mean: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of a normal variable of variance 0.1 and more after rounding to whole numbers.
 
     With r(y) = (1 / pi) sum_k (-1)^k sin(2 pi k y) / k what rounding adds and d_k = exp(-2 pi^2 k^2 variance): E r = (1 / pi)
@@ -258,8 +260,8 @@ def dn_moments(
         dn2 = dn2 * (read_out.codes(dn + 0.5) - read_out.codes(dn - 0.5)) ** 2
         dn = bent
     if read_out.processing is not None:
-        dn = filtered(dn, read_out.processing, camera.cfa)
-        dn2 = filtered(np.broadcast_to(dn2, dn.shape), np.square(read_out.processing), camera.cfa)
+        dn = filter_planes(dn, read_out.processing, camera.cfa)
+        dn2 = filter_planes(np.broadcast_to(dn2, dn.shape), np.square(read_out.processing), camera.cfa)
     skewness = np.minimum(electrons / np.maximum(noise_e2, 1e-12) ** 1.5, 1.0)
     return coded_moments(dn, dn2, np.inf if by_charge else camera.white_level_dn, skewness)
 
@@ -310,7 +312,7 @@ def sample_from(
         if read_out.codes is not None:
             charge = read_out.codes(charge.astype(float)).astype(np.float32)
         if read_out.processing is not None:
-            charge = filtered(charge, read_out.processing, camera.cfa)
+            charge = filter_planes(charge, read_out.processing, camera.cfa)
         np.rint(charge, out=charge)
         np.clip(charge, np.float32(0.0), np.float32(camera.white_level_dn), out=charge)
         frame[strip] = charge
@@ -353,7 +355,7 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
 CROSS = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 
-def passed_on(correlation: FloatArray | float) -> FloatArray:
+def solve_passed_share(correlation: FloatArray | float) -> FloatArray:
     """Share g of each neighbour's deviation that a pixel takes over, given the correlation r that results between two
     equal ones: r = 2 g / (1 + 4 g^2)."""
     r = np.clip(np.asarray(correlation, float), 0.0, 0.49)
@@ -363,13 +365,13 @@ def passed_on(correlation: FloatArray | float) -> FloatArray:
 def shared_departures(departure: NDArray[F], mean: NDArray[F], correlation: FloatArray) -> FloatArray:
     """Deviations (rows, cols) of Poisson variables of given means after every pixel has taken over a share of its
     neighbours', with unchanged variances: d_i + g_i sum d_j, over sqrt(1 + g_i^2 sum v_j / v_i)."""
-    share = passed_on(correlation)
+    share = solve_passed_share(correlation)
     spread = convolve(np.asarray(mean, float), CROSS, mode="mirror") / np.maximum(mean, 1e-12)
     taken = departure + share * convolve(departure, CROSS, mode="mirror")
     return np.asarray(taken / np.sqrt(1.0 + np.square(share) * spread))
 
 
-def filtered(frame: NDArray[F], kernel: FloatArray, cfa: Cfa) -> NDArray[F]:
+def filter_planes(frame: NDArray[F], kernel: FloatArray, cfa: Cfa) -> NDArray[F]:
     """Each colour's plane of a frame (rows, cols) convolved with one kernel; mirrored about the outermost pixels."""
     out = np.array(frame)
     for plane in planes(out, cfa).values():

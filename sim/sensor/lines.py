@@ -27,22 +27,22 @@ class LineNoise:
     odd_even_e: float = 0.0
     seed: int = 0
 
-    def _along(self, shape: tuple[int, ...]) -> tuple[int, int]:
+    def _axis_shape(self, shape: tuple[int, ...]) -> tuple[int, int]:
         return (shape[0], 1) if self.lines == "rows" else (1, shape[1])
 
     def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         """Electrons of one frame, (rows, 1) or (1, columns)."""
-        along = self._along(shape)
+        along = self._axis_shape(shape)
         total = np.broadcast_to(np.asarray(self.mean_e(shape), float), along)
         if self.temporal_e > 0.0:
-            total = total + self.temporal_e * _correlated(rng.standard_normal(along), self.correlation)
+            total = total + self.temporal_e * _correlate(rng.standard_normal(along), self.correlation)
         return total
 
     def mean_e(self, shape: tuple[int, ...]) -> FloatArray | float:
         """The fixed part, of the same shape; 0 for none."""
         if self.fixed_e == 0.0 and self.odd_even_e == 0.0:
             return 0.0
-        along = self._along(shape)
+        along = self._axis_shape(shape)
         offset = np.random.default_rng([self.seed, _STREAM[self.lines]]).standard_normal(along)
         odd = np.arange(max(along)).reshape(along) % 2 - 0.5
         return self.fixed_e * (offset - offset.mean()) + self.odd_even_e * odd
@@ -62,7 +62,7 @@ class LineNoise:
         return np.asarray(self.temporal_e**2 * (1.0 - c * c) / (1.0 - 2.0 * c * turn + c * c))
 
 
-def _correlated(white: FloatArray, correlation: float) -> FloatArray:
+def _correlate(white: FloatArray, correlation: float) -> FloatArray:
     """White noise of variance 1 along its longer axis as a stationary autoregressive process of first order, of variance 1."""
     if correlation == 0.0:
         return white

@@ -63,7 +63,7 @@ def _fill(
         if k < math.floor(mu - 1.1484):
             u, below = rng.random(), mu - k
             if k < 0 or 6.0 * mu * mu * u < below * below * below:
-                k = _corrected(mu, s, k, u, rng)
+                k = _correct_candidate(mu, s, k, u, rng)
         drawn[i] = k
 
 
@@ -86,7 +86,7 @@ def _few(mu: float, u: float, v: float, share: FloatArray, guide: NDArray[np.int
 
 
 @njit(cache=True)
-def _corrected(mu: float, s: float, k: int, u: float, rng: np.random.Generator) -> int:
+def _correct_candidate(mu: float, s: float, k: int, u: float, rng: np.random.Generator) -> int:
     """Steps P, Q, E and H of PD: accept the candidate, or draw from a double exponential hat over the difference to
     the normal density."""
     if k >= 0:

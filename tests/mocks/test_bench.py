@@ -20,7 +20,7 @@ from mocks.light_path import WAVELENGTH_NM, LightSettings, sphere_radiance
 from mocks.targets import BOARD_POSES, BOARD_SQUARES, EDGE_ANGLES_DEG, SQUARE_MM, board_pose, corners_px
 from mocks.truth import hidden_truth
 from sim.camera import Side
-from sim.frame import Exposure, expected
+from sim.frame import Exposure, predict_frame
 from sim.point import edge_profile
 from sim.scene.scenes import UniformField
 from sim.sensor.electrons import dark_current_e_per_s
@@ -204,7 +204,7 @@ class TestFrames:
         """Without concealed effects the bench and `sim.frame` say the same of a flat."""
         camera = hidden_truth(1).cameras["right"].model
         radiance = Spectrum.of(WAVELENGTH_NM, light(filter_place=2))
-        there = expected(camera, Exposure(UniformField(radiance), 0.0008))
+        there = predict_frame(camera, Exposure(UniformField(radiance), 0.0008))
         rate = bench._light_rate("right")
         dark = camera.dark_current_e_per_s * 0.0008
         here = camera.black_level_dn + camera.conversion_gain_dn_per_e * (rate * 0.0008 + dark)

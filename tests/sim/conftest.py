@@ -46,7 +46,7 @@ def mono_camera(colour_camera: CameraModel) -> CameraModel:
 
 @pytest.fixture
 def lamp() -> Spectrum:
-    return blackbody_radiance(3000.0, np.arange(380.0, 781.0, 5.0)).scaled(6e-7)
+    return blackbody_radiance(3000.0, np.arange(380.0, 781.0, 5.0)).scale(6e-7)
 
 
 class SyntheticLens:

@@ -40,7 +40,7 @@ class Birefringent(Local):
     d_um: float = 0.0
 
     def on_image(self, image: Image) -> Image:
-        return image.adding(
+        return image.add_laws(
             transfer=lambda fx, fy, wavelength_nm: np.cos(np.pi * fx * self.d_um) * np.cos(np.pi * fy * self.d_um)
         )
 
@@ -51,7 +51,7 @@ class Shift(Local):
     y_um: float = 0.0
 
     def on_image(self, image: Image) -> Image:
-        return image.adding(
+        return image.add_laws(
             transfer=lambda fx, fy, wavelength_nm: np.exp(-2j * np.pi * (fx * self.x_um + fy * self.y_um))
         )
 
@@ -61,7 +61,7 @@ class Veil(Local):
     share: float = 0.0
 
     def on_image(self, image: Image) -> Image:
-        return image.adding(
+        return image.add_laws(
             transfer=lambda fx, fy, wavelength_nm: np.where(np.hypot(fx, fy) > 0, 1.0 - self.share, 1.0)
         )
 
@@ -72,7 +72,7 @@ class AngleCut(Local):
     name: ClassVar[str] = "test_angle_cut"
 
     def on_image(self, image: Image) -> Image:
-        return image.adding(transmittance=self.through)
+        return image.add_laws(transmittance=self.through)
 
     def through(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
         cut = 650.0 * np.sqrt(1 - np.asarray(sin_theta) ** 2 / 2.25)
@@ -83,7 +83,7 @@ class EveryStage(Local):
     name: ClassVar[str] = "test_every_stage"
 
     def on_light(self, light: Light) -> Light:
-        return light.adding(
+        return light.add_laws(
             spectrum=lambda wavelength_nm, radiance, kind: radiance * (1.1 if kind == "flat" else 1.0),
             level=lambda elapsed_s: 1.0 + 0.01 * elapsed_s,
             shading=lambda x_um, y_um: 1.0 + 0.001 * x_um + 0.0 * y_um,
@@ -91,14 +91,14 @@ class EveryStage(Local):
         )
 
     def on_charge(self, charge: Charge) -> Charge:
-        return charge.adding(
+        return charge.add_laws(
             exposure_s=lambda exposure_s: exposure_s + 0.002,
             overflow=lambda electrons: electrons + 7.0,
             variance_e2=lambda electrons, variance_e2: variance_e2 * 0.5,
         )
 
     def on_signal(self, signal: Signal) -> Signal:
-        return signal.adding(
+        return signal.add_laws(
             response=lambda electrons: electrons * 0.98,
             offset_dn=lambda elapsed_s, temperature_c: 0.5 * elapsed_s + (temperature_c or 0.0),
         )
@@ -126,7 +126,7 @@ class ReadOutRamp(Local):
     last_row_e: Annotated[float, Quantity("e", "of the last row", prior=(0.0, 10.0), absent=0.0)] = 0.0
 
     def on_signal(self, signal: Signal) -> Signal:
-        return signal.adding(disturbances=Ramp(self.last_row_e))
+        return signal.add_laws(disturbances=Ramp(self.last_row_e))
 
 
 def scenes(lamp: Spectrum) -> list[Scene]:
@@ -135,12 +135,10 @@ def scenes(lamp: Spectrum) -> list[Scene]:
         Darkness(),
         UniformField(lamp),
         KnifeEdge(
-            (EdgeRegion((10, 10, 40, 40), 5.0), EdgeRegion((10, 50, 40, 90), -80.0, 2.5)), lamp.scaled(0.02), lamp
+            (EdgeRegion((10, 10, 40, 40), 5.0), EdgeRegion((10, 50, 40, 90), -80.0, 2.5)), lamp.scale(0.02), lamp
         ),
         ReflectanceChart(((8.0, 10.0), (9.0, 88.0), (64.0, 86.0), (62.0, 8.0)), lamp),
-        ScreenPattern(
-            pattern, Warp.from_corners(20, 20, [(5, 8), (6, 90), (66, 88), (64, 6)]), lamp.scaled(0.01), lamp
-        ),
+        ScreenPattern(pattern, Warp.from_corners(20, 20, [(5, 8), (6, 90), (66, 88), (64, 6)]), lamp.scale(0.01), lamp),
         planar(pattern, lamp),
     ]
 
@@ -156,7 +154,7 @@ def planar(texture: np.ndarray, lamp: Spectrum) -> PlanarTarget:
         tuple(map(tuple, rotation.tolist())),
         (-40.0, -40.0, 400.0),
         geometry,
-        lamp.scaled(0.02),
+        lamp.scale(0.02),
         lamp,
         1.0,
     )

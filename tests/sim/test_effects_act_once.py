@@ -27,7 +27,7 @@ from tests.sim.local_effects import scenes
 
 def _two_cells(lamp: Spectrum) -> tuple[Scene, Scene]:
     """An upright edge between columns 47 and 48, as a knife edge and as a drawn screen."""
-    dark = lamp.scaled(0.02)
+    dark = lamp.scale(0.02)
     edge = KnifeEdge((EdgeRegion((0, 0, 72, 96), 0.0),), dark, lamp)
     warp = Warp.from_corners(2, 1, [(-1000.0, -952.5), (-1000.0, 1047.5), (1000.0, 1047.5), (1000.0, -952.5)])
     return edge, ScreenPattern(np.array([[0, 1]], np.uint8), warp, dark, lamp, kind="slanted_edge")
@@ -69,7 +69,7 @@ def test_a_blur_acts_once_in_a_frame_as_in_an_edges_profile(
             sim_frame.expected_electrons(camera, Exposure(scene, 1.0), acting, oversample=6) / level
             for acting in ((one,), ())
         )
-        with_it = with_it if processing is None else sensor.filtered(with_it, processing, camera.cfa)
+        with_it = with_it if processing is None else sensor.filter_planes(with_it, processing, camera.cfa)
         np.testing.assert_allclose((with_it - without)[36, 8:-8], wanted[8:-8], atol=0.03 * np.abs(wanted).max())
 
 
@@ -79,5 +79,5 @@ def test_crosstalk_acts_once_in_a_mosaic(colour_camera: CameraModel, lamp: Spect
     for scene in scenes(lamp)[1:]:
         without = sim_frame.expected_electrons(colour_camera, Exposure(scene, 0.02))
         with_it = sim_frame.expected_electrons(colour_camera, Exposure(scene, 0.02), (kind,))
-        np.testing.assert_allclose(with_it, charge_of(colour_camera, (kind,)).moved(without), rtol=1e-12)
+        np.testing.assert_allclose(with_it, charge_of(colour_camera, (kind,)).move_charge(without), rtol=1e-12)
         assert np.abs(with_it - without).max() > 1.0

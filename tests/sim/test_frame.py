@@ -11,7 +11,7 @@ import pytest
 from sim import frame as sim_frame
 from sim.camera import CameraModel, Geometry, Lens
 from sim.effects import library
-from sim.frame import Exposure, expected, sample
+from sim.frame import Exposure, predict_frame, sample
 from sim.optics.diffraction import diffraction_otf
 from sim.optics.illumination import irradiance_factor, relative_illumination
 from sim.point import Blur
@@ -35,7 +35,7 @@ from tests.sim.local_effects import AngleCut, Birefringent, EveryStage, Local, S
 def test_an_edge_by_its_profile_is_the_edge_drawn_and_blurred(mono_camera: CameraModel, lamp: Spectrum) -> None:
     effects = (Birefringent(d_um=2.0), Shift(x_um=0.6, y_um=0.3))
     angle = np.deg2rad(8.0)
-    dark = lamp.scaled(0.02)
+    dark = lamp.scale(0.02)
     by_profile = sim_frame.expected_electrons(
         mono_camera, Exposure(KnifeEdge((EdgeRegion((0, 0, 72, 96), 8.0, 1.25),), dark, lamp), 0.05), effects
     )
@@ -57,7 +57,7 @@ def test_blur_conserves_light(mono_camera: CameraModel, lamp: Spectrum) -> None:
         update={"dark_current_e_per_s": 0.0, "lens": Lens(f_number=4.0, focal_length_mm=5000.0)}
     )
     square = Warp.from_corners(1, 1, [(30.2, 40.1), (30.2, 46.6), (36.7, 46.6), (36.7, 40.1)])
-    scene = ScreenPattern(np.ones((1, 1), np.uint8), square, lamp.scaled(0.0), lamp)
+    scene = ScreenPattern(np.ones((1, 1), np.uint8), square, lamp.scale(0.0), lamp)
     frame = sim_frame.expected_electrons(camera, Exposure(scene, 1.0), (Birefringent(d_um=2.0),), oversample=3)
     light = frame.sum() / electron_rate(camera, "Y", lamp)
     # Diffraction's tails outside the frame (some 35 px away) hold about 2 N lambda / (pi^2 35 p) = 0.4 %; clipping of ringing
@@ -68,7 +68,7 @@ def test_blur_conserves_light(mono_camera: CameraModel, lamp: Spectrum) -> None:
 
 
 def test_a_flat_field_is_rate_times_time_times_cos4(colour_camera: CameraModel, lamp: Spectrum) -> None:
-    mean = expected(colour_camera, Exposure(UniformField(lamp), 0.1, gain_db=6.0))
+    mean = predict_frame(colour_camera, Exposure(UniformField(lamp), 0.1, gain_db=6.0))
     for channel, places in mosaic.phases("GBRG").items():
         electrons = electron_rate(colour_camera, channel, lamp) * 0.1
         for row0, col0 in places:
@@ -80,7 +80,7 @@ def test_a_flat_field_is_rate_times_time_times_cos4(colour_camera: CameraModel, 
 
 
 def test_a_dark_frame_is_black_and_dark_current(colour_camera: CameraModel) -> None:
-    np.testing.assert_allclose(expected(colour_camera, Exposure(Darkness(), 10.0)), 240 + 0.35 * 30.0, rtol=1e-12)
+    np.testing.assert_allclose(predict_frame(colour_camera, Exposure(Darkness(), 10.0)), 240 + 0.35 * 30.0, rtol=1e-12)
     np.testing.assert_allclose(
         sim_frame.variance(colour_camera, Exposure(Darkness(), 10.0)), 0.35**2 * (30.0 + 2.5**2) + 1 / 12, rtol=1e-12
     )
@@ -109,7 +109,7 @@ def test_patches_in_their_middle_are_flat_fields_of_their_radiance(colour_camera
 def test_samples_scatter_as_expected_and_variance_say(colour_camera: CameraModel, lamp: Spectrum, index: int) -> None:
     exposure = Exposure(scenes(lamp)[index], 0.3, gain_db=3.0)
     mean, variance = sim_frame.moments(colour_camera, exposure)
-    np.testing.assert_array_equal(mean, expected(colour_camera, exposure))
+    np.testing.assert_array_equal(mean, predict_frame(colour_camera, exposure))
     np.testing.assert_array_equal(variance, sim_frame.variance(colour_camera, exposure))
     rng = np.random.default_rng(11 + index)
     electrons = sim_frame.expected_electrons(colour_camera, exposure)
@@ -137,7 +137,7 @@ def test_a_sample_is_reproducible_and_carries_the_pattern(colour_camera: CameraM
     two = sample(colour_camera, exposure, np.random.default_rng(3), fixed_pattern=pattern)
     assert one.dtype == np.uint16
     np.testing.assert_array_equal(one, two)
-    mean = expected(colour_camera, exposure)
+    mean = predict_frame(colour_camera, exposure)
     wanted = 240 + (mean - 240 - 0.35 * 0.6) * 1.1 + 0.35 * (40.0 + 0.6)
     noise = np.sqrt(sim_frame.variance(colour_camera, exposure) * 1.1)
     assert np.mean(one - wanted) == pytest.approx(0.0, abs=4.5 * noise.max() / np.sqrt(one.size))
@@ -153,7 +153,9 @@ def test_effects_at_their_absent_values_are_the_baseline_bit_for_bit(
         name: ClassVar[str] = "test_nothing"
 
     absent = (Nothing(), Birefringent())
-    np.testing.assert_array_equal(expected(colour_camera, exposure), expected(colour_camera, exposure, absent))
+    np.testing.assert_array_equal(
+        predict_frame(colour_camera, exposure), predict_frame(colour_camera, exposure, absent)
+    )
     np.testing.assert_array_equal(
         sample(colour_camera, exposure, np.random.default_rng(4)),
         sample(colour_camera, exposure, np.random.default_rng(4), absent),
@@ -164,7 +166,9 @@ def test_every_library_effect_absent_is_the_baseline(colour_camera: CameraModel,
     effects = tuple(effect() for effect in library.effects().values())
     for scene in scenes(lamp)[1:5]:
         exposure = Exposure(scene, 0.02, elapsed_s=100.0, temperature_c=30.0)
-        np.testing.assert_array_equal(expected(colour_camera, exposure), expected(colour_camera, exposure, effects))
+        np.testing.assert_array_equal(
+            predict_frame(colour_camera, exposure), predict_frame(colour_camera, exposure, effects)
+        )
 
 
 def test_every_stage_acts_once(colour_camera: CameraModel, lamp: Spectrum) -> None:
@@ -195,7 +199,7 @@ def test_a_filter_that_shifts_with_the_angle_shades_the_corners(colour_camera: C
     lit = ScreenPattern(
         np.ones((1, 1)),
         Warp.from_corners(1, 1, [(-300, -300), (-300, 400), (400, 400), (400, -300)]),
-        lamp.scaled(0.1),
+        lamp.scale(0.1),
         lamp,
         kind="white",
     )
@@ -205,7 +209,7 @@ def test_a_filter_that_shifts_with_the_angle_shades_the_corners(colour_camera: C
 
 
 def test_a_knife_edge_gives_each_pixel_to_the_nearest_region(colour_camera: CameraModel, lamp: Spectrum) -> None:
-    scene = KnifeEdge((EdgeRegion((10, 10, 60, 40), 0.0), EdgeRegion((10, 50, 60, 90), 180.0)), lamp.scaled(0.0), lamp)
+    scene = KnifeEdge((EdgeRegion((10, 10, 60, 40), 0.0), EdgeRegion((10, 50, 60, 90), 180.0)), lamp.scale(0.0), lamp)
     image = sim_frame.expected_electrons(colour_camera, Exposure(scene, 1.0))
     level = electron_rate(colour_camera, "G", lamp)
     greens = mosaic.planes(image, "GBRG")["G2"] / level
@@ -232,7 +236,7 @@ def test_a_charuco_boards_corners_are_found_where_they_were_put() -> None:
         dsnu_e=0.0, prnu_percent=0.0, quantum_efficiency={"Y": qe}, lens=Lens(f_number=4.0, focal_length_mm=20.0), geometry=geometry,
     )  # fmt: skip
     light = Spectrum.of([400.0, 700.0], [1.0, 1.0])
-    light = light.scaled(1800.0 / electron_rate(camera, "Y", light))
+    light = light.scale(1800.0 / electron_rate(camera, "Y", light))
     rotation = cv2.Rodrigues(np.array([0.25, -0.3, 0.08]))[0]
     target = PlanarTarget(
         texture,
@@ -240,11 +244,11 @@ def test_a_charuco_boards_corners_are_found_where_they_were_put() -> None:
         tuple(map(tuple, rotation.tolist())),
         (-20.0, -15.0, 110.0),
         geometry,
-        light.scaled(0.03),
+        light.scale(0.03),
         light,
         1.0,
     )
-    frame = np.rint(expected(camera, Exposure(target, 1.0))).astype(np.uint8)
+    frame = np.rint(predict_frame(camera, Exposure(target, 1.0))).astype(np.uint8)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(frame)
     assert ids is not None and len(ids) >= 12
     # Corner k of 5 x 3 stands at 8 mm steps: 32 texels of 0.25 mm.
@@ -262,7 +266,7 @@ def test_a_lens_is_diffraction_limited_unless_it_says_otherwise(
     """The formula that stood here before lenses had imaging models, to the last bit."""
     exposure = Exposure(scenes(lamp)[index], 0.02)
     effects = (Birefringent(d_um=2.1),)
-    now = expected(colour_camera, exposure, effects)
+    now = predict_frame(colour_camera, exposure, effects)
 
     def before(
         self: Blur, wavelength_nm: float, fx: FloatArray, fy: FloatArray, place_um: tuple[float, float] = (0.0, 0.0)
@@ -274,7 +278,7 @@ def test_a_lens_is_diffraction_limited_unless_it_says_otherwise(
         return value
 
     monkeypatch.setattr(Blur, "at", before)
-    np.testing.assert_array_equal(now, expected(colour_camera, exposure, effects))
+    np.testing.assert_array_equal(now, predict_frame(colour_camera, exposure, effects))
 
 
 def test_magnification_dims_a_whole_frame_as_in_iset(colour_camera: CameraModel, lamp: Spectrum) -> None:

@@ -18,8 +18,8 @@ from sim.frame import (
     collected_electrons,
     expected_electrons,
     expected_sequence,
+    pair_gain_factor,
     read_electrons,
-    right_over_left,
     scene_light,
 )
 from sim.scene import Darkness, ScreenPattern, UniformField, Warp
@@ -58,9 +58,9 @@ def test_kept_transfers_give_the_same_frames(colour_camera: CameraModel, lamp: S
     warp = Warp.from_corners(30, 30, [(2, 4), (3, 92), (70, 90), (68, 3)])
     effects = (OpticalLowPassFilter(displacement_x_um=2.0, displacement_y_um=1.0),)
     kept = KeptTransfers()
-    for light in (lamp, lamp, lamp.scaled(2.0)):
+    for light in (lamp, lamp, lamp.scale(2.0)):
         pattern = rng.integers(0, 2, (30, 30)).astype(np.uint8)
-        scene = ScreenPattern(pattern, warp, light.scaled(0.01), light)
+        scene = ScreenPattern(pattern, warp, light.scale(0.01), light)
         plain = scene_light(colour_camera, scene, effects).scene
         assert np.allclose(
             scene_light(colour_camera, scene, effects, transfers=kept).scene, plain, atol=1e-5 * plain.max()
@@ -94,4 +94,4 @@ def test_effects_of_the_rig_act_outside_a_frame(colour_camera: CameraModel, lamp
     there = radiance_at_lens(colour_camera, lamp, (WavelengthOffset(offset_nm=5.0),), "flat")
     wavelength_nm = np.arange(450.0, 650.0, 5.0)
     assert np.allclose(there.at(wavelength_nm), lamp.at(wavelength_nm - 5.0))
-    assert right_over_left(colour_camera, (StereoGainMismatch(gain_percent=4.0), WavelengthOffset())) == 1.04
+    assert pair_gain_factor(colour_camera, (StereoGainMismatch(gain_percent=4.0), WavelengthOffset())) == 1.04

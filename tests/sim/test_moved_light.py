@@ -30,7 +30,7 @@ class Magnified(Local):
         def shift(x_um: FloatArray, y_um: FloatArray, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
             return self.percent / 100.0 * x_um, self.percent / 100.0 * y_um
 
-        return image.adding(shift=shift)
+        return image.add_laws(shift=shift)
 
 
 @pytest.fixture
@@ -43,12 +43,12 @@ def _screen(scale: float) -> Scene:
     pattern = np.random.default_rng(3).integers(0, 2, (11, 15)).astype(np.uint8)
     half_y, half_x = 22.0 * scale, 30.0 * scale
     warp = Warp.from_corners(11, 15, [(24 - half_y, 32 - half_x), (24 - half_y, 32 + half_x), (24 + half_y, 32 + half_x), (24 + half_y, 32 - half_x)])  # fmt: skip
-    return ScreenPattern(pattern, warp, LIGHT.scaled(0.01), LIGHT)
+    return ScreenPattern(pattern, warp, LIGHT.scale(0.01), LIGHT)
 
 
 def _edge(scale: float) -> Scene:
     """An edge of 8 degrees, 5 px off the frame's middle, as the same magnification leaves it."""
-    return KnifeEdge((EdgeRegion((0, 0, 49, 65), 8.0, 5.0 * scale),), LIGHT.scaled(0.01), LIGHT)
+    return KnifeEdge((EdgeRegion((0, 0, 49, 65), 8.0, 5.0 * scale),), LIGHT.scale(0.01), LIGHT)
 
 
 @pytest.mark.parametrize(("scene", "rms"), [(_screen, 3e-3), (_edge, 1e-6)])

@@ -15,7 +15,7 @@ from sim.effects.inter_pixel_capacitance import InterPixelCapacitance
 from sim.frame import Exposure
 from sim.optics.diffraction import aperture_otf, diffraction_otf
 from sim.optics.illumination import relative_illumination
-from sim.point import common_wavelengths, edge_profile, kernel, mixed, optical_transfer, wavelength_shares
+from sim.point import common_wavelengths, edge_profile, kernel, mix_channels, optical_transfer, wavelength_shares
 from sim.scene import (
     ScreenPattern,
     Warp,
@@ -111,7 +111,7 @@ def test_a_coarse_kernel_convolves_pixel_aligned_cells(mono_camera: CameraModel,
     cell[20, 20] = 1
     at = np.array([(-0.5, -0.5), (-0.5, 40.5), (40.5, 40.5), (40.5, -0.5)]) + np.array([15.0, 27.0])
     camera = mono_camera.model_copy(update={"dark_current_e_per_s": 0.0})
-    scene = ScreenPattern(cell, Warp.from_corners(41, 41, at), lamp.scaled(0.0), lamp)
+    scene = ScreenPattern(cell, Warp.from_corners(41, 41, at), lamp.scale(0.0), lamp)
     frame = sim_frame.expected_electrons(camera, Exposure(scene, 1.0), (Shift(x_um=1.5, y_um=0.0),), oversample=8)
     frame /= electron_rate(camera, "Y", lamp) * relative_illumination(camera, 35.0, 47.0)
     wanted = kernel(camera, "Y", lamp, 33, 1, (Shift(x_um=1.5, y_um=0.0),))
@@ -156,7 +156,7 @@ def test_charge_brings_the_transfer_of_neighbours_of_other_colours(colour_camera
             for part, phase in ((amplitude, wave), (level, np.ones_like(level)))
         )
     wanted = [(amplitude[channel == i].mean() / level[channel == i].mean()) for i in range(3)]
-    got = mixed(camera, transfers[:, None], signals, np.array([fx]), np.array([fy]), effects)[:, 0]
+    got = mix_channels(camera, transfers[:, None], signals, np.array([fx]), np.array([fy]), effects)[:, 0]
     assert np.allclose(got, wanted, rtol=0, atol=1e-12)
 
 

@@ -41,11 +41,9 @@ def _scenes(lamp: Spectrum) -> list[Scene]:
     cube = np.random.default_rng(1).random((72, 96, 16)) * lamp.at(wavelength_nm)
     return [
         UniformField(lamp),
-        KnifeEdge((EdgeRegion((10, 10, 60, 80), 5.0),), lamp.scaled(0.02), lamp),
+        KnifeEdge((EdgeRegion((10, 10, 60, 80), 5.0),), lamp.scale(0.02), lamp),
         ReflectanceChart(((8.0, 10.0), (9.0, 88.0), (64.0, 86.0), (62.0, 8.0)), lamp),
-        ScreenPattern(
-            pattern, Warp.from_corners(24, 20, [(5, 8), (6, 90), (66, 88), (64, 6)]), lamp.scaled(0.02), lamp
-        ),
+        ScreenPattern(pattern, Warp.from_corners(24, 20, [(5, 8), (6, 90), (66, 88), (64, 6)]), lamp.scale(0.02), lamp),
         SpectralImage(wavelength_nm, cube),
     ]
 
@@ -122,7 +120,7 @@ def test_distortion_moves_light_unless_the_scene_is_placed_in_the_image(
     spot[4, 4] = 1
     col = 47.5 + 38.0
     warp = Warp.from_corners(9, 9, [(35.5 - 9, col - 9), (35.5 - 9, col + 9), (35.5 + 9, col + 9), (35.5 + 9, col - 9)])
-    scene = ScreenPattern(spot, warp, lamp.scaled(0.0), lamp)
+    scene = ScreenPattern(spot, warp, lamp.scale(0.0), lamp)
     at = {}
     for placed in ("ideal", "image"):
         frame = expected_electrons(camera, Exposure(scene, 0.1, placed=placed))
@@ -169,8 +167,8 @@ def test_light_that_no_channel_sees_is_named(colour_camera: CameraModel, lamp: S
     infrared = SpectralImage((900.0, 950.0), np.ones((72, 96, 2)))
     with pytest.raises(ValueError, match="outside the limits"):
         expected_electrons(colour_camera, Exposure(infrared, 0.1))
-    dark = lamp.scaled(0.0)
-    assert sim_frame.expected(colour_camera, Exposure(UniformField(dark), 0.1)).max() < 250.0
+    dark = lamp.scale(0.0)
+    assert sim_frame.predict_frame(colour_camera, Exposure(UniformField(dark), 0.1)).max() < 250.0
 
 
 def test_an_exposure_that_saturates_everything_is_named(colour_camera: CameraModel, lamp: Spectrum) -> None:

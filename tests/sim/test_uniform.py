@@ -13,7 +13,7 @@ from sim.effects import library
 from sim.effects.ambient_light import AmbientLight
 from sim.effects.base import Effect
 from sim.effects.exposure_offset import ExposureOffset
-from sim.frame import Exposure, expected
+from sim.frame import Exposure, predict_frame
 from sim.optics.illumination import irradiance_factor
 from sim.point import edge_profile, kernel
 from sim.scene import (
@@ -42,7 +42,7 @@ def test_a_laser_line_gives_the_closed_form(mono_camera: CameraModel) -> None:
 
 def test_electrons_are_linear_in_light_and_follow_the_aperture(colour_camera: CameraModel, lamp: Spectrum) -> None:
     rate = electron_rate(colour_camera, "G", lamp)
-    assert electron_rate(colour_camera, "G", lamp.scaled(3.0)) == pytest.approx(3 * rate, rel=1e-12)
+    assert electron_rate(colour_camera, "G", lamp.scale(3.0)) == pytest.approx(3 * rate, rel=1e-12)
     slow = colour_camera.model_copy(update={"lens": Lens(f_number=8.0, focal_length_mm=8.0, transmittance=0.45)})
     assert electron_rate(slow, "G", lamp) == pytest.approx(rate / 2 * (1 + 4 * 16) / (1 + 4 * 64), rel=1e-12)
     half = Spectrum.of([300.0, 800.0], [0.5, 0.5])
@@ -63,7 +63,7 @@ class Broken(Local):
     name: ClassVar[str] = "test_broken"
 
     def on_light(self, light: Light) -> Light:
-        return light.adding(
+        return light.add_laws(
             spectrum=lambda wavelength_nm, radiance, kind: np.where(wavelength_nm == 550.0, np.nan, radiance)
         )
 
@@ -74,7 +74,7 @@ def test_impossible_radiance_is_named(colour_camera: CameraModel, lamp: Spectrum
     with pytest.raises(ValueError, match=message.format("-1e-05")):
         electron_rate(colour_camera, "G", light)
     with pytest.raises(ValueError, match=message.format("-1e-05")):
-        expected(colour_camera, Exposure(UniformField(light), 0.01))
+        predict_frame(colour_camera, Exposure(UniformField(light), 0.01))
     with pytest.raises(ValueError, match=message.format("nan")):
         electron_rate(colour_camera, "G", lamp, (Broken(),))
 
@@ -91,7 +91,7 @@ def test_other_impossible_input_is_named(colour_camera: CameraModel, lamp: Spect
     with pytest.raises(ValueError, match="support 4 of the kernel has to be odd"):
         kernel(colour_camera, "G", lamp, 4)
     with pytest.raises(ValueError, match="give at least one edge region"):
-        expected(colour_camera, Exposure(KnifeEdge((), lamp, lamp), 0.01))
+        predict_frame(colour_camera, Exposure(KnifeEdge((), lamp, lamp), 0.01))
 
 
 # --- the entries agree -------------------------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ def test_a_flat_frame_has_the_mean_of_the_uniform_entry(
     camera = colour_camera.model_copy(update={"dark_current_e_per_s": 0.0})
     exposure = Exposure(UniformField(lamp), 0.02, elapsed_s=300.0)
     for one in kind.prototypes(camera)[0]:
-        frame = expected(camera, exposure, (one,)) - camera.black_level_dn
+        frame = predict_frame(camera, exposure, (one,)) - camera.black_level_dn
         for channel, mean_dn in _means_dn(camera, lamp, exposure, (one,)).items():
             step = mosaic.step(camera.cfa)
             planes = [frame[row::step, col::step] for row, col in mosaic.phases(camera.cfa)[channel]]
@@ -139,10 +139,10 @@ def test_a_flat_frame_has_the_mean_of_the_uniform_entry(
 def test_light_of_the_room_is_collected_while_the_shutter_is_open(colour_camera: CameraModel, lamp: Spectrum) -> None:
     """An exposure that is 2 ms too long collects light of the room 2 ms longer, too, in every entry."""
     acting = (AmbientLight(rate_e_per_s=5e4), ExposureOffset(offset_us=2000.0))
-    dark = lamp.scaled(0.0)
+    dark = lamp.scale(0.0)
     camera = colour_camera.model_copy(update={"dark_current_e_per_s": 0.0})
     assert Uniform(camera, acting).ambient_e("G", 0.010) == pytest.approx(5e4 * 0.012)
-    frame = expected(camera, Exposure(UniformField(dark), 0.010), acting) - camera.black_level_dn
+    frame = predict_frame(camera, Exposure(UniformField(dark), 0.010), acting) - camera.black_level_dn
     wanted = _means_dn(camera, dark, Exposure(UniformField(dark), 0.010), acting)["G"]
     assert wanted == pytest.approx(camera.conversion_gain_dn_per_e * 5e4 * 0.012)
     row, col = mosaic.phases(camera.cfa)["G"][0]

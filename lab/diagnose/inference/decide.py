@@ -254,7 +254,7 @@ def _with_every_mode(
     modes = [effect]
     if len(signed) > 1:
         total = float(np.sqrt(np.sum(np.square(list(signed.values())))))
-        alone = [effect.having(**{n: total if n == name else 0.0 for n in signed}) for name in signed]
+        alone = [effect.replace_fields(**{n: total if n == name else 0.0 for n in signed}) for name in signed]
         for fit in (refit(model, (*others, start), policy) for start in alone):
             place = np.array([[getattr(one, n) for n in signed] for one in (fit.effects[-1], *modes)], float)
             unsigned_distance = np.minimum(
@@ -262,7 +262,7 @@ def _with_every_mode(
             )
             if np.all(unsigned_distance > SAME_MODE * total) and fit.log_likelihood >= least:
                 modes.append(fit.effects[-1])
-    turned = effect.having(**{n: -v for n, v in signed.items()})
+    turned = effect.replace_fields(**{n: -v for n, v in signed.items()})
     is_unsigned = log_likelihood(model, (*others, turned), policy) >= least
     if is_unsigned and max(signed.values(), key=abs) < 0.0:
         effect, candidate = turned, replace(candidate, effect=turned)

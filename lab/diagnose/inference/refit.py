@@ -128,7 +128,7 @@ def moved(effects: Effects, coords: Sequence[Coordinate], u: FloatArray) -> tupl
     values: list[dict[str, float]] = [{} for _ in effects]
     for c, at in zip(coords, u, strict=True):
         values[c.index][c.name] = c.to_value(float(at))
-    return tuple(e.having(**v) for e, v in zip(effects, values, strict=True))
+    return tuple(e.replace_fields(**v) for e, v in zip(effects, values, strict=True))
 
 
 def log_likelihood(model: MeasurementModel, effects: Effects, policy: DecisionPolicy) -> float:
@@ -431,7 +431,7 @@ def _usual_log_odds(effect: Effect, std: dict[str, float | None]) -> float:
         value, low, high = float(getattr(effect, name)), quantities[name].lower, quantities[name].upper
         around = (value - (width or 0.0), value, value + (width or 0.0))
         near.append([min(max(v, -np.inf if low is None else low), np.inf if high is None else high) for v in around])
-    return max(effect.having(**dict(zip(std, v, strict=True))).log_prior() for v in product(*near))
+    return max(effect.replace_fields(**dict(zip(std, v, strict=True))).log_prior() for v in product(*near))
 
 
 def _difference_step(coordinate: Coordinate, at: float, typical: float, high: float) -> float:

@@ -230,4 +230,4 @@ def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: Float
         if quantity.lower is not None:
             lowest = absent + INSIDE_BOUND * (quantity.lower - absent) if quantity.lower < absent else quantity.lower
             values[name] = max(values[name], lowest)
-    return likeliest.having(**values)
+    return likeliest.replace_fields(**values)

@@ -15,7 +15,7 @@ from lab.diagnose.inference.refit import Fit, log_likelihood
 from lab.diagnose.inference.search import Search
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
-from sim.effects.library import changed_by
+from sim.effects.library import list_changes
 from sim.effects.other_f_number import OtherFNumber
 from sim.point import TRANSFER
 
@@ -190,7 +190,7 @@ def _misstated_metadata(search: Search, fit: Fit, index: int) -> tuple[float, st
     that blurs; and that in words. -inf for effects that don't blur, and where the fitted ratio is below
     `misstated_ratio`."""
     model, policy, effect = search.model, search.policy, fit.effects[index]
-    if TRANSFER.isdisjoint(changed_by(effect)):
+    if TRANSFER.isdisjoint(list_changes(effect)):
         return -np.inf, ""
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
     starts = [(*rest, OtherFNumber(ratio=ratio)) for ratio in F_NUMBER_RATIOS]

@@ -225,7 +225,7 @@ def _mixing(study: Study, points: list[Patch], electrons: FloatArray, model: Uni
         by_patch.setdefault((p.captures[0].id, p.name), {})[p.channel] = i
     for members in by_patch.values():
         if len(members) == len(study.channels):
-            mixed = model.mixing({c: float(electrons[i]) for c, i in members.items()})
+            mixed = model.mixing_factors({c: float(electrons[i]) for c, i in members.items()})
             for c, i in members.items():
                 factor[i] = mixed.get(c, 1.0)
     return factor

@@ -13,7 +13,7 @@ from lab.diagnose.measurements.temporal_noise import PAIRS, dark_repeats, flat_r
 from lab.errors import NotDetermined
 from sim.camera import Cfa
 from sim.sensor import mosaic
-from sim.sensor.electrons import passed_on
+from sim.sensor.electrons import solve_passed_share
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -53,7 +53,7 @@ def neighbour_block(study: Study) -> Block:
                     camera.cfa,
                     list(r.signal),
                     np.maximum(model.shot_e2(electrons), 0.0),
-                    passed_on(model.shared(electrons)),
+                    solve_passed_share(model.neighbour_correlation(electrons)),
                     read,
                     1.0 / 12.0 / gain**2,
                     kernel,

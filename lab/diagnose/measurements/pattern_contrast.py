@@ -10,7 +10,7 @@ from lab.diagnose.measurements.pattern_fit import EVEN_TERMS, Pattern, even_powe
 from lab.diagnose.measurements.reads import SHOWN
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from sim.point import TRANSFER_AT, common_wavelengths, detected_transfer, mixed, mixes_colours, transfer_at
+from sim.point import TRANSFER_AT, common_wavelengths, detected_transfer, mix_channels, mixes_colours, transfer_at
 from sim.spectrum import FloatArray
 from sim.uniform import electron_rate
 
@@ -96,7 +96,7 @@ def _transfers(
     if not mixing:
         return found
     rates = [1.0 if first.light is None else max(electron_rate(camera, c, first.light), 0.0) for c in channels]
-    return mixed(camera, found, np.array(rates), fx, fy, effects)[[channels.index(c) for c in sights]]
+    return mix_channels(camera, found, np.array(rates), fx, fy, effects)[[channels.index(c) for c in sights]]
 
 
 def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lab.diagnose.measurements.block import Effects
 from sim.effects.base import Effect
-from sim.effects.library import changed_by
+from sim.effects.library import list_changes
 
 #: Image lag.
 LAG = frozenset({"charge.lag"})
@@ -23,4 +23,4 @@ SHIFT = frozenset({"image.shift"})
 
 def acting(effects: Effects, reads: frozenset[str]) -> tuple[Effect, ...]:
     """The effects that change any of the quantities `reads`."""
-    return tuple(effect for effect in effects if not reads.isdisjoint(changed_by(effect)))
+    return tuple(effect for effect in effects if not reads.isdisjoint(list_changes(effect)))

@@ -41,7 +41,7 @@ from sim.point import (
     common_wavelengths,
     detected_transfer,
     halos,
-    mixed,
+    mix_channels,
     transfer_at,
     varies_over_field,
     wavelength_shares,
@@ -331,7 +331,7 @@ class _Edges:
         count = len(self._camera.channels)
         parts = [slice(first, first + count) for first in range(0, len(otf), count)]
         rates = np.array([max(self._rate(k), 0.0) for k in range(len(otf))])
-        return np.concatenate([mixed(self._camera, otf[p], rates[p], *self._frequencies, moving) for p in parts])
+        return np.concatenate([mix_channels(self._camera, otf[p], rates[p], *self._frequencies, moving) for p in parts])
 
     def _rate(self, sight: int) -> float:
         """Electrons a second of a sight; 1 where its light isn't stated."""
@@ -416,7 +416,7 @@ class _Edges:
     def _shade(self, edge: int, distance: FloatArray, effects: Effects) -> FloatArray:
         """Illumination (distances,) over that at the edge, averaged along the edge, with effects."""
         x_um, y_um, light, fit = self._lighting[edge]
-        terms = fit @ Uniform(self._camera, effects).illuminated(light, x_um, y_um)
+        terms = fit @ Uniform(self._camera, effects).shade_light(light, x_um, y_um)
         reach = self.edges[edge].measured.geometry.reach_px
         return np.asarray(polynomial.polyval(np.clip(distance, -reach, reach) / UNEVEN_PX, terms / terms[0]))
 

@@ -26,7 +26,7 @@ from lab.fit.geometry.board_detection import BoardView
 from lab.predict.camera_model import camera_model
 from sim.camera import Side
 from sim.effects.veiling_glare import VeilingGlare
-from sim.frame import right_over_left
+from sim.frame import pair_gain_factor
 from sim.optics.illumination import relative_illumination
 from sim.point import even_share
 from sim.sensor import mosaic
@@ -123,7 +123,7 @@ def scene_gain_block(study: Study) -> Block:
     glare, glare_std = _glare(study, "left")
 
     def predict(effects: Effects) -> Prediction:
-        gain = np.log(max(right_over_left(study.camera, effects), 1e-6))
+        gain = np.log(max(pair_gain_factor(study.camera, effects), 1e-6))
         scattered = even_share(study.camera, effects) * right_lift
         jacobian = {"stereo_gain:glare of the left camera": -glare_std * left_lift}
         jacobian |= _row_light(Uniform(study.camera, effects), study.camera.rows, scenes, exposures)

@@ -196,8 +196,8 @@ def _family_statement(
             told.append(f"Of the listed laws: {', '.join(names)}.")
         if corrections:
             told.append(f"What it leaves is in the improved model: {'; '.join(corrections)}.")
-    if len(names) > 1 and family.told_apart_by:
-        told.append(f"What tells them apart: {family.told_apart_by}.")
+    if len(names) > 1 and family.separating_capture:
+        told.append(f"What tells them apart: {family.separating_capture}.")
     return " ".join(told)
 
 

@@ -25,7 +25,7 @@ from lab.pipeline import CaptureRequest, PipelineRequest, _Pipeline
 from sim.camera import CameraModel
 from sim.effects.library import effect
 from sim.optics.imaging import MeasuredPsf
-from sim.parameters import declared
+from sim.parameters import read_quantities
 from tests.api.conftest import Running, until_state
 from tests.lab.calibration.test_life import fitted
 
@@ -62,7 +62,7 @@ def test_a_fit_over_the_network_keeps_its_cameras(
         assert (noise.value, noise.std) == (2.0, fitted(2.0).cameras["left"].noise.read_noise_e_std)  # type: ignore[union-attr]
         for one in left.parameters:
             if not one.name.startswith("lens."):
-                assert one.unit == declared(CameraModel)[one.name].unit
+                assert one.unit == read_quantities(CameraModel)[one.name].unit
         archive = client.fetch_camera_model(listed.id, tmp_path / "cameras.zip")
         with zipfile.ZipFile(archive) as packed:
             packed.extractall(tmp_path / "cameras")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from lab.diagnose.effect_list import effect_list
 from sim.camera import CameraModel
-from sim.parameters import declared
+from sim.parameters import read_quantities
 from tests.api.conftest import Running
 
 
 def test_parameters_are_those_of_the_camera_model(shared: Running) -> None:
     with shared.client("read") as client:
         told = {one["name"]: one for one in client.get("/api/v1/parameters").json()}
-    for name, quantity in declared(CameraModel).items():
+    for name, quantity in read_quantities(CameraModel).items():
         assert told[name]["unit"] == quantity.unit and told[name]["meaning"] == quantity.meaning
         assert told[name]["lower"] == quantity.lower and told[name]["upper"] == quantity.upper
     assert told["lens.f_number"]["unit"] == "1"

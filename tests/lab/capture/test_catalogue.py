@@ -25,7 +25,7 @@ from lab.capture.tables import StepRow
 from lab.capture_kinds.base import SEQUENCES
 from lab.capture_kinds.dark import DarkSequence
 from lab.errors import InputError
-from sim.parameters import declared
+from sim.parameters import read_quantities
 from tests.lab import fake_bench
 
 STATION = fake_bench.station()
@@ -35,9 +35,9 @@ DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
 def test_every_sequence_is_listed_with_what_it_declares() -> None:
     for told, kind in zip(catalogue(), SEQUENCES.values(), strict=True):
         assert told == described(kind.name) and told.purpose and told.capture_kinds
-        assert [one.name for one in told.parameters] == list(declared(kind))
+        assert [one.name for one in told.parameters] == list(read_quantities(kind))
         for one in told.parameters:
-            quantity = declared(kind)[one.name]
+            quantity = read_quantities(kind)[one.name]
             assert (one.unit, one.lower, one.upper) == (quantity.unit, quantity.lower, quantity.upper)
     assert {one.name for told in catalogue() for one in told.parameters if one.several} == {"exposures_s", "levels"}
     with pytest.raises(InputError, match="no sequence 'magic'; there are dark"):

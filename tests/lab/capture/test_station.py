@@ -61,8 +61,8 @@ def test_everything_is_where_the_file_says(tmp_path: Path) -> None:
     assert station.monochromator.settings == {"move_timeout_s": 12.0}
     assert station.display is None
     assert station.one(CapTarget) == "cap"
-    assert list(station.having(BoardTarget)) == ["charuco-01"]
-    assert station.having(EdgeTarget)["edge-1"].right is None
+    assert list(station.list_targets(BoardTarget)) == ["charuco-01"]
+    assert station.list_targets(EdgeTarget)["edge-1"].right is None
 
 
 def test_curves_are_taken_inline_and_from_files(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ class WedgeSequence(Sequence):
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
         name = station.one(WedgeTarget)
-        wedge = station.having(WedgeTarget)[name]
+        wedge = station.list_targets(WedgeTarget)[name]
         lit = Setting(target=name, wavelength_nm=0.0)
         found = exposure_step("wedge", "step wedge", lit, 0.7)
         taken = [

@@ -19,7 +19,7 @@ from sim.camera import CameraModel, Geometry, Lens
 from sim.effects.library import effect
 from sim.optics.imaging import MeasuredOtf, MeasuredPsf, TracedLens, ZernikePupil
 from sim.optics.table import LensTable
-from sim.parameters import declared
+from sim.parameters import read_quantities
 
 LENSES = Path(__file__).parents[3].parent / "shared" / "data" / "lenses"
 
@@ -45,7 +45,7 @@ def _files() -> list[CameraFile]:
         update={
             "geometry": Geometry(camera_matrix=((2318.8, 0.0, 640.1), (0.0, 2318.8, 479.7), (0.0, 0.0, 1.0)), distortion=(-0.1, 0.02, 1e-4, 0.0, 0.0)),
             "std": {"read_noise_e": 0.1, "full_well_e": 12.3},
-            "quantum_efficiency_std": {"R": default_camera().camera.quantum_efficiency["R"].scaled(0.01)},
+            "quantum_efficiency_std": {"R": default_camera().camera.quantum_efficiency["R"].scale(0.01)},
             "dark_current_doubling_c": None,
         }
     )  # fmt: skip
@@ -93,7 +93,7 @@ def test_every_parameter_has_its_unit_and_meaning_beside_it(tmp_path: Path) -> N
     write_camera(file, default_camera())
     text = file.read_text()
     for model in (CameraModel, Lens):
-        for key, quantity in declared(model).items():
+        for key, quantity in read_quantities(model).items():
             assert any(line.startswith((f"{key} = ", f"# {key} ")) and line.endswith(f"# {said_of(quantity)}") for line in text.splitlines())  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from lab.formats.recording_set import load_frame
 from lab.predict.simulate import SimulateOptions, automatic_exposure_s, preview, simulate
 from sim.camera import CameraModel, Cfa, Geometry, Lens
 from sim.optics.imaging import MeasuredOtf, MeasuredPsf, TracedLens, ZernikePupil
-from sim.parameters import Quantity, declared
+from sim.parameters import Quantity, read_quantities
 from sim.scene.catalogue import SCENES, NamedScene
 from sim.sensor.electrons import capacity_e
 from sim.spectrum import Spectrum
@@ -228,7 +228,7 @@ def test_the_documentation_is_what_the_declarations_say() -> None:
     text = (pages / "camera-file.md").read_text(encoding="utf-8")
     lines = text.splitlines()
     for model in (CameraModel, Lens):
-        for key, quantity in declared(model).items():
+        for key, quantity in read_quantities(model).items():
             assert parameter_row(key, quantity) in lines
     for model in (CameraModel, Lens, ZernikePupil, MeasuredPsf, MeasuredOtf):
         for key in model.model_fields:

@@ -15,12 +15,12 @@ from sim.effects.library import effect, effects, may_change
 from sim.frame import (
     Exposure,
     collected_mosaic,
-    expected,
     expected_electrons,
     expected_sequence,
+    pair_gain_factor,
+    predict_frame,
     read_out,
     right_delay_s,
-    right_over_left,
     screen_light,
     with_reflections,
 )
@@ -80,14 +80,14 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
         for c in "RGB"
         for light, kind in ((LIGHT, "flat"), (LINE, "narrowband"), (RED_LINE, "narrowband"))
     ]
-    frame = expected(CAMERA, Exposure(UniformField(LIGHT), 0.01), acting)
+    frame = predict_frame(CAMERA, Exposure(UniformField(LIGHT), 0.01), acting)
     place = np.linspace(-40.0, 40.0, 5)
     one = Uniform(CAMERA, acting)
     moved = displaced_um(CAMERA, place, 0.5 * place, 620.0, acting)
     rest = [one.source(600.0), one.collected_s(0.02), one.ambient_e("G", 1.0) / 1e3, one.offset_dn(600.0, 30.0),
             float(one.shot_e2(np.array(9e3))), even_share(CAMERA, acting), sum(h[0] for h in halos(CAMERA, acting)),
             1e3 * one.unsteadiness**2,
-            *one.illuminated(np.ones(5), place, place), *np.ravel(np.zeros(10) if moved is None else moved)]  # fmt: skip
+            *one.shade_light(np.ones(5), place, place), *np.ravel(np.zeros(10) if moved is None else moved)]  # fmt: skip
     # what acts on dark pixels, on the frame after, and on the read-out, in electrons or DN
     dark = Exposure(Darkness(), 0.5, temperature_c=32.0)
     after = list(expected_sequence(CAMERA, [Exposure(UniformField(LIGHT), 0.004), dark], acting))
@@ -98,10 +98,10 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     shared = np.zeros(41) if out.neighbours is None else np.broadcast_to(out.neighbours(levels), 41)
     asked = np.tile(np.linspace(0.0, 1.0, 5), (5, 1))
     shown = with_reflections(CAMERA, screen_light(CAMERA, asked, place[None, :], 0.5 * place[:, None], acting), acting)
-    pair = [right_over_left(CAMERA, acting), right_delay_s(CAMERA, acting)]
+    pair = [pair_gain_factor(CAMERA, acting), right_delay_s(CAMERA, acting)]
     full = np.zeros((7, 3))
     full[3, 1] = 2.0 * CAMERA.full_well_e
-    full = charge_of(CAMERA, acting).overflown(full)
+    full = charge_of(CAMERA, acting).overflow_wells(full)
     return np.concatenate(
         [
             np.real(np.concatenate(otf)),
@@ -419,7 +419,7 @@ def _centres(
     camera: CameraModel, points: np.ndarray, line: Spectrum, acting: tuple[Effect, ...], around: np.ndarray
 ) -> np.ndarray:
     """Centroids [row, col] of small dots, over 3 x 3 px `around` places, in a frame without mosaic or fall-off."""
-    dots = PointArray(tuple(map(tuple, points.tolist())), 1.5, line.scaled(0.0), line)
+    dots = PointArray(tuple(map(tuple, points.tolist())), 1.5, line.scale(0.0), line)
     frame = expected_electrons(camera, Exposure(dots, 1.0), acting, oversample=6, margin_px=16)
     row, col = np.indices(frame.shape)
     frame = frame / relative_illumination(camera, row, col)
@@ -467,13 +467,13 @@ def test_a_uniform_field_stays_uniform_where_light_is_moved() -> None:
     for name in ("lateral_chromatic_aberration", "distortion", "decentre"):
         one = effect(name)(**dict.fromkeys(effect(name).quantities(), 5.0))
         scene = Exposure(UniformField(LIGHT), 0.01)
-        np.testing.assert_array_equal(expected(CAMERA, scene, (one,)), expected(CAMERA, scene))
+        np.testing.assert_array_equal(predict_frame(CAMERA, scene, (one,)), predict_frame(CAMERA, scene))
 
 
 def test_lateral_colour_moves_an_edge_as_it_moves_a_dot() -> None:
     """A vertical edge 12 px right of the axis, seen in red: the edge's profile is moved by the law at the edge's middle."""
     one = effect("lateral_chromatic_aberration")(slope_um=3.0)
-    edge = KnifeEdge((EdgeRegion((4, 24, 20, 31), 0.0),), LIGHT.scaled(0.1), LIGHT)
+    edge = KnifeEdge((EdgeRegion((4, 24, 20, 31), 0.0),), LIGHT.scale(0.1), LIGHT)
     camera = CAMERA.model_copy(update={"cfa": "MONO", "quantum_efficiency": {"Y": LINE_650}})
     plain, moved = (expected_electrons(camera, Exposure(edge, 1.0), acting) for acting in ((), (one,)))
     plain, moved = (f / relative_illumination(camera, *np.indices(f.shape)) for f in (plain, moved))
@@ -489,7 +489,7 @@ def test_a_pinholes_scene_is_distorted_as_the_geometry_says() -> None:
     geometry = Geometry(camera_matrix=matrix, distortion=(-0.1, 0.01, 2e-3, -1e-3))
     camera = CAMERA.model_copy(update={"rows": 72, "cols": 96, "cfa": "MONO", "quantum_efficiency": {"Y": LINE_650}})
     texture = (np.indices((14, 18)).sum(axis=0) % 2).astype(np.uint8)
-    board = PlanarTarget(texture, 10.0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (-90.0, -70.0, 100.0), Geometry(camera_matrix=matrix), LIGHT.scaled(0.1), LIGHT)  # fmt: skip
+    board = PlanarTarget(texture, 10.0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (-90.0, -70.0, 100.0), Geometry(camera_matrix=matrix), LIGHT.scale(0.1), LIGHT)  # fmt: skip
     lens = Lens(f_number=4.0, focal_length_mm=8.0)
     camera = camera.model_copy(update={"lens": lens})
     seen = expected_electrons(camera, Exposure(replace(board, geometry=geometry), 1.0))
@@ -500,7 +500,7 @@ def test_a_pinholes_scene_is_distorted_as_the_geometry_says() -> None:
 
 
 def test_distortion_that_folds_the_image_is_refused() -> None:
-    board = Exposure(PointArray(((5.0, 5.0),), 1.0, LIGHT.scaled(0.1), LIGHT), 1.0)
+    board = Exposure(PointArray(((5.0, 5.0),), 1.0, LIGHT.scale(0.1), LIGHT), 1.0)
     folded = Geometry(camera_matrix=((10.0, 0.0, 15.5), (0.0, 10.0, 11.5), (0.0, 0.0, 1.0)), distortion=(-0.5,))
     with pytest.raises(ValueError, match="folds the image"):
         expected_electrons(CAMERA, board, (effect("distortion")(geometry=folded),))
@@ -510,7 +510,7 @@ def test_distortion_bends_an_edge() -> None:
     """A vertical edge 19.5 px right of the axis: at the frame's ends it lies further out than in the middle, by the law."""
     one = effect("distortion")(corner_percent=5.0)
     camera = CAMERA.model_copy(update={"rows": 96, "cols": 96, "cfa": "MONO", "quantum_efficiency": {"Y": LINE_650}})
-    edge = KnifeEdge((EdgeRegion((0, 60, 96, 75), 0.0),), LIGHT.scaled(0.1), LIGHT)
+    edge = KnifeEdge((EdgeRegion((0, 60, 96, 75), 0.0),), LIGHT.scale(0.1), LIGHT)
     frames = [expected_electrons(camera, Exposure(edge, 1.0), acting) for acting in ((), (one,))]
     plain, moved = (f / relative_illumination(camera, *np.indices(f.shape)) for f in frames)
     contrast = plain[48, 90] - plain[48, 40]

@@ -36,7 +36,7 @@ PLACE = np.linspace(-HALF_UM, HALF_UM, 9)
 
 
 def _light(one: Effect, x_um: np.ndarray, y_um: np.ndarray) -> np.ndarray:
-    return Uniform(CAMERA, (one,)).illuminated(np.ones(np.shape(x_um)), x_um, y_um)
+    return Uniform(CAMERA, (one,)).shade_light(np.ones(np.shape(x_um)), x_um, y_um)
 
 
 def test_vignetting_takes_its_share_in_the_corner_whatever_its_power() -> None:

@@ -24,10 +24,10 @@ from sim.frame import (
     Exposure,
     collected_mosaic,
     dark_electrons,
-    expected,
     expected_electrons,
     expected_sequence,
     moments,
+    predict_frame,
     sample,
     sample_sequence,
 )
@@ -88,11 +88,11 @@ def test_row_noise_is_shared_along_rows_only() -> None:
 
 def test_column_offsets_stay_and_have_no_mean() -> None:
     one = ColumnNoise(offset_e=6.0)
-    offset = (expected(CAMERA, DARK, (one,)) - expected(CAMERA, DARK))[0] / 0.5
-    assert np.ptp(expected(CAMERA, DARK, (one,)) - expected(CAMERA, DARK), axis=0).max() < 1e-9
+    offset = (predict_frame(CAMERA, DARK, (one,)) - predict_frame(CAMERA, DARK))[0] / 0.5
+    assert np.ptp(predict_frame(CAMERA, DARK, (one,)) - predict_frame(CAMERA, DARK), axis=0).max() < 1e-9
     assert offset.mean() == pytest.approx(0.0, abs=1e-3)
     assert offset.std() == pytest.approx(6.0, rel=4.5 / np.sqrt(2 * 64))
-    bright = expected(CAMERA, BRIGHT, (one,)) - expected(CAMERA, BRIGHT)
+    bright = predict_frame(CAMERA, BRIGHT, (one,)) - predict_frame(CAMERA, BRIGHT)
     np.testing.assert_allclose(bright[0] / 0.5, offset, atol=1e-2)  # the dark frame's noise rounds to 1e-2
     (drawn,), (other,) = (signal_of(CAMERA, (e,)).lines for e in (one, ColumnNoise(offset_e=6.0, pattern_seed=1)))
     assert np.any(drawn.mean_e((48, 64)) != other.mean_e((48, 64)))
@@ -159,7 +159,7 @@ def test_lag_leaves_powers_of_its_share_and_loses_nothing() -> None:
 
 def test_lag_keeps_to_the_full_well() -> None:
     """What overflows isn't left behind."""
-    flood = Exposure(UniformField(LIGHT.scaled(100.0)), 1.0)
+    flood = Exposure(UniformField(LIGHT.scale(100.0)), 1.0)
     _, after = expected_sequence(CAMERA, [flood, DARK], (ImageLag(lag_percent=2.0),))
     assert after[0, 0] == pytest.approx((5.0 + 0.02 * 7500.0) * 0.98)
 
@@ -197,17 +197,17 @@ def test_full_pixels_lose_to_empty_ones_and_none_is_lost() -> None:
     frame = np.zeros((9, 9))
     frame[4, 4] = CAMERA.full_well_e
     state = charge_of(CAMERA, (BrighterFatter(exchanged_percent=2.0),))
-    after = state.moved(frame)
+    after = state.move_charge(frame)
     assert after[4, 4] == pytest.approx(0.98 * CAMERA.full_well_e)
     assert after[4, 5] == pytest.approx(0.005 * CAMERA.full_well_e)
     assert after.sum() == pytest.approx(CAMERA.full_well_e)
-    np.testing.assert_array_equal(state.moved(np.full((5, 5), 4e3)), np.full((5, 5), 4e3))
+    np.testing.assert_array_equal(state.move_charge(np.full((5, 5), 4e3)), np.full((5, 5), 4e3))
 
 
 def test_a_ripple_lifts_and_lowers_codes_in_turn() -> None:
     law = codes_of(CAMERA, (AdcRipple(sine_dn=3.0, cosine_dn=4.0, period_dn=512.0),))
     dn = np.array([0.0, 128.0, 256.0, 512.0])
-    np.testing.assert_allclose(law.converted(dn) - dn, [4.0, 3.0, -4.0, 4.0], atol=1e-12)
+    np.testing.assert_allclose(law.convert(dn) - dn, [4.0, 3.0, -4.0, 4.0], atol=1e-12)
 
 
 def test_the_converters_bits_jump_where_they_stand() -> None:
@@ -231,7 +231,7 @@ def test_blooming_conserves_charge_and_keeps_to_the_column(at: tuple[int, int]) 
     full = CAMERA.full_well_e
     before = np.full((48, 64), 500.0)
     before[at] = 6.0 * full
-    after = charge_of(CAMERA, (Blooming(share_percent=60.0),)).overflown(before)
+    after = charge_of(CAMERA, (Blooming(share_percent=60.0),)).overflow_wells(before)
     assert after.sum() == pytest.approx(before.sum(), rel=1e-12)  # none reaches the rim
     changed = after != before
     assert set(np.flatnonzero(changed.any(axis=0))) == {at[1]}
@@ -247,12 +247,12 @@ def test_blooming_of_neighbours_adds_up_and_runs_off_the_frame() -> None:
     full = CAMERA.full_well_e
     before = np.zeros((10, 2))
     before[0, 0], before[1, 0] = 3.0 * full, 2.0 * full
-    after = charge_of(CAMERA, (Blooming(share_percent=100.0),)).overflown(before)
+    after = charge_of(CAMERA, (Blooming(share_percent=100.0),)).overflow_wells(before)
     # downwards 1 + 0.5 full wells; upwards from row 1 through the full row 0, and from row 0, off the frame
     np.testing.assert_allclose(after[:, 0], [full, full, full, 0.5 * full, *[0.0] * 6])
     np.testing.assert_array_equal(after[:, 1], 0.0)
     even = np.full((10, 2), 0.9 * full)
-    np.testing.assert_array_equal(charge_of(CAMERA, (Blooming(share_percent=50.0),)).overflown(even), even)
+    np.testing.assert_array_equal(charge_of(CAMERA, (Blooming(share_percent=50.0),)).overflow_wells(even), even)
 
 
 def test_greens_differ_by_their_ratio_and_keep_their_mean() -> None:
@@ -266,7 +266,7 @@ def test_greens_differ_by_their_ratio_and_keep_their_mean() -> None:
     assert part["G2"].mean() / same["G2"].mean() == pytest.approx(0.985)
     assert frame.mean() == pytest.approx(plain.mean(), rel=1e-9)
     np.testing.assert_array_equal(part["R"], same["R"])
-    np.testing.assert_array_equal(expected(CAMERA, BRIGHT, (GreenImbalance(imbalance_percent=3.0),)), expected(CAMERA, BRIGHT))  # fmt: skip
+    np.testing.assert_array_equal(predict_frame(CAMERA, BRIGHT, (GreenImbalance(imbalance_percent=3.0),)), predict_frame(CAMERA, BRIGHT))  # fmt: skip
 
 
 def _lit(one: LightFlicker, even: FloatArray, exposure_s: float, elapsed_s: float) -> FloatArray:

@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 
 from sim.optics.diffraction import aperture_otf, diffraction_otf
-from sim.optics.fold import folded, folded_diffraction
+from sim.optics.fold import fold_diffraction, fold_transfer
 
 
 @pytest.mark.parametrize("shape", [(24, 30), (25, 32), (7, 9)])
 @pytest.mark.parametrize("cutoff", [0.3, 1.4, 2.6])
 def test_the_radial_table_is_the_sum_over_aliases(shape: tuple[int, int], cutoff: float) -> None:
-    plain = folded(lambda fx, fy: diffraction_otf(np.hypot(fx, fy) / cutoff, 1e3, 1.0), shape, 0.8, cutoff)
+    plain = fold_transfer(lambda fx, fy: diffraction_otf(np.hypot(fx, fy) / cutoff, 1e3, 1.0), shape, 0.8, cutoff)
     # A line between 4096 samples of a curve whose slope falls to 0 as a root at the cutoff: 1e-6.
-    np.testing.assert_allclose(folded_diffraction(shape, 0.8, cutoff), plain, atol=1e-6)
+    np.testing.assert_allclose(fold_diffraction(shape, 0.8, cutoff), plain, atol=1e-6)
 
 
 def test_light_is_conserved_and_a_perfect_image_is_its_pixels() -> None:
     """At zero frequency sinc of every other order is 0. A lens that passes everything over full pixels: sum over orders of
     sinc^2 = 1 at every frequency; 40 orders leave 2 / (pi^2 40)."""
-    assert folded_diffraction((16, 16), 0.7, 1.9)[0, 0] == pytest.approx(1.0, abs=1e-12)
-    full = folded(lambda fx, fy: np.ones(np.broadcast_shapes(fx.shape, fy.shape)), (8, 1), 1.0, 40.0)
+    assert fold_diffraction((16, 16), 0.7, 1.9)[0, 0] == pytest.approx(1.0, abs=1e-12)
+    full = fold_transfer(lambda fx, fy: np.ones(np.broadcast_shapes(fx.shape, fy.shape)), (8, 1), 1.0, 40.0)
     np.testing.assert_allclose(full[:, 0], 1.0, atol=2.0 / (np.pi**2 * 40) + 1e-3)
 
 
@@ -30,7 +30,7 @@ def test_a_direct_kernel_has_the_folded_transform() -> None:
     a direction at most."""
     size = 16
     got = np.fft.irfft2(
-        folded(lambda fx, fy: np.ones(np.broadcast_shapes(fx.shape, fy.shape)), (size, size), 1.0, 20.0)
+        fold_transfer(lambda fx, fy: np.ones(np.broadcast_shapes(fx.shape, fy.shape)), (size, size), 1.0, 20.0)
     )
     wanted = np.zeros((size, size))
     wanted[0, 0] = 1.0

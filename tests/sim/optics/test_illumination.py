@@ -82,7 +82,7 @@ def test_a_flat_gives_its_own_fall_off_back(colour_camera: CameraModel) -> None:
 def test_a_measured_fall_off_shades_the_frame(colour_camera: CameraModel, lamp: Spectrum) -> None:
     half = MeasuredIllumination(values=((1.0, 0.5), (1.0, 0.5)))
     camera = colour_camera.model_copy(
-        update={"lens": colour_camera.lens.model_copy(update={"illumination": half}), "cfa": "MONO", "quantum_efficiency": {"Y": lamp.scaled(0.1 / max(lamp.value))}, "dark_current_e_per_s": 0.0}
+        update={"lens": colour_camera.lens.model_copy(update={"illumination": half}), "cfa": "MONO", "quantum_efficiency": {"Y": lamp.scale(0.1 / max(lamp.value))}, "dark_current_e_per_s": 0.0}
     )  # fmt: skip
     electrons = expected_electrons(camera, Exposure(UniformField(lamp), 0.01))
     assert electrons[5, 0] / electrons[5, -1] == pytest.approx(2.0)

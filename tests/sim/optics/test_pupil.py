@@ -11,9 +11,9 @@ from scipy import integrate
 from sim.optics.diffraction import diffraction_otf
 from sim.optics.pupil import (
     Wavefront,
-    _along,
     _mean,
     _octave,
+    _ratio_along,
     noll_order,
     osa_order,
     pupil_otf,
@@ -78,7 +78,7 @@ WAVEFRONTS = {
     "astigmatism": seidel(defocus_um=0.1, astigmatism_um=0.4, astigmatism_deg=30.0),
     "coma": seidel(coma_um=(0.3, -0.1)),
     "all": seidel(defocus_um=0.2, spherical_um=-0.3, coma_um=(0.15, 0.2), astigmatism_um=0.2, astigmatism_deg=70.0),
-    "trefoil": (zernike(3, 3) + zernike(5, -1)).scaled(0.1).plus({(1, 0): 0.2}),
+    "trefoil": (zernike(3, 3) + zernike(5, -1)).scale(0.1).plus({(1, 0): 0.2}),
 }
 
 
@@ -197,8 +197,8 @@ def test_one_table_serves_all_sizes_and_wavelengths_of_a_shape() -> None:
             coma_um=(0.8 * waves * wavelength_um, 0.6 * waves * wavelength_um), spherical_um=0.1 * wavelength_um
         )
         exact = _mean(share, np.full(19, np.cos(0.3)), np.full(19, np.sin(0.3)), wavelength_um, bend)
-        assert np.allclose(_along(share, 0.3, wavelength_um, bend), exact, atol=1e-6)
+        assert np.allclose(_ratio_along(share, 0.3, wavelength_um, bend), exact, atol=1e-6)
     _octave.cache_clear()
     for size_um in (0.02, 0.03, 0.06):
-        _along(share, 0.3, 0.5, seidel(spherical_um=size_um / 2))
+        _ratio_along(share, 0.3, 0.5, seidel(spherical_um=size_um / 2))
     assert _octave.cache_info().misses == 1

@@ -159,7 +159,7 @@ def test_distortion_has_an_inverse(synthetic_lens: Any) -> None:
         back = lens.ideal_um(*lens.real_um(x, y))
         np.testing.assert_allclose(back[0], x, atol=2e-3)
         np.testing.assert_allclose(back[1], y, atol=2e-3)
-    assert lens.outside(np.array([1900.0]), np.array([0.0]))
+    assert lens.lies_outside(np.array([1900.0]), np.array([0.0]))
 
 
 def test_an_even_scene_takes_the_relative_illumination(synthetic_lens: Any) -> None:

@@ -10,7 +10,7 @@ from scipy.special import j1
 
 from sim.optics import rays as rt
 from sim.optics.diffraction import diffraction_otf
-from sim.optics.planewaves import interpolated, point_spread
+from sim.optics.planewaves import interpolate_rays, point_spread
 from sim.optics.prescription import Aperture, GlassName, Prescription, PrescriptionError, Surface
 from sim.optics.system import OpticalSystem
 from sim.optics.traced_table import OpticalTable, TableSettings, cached_table, lens_table
@@ -243,7 +243,7 @@ def test_rays_between_traced_wavelengths_are_interpolated() -> None:
         assert rays is not None
         traced.append(rays)
     own = system.pupil(tangent, 505.0, 20.0, centre)
-    between = interpolated(traced, [505.0], [1.0])[0]
+    between = interpolate_rays(traced, [505.0], [1.0])[0]
     assert own is not None
     # The path that all rays have in common is 2.5e-8 mm off; 1e-9 mm between rays is 2e-6 of a wave.
     error = between.plane_path_mm(0.0, 3.0) - own.plane_path_mm(0.0, 3.0)

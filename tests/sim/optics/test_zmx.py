@@ -24,7 +24,7 @@ def test_reads_every_surface_in_mm() -> None:
     assert lens.aperture_kind == "entrance_pupil_mm" and lens.aperture_value == 1.2
     assert lens.field_points == ((0.0, 0.0), (0.0, 18.0))
     assert lens.primary_wavelength_nm == pytest.approx(587.5618)
-    assert lens.catalogues == ("SCHOTT",) and lens.centred and lens.warnings == ()
+    assert lens.catalogues == ("SCHOTT",) and lens.is_centred and lens.warnings == ()
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "latin-1"])
@@ -52,7 +52,7 @@ def test_lengths_are_scaled_to_mm(unit: str, scale: float) -> None:
 def test_coordinate_breaks_keep_their_order() -> None:
     lens = read_zmx(LENSES / "tilted.zmx")
     first, second = lens.surfaces[1], lens.surfaces[4]
-    assert not lens.centred
+    assert not lens.is_centred
     assert first.decentre_mm == (0.15, -0.1) and first.tilt_deg == (3.0, -2.0, 10.0) and not first.tilt_first
     assert second.tilt_deg == (1.2, 0.0, 0.0) and second.tilt_first and second.thickness_mm == 18.4
 
@@ -65,7 +65,7 @@ def test_apertures() -> None:
     circle, rectangle = lens.surfaces[1].aperture, lens.surfaces[4].aperture
     assert circle is not None and circle.shape == "circle" and circle.half_width_mm == 2.6
     assert rectangle is not None and rectangle.shape == "rectangle" and rectangle.centre_mm == (0.1, -0.2)
-    assert not lens.centred
+    assert not lens.is_centred
 
 
 @pytest.mark.parametrize(

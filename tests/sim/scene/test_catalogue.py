@@ -42,7 +42,7 @@ def test_a_view_obeys_the_lens_equation() -> None:
 
 def test_a_pattern_and_a_target_of_one_size_lie_on_each_other() -> None:
     view = View(rows=480, cols=640, pixel_pitch_um=3.0, focal_length_mm=8.0, distance_mm=500.0)
-    flat = view.upright(6, 8, 31.0)
+    flat = view.centre_pattern(6, 8, 31.0)
     target = PlanarTarget(
         np.zeros((6, 8)),
         31.0 / view.px_per_mm,
@@ -134,7 +134,7 @@ def test_what_is_not_a_scene_is_refused(camera: CameraModel) -> None:
 def test_a_picture_fits_the_frame_and_keeps_its_light(camera: CameraModel) -> None:
     view = View.of(camera, 400.0)
     codes = np.full((30, 30, 3), 255, np.uint8)
-    shown = PictureOnScreen.chosen({"fill": 0.5}).show(codes, view, WHITE)
+    shown = PictureOnScreen.choose({"fill": 0.5}).show(codes, view, WHITE)
     row, col = shown.warp().to_camera([0.0, 30.0], [0.0, 30.0])
     np.testing.assert_allclose(row, [14.5, 44.5], atol=1e-9)
     np.testing.assert_allclose(col, [29.5, 59.5], atol=1e-9)
@@ -183,15 +183,15 @@ def test_both_cameras_of_a_rig_see_one_plane_where_it_stands(mono_camera: Camera
     texture = charuco_texture((6, 8))
     texel_mm = 10.0 / 56
     pose = rotation_of((0.25, -0.2, 0.1))
-    board = PlanarTarget(texture, texel_mm, pose, (-36.0, -30.0, 200.0), geometries[0], WHITE.scaled(0.05), WHITE, 1.0)
-    views = board.seen_by(rig)
+    board = PlanarTarget(texture, texel_mm, pose, (-36.0, -30.0, 200.0), geometries[0], WHITE.scale(0.05), WHITE, 1.0)
+    views = board.pose_for_rig(rig)
 
     detector = cv2.aruco.CharucoDetector(
         cv2.aruco.CharucoBoard((8, 6), 1.0, 0.75, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000))
     )
     found = []
     for camera, view in zip((left, right), views, strict=True):
-        frame = sim_frame.expected(camera, Exposure(view, 0.002), oversample=2, margin_px=8)
+        frame = sim_frame.predict_frame(camera, Exposure(view, 0.002), oversample=2, margin_px=8)
         grey = np.clip((frame - frame.min()) / np.ptp(frame) * 255, 0, 255).astype(np.uint8)
         corners, ids, _, _ = detector.detectBoard(grey)
         refined = cv2.cornerSubPix(
@@ -224,7 +224,7 @@ def test_a_rig_without_geometry_is_refused(mono_camera: CameraModel) -> None:
     )
     rig = StereoRig(left=mono_camera, right=mono_camera, rotation=pose, translation_mm=(-60.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="left camera has no geometry"):
-        target.seen_by(rig)
+        target.pose_for_rig(rig)
 
 
 def test_the_documentation_lists_every_scene_and_parameter() -> None:

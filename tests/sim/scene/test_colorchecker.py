@@ -43,7 +43,7 @@ def test_recovery_leaves_what_it_is_said_to_leave() -> None:
     """The measured 24, from their colours alone: metamers, 0.04 rms away and of the same colour."""
     measured = np.array([curve.at(np.arange(380.0, 731.0, 10.0)) for curve in colorchecker.reflectances().values()])
     wanted = xyz_under_d50(measured)
-    wavelength_nm, found = colorchecker.recovered(wanted)
+    wavelength_nm, found = colorchecker.recover_reflectances(wanted)
     np.testing.assert_array_equal(wavelength_nm, np.arange(380.0, 731.0, 10.0))
     np.testing.assert_allclose(xyz_under_d50(found), wanted, atol=3e-5)
     assert np.sqrt(np.mean((found - measured) ** 2)) < 0.042
@@ -51,4 +51,4 @@ def test_recovery_leaves_what_it_is_said_to_leave() -> None:
 
 def test_colours_beyond_any_surface_are_refused() -> None:
     with pytest.raises(ValueError, match="beyond any reflectance"):
-        colorchecker.recovered(np.array([[1.3, 1.2, 0.9]]))
+        colorchecker.recover_reflectances(np.array([[1.3, 1.2, 0.9]]))

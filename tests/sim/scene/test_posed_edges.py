@@ -30,12 +30,12 @@ def pinhole(camera: CameraModel, *distortion: float) -> Geometry:
 
 def edges(camera: CameraModel, lamp: Spectrum, *distortion: float) -> PosedEdges:
     one = (PlaneEdge((0.0, 0.0), (0.3, 0.0), 5.0),)
-    return PosedEdges(one, FACING, (0.0, 0.0, 800.0), pinhole(camera, *distortion), lamp.scaled(0.02), lamp)
+    return PosedEdges(one, FACING, (0.0, 0.0, 800.0), pinhole(camera, *distortion), lamp.scale(0.02), lamp)
 
 
 def test_a_facing_edge_is_a_straight_one(colour_camera: CameraModel, lamp: Spectrum) -> None:
     region = EdgeRegion((0, 0, colour_camera.rows, colour_camera.cols), 5.0, 0.3 * np.cos(np.deg2rad(5.0)))
-    straight = KnifeEdge((region,), lamp.scaled(0.02), lamp)
+    straight = KnifeEdge((region,), lamp.scale(0.02), lamp)
     for effects in ((), (Defocus(defocus_um=20.0),)):
         one, other = (
             expected_electrons(colour_camera, Exposure(scene, 0.01), effects)

@@ -108,7 +108,7 @@ def test_upright_cells_are_exact_whatever_their_size() -> None:
     for count, size in ((400, 10.0), (3, 11.1)):
         pattern = rng.random((count, count))
         warp = Warp.from_corners(count, count, [(1, 1), (1, 1 + size), (1 + size, 1 + size), (1 + size, 1)])
-        assert warp.upright
+        assert warp.is_upright
         grid = Grid(14, 15, 2, 1)
         drawn = cells(pattern, warp, grid, 0.25)
         weights = []
@@ -178,7 +178,7 @@ def test_the_colorchecker_has_24_patches_from_dark_skin_to_black() -> None:
 
 # --- drawn scenes ------------------------------------------------------------------------------------------------------
 
-DARK = LIGHT.scaled(0.0)
+DARK = LIGHT.scale(0.0)
 
 
 def covered(scene: Scene, grid: Grid) -> np.ndarray:
@@ -246,7 +246,7 @@ def test_a_drawn_edge_blurs_to_the_edges_exact_profile(mono_camera: CameraModel,
     """Drawn at 6 x 6 samples a pixel and seen through the same transfer. What is left is what squares of 1/6 px alias: with
     a line's spectrum of 1 / (2 pi f) a cycle and lens and pixel passing < 0.05 near 5 cy/px, below 1e-3 of the step."""
     camera = mono_camera.model_copy(update={"lens": mono_camera.lens.model_copy(update={"transmittance": 1.0})})
-    dark = lamp.scaled(0.2)
+    dark = lamp.scale(0.2)
     for angle_deg in (0.0, 5.0, 45.0, 90.0, 187.0, 270.0):
         scene = KnifeEdge((EdgeRegion((0, 0, 72, 96), angle_deg, 0.3),), dark, lamp)
         drawn = draw(scene, Grid(72, 96, 6, 16))
@@ -412,7 +412,7 @@ POSE: dict[str, Any] = {
 
 def screen(**changes: Any) -> Screen:
     primaries = tuple(Spectrum.of([400.0, 500.0, 600.0, 700.0], v) for v in ([0, 0, 1, 2], [0, 2, 1, 0], [3, 1, 0, 0]))
-    return Screen(primaries=primaries, black_radiance=LIGHT.scaled(0.01), **changes)
+    return Screen(primaries=primaries, black_radiance=LIGHT.scale(0.01), **changes)
 
 
 @pytest.mark.parametrize(
@@ -488,7 +488,7 @@ def test_black_and_white_codes_are_a_screens_pattern(mono_camera: CameraModel) -
     framed = np.pad(codes, ((5, 5), (5, 5), (0, 0)))
     image = replace(image, codes=framed, translation_mm=(-11.0, -9.0, 100.0))
     shown = ScreenPattern(
-        pattern, ScreenImage(image.screen, codes, 1.0, **POSE).warp(), LIGHT.scaled(0.01), image.screen.white_radiance
+        pattern, ScreenImage(image.screen, codes, 1.0, **POSE).warp(), LIGHT.scale(0.01), image.screen.white_radiance
     )
     camera = mono_camera.model_copy(update={"rows": 40, "cols": 60})
     one, other = (

@@ -14,7 +14,7 @@ CURVE = Spectrum.of([400.0, 700.0], [1.0, 2.0])
 
 def screen(**changes: object) -> Screen:
     return Screen.model_validate(
-        {"primaries": (CURVE, CURVE.scaled(2.0), CURVE.scaled(3.0)), "black_radiance": CURVE.scaled(0.01)} | changes
+        {"primaries": (CURVE, CURVE.scale(2.0), CURVE.scale(3.0)), "black_radiance": CURVE.scale(0.01)} | changes
     )
 
 
@@ -44,9 +44,9 @@ def test_white_is_all_primaries_and_black() -> None:
 def test_stripes_do_not_overlap() -> None:
     for order in ("RGB", "BGR"):
         layout = SubPixels(width=1 / 3, height=0.7, order=order)
-        edges = sorted(layout.lit(channel)[:2] for channel in range(3))
+        edges = sorted(layout.locate_stripe(channel)[:2] for channel in range(3))
         np.testing.assert_allclose(np.ravel(edges), [0, 1 / 3, 1 / 3, 2 / 3, 2 / 3, 1], atol=1e-15)
-        assert (layout.lit(0)[0] < layout.lit(2)[0]) == (order == "RGB")
+        assert (layout.locate_stripe(0)[0] < layout.locate_stripe(2)[0]) == (order == "RGB")
         assert layout.share == pytest.approx(0.7 / 3)
 
 
@@ -55,7 +55,7 @@ def test_stripes_do_not_overlap() -> None:
     [
         ({"gamma": (2.2, 9.0, 2.2)}, "9.0 is above the upper limit 5.0"),
         ({"black_code": (-0.1, 0.0, 0.0)}, "-0.1 is below the lower limit 0.0"),
-        ({"black_radiance": CURVE.scaled(-1.0)}, "black has a radiance of -2"),
+        ({"black_radiance": CURVE.scale(-1.0)}, "black has a radiance of -2"),
         ({"falloff_exponent": -1.0}, "below the lower limit"),
         ({"sub_pixels": {"width": 0.5}}, "above the upper limit"),
     ],

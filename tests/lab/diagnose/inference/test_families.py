@@ -44,4 +44,4 @@ def test_every_effect_belongs_to_a_family_that_says_how_to_tell_its_members_apar
         inside = members(family)
         assert set(inside) == {kind.name for kind in candidates() if kind.family is family}
         assert family.words and family.sentence.endswith(".")
-        assert len(inside) < 2 or family.told_apart_by
+        assert len(inside) < 2 or family.separating_capture

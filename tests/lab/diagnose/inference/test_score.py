@@ -54,7 +54,7 @@ def test_a_refit_begins_at_the_prototype_that_lies_nearest() -> None:
     assert score.value == pytest.approx(51.0**2 / 26.0)
     assert score.start == many
     (score,) = Signatures(CAMERA, white, columns, lambda one: white[:, None]).scores()  # the scaled one is all of it
-    assert score.start.having(excess_e_per_s=100.0) == many
+    assert score.start.replace_fields(excess_e_per_s=100.0) == many
     assert score.start != many
 
 

@@ -47,7 +47,7 @@ class _Curve(Effect):
     def on_signal(self, signal: Signal) -> Signal:
         if self.size_dn == 0.0:
             return signal
-        return signal.adding(offset_dn=lambda elapsed_s, temperature_c: self.added_dn(elapsed_s))
+        return signal.add_laws(offset_dn=lambda elapsed_s, temperature_c: self.added_dn(elapsed_s))
 
     def added_dn(self, elapsed_s: float) -> float:
         return self.size_dn * float(self.shape(np.asarray(elapsed_s)))
@@ -266,7 +266,7 @@ def test_a_sign_is_unknown_where_only_the_square_acts() -> None:
     for kind, is_unsigned in ((_Squared, True), (_Lopsided, False)):
         truth = kind(size_dn=0.5)
         model = _model((truth,), np.random.default_rng(6))
-        told = truth.having(size_dn=-0.5) if is_unsigned else truth
+        told = truth.replace_fields(size_dn=-0.5) if is_unsigned else truth
         candidate = Candidate(told, {"size_dn": 0.01}, 1.0, (), 50.0)
         found = _with_every_mode(model, candidate, (told,), DecisionPolicy())
         assert found.std["size_dn"] == 0.01

@@ -187,7 +187,7 @@ def test_negative_light_is_left_out_and_named() -> None:
     base = recordings()
     wrong = base.spectrum("nb540.csv")
     spectra = {c.radiance: base.spectrum(c.radiance) for c in base.captures("narrowband")}
-    spectra["nb540.csv"] = wrong.scaled(-1.0)
+    spectra["nb540.csv"] = wrong.scale(-1.0)
     fit = fit_spectral(
         RecordingSet(base.manifest, {c.frame: base.frame(c) for c in base.captures()}, spectra), "left", NOISE
     )
