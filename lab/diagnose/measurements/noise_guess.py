@@ -67,8 +67,9 @@ class NoiseGuess:
 
 
 def noise_guess(study: Study) -> NoiseGuess:
-    """Return the noise fit's gain, black level, dark current, read noise and PRNU where there is a fit; else first estimates from dark and
-    flat captures. What these don't determine is taken from the data sheet, else a usual value.
+    """Return the noise fit's gain, black level, dark current and PRNU where there is a fit; else first estimates from dark and flat
+    captures. The read noise is that of the dark frames as recorded, rounding included. What these don't determine is taken from the data
+    sheet, else a usual value.
 
     Without a fit, the gain is the slope of temporal variance over signal of repeated flats, else the stated one, else that of any repeats.
     """
@@ -92,10 +93,10 @@ def noise_guess(study: Study) -> NoiseGuess:
 
 
 def _as_fitted(study: Study, first: NoiseGuess, fitted: NoiseFit, gain_at_0_db: float) -> NoiseGuess:
-    """Return the noise fit's figures in the place of first estimates. The fit states its gain for 0 dB."""
+    """Return the noise fit's figures in the place of first estimates. The fit states its gain for 0 dB, and its read noise without
+    rounding: that of the dark frames stays."""
     gain = gain_at_0_db * 10.0 ** (_flats_gain_db(study) / 20.0)
     black = first.black if fitted.black_level_dn is None else fitted.black_level_dn
-    read_dn = first.read_dn if fitted.read_noise_e is None else fitted.read_noise_e * gain
     return replace(
         first,
         black=black,
@@ -105,9 +106,8 @@ def _as_fitted(study: Study, first: NoiseGuess, fitted: NoiseFit, gain_at_0_db: 
         dark_c=first.dark_c if fitted.dark_temperature_c is None else fitted.dark_temperature_c,
         gain=gain,
         gain_is_known=True,
-        read_dn=read_dn,
         prnu=first.prnu if fitted.prnu_percent is None else 0.01 * fitted.prnu_percent,
-        jitter_lamp=max(level_repeatability(repeated_levels(study, black, gain, read_dn)), LAMP_FLOOR),
+        jitter_lamp=max(level_repeatability(repeated_levels(study, black, gain, first.read_dn)), LAMP_FLOOR),
     )
 
 
