@@ -8,11 +8,17 @@ import logging
 import threading
 import time
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future
+from functools import partial
 
 import anyio
 
 from api.errors import Conflict
+from api.safety import KnownSafety, StationSafety
+from lab.capture.blocking_calls import in_thread
+from lab.capture.instruments import SafeState
 from lab.capture.plan import CapturePlan, full_plan
+from lab.capture.recovery import make_station_safe
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
@@ -35,9 +41,9 @@ def _wake(followers: list[asyncio.Event]) -> None:
 class LiveSession:
     """One session in a thread of its own. A follower gets the latest progress first, then later ones; a slow follower misses some."""
 
-    def __init__(self, station: Station, changed: Callable[[], None]) -> None:
+    def __init__(self, station: Station, changed: Callable[[], None], safety: KnownSafety) -> None:
         self.station = station
-        self._on_change = changed
+        self._on_change, self._safety = changed, safety
         self.pausing = False
         self.capture: CaptureSession | None = None
         self._latest: Progress | None = None
@@ -61,6 +67,7 @@ class LiveSession:
     def begin(self, capture: CaptureSession) -> None:
         """Start the run's thread. How the run ends is written to the registry."""
         self.capture = capture
+        self._safety.note(self.station, None)
         self._thread = threading.Thread(target=self._work, args=(capture,), name=f"session {capture.id}", daemon=True)
         self._thread.start()
 
@@ -78,6 +85,8 @@ class LiveSession:
         except Exception:
             log.exception("session %s: a defect", capture.id)
         finally:
+            if capture.safe is not None:
+                self._safety.note(self.station, StationSafety.of(capture.safe))
             self._changed(ended=True)
 
     def tell(self, progress: Progress) -> None:
@@ -147,6 +156,7 @@ class LiveSessions:
         changed: Callable[[], None] = lambda: None,
     ) -> None:
         self._store, self._connect, self._changed = store, connect, changed
+        self.safety = KnownSafety(store, changed)
         self._live: dict[str, LiveSession] = {}
         self._lock = threading.Lock()
         self._closed = False
@@ -175,7 +185,7 @@ class LiveSessions:
         the station lacks what the plan needs."""
         with self._lock:
             self._check_free(station)
-            live = LiveSession(station, self._changed)
+            live = LiveSession(station, self._changed, self.safety)
             capture = CaptureSession.start(
                 self._store,
                 station,
@@ -213,7 +223,7 @@ class LiveSessions:
                 now = self._store.session(session_id)
                 if now.state != "queued" or now.error is not None:
                     raise Conflict(f"session {session_id} is {now.state} now: {now.error}")
-            live = LiveSession(station, self._changed)
+            live = LiveSession(station, self._changed, self.safety)
             capture = CaptureSession(
                 self._store, session_id, station=station, on_progress=live.tell, connect=self._connect
             )
@@ -271,15 +281,50 @@ class LiveSessions:
         capture, _ = self._running(session_id)
         capture.abort(reason)
 
-    def halt(self, station: Station | None, reason: str) -> list[str]:
-        """End every run now, or those on the instruments of a station; the sessions' ids."""
+    def halt(self, station: Station | None, reason: str) -> dict[str, Future[None]]:
+        """End every run now, or those on the instruments of a station: shutters first, without waiting for anything. The sessions' ids, and what is done
+        when the shutter has answered, or can't."""
         wanted = None if station is None else station.addresses
-        ended = []
+        ended = {}
         for id, live in list(self._live.items()):
             if not live.ended and (wanted is None or wanted & live.station.addresses) and live.capture is not None:
-                live.capture.abort(reason)
-                ended.append(id)
+                ended[id] = in_thread(partial(self._shut, live, live.capture, reason))
+                in_thread(partial(live.capture.abort, reason))
         return ended
+
+    def _shut(self, live: LiveSession, capture: CaptureSession, reason: str) -> None:
+        try:
+            if capture.shut(reason):
+                self._note(live, self.safety.note_shut)
+            elif capture.safe is not None and not live.ended:  # it is packed: its instruments are let go
+                self.safety.note_asked(live.station)
+                self.safety.note(live.station, StationSafety.of(self._made_safe(live.station)))
+        except Exception as error:
+            self._note(live, partial(self.safety.note_trouble, words=str(error)))
+
+    def _note(self, live: LiveSession, note: Callable[[Station], None]) -> None:
+        """Note what is known while the run ends; what it says of itself at its end counts more."""
+        if not live.ended and (live.capture is None or live.capture.safe is None):
+            note(live.station)
+
+    def make_safe(self, station: Station) -> Future[None]:
+        """Make a station safe on which no run of this service is: what comes of it is noted."""
+        self.safety.note_asked(station)
+        return in_thread(partial(self._make_safe, station))
+
+    def _make_safe(self, station: Station) -> None:
+        try:
+            let_go = self.hold(station)
+        except Conflict as error:
+            self.safety.note_trouble(station, str(error))
+            return
+        try:
+            self.safety.note(station, StationSafety.of(self._made_safe(station)))
+        finally:
+            let_go()
+
+    def _made_safe(self, station: Station) -> SafeState:
+        return make_station_safe(station, self._connect, partial(self.safety.note_shut, station))
 
     def close(self, patience_s: float = PATIENCE_S) -> None:
         """End every run: shutters are closed, and the sessions can be resumed."""

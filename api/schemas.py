@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
 from api.keys import Permission
+from api.safety import StationSafety
 from lab.calibration.camera_models import Kind as CameraModelKind
 from lab.calibration.camera_models import ModelOfCamera
 from lab.calibration.limits import CalibrationLimits
@@ -95,6 +96,9 @@ class StationState(Schema):
     targets: tuple[str, ...] = ()
     sequences: tuple[SequenceName, ...] = Field(default=(), description="what it has the instruments and targets for")
     busy_with: str | None = Field(default=None, description="id of a session that uses its instruments now")
+    safety: StationSafety | None = Field(
+        default=None, description="null: its instruments haven't answered since the service's start, or a run uses them"
+    )
     problem: str | None = None
 
 
@@ -167,10 +171,18 @@ class Halt(Schema):
     station: str | None = Field(default=None, max_length=100, description="null: every station")
 
 
+class HaltedStation(Schema):
+    """A station after a halt."""
+
+    name: str
+    safety: StationSafety
+
+
 class Halted(Schema):
-    """Ids of the sessions that a halt ended; each can be resumed."""
+    """Ids of the sessions that a halt ended, each can be resumed; and what the stations' instruments answered within 1.5 s."""
 
     sessions: tuple[str, ...]
+    stations: tuple[HaltedStation, ...] = ()
 
 
 class Certify(Schema):

@@ -128,9 +128,9 @@ _COOKIE = APIKeyCookie(
 
 
 class Demand:
-    """A dependency of a route: 401 without a valid key, 403 for a key whose scope doesn't allow `wanted`."""
+    """A dependency of a route: 401 without a valid key, 403 for a key whose scope allows none of `wanted`."""
 
-    def __init__(self, wanted: Permission) -> None:
+    def __init__(self, *wanted: Permission) -> None:
         self.wanted = wanted
 
     def __call__(
@@ -148,8 +148,9 @@ class Demand:
                 "no valid key: send 'Authorization: Bearer KEY'; `calibench key create NAME` makes one",
                 headers={"WWW-Authenticate": "Bearer"},
             )
-        if not key.scope.allows(self.wanted):
-            raise HTTPException(403, f"key '{key.name}' has the scope '{key.scope}', this needs '{self.wanted}'")
+        if not any(key.scope.allows(wanted) for wanted in self.wanted):
+            needed = " or ".join(f"'{wanted}'" for wanted in self.wanted)
+            raise HTTPException(403, f"key '{key.name}' has the scope '{key.scope}', this needs {needed}")
         return key
 
 

@@ -18,6 +18,7 @@ from api.keys import Permission
 from api.live import LiveSessions
 from api.pictures import Pictures
 from api.public_text import PublicText
+from api.safety import StationSafety
 from api.security import Demand, Gate
 from api.upload import Inbox
 from api.waiting import QueueRunner
@@ -88,6 +89,11 @@ class Service:
                 (one.name, (at := one.stat()).st_mtime_ns, at.st_size) for one in entries if one.is_file()
             )
         return _read_station(file, there)
+
+    def safety(self, station: Station) -> StationSafety | None:
+        """What is known of a station's safe state, as an answer may have it."""
+        found = self.live.safety.find(station)
+        return found and found.model_copy(update={"words": self.public(found.words)})
 
     def session(self, session_id: str) -> SessionInfo:
         """A session; 404 where there is none."""

@@ -215,6 +215,7 @@ class WireInstrument(Instrument):
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
         self._lock = threading.RLock()
+        self._stopping = threading.Lock()  # a stop ends what others wait for, but no stop
         self._live = False
         self._met = False
 
@@ -236,11 +237,12 @@ class WireInstrument(Instrument):
     def stop(self) -> None:
         if not self._met:
             return
-        self._transport.interrupt()
-        with self._lock:
-            self._transport.resume()
-            with self._conversation():
-                self._make_safe()
+        with self._stopping:
+            self._transport.interrupt()
+            with self._lock:
+                self._transport.resume()
+                with self._conversation():
+                    self._make_safe()
 
     def close(self) -> None:
         if self._met:

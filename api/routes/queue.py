@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
+from concurrent.futures import wait
 from typing import Annotated
 
 from fastapi import APIRouter, Depends
 
 from api.errors import Conflict, answers
 from api.keys import Permission, StoredKey
-from api.schemas import Halt, Halted, QueuePlace
+from api.safety import key_of
+from api.schemas import Halt, Halted, HaltedStation, QueuePlace
 from api.security import Demand
 from api.service import OPERATE, OVER, READ, Here, Service, SessionId
 from lab.capture.queue import QueuedSession, hold_queue, leave_queue, put_into_queue, queue
+from lab.capture.station import Station
 from lab.errors import InputError
 
+#: How long (s) a halt waits for the instruments' answers before it says that they haven't come.
+ANSWER_S = 1.5
 router = APIRouter(tags=["sessions"])
 
 
@@ -59,16 +66,46 @@ def unqueue_session(service: Here, session_id: SessionId) -> list[QueuedSession]
     return _told(service)
 
 
+def _stations(service: Service) -> dict[str, Station]:
+    """The stations by name, without those whose files can't be used."""
+    found = {}
+    for name in service.station_files():
+        with contextlib.suppress(InputError):
+            found[name] = service.station(name)
+    return found
+
+
 @router.post("/halt", responses=answers(401, 403, 404, 422))
 def halt(
-    service: Here, key: Annotated[StoredKey, Depends(Demand(Permission.OPERATE))], asked: Halt | None = None
+    service: Here,
+    key: Annotated[StoredKey, Depends(Demand(Permission.OPERATE, Permission.CALIBRATE))],
+    asked: Halt | None = None,
 ) -> Halted:
-    """End every session that this service runs now, or those on one station: shutters close, screens go dark, each can be resumed. What waits
-    for the same instruments is held until somebody releases it."""
+    """End every session that this service runs now, also one that is packed, or those on one station: shutters close, screens go dark, each can be
+    resumed. Stations on which nothing runs are made safe, too. What waits for the same instruments is held until somebody releases it. Answers
+    within 2 s; `stations` says whose shutter is closed, by its own answer, and whose isn't confirmed by then."""
     station = service.station(asked.station) if asked is not None and asked.station is not None else None
-    why = f"halted by {key.name}"
-    ended = service.live.halt(station, why)  # first: nothing that the registry does delays it
+    until_s, live, why = time.monotonic() + ANSWER_S, service.live, f"halted by {key.name}"
+    ended = live.halt(station, why)  # first: nothing that the registry does delays it
+    stations = (
+        _stations(service)
+        if asked is None or asked.station is None
+        else {asked.station: service.station(asked.station)}
+    )
+    halting = [one.station for id in ended if (one := live.find(id)) is not None]
+    busy = {key_of(one) for one in halting}
+    answering = list(ended.values())
+    for one in {key_of(one): one for one in stations.values()}.values():
+        if key_of(one) not in busy:
+            answering.append(live.make_safe(one))
     with service.store.transaction() as db:
         hold_queue(db, why, station.model_dump(mode="json") if station is not None else None)
-    ended += service.live.halt(station, why)  # what the queue began in between
-    return Halted(sessions=tuple(dict.fromkeys(ended)))
+    later = live.halt(station, why)  # what the queue began in between
+    wait([*answering, *later.values()], max(0.0, until_s - time.monotonic()))
+    told = []
+    for name, one in stations.items():
+        if (found := live.safety.find(one)) is None or (found.state == "halting" and found.shutter == "unknown"):
+            live.safety.note_trouble(one, f"no answer of its shutter within {ANSWER_S:g} s; it is still being asked")
+        if (safety := service.safety(one)) is not None:
+            told.append(HaltedStation(name=name, safety=safety))
+    return Halted(sessions=tuple(dict.fromkeys([*ended, *later])), stations=tuple(told))

@@ -59,6 +59,7 @@ def station_state(service: Service, name: str) -> StationState:
         targets=tuple(station.targets),
         sequences=full_plan(station).names,
         busy_with=service.live.busy(station),
+        safety=service.safety(station),
     )
 
 

@@ -8,6 +8,7 @@ Source: A3, USB3 Vision 1.1, section 5.
 from __future__ import annotations
 
 import contextlib
+import errno
 import queue
 import struct
 import threading
@@ -31,6 +32,8 @@ TRAILER = struct.Struct("<IHHQHHQI")  # 32 bytes
 BUFFERS = 4
 #: How often (s) the thread looks whether it is to end, while nothing comes.
 _LOOK_S = 0.1
+#: Longest wait (s) for a transfer within a frame, after which it is looked whether the stream ends: shorter waits would fall into transfers more often.
+_WAIT_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ class U3vStream:
     def close(self) -> None:
         """End the thread."""
         self._ending.set()
-        self._thread.join(2 * _LOOK_S + self.timeout_s)
+        self._thread.join(2 * _LOOK_S + min(2 * _WAIT_S, self.timeout_s))
 
     # --- the thread -------------------------------------------------------------------------------------------------
 
@@ -139,7 +142,7 @@ class U3vStream:
         at, trailer, late = 0, b"", ""
         try:
             for piece in self._pieces:
-                count = self._device.read(self._endpoint, piece, self._left_ms(deadline))
+                count = self._fill(piece, deadline)
                 if count < len(piece) and count >= TRAILER.size and _is(piece, TRAILER_MAGIC):
                     trailer = piece[:count].tobytes()
                     break
@@ -151,7 +154,7 @@ class U3vStream:
                 if count < len(piece):
                     break  # a short transfer ends the payload
             if not trailer and self._leader is None:
-                trailer = self._read(self._head, self._left_ms(deadline) / 1000)
+                trailer = self._head[: self._fill(self._head, deadline)].tobytes()
                 self._leader = _Leader.of(trailer)
         except usb.core.USBTimeoutError:
             late = f", and nothing more for {self.timeout_s:g} s"
@@ -166,6 +169,29 @@ class U3vStream:
             camera_time_ns=leader.camera_time_ns,
             give_back=lambda: self._free.put(buffer),
         )
+
+    def _fill(self, piece: array[int], deadline: float) -> int:
+        """Read a transfer until the deadline or the stream's end; the bytes that came. A long exposure is waited for in parts, so that a stop
+        needn't wait for its end: a wait that ends within the transfer is followed by another for the rest of it."""
+        came = 0
+        while True:
+            began = time.monotonic()
+            part = piece if came == 0 else piece[came:]
+            wait_ms = min(self._left_ms(deadline), int(1000 * _WAIT_S))
+            try:
+                count = self._device.read(self._endpoint, part, wait_ms)
+            except usb.core.USBTimeoutError:
+                count = 0
+            if came:
+                piece[came : came + count] = part[:count]
+            came += count
+            now = time.monotonic()
+            if came == len(piece) or (count and now - began < wait_ms / 1000):
+                return came
+            if now >= deadline or self._ending.is_set():
+                if came:
+                    return came
+                raise usb.core.USBTimeoutError("nothing came in time", errno=errno.ETIMEDOUT)
 
     @staticmethod
     def _left_ms(deadline: float) -> int:

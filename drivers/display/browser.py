@@ -69,6 +69,7 @@ class BrowserDisplay(Display):
         self._allow_remote = allow_remote
         self._record = recorder or (lambda direction, data: None)
         self._lock = threading.RLock()
+        self._stopping = threading.Lock()  # a stop ends what others wait for, but no stop
         self._change = threading.Condition()
         self._page: ServerConnection | None = None
         self._geometry: dict[str, Any] = {}
@@ -113,11 +114,12 @@ class BrowserDisplay(Display):
     def stop(self) -> None:
         if self._page is None:
             return
-        self._interrupted.set()
-        with self._lock:
-            self._interrupted.clear()
-            if self._page is not None:
-                self._request(np.zeros((0, 0), np.uint8), 1)
+        with self._stopping:
+            self._interrupted.set()
+            with self._lock:
+                self._interrupted.clear()
+                if self._page is not None:
+                    self._request(np.zeros((0, 0), np.uint8), 1)
 
     def close(self) -> None:
         with suppress(InstrumentError):

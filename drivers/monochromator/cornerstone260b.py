@@ -60,6 +60,7 @@ class Cornerstone260B(Monochromator):
         self._who = f"Cornerstone 260B at {address}"
         self._lock = threading.RLock()
         self._stopped = threading.Event()
+        self._stopping = threading.Lock()  # a stop ends what others wait for, but no stop
         self._open: UsbTmc | None = None
         self._met = False
         self._found_units = ""
@@ -135,12 +136,13 @@ class Cornerstone260B(Monochromator):
     def stop(self) -> None:
         if not self._met:
             return
-        self._stopped.set()
-        with self._lock:
-            self._stopped.clear()
-            with self._conversation() as wire:
-                wire.write("abort")
-                self._do("shutter 0")
+        with self._stopping:
+            self._stopped.set()
+            with self._lock:
+                self._stopped.clear()
+                with self._conversation() as wire:
+                    wire.write("abort")
+                    self._do("shutter 0")
 
     def close(self) -> None:
         if self._met:

@@ -6,6 +6,7 @@ calls the devices' `pause` and `stop`, which close the shutter and darken the sc
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -132,17 +133,31 @@ class ShutterDevice(Device):
         super().__init__("shutter")
         self.monochromator = monochromator
         self.value: bool | None = None
+        self._moving = threading.Lock()
+        self._barred = False
 
     def set(self, opened: bool) -> Status:
         def move() -> None:
-            self.value = None
-            if opened:
-                self.monochromator.open_shutter()
-            else:
-                self.monochromator.close_shutter()
-            self.value = opened
+            with self._moving:
+                self.value = None
+                if opened and self._barred:
+                    raise InstrumentError("monochromator: the run was halted; its shutter stays closed")
+                if opened:
+                    self.monochromator.open_shutter()
+                else:
+                    self.monochromator.close_shutter()
+                self.value = opened
 
         return Status("monochromator", move, MOVE_S)
+
+    def bar(self) -> None:
+        """Close the shutter now, whatever the monochromator does, and open it no more. Raises InstrumentError where it doesn't say that it is
+        closed."""
+        self._barred = True
+        self.monochromator.stop()
+        with self._moving:  # one that was about to open it has done so, or was refused
+            shut(self.monochromator)
+            self.value = False
 
     async def stop(self, success: bool = True) -> None:
         self.value = None
@@ -156,6 +171,13 @@ class ShutterDevice(Device):
 
     def readings(self) -> dict[str, float | str]:
         return {"shutter_open": float(bool(self.value))}
+
+
+def shut(monochromator: Monochromator) -> None:
+    """Stop a monochromator and ask for its shutter. Raises InstrumentError where it says that it is open still."""
+    monochromator.stop()
+    if monochromator.shutter_is_open():
+        raise InstrumentError("monochromator: its shutter is open though it was told to close; block the light by hand")
 
 
 @dataclass(frozen=True)

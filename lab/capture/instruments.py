@@ -5,13 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from datetime import datetime
 from functools import partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import InstrumentError
-from drivers.instrument import Identity
+from drivers.instrument import Identity, Instrument
+from drivers.monochromator.base import Monochromator
 from lab.capture.blocking_calls import STOP_S, in_thread
 from lab.capture.devices import (
     CamerasDevice,
@@ -24,7 +27,9 @@ from lab.capture.devices import (
     TargetDevice,
     WriteFrame,
     WriteSpectrum,
+    shut,
 )
+from lab.capture.records import now
 from lab.capture.station import Drivers, Station
 from lab.capture_kinds.base import CaptureLimits, FixedExposure, Step
 from lab.capture_kinds.irradiance import irradiance_nm
@@ -39,6 +44,18 @@ class BenchState(Frozen):
     shutter_open: bool | None = None
     wavelength_nm: float | None = None
     temperature_c: dict[Side, float] = {}
+
+
+Shutter = Literal["closed", "unknown", "none"]
+
+
+class SafeState(Frozen):
+    """How a station's instruments were brought into their safe state. `shutter`: `closed` by the monochromator's own answer, `unknown` where it didn't give
+    one, `none` where the station has no monochromator; `complaints`: a line for each instrument that failed to stop; `at`: when (UTC)."""
+
+    shutter: Shutter
+    complaints: tuple[str, ...] = ()
+    at: datetime
 
 
 class Instruments:
@@ -84,13 +101,16 @@ class Instruments:
             temperature_c={side: value for side, value in taken.items() if value is not None},
         )
 
-    def connect(self) -> dict[str, Identity]:
+    def connect(self, go_on: Callable[[], None] = lambda: None) -> dict[str, Identity]:
         """Connect to every instrument and bring it into its safe state. Returns the identities by name.
+
+        `go_on` is called before each; what it raises ends the connecting.
 
         Raises DeviceError where an instrument doesn't answer, and where a camera's pixels or colour filters contradict its data sheet.
         """
         found: dict[str, Identity] = {}
         for name, driver in self.drivers.all.items():
+            go_on()
             try:
                 driver.connect()
                 driver.stop()
@@ -172,12 +192,9 @@ class Instruments:
                 "the system scales its pixels, or it is another screen; set its scaling to 100 %, or correct rows and cols there"
             )
 
-    def make_safe(self) -> list[str]:
-        """Close the shutter, darken the screen, stop all motion: every instrument at once, within `STOP_S`.
-
-        Returns one line for each instrument that failed to stop.
-        """
-        return stop_complaints({name: in_thread(driver.stop) for name, driver in self.drivers.all.items()})
+    def make_safe(self) -> SafeState:
+        """Close the shutter, darken the screen, stop all motion: every instrument at once, within `STOP_S`."""
+        return made_safe(self.drivers, lambda driver: None)
 
     def close(self) -> None:
         """Close all connections. Never raises."""
@@ -190,16 +207,36 @@ class Instruments:
                 continue
 
 
-def stop_complaints(stopping: Mapping[str, Future[None]]) -> list[str]:
-    """Wait for instruments that are being stopped, `STOP_S` for all together. Returns one line for each that failed to stop."""
-    complaints, until = [], time.monotonic() + STOP_S
+def made_safe(
+    drivers: Drivers, first: Callable[[Instrument], None], on_shut: Callable[[], None] = lambda: None
+) -> SafeState:
+    """Stop every instrument of a station, all at once, within `STOP_S`, after `first` was called with it. `on_shut` is called as soon as the
+    monochromator has answered that its shutter is closed."""
+
+    def stopped(driver: Instrument) -> None:
+        first(driver)
+        if isinstance(driver, Monochromator):
+            shut(driver)
+            on_shut()
+        else:
+            driver.stop()
+
+    complaints = _complaints({name: in_thread(partial(stopped, driver)) for name, driver in drivers.all.items()})
+    shutter: Shutter = "unknown" if "monochromator" in complaints else "closed"
+    shutter = "none" if drivers.monochromator is None else shutter
+    return SafeState(shutter=shutter, complaints=tuple(complaints.values()), at=now())
+
+
+def _complaints(stopping: Mapping[str, Future[None]]) -> dict[str, str]:
+    """Wait for instruments that are being stopped, `STOP_S` for all together. Returns a line for each that failed to stop, by its name."""
+    complaints, until = {}, time.monotonic() + STOP_S
     for name, future in stopping.items():
         try:
             future.result(max(0.0, until - time.monotonic()))
         except TimeoutError:
-            complaints.append(f"{name}: didn't stop within {STOP_S:g} s")
+            complaints[name] = f"{name}: didn't stop within {STOP_S:g} s"
         except Exception as error:
-            complaints.append(named_complaint(name, error))
+            complaints[name] = named_complaint(name, error)
     return complaints
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture.records import RunRecord, SessionInfo, StoredFile
+from lab.capture_kinds.base import Capture
 from lab.formats.recording_set import RecordingSet, manifest_json
 
 _GZIP_LEVEL = 1  # of frames that are mostly noise, level 6 saves 2 % more and takes three times as long
@@ -29,6 +31,12 @@ def _chunk(frame: NDArray[np.uint16]) -> bytes:
     """A frame as HDF5's shuffle and gzip filters encode it. HDF5's own filters would block other threads; zlib doesn't."""
     shuffled = np.ascontiguousarray(frame.astype("<u2").view(np.uint8).reshape(-1, 2).T)
     return zlib.compress(shuffled.tobytes(), _GZIP_LEVEL)
+
+
+def _chunks(recordings: RecordingSet, captures: Sequence[Capture]) -> Generator[bytes, None, None]:
+    """The frames as chunks, packed by threads. Closing it drops those that weren't begun: leaving the pool alone would pack them all."""
+    with ThreadPoolExecutor(_PACKERS, thread_name_prefix="pack") as pool:
+        yield from pool.map(lambda capture: _chunk(recordings.frame(capture)), captures)
 
 
 def write_nexus(
@@ -73,8 +81,7 @@ def write_nexus(
                 shuffle=bool(mine),
             )
             data.attrs["units"] = "DN"
-            with ThreadPoolExecutor(_PACKERS, thread_name_prefix="pack") as pool:
-                chunks = pool.map(lambda stored: _chunk(recordings.frame(first[stored.path])), mine)
+            with contextlib.closing(_chunks(recordings, [first[stored.path] for stored in mine])) as chunks:
                 for at, (stored, chunk) in enumerate(zip(mine, chunks, strict=True)):
                     data.id.write_direct_chunk((at, 0, 0), chunk)
                     index[stored.path] = at

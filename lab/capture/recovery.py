@@ -10,12 +10,10 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 
-from drivers.instrument import Instrument
 from lab.capture.blocking_calls import STOP_S, in_thread
 from lab.capture.file_lock import Lock
-from lab.capture.instruments import stop_complaints
+from lab.capture.instruments import SafeState, Shutter, made_safe
 from lab.capture.records import now
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
@@ -27,32 +25,27 @@ log = logging.getLogger(__name__)
 LOOK_S, LONGEST_PAUSE_S = 5.0, 60.0
 
 
-def make_station_safe(station: Station, connect: Callable[[Station], Drivers] = drivers_of) -> list[str]:
+def make_station_safe(
+    station: Station, connect: Callable[[Station], Drivers] = drivers_of, on_shut: Callable[[], None] = lambda: None
+) -> SafeState:
     """Connect to every instrument of a station and stop it, all at once: shutter closed, screen dark, motion stopped. A person at a prompt isn't asked.
 
-    Returns one line for each instrument that wasn't reached or didn't stop within `STOP_S`. Raises nothing.
+    An instrument that isn't reached, or doesn't stop within `STOP_S`, has its complaint. `on_shut` is called as soon as
+    the shutter is closed. Raises nothing.
     """
     try:
-        drivers = connect(station.machines).all
+        drivers = connect(station.machines)
     except (InputError, DeviceError) as error:
-        return [str(error)]
-
-    def stopped(driver: Instrument) -> None:
-        driver.connect()
-        driver.stop()
-
-    stopping: dict[str, Future[None]] = {
-        name: in_thread(lambda one=driver: stopped(one))  # type: ignore[misc]
-        for name, driver in drivers.items()
-    }
-    complaints, until = stop_complaints(stopping), time.monotonic() + STOP_S
-    closing = [in_thread(driver.close) for driver in drivers.values()]
+        shutter: Shutter = "none" if station.monochromator is None else "unknown"
+        return SafeState(shutter=shutter, complaints=(str(error),), at=now())
+    found, until = made_safe(drivers, lambda driver: driver.connect(), on_shut), time.monotonic() + STOP_S
+    closing = [in_thread(driver.close) for driver in drivers.all.values()]
     for done in closing:
         try:
             done.result(max(0.0, until - time.monotonic()))
         except Exception:
             log.debug("a connection wasn't closed", exc_info=True)
-    return complaints
+    return found
 
 
 def ended_without_progress_twice(store: Store, session_id: str) -> bool:
@@ -145,7 +138,7 @@ class Recovery:
                 return  # it ended in good order, just now
             station = self._store.station(session_id)
             began = f"the process that ran it died (a crash, kill -9, a power cut), found {now():%Y-%m-%d %H:%M:%S} UTC"
-            complaints = [] if is_safe else make_station_safe(station, self._connect)
+            complaints = () if is_safe else make_station_safe(station, self._connect).complaints
             if complaints:
                 _, pause_s = self._next_try_s.get(session_id, (0.0, LOOK_S / 2))
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)

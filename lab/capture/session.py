@@ -16,7 +16,7 @@ import signal
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -29,7 +29,7 @@ from bluesky.utils import DuringTask, FailedStatus, Msg, RunEngineInterrupted, T
 from drivers.errors import InstrumentError
 from drivers.instrument import Identity
 from lab.capture.blocking_calls import in_thread
-from lab.capture.instruments import BenchState, Instruments
+from lab.capture.instruments import BenchState, Instruments, SafeState
 from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import JournalEntry, RunRecord, SessionInfo, now
 from lab.capture.station import Drivers, Station, drivers_of
@@ -49,6 +49,8 @@ bluesky.run_engine.__dict__["print"] = lambda *words, **_: log.debug(" ".join(ma
 #: How often (s) a waiting main thread wakes to let Python run signal handlers.
 WAKE_S = 0.1
 
+#: In the error of a session whose run left an instrument out of its safe state.
+UNSAFE = "not brought into a safe state"
 PACKAGES = ("calibench", "numpy", "bluesky", "pyserial", "pyusb", "h5py")
 
 
@@ -119,6 +121,10 @@ class _Writes:
             self._change.wait_for(lambda: self._under_way == 0)
 
 
+class _Ended(Exception):
+    """The run was ended from another thread."""
+
+
 class CaptureSession:
     """One session on its station. `run` blocks; `pause`, `resume` and `abort` may be called from other threads.
 
@@ -149,6 +155,8 @@ class CaptureSession:
         self._entries: list[JournalEntry] = []
         self._done = 0
         self._writes = _Writes()
+        #: How the run left its instruments; None while it captures, and where it had nothing to capture.
+        self.safe: SafeState | None = None
 
     @classmethod
     def start(
@@ -199,8 +207,19 @@ class CaptureSession:
             self._resume_asked = True
             self._control.notify_all()
 
+    def shut(self, reason: str) -> bool:
+        """Close the shutter now, without waiting for the step under way, and open it no more in this run. Whether there is one that the run holds.
+        Raises InstrumentError where the monochromator doesn't say that it is closed. `abort` then ends the run, for the same `reason`."""
+        with self._control:
+            self._ended_by = self._ended_by or reason
+            instruments = self._instruments
+        if instruments is None or instruments.shutter is None:
+            return False
+        instruments.shutter.bar()
+        return True
+
     def abort(self, reason: str = "aborted") -> None:
-        """End the run now. The current step is dropped, finished ones stay, and `run` continues from there."""
+        """End the run now. The current step is dropped, finished ones stay, and `run` continues from there: also while the session is packed."""
         with self._control:
             if self._ended_by is None:
                 self._ended_by = reason
@@ -244,15 +263,25 @@ class CaptureSession:
                 self._capture()
             if self._ended_by is None:
                 self._tell("packing", "packing the session")
-                self.store.close_session(self.id, lambda what, share: self._tell("packing", f"{what}, {share:.0%}"))
-                self._tell("finished", "done")
-                return
+                with contextlib.suppress(_Ended):
+                    self.store.close_session(self.id, self._tell_packing)
+                    self._tell("finished", "done")
+                    return
         except BaseException as error:
             self.store.set_state(self.id, "failed", error=str(error) or type(error).__name__)
             self._tell("failed", str(error), quietly=True)
             raise
         self.store.set_state(self.id, "interrupted", error=self._ended_by)
         self._tell("interrupted", self._ended_by or "")
+
+    def _tell_packing(self, what: str, share: float) -> None:
+        self._check_goes_on()
+        self._tell("packing", f"{what}, {share:.0%}")
+
+    def _check_goes_on(self) -> None:
+        """Raise `_Ended` where the run was ended from another thread."""
+        if self._ended_by is not None:
+            raise _Ended(self._ended_by)
 
     def _capture(self) -> None:
         """Connect, run the plan, and bring all instruments into their safe state."""
@@ -271,8 +300,9 @@ class CaptureSession:
         )
         failure: BaseException | None = None
         try:
-            identities = instruments.connect()
-            self._instruments = instruments
+            with self._control:
+                self._instruments = instruments
+            identities = instruments.connect(self._check_goes_on)
             self._check_identities(identities)
             if self.store.session(self.id).demands_certified:
                 from lab.calibration.life import cameras_of, check_certified
@@ -286,13 +316,13 @@ class CaptureSession:
         except BaseException as error:
             failure = error
         self._writes.close()
-        complaints = instruments.make_safe()
+        self.safe = instruments.make_safe()
         instruments.close()
         self._instruments = None
-        if failure is not None:
-            raise _plain(failure, complaints) from failure
-        if complaints:
-            raise DeviceError("; ".join(complaints))
+        if failure is not None and not (self._ended_by is not None and isinstance(failure, Exception)):
+            raise _plain(failure, self.safe.complaints) from failure
+        if self.safe.complaints:
+            raise DeviceError(f"{self._ended_by or 'at its end'}; {UNSAFE}: {'; '.join(self.safe.complaints)}")
 
     def _check_identities(self, identities: dict[str, Identity]) -> None:
         """Check that the session's instruments are the same. Raises InputError if one was exchanged since the previous run."""
@@ -466,12 +496,12 @@ def _append(file: Path, name: str, document: dict[str, Any]) -> None:
         lines.write(json.dumps([name, document], default=str) + "\n")
 
 
-def _plain(error: BaseException, complaints: list[str]) -> BaseException:
+def _plain(error: BaseException, complaints: Sequence[str]) -> BaseException:
     """The error as an InputError or a DeviceError where its kind is known, with the instruments that didn't reach their safe state."""
     while isinstance(error, FailedStatus) and error.__cause__ is not None:
         error = error.__cause__
     unsafe = [line for line in complaints if line not in str(error)]
-    tail = f"; not brought into a safe state: {'; '.join(unsafe)}" if unsafe else ""
+    tail = f"; {UNSAFE}: {'; '.join(unsafe)}" if unsafe else ""
     if isinstance(error, DeviceError | InstrumentError):
         return DeviceError(f"{error}{tail}")
     if isinstance(error, OSError):

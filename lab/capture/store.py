@@ -461,7 +461,7 @@ class Store:
         """Pack a session whose steps are all done into one NeXus-layout file, and remove the files of its frames.
 
         The packed frames are read back and compared by their SHA-256 before anything is removed. A second call changes nothing.
-        Raises InputError while steps are still to do.
+        Raises InputError while steps are still to do. What `progress` raises ends the packing, which a later call begins anew.
         """
         info = self.session(session_id)
         if info.steps_done < info.steps:
@@ -483,8 +483,10 @@ class Store:
                 {file.path: StoredPlace(file.sha256, file.side, index[file.path]) for file in frames},
                 pack=partial,
             )
-            for file in frames:
+            for number, file in enumerate(frames):
                 packed.frame(file.path, recordings.manifest.cameras["left"])
+                if progress:
+                    progress("checking the packed session", number / len(frames))
             with partial.open("rb") as written:
                 os.fsync(written.fileno())
             partial.rename(pack)

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import Disconnected, InstrumentError, Interrupted, NoAnswer
-from drivers.transport import Transport
+from drivers.instrument import Identity
+from drivers.transport import Transport, WireInstrument
 
 
 class Line:
@@ -137,3 +138,45 @@ def test_a_host_that_hangs_up_is_one_error() -> None:
         server.accept()[0].close()
         with pytest.raises(Disconnected, match="the line broke"):
             transport.read(1)
+
+
+class _Lamp(WireInstrument):
+    """Says `off` and waits for `ok`."""
+
+    def identity(self) -> Identity:
+        return Identity("", "lamp")
+
+    def _establish(self) -> None:
+        pass
+
+    def _make_safe(self) -> None:
+        self._transport.write(b"off\n")
+        self._transport.read_until(b"ok\n", timeout_s=30)
+
+
+def test_a_stop_is_not_ended_by_another_stop(line: Line) -> None:
+    """A run that ends and a halt stop the same instrument at once: both are told that it is safe."""
+    transport = Transport(line.address, "lamp")
+    lamp = _Lamp(transport)
+    lamp.connect()
+    failures: list[Exception] = []
+
+    def stop() -> None:
+        try:
+            lamp.stop()
+        except InstrumentError as error:
+            failures.append(error)
+
+    threads = [threading.Thread(target=stop) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+        assert os.read(line.master, 4) == b"off\n" if thread is threads[0] else True
+    threads[1].join(0.2)  # while the first waits for its answer
+    os.write(line.master, b"ok\n")
+    threads[0].join(30)
+    assert os.read(line.master, 4) == b"off\n"
+    os.write(line.master, b"ok\n")
+    threads[1].join(30)
+    assert failures == []
+    lamp._met = False  # its close would stop it once more
+    lamp.close()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import struct
+import threading
 import time
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterator, Sequence
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from drivers.camera.base import capture_together
 from drivers.camera.gencp import GenCp
 from drivers.camera.pixel_format import PIXEL_FORMATS, PixelFormat
 from drivers.camera.u3v import U3vCamera
+from drivers.camera.u3v_stream import LEADER, LEADER_MAGIC, StreamLayout, U3vStream
 from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Refused
 from mocks.bench import Bench
 from mocks.pixels import pack_12p
@@ -438,3 +442,42 @@ def test_a_server_that_goes_away(bench: Bench) -> None:
 def test_no_answer_breaks_the_control_channel(answer: bytes) -> None:
     with pytest.raises(InstrumentError):
         control(Wire(answer.hex()), 7).read(0, 1 << 14)
+
+
+class _Slow:
+    """A pyusb device that gives a leader and nothing more until its time-outs have passed; then the parts that are left in `parts`."""
+
+    def __init__(self, parts: Sequence[bytes] = ()) -> None:
+        self.leader, self.waits, self.parts = True, threading.Event(), list(parts)
+
+    def read(self, endpoint: int, into: Any, timeout_ms: int) -> int:
+        if self.leader:
+            self.leader = False
+            head = LEADER.pack(LEADER_MAGIC, 0, LEADER.size, 1, 0, 1, 0, 0x01080001, 4, 4, 0, 0, 0, 0)
+            into[: len(head)] = array("B", head)
+            return len(head)
+        self.waits.set()
+        time.sleep(timeout_ms / 1000)
+        if not self.parts:
+            raise usb.core.USBTimeoutError("Operation timed out")
+        part = self.parts.pop(0)
+        into[: len(part)] = array("B", part)
+        return len(part)
+
+
+def test_a_stream_ends_while_a_long_exposure_is_waited_for() -> None:
+    device = _Slow()
+    stream = U3vStream(cast(Any, device), 0x81, StreamLayout(64, 64, (16,)), timeout_s=600.0)
+    assert device.waits.wait(30.0)
+    stream.close()
+    assert not stream._thread.is_alive()
+
+
+def test_a_transfer_that_comes_while_a_wait_ends_is_taken_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.camera.u3v_stream._WAIT_S", 0.01)
+    device = _Slow([b"01234", b"56789abcdef"])
+    device.leader = False
+    stream = U3vStream.__new__(U3vStream)
+    stream._device, stream._endpoint, stream._ending = cast(Any, device), 0x81, threading.Event()
+    piece = array("B", bytes(16))
+    assert stream._fill(piece, time.monotonic() + 30.0) == 16 and piece.tobytes() == b"0123456789abcdef"

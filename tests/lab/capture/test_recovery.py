@@ -81,5 +81,6 @@ def test_a_session_whose_process_lives_is_left_alone(store: Store) -> None:
 
 
 def test_a_station_whose_drivers_cannot_be_made_is_a_complaint() -> None:
-    (said,) = make_station_safe(station())  # the driver "fake" isn't registered
-    assert "fake" in said and "\n" not in said
+    found = make_station_safe(station())  # the driver "fake" isn't registered
+    (said,) = found.complaints
+    assert "fake" in said and "\n" not in said and found.shutter == "unknown"

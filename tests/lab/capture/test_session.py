@@ -19,6 +19,7 @@ import pytest
 
 from drivers.errors import InstrumentError, NoAnswer
 from drivers.instrument import Identity
+from lab.capture import nexus
 from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import JournalEntry
 from lab.capture.session import CaptureSession, Progress
@@ -206,6 +207,59 @@ def test_a_shutter_that_cannot_be_closed_is_said(store: Store) -> None:
     session = begin(store, bench, LIT, unplug)
     with pytest.raises(DeviceError, match=r"not brought into a safe state: .*monochromator"):
         session.run()
+
+
+def test_a_shutter_that_says_open_is_not_taken_for_closed(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fake_bench.FakeMonochromator, "shutter_is_open", lambda self: True)
+    session = begin(store, Bench(), DARKS)
+    with pytest.raises(DeviceError, match=r"not brought into a safe state: .*its shutter is open"):
+        session.run()
+    assert session.safe is not None and session.safe.shutter == "unknown"
+
+
+def test_the_shutter_is_closed_before_the_step_under_way_ends(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera exposes, and doesn't return until the shutter was closed: nothing of the run opens it again."""
+    bench, exposes, shut = Bench(), threading.Event(), threading.Event()
+
+    def fire(self: fake_bench.FakeCamera) -> None:
+        if bench.opened:
+            exposes.set()
+            assert shut.wait(30.0)
+
+    monkeypatch.setattr(fake_bench.FakeCamera, "fire", fire)
+    session = begin(store, bench, LIT)
+    worker = threading.Thread(target=session.run)
+    worker.start()
+    assert exposes.wait(30.0)
+    instruments = session._instruments
+    assert session.shut("halted") and not bench.opened and instruments is not None and instruments.shutter is not None
+    again = instruments.shutter.set(True).exception(30.0)
+    assert "halted" in str(again) and not bench.opened
+    session.abort("halted")
+    shut.set()
+    worker.join(30.0)
+    assert store.session(session.id).state == "interrupted" and not bench.opened
+    assert session.safe is not None and session.safe.shutter == "closed" and not session.safe.complaints
+
+
+def test_an_abort_ends_the_packing_which_goes_on_later(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    packed: list[int] = []
+    chunk = nexus._chunk
+
+    def slow(frame: Any) -> bytes:
+        packed.append(1)
+        session.abort("halted")
+        return chunk(frame)
+
+    monkeypatch.setattr(nexus, "_chunk", slow)
+    session = begin(store, Bench(), DARKS)
+    info = session.run()
+    assert (info.state, info.error) == ("interrupted", "halted") and info.steps_done == info.steps
+    # Those that a thread had begun, two at a time, and no other of the 40 frames.
+    assert len(packed) < 10
+    monkeypatch.setattr(nexus, "_chunk", chunk)
+    assert CaptureSession(store, session.id, connect=Bench().drivers).run().state == "finished"
+    assert_whole(store, session.id)
 
 
 def test_a_run_that_failed_frees_its_journal(store: Store) -> None:

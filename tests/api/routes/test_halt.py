@@ -1,0 +1,129 @@
+"""A halt is confirmed by the shutter's own answer, whatever runs; what isn't confirmed never reads as free."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from lab.capture import nexus
+from tests.api.conftest import STATION, Running, serving, until, until_state
+from tests.lab import fake_bench
+
+DARKS = {"station": "fakes", "quick": True, "sequences": ["dark"]}
+
+
+def safety(client: httpx.Client) -> dict[str, Any] | None:
+    found: dict[str, Any] | None = client.get("/api/v1/stations/fakes").json()["safety"]
+    return found
+
+
+def halt(client: httpx.Client) -> dict[str, Any]:
+    """The `safety` of the station in the answer."""
+    response = client.post("/api/v1/halt")
+    assert response.status_code == 200, response.text
+    (station,) = response.json()["stations"]
+    assert station["name"] == "fakes"
+    found: dict[str, Any] = station["safety"]
+    return found
+
+
+@pytest.mark.parametrize("scope", ["operate", "calibrate"])
+def test_a_halt_is_confirmed_while_a_camera_exposes(
+    tmp_path: Path, scope: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The camera exposes until the halt has been answered."""
+    exposes, go_on = threading.Event(), threading.Event()
+
+    def fire(self: fake_bench.FakeCamera) -> None:
+        exposes.set()
+        assert go_on.wait(30.0)
+
+    monkeypatch.setattr(fake_bench.FakeCamera, "fire", fire)
+    with serving(tmp_path) as running, running.client("admin") as client, running.client(scope) as halting:
+        assert safety(client) is None  # nothing has answered yet
+        session = client.post("/api/v1/sessions", json=DARKS).json()["id"]
+        assert exposes.wait(30.0)
+        assert halt(halting)["shutter"] == "closed" and not running.bench.opened
+        go_on.set()
+        assert until_state(client, session, "interrupted")["error"] == f"halted by {scope}"
+        at_last = until(client, "/api/v1/stations/fakes", lambda now: now["busy_with"] is None)["safety"]
+        assert at_last["state"] == "safe" and at_last["shutter"] == "closed"
+
+
+def test_a_halt_while_a_session_is_packed(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    packs, go_on = threading.Event(), threading.Event()
+    chunk = nexus._chunk
+
+    def slow(frame: Any) -> bytes:
+        packs.set()
+        assert go_on.wait(30.0)
+        return chunk(frame)
+
+    monkeypatch.setattr(nexus, "_chunk", slow)
+    with running.client("operate") as client:
+        session = client.post("/api/v1/sessions", json=DARKS).json()["id"]
+        assert packs.wait(30.0)
+        running.bench.opened = True  # by hand
+        assert halt(client)["shutter"] == "closed" and not running.bench.opened
+        go_on.set()
+        until_state(client, session, "interrupted")
+
+
+def test_a_halt_where_nothing_runs_makes_the_station_safe(running: Running) -> None:
+    with running.client("operate") as client:
+        running.bench.opened = True
+        assert halt(client)["shutter"] == "closed" and not running.bench.opened
+        assert until(client, "/api/v1/stations/fakes", lambda now: now["safety"]["state"] == "safe")
+
+
+def test_a_station_that_was_not_made_safe_says_so_until_it_is(tmp_path: Path) -> None:
+    """Also after a restart of the service."""
+    with serving(tmp_path, delay_s=0.05) as running, running.client("operate") as client:
+        session = client.post("/api/v1/sessions", json=DARKS).json()["id"]
+        until_state(client, session, "running")
+        running.bench.unplugged.add("monochromator")
+        found = halt(client)
+        assert (found["state"], found["shutter"]) == ("not confirmed", "unknown") and "the line is gone" in found["words"]
+        ended = until_state(client, session, "failed")
+        assert "halted by operate; not brought into a safe state: monochromator" in ended["error"]
+        assert client.get("/api/v1/stations/fakes").json()["safety"]["state"] == "not confirmed"
+        for name, _, _ in running.store.keys():
+            running.store.remove_key(name)
+    with serving(tmp_path) as running, running.client("operate") as client:
+        known = safety(client)
+        assert known is not None and known["state"] == "not confirmed" and session in known["words"]
+        assert halt(client)["shutter"] == "closed"
+        assert until(client, "/api/v1/stations/fakes", lambda now: now["safety"]["state"] == "safe")
+
+
+def test_an_instrument_that_does_not_answer_is_not_waited_for(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = threading.Event()
+    stop = fake_bench.FakeMonochromator.stop
+
+    def silent(self: fake_bench.FakeMonochromator) -> None:
+        assert answers.wait(30.0)
+        stop(self)
+
+    monkeypatch.setattr(fake_bench.FakeMonochromator, "stop", silent)
+    with running.client("operate") as client:
+        found = halt(client)
+        assert found["state"] == "not confirmed" and "no answer" in found["words"]
+        answers.set()
+        assert until(client, "/api/v1/stations/fakes", lambda now: now["safety"]["state"] == "safe")
+
+
+def test_a_key_that_may_only_read_halts_nothing(shared: Running) -> None:
+    with shared.client("read") as client:
+        refused = client.post("/api/v1/halt")
+        assert refused.status_code == 403 and "'operate' or 'calibrate'" in refused.json()["detail"]
+
+
+def test_two_stations_at_one_shutter_are_asked_once(running: Running) -> None:
+    (running.store.root / "stations" / "twin.toml").write_text(STATION)
+    with running.client("operate") as client:
+        found = client.post("/api/v1/halt").json()["stations"]
+        assert [(one["name"], one["safety"]["shutter"]) for one in found] == [("fakes", "closed"), ("twin", "closed")]
