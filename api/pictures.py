@@ -8,7 +8,7 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-from api.preview import preview_png
+from api.preview import Form, preview
 from lab.capture.store import Store
 from lab.formats.recording_set import DataSheet
 from lab.quick_look.frame_figures import FrameFigures, frame_figures
@@ -23,16 +23,16 @@ class Pictures:
         self._store = store
         self._making = threading.Lock()
         self._frame = functools.lru_cache(FRAMES)(self._loaded)
-        self._png = functools.lru_cache(PICTURES)(self._made_png)
+        self._picture = functools.lru_cache(PICTURES)(self._made_picture)
         self._figures = functools.lru_cache(FIGURES)(self._made_figures)
 
-    def png(self, session_id: str, capture_id: int, width_px: int, stretch: bool) -> bytes:
-        """A capture as `preview_png` shows it. Raises InputError where its frame is missing or damaged."""
+    def picture(self, session_id: str, capture_id: int, width_px: int, stretch: bool, form: Form) -> bytes:
+        """A capture as `preview` shows it. Raises InputError where its frame is missing or damaged."""
         with self._making:
-            return self._png(session_id, capture_id, width_px, stretch)
+            return self._picture(session_id, capture_id, width_px, stretch, form)
 
     def figures(self, session_id: str, capture_id: int) -> FrameFigures:
-        """The figures of a capture's frame. Raises InputError as `png`."""
+        """The figures of a capture's frame. Raises InputError as `picture`."""
         with self._making:
             return self._figures(session_id, capture_id)
 
@@ -41,9 +41,9 @@ class Pictures:
         (capture,) = recordings.captures()
         return recordings.frame(capture), recordings.camera(capture.side)
 
-    def _made_png(self, session_id: str, capture_id: int, width_px: int, stretch: bool) -> bytes:
+    def _made_picture(self, session_id: str, capture_id: int, width_px: int, stretch: bool, form: Form) -> bytes:
         frame, camera = self._frame(session_id, capture_id)
-        return preview_png(frame, camera, width_px, stretch)
+        return preview(frame, camera, width_px, stretch, form)
 
     def _made_figures(self, session_id: str, capture_id: int) -> FrameFigures:
         return frame_figures(*self._frame(session_id, capture_id))

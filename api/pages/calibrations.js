@@ -1,7 +1,7 @@
 // Calibrations: their states, certifying one, and the history of a figure with its bands.
 
 import { number, svg, ticks } from "./charts.js";
-import { $, api, ask, element, post, show, time, told } from "./page.js";
+import { $, api, ask, element, may, post, show, time, told } from "./page.js";
 
 const HEIGHT = 240;
 const LEFT = 76;
@@ -22,7 +22,7 @@ function row(one) {
     link.setAttribute("aria-label", label === "Compare" ? `Compare ${one.name} with the certified calibration` : `Camera files of ${one.name}`);
     actions.append(link, " ");
   }
-  if (one.state === "candidate") {
+  if (one.state === "candidate" && may("calibrate")) {
     const button = element("button", { textContent: "Certify …" });
     button.setAttribute("aria-label", `Certify ${one.name}`);
     button.addEventListener("click", told("calibration-problem", () => openCertify(one)));

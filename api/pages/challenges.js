@@ -1,14 +1,12 @@
 // Challenges: recording sets of cameras that conceal something, made and scored by jobs; their truths are sealed until then.
 
-import { $, api, ask, element, post, show, time, told } from "./page.js";
+import { $, api, ask, element, may, post, show, time, told } from "./page.js";
 
 let after = () => {};
-let mayChange = false;
 
-export function challengesAre(scope, changed) {
-  mayChange = ["calibrate", "admin"].includes(scope);
+export function challengesAre(changed) {
   after = changed;
-  $("challenge-form").hidden = !mayChange;
+  $("challenge-form").hidden = !may("calibrate");
 }
 
 export const nameOf = (one) => one.name || one.id;
@@ -30,9 +28,9 @@ function row({ one, working, score }) {
   if (one.scored) {
     opens("score", "Score");
     opens("truths", "Truths");
-  } else if (mayChange && made < one.cases) does("Go on", () => post(`/challenges/${one.id}/jobs`, { kind: "make" }), working);
-  else if (mayChange) does("Score", () => post(`/challenges/${one.id}/jobs`, { kind: "score" }), working);
-  if (mayChange) {
+  } else if (may("calibrate") && made < one.cases) does("Go on", () => post(`/challenges/${one.id}/jobs`, { kind: "make" }), working);
+  else if (may("calibrate")) does("Score", () => post(`/challenges/${one.id}/jobs`, { kind: "score" }), working);
+  if (may("calibrate")) {
     does("Delete", async () => {
       if (confirm(`Delete ${nameOf(one)}, its recordings and its truths for ever?`)) await ask(`/challenges/${one.id}`, { method: "DELETE" });
     }, working, "danger");

@@ -1,13 +1,11 @@
 // Camera models: those of fits and diagnoses, and those that are sent in; fetched, and the sent ones deleted.
 
-import { $, api, ask, element, show, time, told } from "./page.js";
+import { $, api, ask, element, may, show, time, told } from "./page.js";
 import { takesFiles } from "./send.js";
 
-let mayChange = false;
 
-export function modelsAre(scope) {
-  mayChange = ["calibrate", "admin"].includes(scope);
-  $("model-drop").hidden = !mayChange;
+export function modelsAre() {
+  $("model-drop").hidden = !may("calibrate");
 }
 
 const names = (cameras) => Object.entries(cameras).map(([side, camera]) => `${side} camera ${camera.name}`.trim());
@@ -25,7 +23,7 @@ function row(one) {
     link.setAttribute("aria-label", `Download camera model ${one.id}`);
     actions.append(link, " ");
   }
-  if (mayChange && one.kind === "sent") {
+  if (may("calibrate") && one.kind === "sent") {
     const button = element("button", { textContent: "Delete" });
     button.setAttribute("aria-label", `Delete camera model ${one.id}`);
     button.addEventListener("click", told("models-problem", async () => {

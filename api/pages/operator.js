@@ -4,7 +4,7 @@ import { showCalibrations } from "./calibrations.js";
 import { challengesAre, showChallenges } from "./challenges.js";
 import { showFindings } from "./findings.js";
 import { modelsAre, showModels } from "./models.js";
-import { $, Problem, api, ask, element, post, put, show, time, told } from "./page.js";
+import { $, api, ask, element, halt, may, mayHalt, page, post, put, reach, scopeIs, show, time, told } from "./page.js";
 import { asked as planned, showPlan } from "./plan.js";
 import { queueIs, showQueue } from "./queue.js";
 import { recordingsAre, showRecordings } from "./recordings.js";
@@ -16,7 +16,6 @@ let atOnce = PICTURES_AT_ONCE;
 let selected = null; // the session whose captures are shown
 let running = []; // the sessions that run now
 let jobsDone = 0;
-let scope = "read";
 
 function exposure(seconds) {
   if (seconds == null) return "";
@@ -36,22 +35,22 @@ function showLogin() {
   leaveStations();
   $("login").hidden = false;
   $("desk").hidden = $("logout").hidden = $("halt").hidden = true;
-  $("who").textContent = "";
+  $("who").textContent = $("halt-told").textContent = "";
   $("login-form").elements.key.focus();
 }
 
 async function enter() {
   const me = await ask("/me");
-  scope = me.scope;
+  scopeIs(me.scope);
   $("who").textContent = `${me.name} (${me.scope})`;
   $("login").hidden = true;
   $("desk").hidden = $("logout").hidden = false;
-  $("halt").hidden = !["operate", "admin"].includes(me.scope);
-  stationsAre(me.scope, () => refresh().catch(() => {}));
+  $("halt").hidden = !mayHalt();
+  stationsAre(() => refresh().catch(() => {}));
   queueIs(refresh);
-  challengesAre(me.scope, refresh);
-  recordingsAre(me.scope, async () => (await showRecordings(), await refresh()));
-  modelsAre(me.scope);
+  challengesAre(refresh);
+  recordingsAre(async () => (await showRecordings(), await refresh()));
+  modelsAre();
   await refresh();
   await Promise.all([showCalibrations(), showRecordings(), showModels()]);
 }
@@ -63,12 +62,16 @@ let stations = [];
 function showStart() {
   const usable = stations.filter((s) => !s.problem);
   const select = $("start-form").elements.station;
+  const kept = select.value;
+  const first = select.options.length === 0;
   show("start-station", usable.map((s) => ({ id: s.name, title: s.title })), (s) => element("option", { value: s.id, textContent: s.title === s.id ? s.id : `${s.id}: ${s.title}` }));
+  // A file that appears changes nothing of what was chosen; where the chosen one is gone, somebody chooses anew.
+  if (!first) select.value = usable.some((s) => s.name === kept) ? kept : "";
   const problems = stations.filter((s) => s.problem).map((s) => `${s.name}: ${s.problem}`);
   if (!stations.length) problems.push("No station file yet: put one into the folder 'stations' of the data folder.");
   $("no-station").hidden = problems.length === 0;
   $("no-station").textContent = problems.join(" ");
-  $("start-form").hidden = usable.length === 0 || !["operate", "admin"].includes(scope);
+  $("start-form").hidden = usable.length === 0 || !may("operate");
   const chosen = usable.find((s) => s.name === select.value);
   showStartButton(chosen);
   showPlan(chosen, $("start-form").elements.quick.checked).catch((error) => ($("plan-problem").textContent = error.message));
@@ -88,21 +91,31 @@ $("start-form").addEventListener(
     const at = fields.not_before.value ? new Date(fields.not_before.value).toISOString() : null;
     const queued = Boolean(at || stations.find((s) => s.name === fields.station.value)?.busy_with);
     const asked = { station: fields.station.value, name: fields.name.value, quick: fields.quick.checked, demands_certified: fields.certified.checked, ...planned() };
-    const session = await post("/sessions", { ...asked, queue: queued, not_before: at });
+    await post("/sessions", { ...asked, queue: queued, not_before: at });
     fields.name.value = fields.not_before.value = "";
-    if (!queued) await select(session);
   }),
 );
 
 // Ends every session that runs, without a question: shutters close, screens go dark, each can be resumed, and the queue is held.
-$("halt").addEventListener("click", guarded("live-problem", () => post("/halt")));
+$("halt").addEventListener("click", async () => {
+  await halt($("halt-told"));
+  await refresh().catch(() => {});
+});
+
+let lostAt = null;
+document.addEventListener("connection", (event) => {
+  lostAt = event.detail ? null : (lostAt ?? new Date());
+  $("lost").hidden = !lostAt;
+  const words = lostAt ? `No connection to the service since ${lostAt.toISOString().slice(11, 19)} UTC: what stands here is old, and a halt doesn't reach it.` : "";
+  if ($("lost").textContent !== words) $("lost").textContent = words;
+});
 
 $("login-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   const form = event.target;
   const problem = form.querySelector(".problem");
   problem.textContent = "";
-  const response = await fetch("/login", {
+  const response = await reach("/login", {
     method: "POST",
     headers: { "Content-Type": "application/json" },
     body: JSON.stringify({ key: form.elements.key.value }),
@@ -113,7 +126,7 @@ $("login-form").addEventListener("submit", async (event) => {
 });
 
 $("logout").addEventListener("click", async () => {
-  await fetch("/logout", { method: "POST" });
+  await reach("/logout", { method: "POST" });
   showLogin();
 });
 
@@ -134,7 +147,7 @@ function stateCell(item) {
 
 function sessionRow(session) {
   const actions = element("td");
-  if (["created", "interrupted", "failed"].includes(session.state)) {
+  if (["created", "interrupted", "failed"].includes(session.state) && may("operate")) {
     const resume = element("button", { textContent: "Resume" });
     resume.addEventListener("click", guarded("live-problem", () => goOn(session)));
     actions.append(resume, " ");
@@ -158,7 +171,7 @@ function sessionRow(session) {
 
 function jobRow(job) {
   const actions = element("td");
-  if (job.state === "running" || job.state === "queued") {
+  if ((job.state === "running" || job.state === "queued") && may("calibrate")) {
     const cancel = element("button", { textContent: "Cancel" });
     cancel.addEventListener("click", guarded("job-problem", () => post(`/jobs/${job.id}/cancel`)));
     actions.append(cancel);
@@ -194,7 +207,7 @@ async function select(session) {
   $("session").hidden = false;
   $("session-problem").textContent = "";
   $("session-title").textContent = session.name || session.id;
-  const buttons = ["fit", "validate", "diagnose", "report", "pipeline"].map((kind) => {
+  const buttons = (may("calibrate") ? ["fit", "validate", "diagnose", "report", "pipeline"] : []).map((kind) => {
     const button = element("button", { textContent: kind[0].toUpperCase() + kind.slice(1), title: `${kind} this session` });
     button.addEventListener(
       "click",
@@ -203,15 +216,22 @@ async function select(session) {
     return button;
   });
   const link = element("a", { href: `${api}/sessions/${session.id}/archive.zip`, textContent: "Download" });
-  const away = element("button", { textContent: "Delete", className: "danger", hidden: scope !== "admin" });
+  const away = element("button", { textContent: "Delete", className: "danger", hidden: !may("admin") });
   away.addEventListener("click", guarded("session-problem", () => deleteSession(session)));
   $("session-actions").replaceChildren(...[...buttons, link, away].flatMap((b) => [b, " "]));
-  watch(session);
+  if (!running.length || running.includes(session.id)) watch(session); // what runs stays in view
   const filter = $("capture-filter").elements;
   filter.kind.replaceChildren();
   await showCaptures();
-  $("session").scrollIntoView({ block: "nearest" });
+  // The live view above it stays in sight, the halt in the page's head, and Tab goes on in the session.
+  $("watch").scrollIntoView({ block: "start" });
+  $("session-title").focus({ preventScroll: true });
 }
+
+$("back").addEventListener("click", () => {
+  const row = [...$("sessions").children].find((one) => one.itemId === selected);
+  ([...(row?.querySelectorAll("button") ?? [])].at(-1) ?? $("more-sessions")).focus();
+});
 
 async function deleteSession(session) {
   if (!confirm(`Delete ${session.name || session.id} and all its captures for ever? Results and calibrations of it stay.`)) return;
@@ -235,11 +255,10 @@ const filtered = () => {
   return asked;
 };
 
-async function page(asked) {
-  const response = await fetch(`${api}/sessions/${selected}/captures?${asked}`);
-  if (!response.ok) throw new Problem((await response.json()).detail);
-  total = Number(response.headers.get("X-Total-Count"));
-  return response.json();
+async function capturesOf(asked) {
+  const found = await page(`/sessions/${selected}/captures?${asked}`);
+  total = found.total;
+  return found.items;
 }
 
 async function showFilter() {
@@ -260,27 +279,31 @@ async function showCaptures() {
     await showFilter();
     const asked = filtered();
     asked.set("order", "newest");
-    captures = await page(asked);
+    captures = await capturesOf(asked);
     shownFor = `${selected} ${filtered()}`;
-  } else if (running.includes(selected)) {
-    const known = captures.length;
-    for (let more = true; more; ) {
-      const asked = filtered();
-      if (captures.length) asked.set("after", captures[0].id);
-      const found = await page(asked);
-      captures = [...found.reverse(), ...captures];
-      more = found.length === 200;
-    }
-    if (known !== captures.length) await showFilter();
   }
   drawCaptures();
 }
+
+// Those that were taken since: a session that runs shows its newest frame above, and its others when somebody asks for them.
+async function newerCaptures() {
+  for (let more = true; more; ) {
+    const asked = filtered();
+    if (captures.length) asked.set("after", captures[0].id);
+    const found = await capturesOf(asked);
+    captures = [...found.reverse(), ...captures];
+    more = found.length === 200;
+  }
+  await showFilter();
+  drawCaptures();
+}
+$("newer").addEventListener("click", guarded("session-problem", newerCaptures));
 
 async function olderCaptures() {
   const asked = filtered();
   asked.set("order", "newest");
   asked.set("after", captures.at(-1).id);
-  captures = [...captures, ...(await page(asked))];
+  captures = [...captures, ...(await capturesOf(asked))];
 }
 
 function drawCaptures() {
@@ -292,8 +315,9 @@ function drawCaptures() {
   const left = pictures.length - shown.length + (captures.length < total ? 1 : 0);
   $("capture-count").textContent = total ? `${total} captures; ${shown.length} frames shown, the newest first` : "None yet.";
   $("more").hidden = left === 0;
+  $("newer").hidden = true;
   const stretch = $("capture-filter").elements.stretch.checked;
-  show("captures", shown.map((c) => ({ ...c, picture: `${c.preview}?width=320${stretch ? "&stretch=true" : ""}` })), (c) =>
+  show("captures", shown.map((c) => ({ ...c, picture: `${c.preview.replace(/png$/, "webp")}?width=320${stretch ? "&stretch=true" : ""}` })), (c) =>
     element(
       "figure",
       {},
@@ -317,18 +341,59 @@ $("more").addEventListener(
 );
 $("capture-filter").addEventListener("change", guarded("session-problem", showCaptures));
 
-async function refresh() {
+// The sessions that the page knows, the newest first: the first page is asked for again and again, older ones by `Show older ones`.
+const PAGE = 50;
+let sessions = [];
+
+async function showSessions() {
+  const { items, total } = await page(`/sessions?limit=${PAGE}`);
+  const ids = new Set(items.map((s) => s.id));
+  const oldest = items.at(-1)?.created ?? "";
+  sessions = [...items, ...(items.length < PAGE ? [] : sessions.filter((s) => !ids.has(s.id) && s.created <= oldest))];
+  $("more-sessions").hidden = sessions.length >= total;
+}
+
+$("more-sessions").addEventListener(
+  "click",
+  guarded("live-problem", async () => {
+    sessions = [...sessions, ...(await ask(`/sessions?limit=${PAGE}&after=${sessions.at(-1).id}`))];
+  }),
+);
+
+// What a session's run changes is asked for at every look, the rest at every `SELDOM`th, at a change of what runs, and after what somebody does.
+const SELDOM = 4;
+let looks = 0;
+let jobs = [];
+let state = "";
+
+async function refresh(seldom = true) {
   if ($("desk").hidden) return;
-  let sessions, jobs;
-  [sessions, jobs, stations] = await Promise.all([ask("/sessions?limit=50"), ask("/jobs?limit=50"), ask("/stations")]);
-  const names = new Map(sessions.map((s) => [s.id, s.name || s.id]));
+  [, stations] = await Promise.all([showSessions(), ask("/stations")]);
+  const now = JSON.stringify(sessions.map((s) => [s.id, s.state]));
+  if (now !== state || jobs.some((job) => ["queued", "running"].includes(job.state))) seldom = true;
+  state = now;
   const live = await showStations(stations, sessions);
   const ended = running.includes(selected) && !live.some((s) => s.id === selected);
   running = live.map((s) => s.id);
   showStart();
-  await showQueue();
   show("sessions", sessions, sessionRow);
   $("no-sessions").hidden = sessions.length > 0;
+  if (seldom) await showJobs();
+  if (live.length && !running.includes(watches())) watch(live[0]); // the queue's next one
+  await showWatched();
+  if (selected) await showFindings(selected, jobs.filter((job) => job.session_id === selected && job.state === "done").length);
+  if (ended) await newerCaptures();
+  else if (running.includes(selected)) $("newer").hidden = !($("newer").textContent = newerWords());
+}
+
+function newerWords() {
+  const one = sessions.find((s) => s.id === selected);
+  return one && one.steps_done > 0 ? "Show those taken since" : "";
+}
+
+async function showJobs() {
+  const names = new Map(sessions.map((s) => [s.id, s.name || s.id]));
+  [jobs] = await Promise.all([ask("/jobs?limit=50"), showQueue()]);
   const challenges = await showChallenges(jobs);
   const of = (job) => (job.challenge_id ? (challenges.get(job.challenge_id) ?? "a challenge") : (names.get(job.session_id) ?? job.session_id ?? `recordings ${job.recordings_id}`));
   show("jobs", jobs.map((job) => ({ ...job, of: of(job) })), jobRow);
@@ -336,13 +401,9 @@ async function refresh() {
   const done = jobs.filter((job) => job.state === "done").length;
   if (done !== jobsDone) await Promise.all([showCalibrations(), showModels()]); // a fit is a new candidate
   jobsDone = done;
-  if (!watches() && live.length) watch(live[0]);
-  await showWatched();
-  if (selected) await showFindings(selected, jobs.filter((job) => job.session_id === selected && job.state === "done").length);
-  if (ended || running.includes(selected)) await showCaptures();
 }
 
 $("watch-side").addEventListener("change", () => showWatched().catch(() => {}));
 // What runs tells of itself through its events; the lists are looked at now and then, and not where nobody sees them.
-setInterval(() => document.hidden || refresh().catch(() => {}), 3000);
+setInterval(() => document.hidden || refresh(++looks % SELDOM === 0).catch(() => {}), 5000);
 enter().catch(() => showLogin());

@@ -7,18 +7,46 @@ export const LIVE = ["connecting", "running", "pausing", "paused", "packing"];
 
 export class Problem extends Error {}
 
-export async function ask(path, options = {}) {
-  const response = await fetch(api + path, {
-    headers: options.body ? { "Content-Type": "application/json" } : {},
-    ...options,
-  });
+// What a key allows, as the service decides it: `wanted` is "operate", "calibrate" or "admin"; anything but reading allows a halt.
+let scope = "read";
+export const scopeIs = (mine) => (scope = mine);
+export const may = (wanted) => scope === "admin" || scope === wanted;
+export const mayHalt = () => scope !== "read";
+
+const ANSWER_MS = 20_000;
+
+// Every answer, and every one that didn't come, tells whether the service can be reached: the event "connection", with `detail` true or false.
+export async function reach(path, options = {}, patience = ANSWER_MS) {
+  try {
+    const response = await fetch(path, { signal: AbortSignal.timeout(patience), ...options });
+    document.dispatchEvent(new CustomEvent("connection", { detail: true }));
+    return response;
+  } catch {
+    document.dispatchEvent(new CustomEvent("connection", { detail: false }));
+    throw new Problem("the service doesn't answer");
+  }
+}
+
+export async function ask(path, options = {}, patience = ANSWER_MS) {
+  return (await asked(path, options, patience)).body;
+}
+
+// A page of a list, and how many items there are on all pages.
+export async function page(path) {
+  const { body, response } = await asked(path);
+  return { items: body, total: Number(response.headers.get("X-Total-Count")) };
+}
+
+async function asked(path, options = {}, patience = ANSWER_MS) {
+  const headers = options.body ? { "Content-Type": "application/json" } : {};
+  const response = await reach(api + path, { headers, ...options }, patience);
   if (response.status === 401) {
     document.dispatchEvent(new Event("logged-out"));
     throw new Problem("log in first");
   }
   const body = response.status === 204 ? null : await response.json();
   if (!response.ok) throw new Problem(body.detail);
-  return body;
+  return { body, response };
 }
 
 export const post = (path, body) => ask(path, { method: "POST", body: body === undefined ? undefined : JSON.stringify(body) });
@@ -65,3 +93,26 @@ export const told = (place, action) => async (event) => {
     problem.textContent = error.message;
   }
 };
+
+export const clock = (text) => `${time(text).slice(11)} UTC`;
+
+// A halt's answer has to come within this time (ms), or somebody goes to the bench.
+const HALT_MS = 2000;
+
+// Halts a station, or all where none is named, and says beside the button in `place` what came of it.
+export async function halt(place, station = null) {
+  place.className = "halted";
+  place.textContent = "halting …";
+  try {
+    const found = await ask("/halt", { method: "POST", body: JSON.stringify({ station }) }, HALT_MS);
+    const open = found.stations.filter((one) => one.safety.shutter === "unknown");
+    place.classList.toggle("unsafe", open.length > 0);
+    const shut = found.stations.filter((one) => one.safety.shutter === "closed");
+    const words = open.map((one) => `NOT CONFIRMED: go to the bench of ${one.name} (${one.safety.words})`);
+    if (shut.length) words.push(`shutter closed ${clock(shut[0].safety.at)}${found.stations.length > 1 ? `: ${shut.map((one) => one.name).join(", ")}` : ""}`);
+    place.textContent = words.join("; ") || "halted; no station here has a shutter";
+  } catch (error) {
+    place.classList.add("unsafe");
+    place.textContent = `NOT CONFIRMED: go to the bench (${error.message})`;
+  }
+}

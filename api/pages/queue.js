@@ -1,6 +1,6 @@
 // The queue: who waits, in which order, and what is held.
 
-import { $, ask, element, put, show, time, told } from "./page.js";
+import { $, ask, element, may, put, show, time, told } from "./page.js";
 
 let after = () => {};
 
@@ -9,6 +9,7 @@ export const queueIs = (changed) => (after = changed);
 function row(one) {
   const actions = element("td");
   const does = (label, says, action, disabled = false) => {
+    if (!may("operate")) return;
     const button = element("button", { textContent: label, disabled });
     button.setAttribute("aria-label", `${says} ${one.name || one.id}`);
     button.addEventListener("click", told("queue-problem", async () => (await action(), after())));

@@ -1,15 +1,13 @@
 // Recording sets: sent in by drag and drop or by the file chooser, worked on, fetched, deleted.
 
-import { $, api, ask, element, post, show, told } from "./page.js";
+import { $, api, ask, element, may, post, show, told } from "./page.js";
 import { takesFiles } from "./send.js";
 
 let after = () => {};
-let mayChange = false;
 
-export function recordingsAre(scope, changed) {
-  mayChange = ["calibrate", "admin"].includes(scope);
+export function recordingsAre(changed) {
   after = changed;
-  $("drop").hidden = !mayChange;
+  $("drop").hidden = !may("calibrate");
 }
 
 takesFiles("drop", "recordings-problem", {
@@ -29,11 +27,11 @@ function row(one) {
     button.addEventListener("click", told("recordings-problem", async () => (await action(), after())));
     actions.append(button, " ");
   };
-  if (mayChange) for (const kind of ["fit", "diagnose", "report"]) does(kind[0].toUpperCase() + kind.slice(1), () => post(`/recordings/${one.id}/jobs`, { kind }));
+  if (may("calibrate")) for (const kind of ["fit", "diagnose", "report"]) does(kind[0].toUpperCase() + kind.slice(1), () => post(`/recordings/${one.id}/jobs`, { kind }));
   const link = element("a", { href: `${api}/recordings/${one.id}/archive.zip`, textContent: "Download" });
   link.setAttribute("aria-label", `Download ${one.name || one.id}`);
   actions.append(link, " ");
-  if (mayChange) {
+  if (may("calibrate")) {
     does("Delete", async () => {
       if (confirm(`Delete ${one.name || one.id} for ever? Results of it stay.`)) await ask(`/recordings/${one.id}`, { method: "DELETE" });
     });

@@ -23,7 +23,7 @@ export const watches = () => watched;
 const share = (value) => (value === 0 ? "none" : value < 0.0001 ? "< 0.01 %" : `${number(100 * value, 3)} %`);
 
 function drawFrame(capture, figures) {
-  const picture = element("img", { src: `${capture.preview}?width=640&stretch=true`, alt: `newest frame, ${capture.side} camera: ${capture.name}` });
+  const picture = element("img", { src: `${capture.preview.replace(/png$/, "webp")}?width=640&stretch=true`, alt: `newest frame, ${capture.side} camera: ${capture.name}` });
   $("watch-frame").replaceChildren(picture, element("figcaption", { textContent: capture.name }));
   const series = figures.channels.map((one) => ({
     name: one.channel,

@@ -375,3 +375,111 @@ def test_a_camera_model_is_sent_in_and_deleted(browser: Any, lab: Running, tmp_p
     page.wait_for_selector("#models tr:has-text('sent')", state="detached")
     watched.complaints = [line for line in watched.complaints if "422" not in line]  # the refused one
     watched.close()
+
+
+def test_a_halt_is_answered_beside_its_button_also_without_a_network(browser: Any, lab: Running) -> None:
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab, "calibrate")
+    assert page.is_visible("#halt") and not page.is_visible("#start-form")
+    assert not page.query_selector("#sessions button:has-text('Resume')")
+    page.click("#halt")
+    page.wait_for_selector("#halt-told:has-text('shutter closed')")
+    page.wait_for_selector(".station dd:has-text('closed')")
+    lab.bench.unplugged.add("monochromator")
+    page.click(".station button:has-text('Halt')")
+    page.wait_for_selector(".station .halted.unsafe:has-text('NOT CONFIRMED: go to the bench')")
+    page.wait_for_selector(".station .state.unsafe:has-text('NOT CONFIRMED')")
+    assert watched.serious() == []
+    lab.bench.unplugged.clear()
+    watched.context.set_offline(True)
+    page.click("#halt")
+    page.wait_for_selector("#halt-told.unsafe:has-text('NOT CONFIRMED: go to the bench')")
+    page.wait_for_selector("#lost:has-text('No connection')")
+    assert "free" not in page.inner_text(".station .state")
+    watched.context.set_offline(False)
+    page.wait_for_selector("#lost", state="hidden")
+    page.click("#halt")
+    page.wait_for_selector(".station .state:text-is('free')")
+    watched.complaints = [line for line in watched.complaints if "ERR_INTERNET_DISCONNECTED" not in line]
+    watched.close()
+
+
+def test_a_key_that_may_only_read_gets_no_button_that_fails(browser: Any, lab: Running) -> None:
+    watched = Watched(browser, lab)
+    watched.log_in(lab, "read")
+    page = watched.page
+    page.click("#sessions tr:has(.state.finished) button:has-text('Open')")
+    page.wait_for_selector("#captures img")
+    page.wait_for_selector("#queue tr")
+    words = {button.inner_text() for button in page.query_selector_all("main button") if button.is_visible()}
+    assert words <= {"Open", "Show more", "Back to the sessions"}
+    watched.close()
+
+
+def test_what_runs_stays_in_view_and_what_was_chosen_stays_chosen(browser: Any, lab: Running) -> None:
+    other = STATION.replace('address = "', 'address = "other ').replace("a bench of fakes", "another bench")
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    lab.bench.delay_s = 0.1
+    page.fill("input[name=name]", "in view")
+    page.click("#start")
+    page.wait_for_selector(".station.busy button:has-text('Halt')")
+    page.wait_for_selector("#watch-title:has-text('in view')")
+    assert page.evaluate("scrollY") == 0
+    (lab.store.root / "stations" / "another.toml").write_text(other)  # before the chosen one in the list
+    page.wait_for_selector("#start-station option:nth-child(2)", state="attached")
+    assert page.input_value("#start-station") == "fakes"
+    page.click("#sessions tr:has(.state.finished) button:has-text('Open')")
+    page.wait_for_selector("#captures img")
+    assert "in view" in page.inner_text("#watch-title")  # what runs, not what was opened
+    assert watched.can_halt() and watched.focused()["text"] == "nightly"
+    box = page.query_selector("#watch-title").bounding_box()
+    assert 0 <= box["y"] <= DESK["height"]
+    watched.tab_to("Fit")
+    page.click("#halt")
+    page.wait_for_selector("#sessions tr:has-text('in view') .state.interrupted")
+    lab.bench.delay_s = 0.0
+    (lab.store.root / "stations" / "another.toml").unlink()
+    watched.close()
+
+
+def test_sessions_beyond_the_first_page_are_reached(browser: Any, tmp_path: Path) -> None:
+    with serving(tmp_path) as running, running.client() as client:
+        asked = {"station": "fakes", "quick": True, "sequences": ["dark"], "queue": True}
+        for number in range(53):
+            late = asked | {"name": f"number {number}", "not_before": "2999-01-01T00:00:00Z"}
+            assert client.post("/api/v1/sessions", json=late).status_code == 201
+        watched = Watched(browser, running)
+        page = watched.page
+        page.fill("input[name=key]", running.keys["read"])
+        page.press("input[name=key]", "Enter")
+        page.wait_for_selector("#sessions tr:nth-child(50)")
+        page.click("#more-sessions")
+        page.wait_for_selector("#sessions tr:nth-child(53):has-text('number 0')")
+        page.wait_for_selector("#more-sessions", state="hidden")
+        watched.close()
+
+
+def test_a_running_page_asks_for_little(browser: Any, lab: Running) -> None:
+    """Below 60 requests and 2 MB in 30 s of the page's clock, while a session runs."""
+    watched = Watched(browser, lab)
+    page = watched.page
+    page.clock.install()
+    watched.log_in(lab)
+    lab.bench.delay_s = 0.1
+    page.click("#start")
+    page.wait_for_selector(".station.busy progress")
+    page.wait_for_selector("#watch-histogram svg .line")
+    asked: list[Any] = []
+    page.on("requestfinished", lambda request: asked.append(request))
+    for _ in range(6):  # 30 s
+        page.clock.run_for(5000)
+        page.wait_for_load_state("networkidle")
+    sizes = [sum(one.sizes()[key] for key in ("responseBodySize", "responseHeadersSize")) for one in asked]
+    assert 6 * 2 <= len(asked) < 60 and sum(sizes) < 2_000_000
+    page.click("#halt")
+    page.wait_for_selector("#halt-told:has-text('shutter closed')")
+    lab.bench.delay_s = 0.0
+    watched.close()

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from api.preview import GAMMA, preview_png
+from api.preview import GAMMA, preview
 from lab.formats.recording_set import DataSheet
 from sim.sensor.mosaic import phases
 
@@ -18,7 +18,7 @@ def camera(cfa: str, rows: int = 40, cols: int = 60) -> DataSheet:
 
 
 def picture(*args: Any, **options: Any) -> np.ndarray[Any, Any]:
-    found = cv2.imdecode(np.frombuffer(preview_png(*args, **options), np.uint8), cv2.IMREAD_UNCHANGED)
+    found = cv2.imdecode(np.frombuffer(preview(*args, **options), np.uint8), cv2.IMREAD_UNCHANGED)
     assert found is not None
     return found
 

@@ -87,11 +87,14 @@ def test_a_station_that_was_not_made_safe_says_so_until_it_is(tmp_path: Path) ->
         until_state(client, session, "running")
         running.bench.unplugged.add("monochromator")
         found = halt(client)
-        assert (found["state"], found["shutter"]) == ("not confirmed", "unknown") and "the line is gone" in found["words"]
+        assert (found["state"], found["shutter"]) == ("not confirmed", "unknown") and "the line is gone" in found[
+            "words"
+        ]
         ended = until_state(client, session, "failed")
         assert "halted by operate; not brought into a safe state: monochromator" in ended["error"]
         assert client.get("/api/v1/stations/fakes").json()["safety"]["state"] == "not confirmed"
-        for name, _, _ in running.store.keys():
+        stored = running.store.keys()
+        for name, _, _ in stored:
             running.store.remove_key(name)
     with serving(tmp_path) as running, running.client("operate") as client:
         known = safety(client)
@@ -100,7 +103,9 @@ def test_a_station_that_was_not_made_safe_says_so_until_it_is(tmp_path: Path) ->
         assert until(client, "/api/v1/stations/fakes", lambda now: now["safety"]["state"] == "safe")
 
 
-def test_an_instrument_that_does_not_answer_is_not_waited_for(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_instrument_that_does_not_answer_is_not_waited_for(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
     answers = threading.Event()
     stop = fake_bench.FakeMonochromator.stop
 
