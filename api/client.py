@@ -4,7 +4,7 @@
         session = client.capture("bench", quick=True, sequences=("dark", "flat"))
         fit = client.fit(session.id)
 
-Needs httpx: `pip install 'calibench[test]'`.
+Needs httpx: calibench's extra `test`.
 """
 
 from __future__ import annotations

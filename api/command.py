@@ -40,6 +40,12 @@ def _store(folder: Path | None) -> Store:
     return Store.open(Settings() if folder is None else Settings(data=folder))
 
 
+def _store_to_read(folder: Path | None) -> Store:
+    from lab.cli.sources import store_to_read
+
+    return store_to_read(folder)
+
+
 def _first_key(store: Store) -> None:
     secret = create_key(store, FIRST_KEY, Permission.ADMIN)
     typer.echo(f"first start: the key '{FIRST_KEY}' (scope admin), shown only this once:\n\n    {secret}\n")
@@ -150,12 +156,12 @@ def create(
 @key.command("list")
 def list_keys(data: Folder = None) -> None:
     """Names and scopes of all keys."""
-    for stored in stored_keys(_store(data)):
+    for stored in stored_keys(_store_to_read(data)):
         typer.echo(f"{stored.name}  {stored.scope}")
 
 
 @key.command("remove")
 def remove(name: str, data: Folder = None) -> None:
     """Remove a key and the logins of the operator's page that were made with it."""
-    _store(data).remove_key(name)
+    _store_to_read(data).remove_key(name)
     typer.echo(f"removed: {name}")

@@ -1,6 +1,6 @@
 """pytest fixtures for those who test a camera's calibration: a running mock bench, its station, a service with a client, a reference.
 
-`pip install 'calibench[test]'` registers them. They are made when a test asks for one, once a run.
+An installation of calibench registers them; its extra `test` brings what they need. They are made when a test asks for one, once a run.
 
 `calibench_bench`      the mock bench, in a process of its own; `.station_file` is its station file
 `calibench_station`    that station, as `lab.capture.station.Station`

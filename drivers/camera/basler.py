@@ -28,7 +28,9 @@ def pylon_library() -> Any:
             )  # of its wrapper generator; as an error it ends the process
             from pypylon import pylon
     except ImportError as error:
-        raise InstrumentError("Basler cameras: pypylon isn't installed; install calibench[basler]") from error
+        raise InstrumentError(
+            "Basler cameras: pypylon isn't installed; install calibench with its extra basler"
+        ) from error
     return pylon
 
 

@@ -42,7 +42,9 @@ def _library() -> Any:
     try:
         from harvesters import core
     except ImportError as error:
-        raise InstrumentError("GenTL cameras: harvesters isn't installed; install calibench[gentl]") from error
+        raise InstrumentError(
+            "GenTL cameras: harvesters isn't installed; install calibench with its extra gentl"
+        ) from error
     return core
 
 

@@ -142,7 +142,9 @@ class ScpiPhotodiode(Photodiode):
         try:
             import pyvisa
         except ImportError as error:
-            raise InstrumentError("photodiode: PyVISA isn't installed; install calibench[visa]") from error
+            raise InstrumentError(
+                "photodiode: PyVISA isn't installed; install calibench with its extra visa"
+            ) from error
         try:
             self._open = pyvisa.ResourceManager(self._library).open_resource(self.address)
             self._open.timeout = self.timeout_s * 1000.0

@@ -44,6 +44,11 @@ def back_up(store: Store, folder: Path) -> BackupCount:
     and where files that the registry names are missing or damaged.
     """
     target = folder.resolve()
+    if store.count_sessions() == 0 and any((store.root / "sessions").glob("*/*")):
+        raise InputError(
+            f"{store.root}: its registry names no session, and there are folders of sessions; where the registry is a database server's, set "
+            "CALIBENCH_DATABASE_URL as the service has it, and dump it by its own means (pg_dump)"
+        )
     if store.settings.database_url is not None:
         raise InputError(
             "backup: the registry is a database server's; dump it by its own means (pg_dump), then copy the data folder"

@@ -17,6 +17,11 @@ class Settings(BaseSettings):
     scheduler: str | None = None  # address of a Dask scheduler; None: in this process
 
     @property
+    def registry_file(self) -> Path | None:
+        """The registry's file; None where it is a database server's."""
+        return None if self.database_url else self.data / "registry.sqlite"
+
+    @property
     def url(self) -> str:
         """The registry's SQLAlchemy URL."""
         return self.database_url or f"sqlite:///{(self.data / 'registry.sqlite').resolve()}"

@@ -197,7 +197,7 @@ def open_engine(url: str) -> sa.Engine:
         raise InputError("CALIBENCH_DATABASE_URL: isn't a database's URL; give postgresql://USER@HOST/NAME") from error
     except ImportError as error:
         raise InputError(
-            f"registry {address!r}: its driver isn't installed ({error}); pip install 'calibench[postgresql]'"
+            f"registry {address!r}: its driver isn't installed ({error}); install calibench with its extra postgresql"
         ) from error
     except sa.exc.NoSuchModuleError as error:
         raise InputError(f"registry {address!r} can't be opened ({error}); correct CALIBENCH_DATABASE_URL") from error

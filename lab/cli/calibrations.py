@@ -12,7 +12,7 @@ from rich.table import Table
 
 from lab.cli.console import check_writable, out, write_json
 from lab.cli.exit_codes import EXIT_CHECK
-from lab.cli.sources import Json, StoreFolder, open_store
+from lab.cli.sources import Json, StoreFolder, store_to_read
 from lab.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def list_calibrations(data: StoreFolder = None) -> None:
     from lab.calibration.life import calibrations as known
 
     table = _table("id", "of", "begun (UTC)", "state", "by", "until", "cameras")
-    for one in known(open_store(data)):
+    for one in known(store_to_read(data)):
         until = f"{one.expires:%Y-%m-%d}" if one.expires else ""
         begun, cameras = f"{one.created:%Y-%m-%d %H:%M}", ", ".join(one.cameras.values())
         table.add_row(
@@ -72,7 +72,7 @@ def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder
     from lab.report.figures import shown_unit
 
     check_writable(json)
-    store = open_store(data)
+    store = store_to_read(data)
     found = calibration(store, id)
     chosen = found.limits if limits is None and found.limits is not None else _standing(store, limits)
     by_limit = judged(figures(store, found.id), chosen) if chosen is not None else ()
@@ -107,7 +107,7 @@ def certify(
     """Certify a candidate against limits; the same cameras' earlier calibration is superseded."""
     from lab.calibration import life
 
-    store = open_store(data)
+    store = store_to_read(data)
     found = life.certify(store, id, by or _user(), _limits(store, limits), accept_warnings=accept_warnings)
     until = f"until {found.expires:%Y-%m-%d}" if found.expires else "until it is superseded"
     out.print(
@@ -140,7 +140,7 @@ def history(
     from lab.report.figures import shown_unit
 
     check_writable(json)
-    store = open_store(data)
+    store = store_to_read(data)
     if not figure:
         for name, one, where in figure_names(store):
             if camera in ("", name):

@@ -85,7 +85,7 @@ def capture(
             demands_certified=certified,
         ),
     )
-    out.print(f"session: {run_here(request, store, _capturer(store, station, conceal)).session}")
+    out.print(f"session: {run_here(request, store, _capturer(store, station, conceal, ['capture'])).session}")
 
 
 @commands.command()
@@ -119,7 +119,8 @@ def run(
         name=name,
     )
     request = PipelineRequest("pipeline", capture=session, resolve=resolve)
-    found = run_here(request, store, _capturer(store, station, conceal))
+    verb = ["run", "--resolve"] if resolve else ["run"]  # what goes on then fits and diagnoses, too
+    found = run_here(request, store, _capturer(store, station, conceal, verb))
     assert found.fit is not None
     assert found.validation is not None
     assert found.diagnosis is not None
@@ -167,8 +168,9 @@ def sequences(
         print_sequences(catalogue(), found)
 
 
-def _capturer(store: Store, station_file: Path | None, conceal: list[str] | None) -> Capturer:
-    """Captures in this thread: on the station of a file, or on a mock bench that is started for each session."""
+def _capturer(store: Store, station_file: Path | None, conceal: list[str] | None, verb: list[str]) -> Capturer:
+    """Captures in this thread: on the station of a file, or on a mock bench that is started for each session. `verb`: the words of the command that
+    does, which goes on with an interrupted session."""
     if station_file is not None and conceal:
         raise InputError("--conceal: only the mock bench conceals effects; leave --station out")
 
@@ -187,14 +189,14 @@ def _capturer(store: Store, station_file: Path | None, conceal: list[str] | None
                 return capture_here(store, read_station(file), request, told)
             except KeyboardInterrupt:
                 if session:
-                    err.print(f"calibench: go on with `{_resuming(session, store, station_file, conceal or [])}`")
+                    err.print(f"calibench: go on with `{_resuming(verb, session, store, station_file, conceal or [])}`")
                 raise
 
     return captured
 
 
-def _resuming(session: str, store: Store, station_file: Path | None, conceal: list[str]) -> str:
+def _resuming(verb: list[str], session: str, store: Store, station_file: Path | None, conceal: list[str]) -> str:
     """The command that resumes a session where it was captured."""
-    words = ["calibench", "capture", "--resume", session, "--out", str(store.root)]
+    words = ["calibench", *verb, "--resume", session, "--out", str(store.root)]
     words += [] if station_file is None else ["--station", str(station_file)]
     return shlex.join([*words, *(f"--conceal={item}" for item in conceal)])

@@ -34,6 +34,15 @@ def check_writable(file: Path | None) -> None:
         raise InputError(f"{file}: can't be written; name a file in a folder that exists and is yours")
 
 
+def check_folder(folder: Path | None) -> None:
+    """Refuse a folder of results that can't be made or written into, before the work. Raises InputError."""
+    if folder is None:
+        return
+    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise InputError(f"{folder}: can't be written into; name a folder that is yours")
+
+
 def write_json(result: BaseModel, file: Path | None) -> None:
     """Write a result as JSON, completely or not at all: to a file, to stdout ("-"), or nowhere (None)."""
     if file is None:

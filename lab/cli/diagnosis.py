@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from lab.cli.console import check_writable, err, make_folder, out, write_json
+from lab.cli.console import check_folder, check_writable, err, make_folder, out, write_json
 from lab.cli.exit_codes import EXIT_CHECK, EXIT_INPUT
 from lab.cli.sources import (
     FitFile,
@@ -86,6 +86,7 @@ def diagnose(
     recordings = recordings_of(source, data)
     if save is not None:
         camera_path(recordings, recordings.sides[0], save)
+        check_folder(save.parent if save.suffix == ".toml" else save)
     request = PipelineRequest(
         "diagnose",
         recordings=recordings,

@@ -12,7 +12,7 @@ from lab.cli import calibrations, capturing, devices, diagnosis, effects, fittin
 from lab.cli.challenge import commands as challenge
 from lab.cli.console import err
 from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
-from lab.errors import DeviceError, InputError
+from lab.errors import DeviceError, InputError, failure_of_environment
 
 app = typer.Typer(
     name="calibench",
@@ -65,6 +65,9 @@ def main(arguments: list[str] | None = None) -> int:
             return EXIT_INPUT
         if os.environ.get("CALIBENCH_DEBUG"):
             traceback.print_exc()
+        if (told := failure_of_environment(error)) is not None:
+            err.print(f"[red]calibench:[/] {escape(told)}")
+            return EXIT_INPUT
         text = " ".join(str(error).split())
         err.print(
             f"[red]calibench:[/] {type(error).__name__}: {escape(text)}: a defect of calibench; "

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from lab.cli.console import check_writable, err, make_folder, write_json
+from lab.cli.console import check_folder, check_writable, err, make_folder, write_json
 from lab.cli.exit_codes import EXIT_CHECK
 from lab.cli.sources import Json, Source, StoreFolder, existing_store, recordings_of, run_here
 from lab.cli.tables import print_comparison, print_fit
@@ -41,6 +41,8 @@ def fit(
 ) -> None:
     """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo."""
     check_writable(json)
+    check_folder(cameras)
+    check_folder(maps)
     recordings = recordings_of(source, data)
     result = _fit(recordings)
     write_json(result, json)

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from lab.cli.console import check_writable, out, warn, write_json
 from lab.cli.progress import progress_bar
-from lab.cli.sources import StoreFolder, open_store
+from lab.cli.sources import StoreFolder, store_to_read
 from lab.cli.tables import print_fit
 from lab.errors import InputError
 from lab.pipeline import session_recordings
@@ -132,7 +132,7 @@ def sessions(data: StoreFolder = None) -> None:
     table = Table(box=None, pad_edge=False)
     for heading in ("session", "name", "created", "state", "steps done"):
         table.add_column(heading)
-    for info in open_store(data).sessions():
+    for info in store_to_read(data).sessions():
         created = f"{info.created:%Y-%m-%d %H:%M}"
         table.add_row(info.id, escape(info.name), created, info.state, f"{info.steps_done} of {info.steps}")
     out.print(table)
@@ -147,7 +147,7 @@ def export(
     """Write a stored session as a recording set."""
     from lab.formats import recording_set
 
-    recordings = session_recordings(open_store(data), session)
+    recordings = session_recordings(store_to_read(data), session)
     warn(recordings.warnings)
     with progress_bar("export") as advance:
         folder = recording_set.write(recordings, to, progress=advance)
@@ -162,6 +162,6 @@ def backup(
     """Copy the data folder while it is in use. The copy is a data folder itself: to restore, use it in place of the other."""
     from lab.capture.backup import back_up
 
-    made = back_up(open_store(data), folder)
+    made = back_up(store_to_read(data), folder)
     mib = made.copied_bytes / (1 << 20)
     out.print(f"{made.sessions} sessions, {made.files} files of them; {made.copied} files copied, {mib:.1f} MiB")

@@ -473,7 +473,7 @@ def test_a_running_page_asks_for_little(browser: Any, lab: Running) -> None:
     page.wait_for_selector(".station.busy progress")
     page.wait_for_selector("#watch-histogram svg .line")
     asked: list[Any] = []
-    page.on("requestfinished", lambda request: asked.append(request))
+    page.on("requestfinished", asked.append)
     for _ in range(6):  # 30 s
         page.clock.run_for(5000)
         page.wait_for_load_state("networkidle")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -35,6 +36,10 @@ def locate(root: Path, path: str) -> Path:
         raise InputError("no such file; add it, or take what needs it out of the manifest")
     if not is_file:
         raise InputError("not a file; name the file itself")
+    if not os.access(found, os.R_OK):
+        raise InputError(
+            "can't be read (Permission denied); run it as the user to whom it belongs, or have its permissions changed"
+        )
     return found
 
 

@@ -1,8 +1,10 @@
 """The command line: exit codes, one line for each problem and no traceback, nothing half-written."""
 
+import errno
 import json
 import os
 import shutil
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sqlalchemy as sa
 
 import lab.diagnose
 import lab.fit
@@ -205,7 +208,7 @@ def test_a_failure_while_writing_leaves_the_old_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
-    assert cli.main(["fit", str(flats), "--json", str(file)]) == 1
+    assert cli.main(["fit", str(flats), "--json", str(file)]) == 2
     assert file.read_text() == "old"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "flats"]
 
@@ -550,8 +553,9 @@ def test_the_help_waits_for_no_numerics(arguments: list[str]) -> None:
     assert sorted(set(SLOW_TO_LOAD) & set(done.stderr.split())) == []
 
 
+@pytest.mark.parametrize("verb", [["capture"], ["run"], ["run", "--resolve"]])
 def test_an_interrupted_session_is_told_with_the_whole_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: list[str]
 ) -> None:
     def interrupted(store: object, station: object, request: object, tell: Callable[[object], None]) -> str:
         tell(SimpleNamespace(session="session-1"))
@@ -561,6 +565,92 @@ def test_an_interrupted_session_is_told_with_the_whole_command(
     monkeypatch.setattr("lab.capture.station.read_station", lambda file: None)
     store = open_store(tmp_path / "data folder")
     with pytest.raises(KeyboardInterrupt):
-        capturing._capturer(store, Path("lab.toml"), None)(CaptureRequest(), lambda progress: None)
-    command = f"calibench capture --resume session-1 --out '{store.root}' --station lab.toml"
+        capturing._capturer(store, Path("lab.toml"), None, verb)(CaptureRequest(), lambda progress: None)
+    command = f"calibench {' '.join(verb)} --resume session-1 --out '{store.root}' --station lab.toml"
     assert capsys.readouterr().err == f"calibench: go on with `{command}`\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["sessions"], ["backup", "BACKUP"], ["calibrations", "list"], ["export", "ID", "--to", "SET"], ["key", "list"]],
+)
+def test_what_only_reads_makes_no_data_folder(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*arguments, "--data", "nosuch"]) == 2
+    assert "nosuch: holds no registry; name the data folder by --data" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_backup_without_the_database_is_refused(
+    store_of_a_server: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The files of a station whose registry is a database server's, and no variable that says so; then with an empty registry from before."""
+    arguments = ["backup", str(tmp_path / "backup"), "--data", str(store_of_a_server)]
+    assert cli.main(arguments) == 2 and "CALIBENCH_DATABASE_URL" in capsys.readouterr().err
+    assert not (store_of_a_server / "registry.sqlite").exists()
+    open_store(store_of_a_server).close()
+    assert cli.main(arguments) == 2 and "CALIBENCH_DATABASE_URL" in capsys.readouterr().err
+    assert not (tmp_path / "backup").exists()
+
+
+@pytest.fixture
+def store_of_a_server(tmp_path: Path) -> Path:
+    data = tmp_path / "of a server"
+    (data / "sessions" / "20300101-120000-abcdef" / "frames").mkdir(parents=True)
+    return data
+
+
+def _full(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device", "/full/frame.npy")
+
+
+def _forbidden(*_: object) -> None:
+    raise PermissionError(errno.EACCES, "Permission denied", "/data/.migration.lock")
+
+
+def _read_only(*_: object) -> None:
+    raise sa.exc.OperationalError("UPDATE", {}, sqlite3.OperationalError("attempt to write a readonly database"))
+
+
+def _full_database(*_: object) -> None:
+    raise sa.exc.OperationalError("INSERT", {}, sqlite3.OperationalError("database or disk is full"))
+
+
+@pytest.mark.parametrize(
+    ("fails", "said"),
+    [
+        (_full, "/full/frame.npy: No space left on device; make room on that disk"),
+        (_forbidden, "/data/.migration.lock: Permission denied; run it as the user to whom it belongs"),
+        (_read_only, "the registry: attempt to write a readonly database; run it as the user to whom"),
+        (_full_database, "the registry: database or disk is full; make room on that disk"),
+    ],
+)
+def test_what_the_environment_lacks_is_no_defect(
+    fails: Callable[..., None], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    open_store().close()
+    monkeypatch.setattr("lab.capture.store.Store.sessions", fails)
+    assert cli.main(["sessions"]) == 2
+    told = capsys.readouterr().err
+    assert said in told and "defect" not in told and told.count("\n") == 1
+
+
+@pytest.mark.parametrize("option", ["--write-cameras", "--maps"])
+def test_a_folder_of_results_is_checked_before_the_work(
+    option: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(fitting, "_fit", lambda recordings: pytest.fail("it was fitted"))
+    (tmp_path / "file").touch()
+    assert cli.main(["fit", str(folder), option, str(tmp_path / "file" / "cameras")]) == 2
+    assert "can't be written into" in capsys.readouterr().err
+
+
+def test_a_frame_that_may_not_be_read_is_not_damaged(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("lab.formats.recording_set.frame_files.os.access", lambda *_: False)
+    assert cli.main(["fit", str(folder)]) == 2
+    told = capsys.readouterr().err
+    assert "can't be read (Permission denied)" in told and "damaged" not in told
