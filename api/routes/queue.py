@@ -92,8 +92,7 @@ def halt(
         if asked is None or asked.station is None
         else {asked.station: service.station(asked.station)}
     )
-    halting = [one.station for id in ended if (one := live.find(id)) is not None]
-    busy = {key_of(one) for one in halting}
+    busy = {key_of(session.station) for id in ended if (session := live.find(id)) is not None}
     answering = list(ended.values())
     for one in {key_of(one): one for one in stations.values()}.values():
         if key_of(one) not in busy:
