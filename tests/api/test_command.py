@@ -50,6 +50,7 @@ def test_keys_are_made_listed_and_taken_away(tmp_path: Path) -> None:
 def test_wrong_use_is_one_line_and_exit_2(
     tmp_path: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    Store(tmp_path).close()  # keys are those of a registry that is there
     assert main([*arguments, "--data", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert said in error and len(error.strip().splitlines()) == 1

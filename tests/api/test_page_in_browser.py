@@ -431,10 +431,12 @@ def test_what_runs_stays_in_view_and_what_was_chosen_stays_chosen(browser: Any, 
     (lab.store.root / "stations" / "another.toml").write_text(other)  # before the chosen one in the list
     page.wait_for_selector("#start-station option:nth-child(2)", state="attached")
     assert page.input_value("#start-station") == "fakes"
-    page.click("#sessions tr:has(.state.finished) button:has-text('Open')")
+    row = "#sessions tr:has(.state.finished)"
+    opened = page.inner_text(row)
+    page.click(f"{row} button:has-text('Open')")
     page.wait_for_selector("#captures img")
     assert "in view" in page.inner_text("#watch-title")  # what runs, not what was opened
-    assert watched.can_halt() and watched.focused()["text"] == "nightly"
+    assert watched.can_halt() and watched.focused()["text"] in opened
     box = page.query_selector("#watch-title").bounding_box()
     assert 0 <= box["y"] <= DESK["height"]
     watched.tab_to("Fit")
@@ -473,7 +475,7 @@ def test_a_running_page_asks_for_little(browser: Any, lab: Running) -> None:
     page.wait_for_selector(".station.busy progress")
     page.wait_for_selector("#watch-histogram svg .line")
     asked: list[Any] = []
-    page.on("requestfinished", asked.append)
+    page.on("requestfinished", lambda request: asked.append(request))  # noqa: PLW0108 - the binding marks the function
     for _ in range(6):  # 30 s
         page.clock.run_for(5000)
         page.wait_for_load_state("networkidle")
