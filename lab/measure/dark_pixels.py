@@ -10,11 +10,11 @@ from scipy import special
 
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
-from lab.fit.rounding import QUANTISATION_DN2
-from lab.fit.weighted_lines import root
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Defect, PixelDefects, ReadNoiseDistribution
 from lab.measure.levels import BoolArray, Float32Array, Stack
+from lab.measure.rounding import QUANTISATION_DN2
+from lab.measure.weighted_lines import root
 from sim.camera import Cfa
 from sim.sensor.mosaic import planes
 

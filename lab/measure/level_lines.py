@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from lab.errors import NotDetermined
-from lab.fit.rounding import QUANTISATION_DN2
-from lab.fit.weighted_lines import DarkLine, chi2_factor, dark_line, least_squares
 from lab.measure.levels import MeasuredLevel, RecordedLevels, Remarks
+from lab.measure.rounding import QUANTISATION_DN2
+from lab.measure.weighted_lines import DarkLine, chi2_factor, dark_line, least_squares
 from sim.spectrum import FloatArray
 
 # --- dark signal ---------------------------------------------------------------------------------------------------

@@ -13,14 +13,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lab.fit.rounding import (
+from lab.formats.recording_set import DataSheet
+from lab.measure.rounding import (
     HIDDEN_DN2,
     QUANTISATION_DN2,
     rounding_std_dn,
     variance_before_rounding,
     variance_rounding_std,
 )
-from lab.formats.recording_set import DataSheet
 from sim.camera import Cfa
 from sim.sensor.mosaic import planes, step
 from sim.spectrum import FloatArray

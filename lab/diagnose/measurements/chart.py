@@ -18,7 +18,7 @@ from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_
 from lab.diagnose.measurements.saturation import CLIPPED_SHARE
 from lab.diagnose.measurements.study import Study, mean_frame
 from lab.errors import NotDetermined
-from lab.fit.rounding import rounding_std_dn
+from lab.measure.rounding import rounding_std_dn
 from sim.point import even_share, optical_transfer, wide_contrast
 from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic

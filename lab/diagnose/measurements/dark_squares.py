@@ -20,7 +20,7 @@ from lab.diagnose.measurements.held_out import held_out_of
 from lab.diagnose.measurements.reads import REFLECTIONS, acting
 from lab.diagnose.measurements.study import Study, mean_frame
 from lab.errors import NotDetermined
-from lab.fit.rounding import rounding_std_dn
+from lab.measure.rounding import rounding_std_dn
 from sim.camera import CameraModel
 from sim.frame import with_reflections
 from sim.point import even_share, optical_transfer, wide_contrast

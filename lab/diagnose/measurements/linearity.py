@@ -16,7 +16,7 @@ from lab.diagnose.measurements.repeatability import level_std, weighted_median
 from lab.diagnose.measurements.study import Study
 from lab.diagnose.measurements.uniform_levels import UniformLevels
 from lab.errors import NotDetermined
-from lab.fit.rounding import rounding_std_dn
+from lab.measure.rounding import rounding_std_dn
 from sim.spectrum import FloatArray
 from sim.uniform import LEVEL, SPECTRAL, electron_rate
 

@@ -17,7 +17,7 @@ from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES, acting
 from lab.diagnose.measurements.study import Study
 from lab.diagnose.measurements.uniform_levels import UniformLevels
 from lab.errors import NotDetermined
-from lab.fit.rounding import rounding_std_dn
+from lab.measure.rounding import rounding_std_dn
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import LEVEL, SPECTRAL
 

@@ -8,7 +8,7 @@ from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, 
 from lab.diagnose.measurements.study import Study
 from lab.diagnose.measurements.temporal_noise import Repeats, flat_repeats
 from lab.errors import NotDetermined
-from lab.fit.rounding import variance_rounding_std
+from lab.measure.rounding import variance_rounding_std
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform, noise_values

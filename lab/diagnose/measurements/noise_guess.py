@@ -20,8 +20,8 @@ from lab.diagnose.measurements.repeatability import (
     repeated_levels,
     steady,
 )
-from lab.fit.rounding import variance_before_rounding
 from lab.formats.results import NoiseFit
+from lab.measure.rounding import variance_before_rounding
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 

@@ -32,7 +32,7 @@ from lab.diagnose.measurements.edge_estimator import (
 from lab.diagnose.measurements.edge_profiles import MeasuredEdge, measured_edges
 from lab.diagnose.measurements.reads import acting
 from lab.diagnose.measurements.study import Study
-from lab.fit.rounding import rounding_waves_dn
+from lab.measure.rounding import rounding_waves_dn
 from sim.effects.base import Effect
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.point import (

@@ -12,9 +12,9 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.diagnose.measurements.dark_frames import TEMPERATURE_STEP_C
 from lab.diagnose.measurements.dark_level import DARK
 from lab.diagnose.metadata.misstatement import Misstatement
-from lab.fit.rounding import rounding_std_dn
 from lab.formats.recording_set import RecordingSet
 from lab.formats.recording_set.frame_files import Frame
+from lab.measure.rounding import rounding_std_dn
 from sim.camera import Side
 from sim.spectrum import FloatArray
 

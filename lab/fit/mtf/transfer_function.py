@@ -41,7 +41,7 @@ from lab.fit.mtf.edge_spread import (
     Spline,
     posterior,
 )
-from lab.fit.rounding import rounding_std_dn, rounding_waves_dn, variance_before_rounding
+from lab.measure.rounding import rounding_std_dn, rounding_waves_dn, variance_before_rounding
 from lab.one_blas_thread import one_blas_thread
 
 Array = NDArray[np.floating[Any]]

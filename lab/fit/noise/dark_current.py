@@ -9,10 +9,10 @@ import numpy as np
 
 from lab.errors import NotDetermined
 from lab.fit.noise.evaluation import Evaluation, in_electrons, transfer_of
-from lab.fit.rounding import HIDDEN_DN2, QUANTISATION_DN2
-from lab.fit.weighted_lines import chi2_factor, dark_line, least_squares
 from lab.formats.results import DarkCurrentLaws
 from lab.measure.level_lines import mean_and_std
+from lab.measure.rounding import HIDDEN_DN2, QUANTISATION_DN2
+from lab.measure.weighted_lines import chi2_factor, dark_line, least_squares
 from sim.parameters import Frozen
 
 # --- temperature law -----------------------------------------------------------------------------------------------

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from lab.fit.rounding import QUANTISATION_DN2
-from lab.fit.weighted_lines import DarkLine, chi2_factor, dark_line, linearity, root
 from lab.formats.results import Emva1288, Emva1288Points
 from lab.measure.levels import BoolArray, MeasuredLevel, PlaneStatistics, SpatialVariance
+from lab.measure.rounding import QUANTISATION_DN2
+from lab.measure.weighted_lines import DarkLine, chi2_factor, dark_line, linearity, root
 from sim.spectrum import FloatArray
 
 HIDDEN_DN2 = 0.24  # temporal variance below which rounding hides the noise

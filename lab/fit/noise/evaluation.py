@@ -11,7 +11,6 @@ from scipy import special
 
 from lab.errors import NotDetermined
 from lab.fit.noise.photon_transfer import TransferFit, fit_transfer
-from lab.fit.rounding import QUANTISATION_DN2
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import InconsistentLevel
 from lab.measure.level_lines import (
@@ -25,6 +24,7 @@ from lab.measure.level_lines import (
     saturation_of,
 )
 from lab.measure.levels import MeasuredLevel, RecordedLevels, Remarks
+from lab.measure.rounding import QUANTISATION_DN2
 
 # --- level consistency ---------------------------------------------------------------------------------------------
 # Which flats serve the lines of responsivity, linearity and gain: the level series without what contradicts it.

@@ -6,9 +6,9 @@ import numpy as np
 
 from lab.fit.noise.dark_current import dark_signal_hidden
 from lab.fit.noise.evaluation import Evaluation, in_electrons
-from lab.fit.rounding import HIDDEN_DN2, QUANTISATION_DN2
-from lab.fit.weighted_lines import chi2_factor, root
 from lab.measure.levels import DEFECT_SIGMA, MeasuredLevel
+from lab.measure.rounding import HIDDEN_DN2, QUANTISATION_DN2
+from lab.measure.weighted_lines import chi2_factor, root
 
 ASYMMETRY = 0.002  # difference of the light on opposite edges, of the mean, above which it is reported
 

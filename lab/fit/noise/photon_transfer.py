@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from lab.fit.weighted_lines import least_squares
+from lab.measure.weighted_lines import least_squares
 from sim.spectrum import FloatArray
 
 LINE_LIMIT = 0.7  # of saturation: range of the straight line of EMVA 1288

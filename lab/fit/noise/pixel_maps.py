@@ -11,10 +11,10 @@ import numpy as np
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
-from lab.fit.rounding import QUANTISATION_DN2
 from lab.formats.recording_set import RecordingSet
 from lab.measure.dark_pixels import stack_of
 from lab.measure.levels import BoolArray, Stack, defective_pixels, shading
+from lab.measure.rounding import QUANTISATION_DN2
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray

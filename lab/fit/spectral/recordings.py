@@ -29,9 +29,9 @@ from lab.fit.spectral.sensitivity import (
     solve_sensitivities,
     trapezoid_weights,
 )
-from lab.fit.weighted_lines import DarkLine, dark_line
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
+from lab.measure.weighted_lines import DarkLine, dark_line
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 from sim.optics.illumination import irradiance_factor

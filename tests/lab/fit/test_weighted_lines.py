@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.fit.weighted_lines import dark_line, linearity
+from lab.measure.weighted_lines import dark_line, linearity
 
 
 def test_dark_line_finds_black_and_rate() -> None:

@@ -28,7 +28,7 @@ from lab.diagnose.measurements.noise_guess import (
     variance_between_pixels,
 )
 from lab.diagnose.measurements.repeatability import level_repeatability, repeated_levels
-from lab.fit.rounding import rounding_std_dn
+from lab.measure.rounding import rounding_std_dn
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     AbsorptionBandLaw,
