@@ -351,10 +351,20 @@ class ServiceClient:
         """One capture."""
         return self._get(StoredCapture, f"/sessions/{session_id}/captures/{capture_id}")
 
-    def preview(self, session_id: str, capture_id: int, *, width_px: int = 480, stretch: bool = False) -> bytes:
-        """A capture's small picture, PNG. `stretch`: white is the frame's own brightest."""
+    def preview(
+        self,
+        session_id: str,
+        capture_id: int,
+        *,
+        width_px: int = 480,
+        stretch: bool = False,
+        picture: Literal["png", "webp"] = "png",
+    ) -> bytes:
+        """A capture's small picture. `stretch`: white is the frame's own brightest; `picture`: its format."""
         asked = {"width": width_px, "stretch": stretch}
-        return self.request("GET", f"/sessions/{session_id}/captures/{capture_id}/preview.png", params=asked).content
+        return self.request(
+            "GET", f"/sessions/{session_id}/captures/{capture_id}/preview.{picture}", params=asked
+        ).content
 
     def capture_figures(self, session_id: str, capture_id: int) -> FrameFigures:
         """Histogram, mean and saturated share of each channel of a frame."""
