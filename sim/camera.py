@@ -23,8 +23,9 @@ TABLE_AGREEMENT = 0.02
 
 
 class Lens(Frozen):
-    """The optics. `imaging` says how a point is imaged (default: diffraction limited at `f_number`), `illumination` how the light
-    falls off (default: cos^4 at `focal_length_mm`); a traced lens's table says both. Raises where a traced lens is of another f-number or focal length.
+    """The optics. `imaging` says how a point is imaged (default: diffraction limited at `f_number`), `illumination` how
+    the light falls off (default: cos^4 at `focal_length_mm`); a traced lens's table says both. Raises where a traced
+    lens is of another f-number or focal length.
     """
 
     f_number: Annotated[float, Quantity("1", "working f-number", lower=0.5, upper=64.0)]
@@ -45,7 +46,8 @@ class Lens(Frozen):
             ):
                 if abs(stated / traced - 1.0) > TABLE_AGREEMENT:
                     raise ValueError(
-                        f"the lens's {name} is {stated:g}, beyond the limit of {100 * TABLE_AGREEMENT:g} % from the traced {traced:g}: state the traced value, or trace the prescription at the aperture you mean"
+                        f"the lens's {name} is {stated:g}, beyond the limit of {100 * TABLE_AGREEMENT:g} % from the "
+                        f"traced {traced:g}: state the traced value, or trace the prescription at the aperture you mean"
                     )
         return self
 

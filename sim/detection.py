@@ -27,8 +27,8 @@ def responsivity(
 ) -> FloatArray:
     """Electrons per photon that would arrive at the image behind a lossless lens, by wavelength (nm).
 
-    QE(wavelength) x lens transmittance x the effects' transmittance at the chief ray's `sin_theta`, which broadcasts against
-    `wavelength_nm`. Raises ValueError for a channel the camera doesn't have.
+    QE(wavelength) x lens transmittance x the effects' transmittance at the chief ray's `sin_theta`, which broadcasts
+    against `wavelength_nm`. Raises ValueError for a channel the camera doesn't have.
     """
     wavelength_nm = np.asarray(wavelength_nm, float)
     value = efficiency(camera, channel).at(wavelength_nm) * camera.lens.transmittance
@@ -38,7 +38,8 @@ def responsivity(
 def efficiency(camera: CameraModel, channel: str) -> Spectrum:
     if channel not in camera.channels or channel not in camera.quantum_efficiency:
         raise ValueError(
-            f"channel {channel!r} has no quantum efficiency in this {camera.cfa} camera (known: {', '.join(camera.quantum_efficiency)}): add the curve or ask for another channel"
+            f"channel {channel!r} has no quantum efficiency in this {camera.cfa} camera (known: "
+            f"{', '.join(camera.quantum_efficiency)}): add the curve or ask for another channel"
         )
     return camera.quantum_efficiency[channel]
 
@@ -79,8 +80,9 @@ def detect_light(
 
 
 def _at_lens(light: Light, radiance: Spectrum | None, wavelength_nm: FloatArray, kind: str) -> FloatArray:
-    """Radiance in front of the lens. What changes the light does so over the wavelengths at which it is stated, whatever the camera's reach;
-    None: equal energy at all."""
+    """Radiance in front of the lens. What changes the light does so over the wavelengths at which it is stated,
+    whatever the camera's reach; None: equal energy at all.
+    """
     if radiance is None:
         return light.radiance(wavelength_nm, np.ones_like(wavelength_nm), kind)
     stated, _ = radiance.arrays
@@ -105,14 +107,17 @@ def _check_radiance(wavelength_nm: FloatArray, radiance: FloatArray) -> None:
     lowest = int(np.argmin(np.where(np.isfinite(radiance), radiance, -np.inf)))
     if not (radiance[lowest] >= 0 and np.isfinite(radiance[lowest])):
         raise ValueError(
-            f"radiance is {radiance[lowest]:g} W sr^-1 m^-2 nm^-1 at {wavelength_nm[lowest]:g} nm, below the limit of 0 or not finite: subtract the radiometer's dark reading, and set what stays below 0 to 0"
+            f"radiance is {radiance[lowest]:g} W sr^-1 m^-2 nm^-1 at {wavelength_nm[lowest]:g} nm, below the limit of "
+            "0 or not finite: subtract the radiometer's dark reading, and set what stays below 0 to 0"
         )
 
 
 def otf_wavelengths(
     camera: CameraModel, channel: str, wavelength_nm: FloatArray, weight: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """A few wavelengths (nm) and shares (sum 1) over which to average the transfer function for detected light `weight`."""
+    """A few wavelengths (nm) and shares (sum 1) over which to average the transfer function for detected light
+    `weight`.
+    """
     return gauss_rule(*otf_weight(camera, channel, wavelength_nm, weight), count)
 
 

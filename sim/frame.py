@@ -1,10 +1,11 @@
 """The entry for whole frames: from a scene to mean electrons, moments, and frames drawn at random.
 
-    radiance -> lens: irradiance factor, transmittance, fall-off -> blur -> quantum efficiency by mosaic -> electrons + dark current
+    radiance -> lens: irradiance factor, transmittance, fall-off -> blur -> quantum efficiency by
+    mosaic -> electrons + dark current
     -> charge between pixels, full well -> shot noise -> read-out -> codes
 
-Effects act on the stages (`sim.stages`); without effects, or with effects at their absent values, the result is the baseline bit
-for bit.
+Effects act on the stages (`sim.stages`); without effects, or with effects at their absent values, the result is the
+baseline bit for bit.
 """
 
 from __future__ import annotations
@@ -35,11 +36,12 @@ from sim.uniform import Uniform
 
 @dataclass(frozen=True)
 class Exposure:
-    """One exposure of a scene. `gain_db` is the analogue gain; `elapsed_s` the time after the session's first capture. Effects
-    may depend on it and on the sensor's `temperature_c`, with which the dark current doubles as the camera model says.
-    `magnification` of the scene dims the image as in ISET: pi / (1 + 4 N^2 (1 + |m|)^2); its blur stays that of `Lens.f_number`.
-    `placed` matters to traced lenses, whose distortion moves the light: a scene's px are those of the ideal camera, or those of
-    the image (a recording's corners), where the distortion is in them already."""
+    """One exposure of a scene. `gain_db` is the analogue gain; `elapsed_s` the time after the session's first capture.
+    Effects may depend on it and on the sensor's `temperature_c`, with which the dark current doubles as the camera
+    model says. `magnification` of the scene dims the image as in ISET: pi / (1 + 4 N^2 (1 + |m|)^2); its blur stays
+    that of `Lens.f_number`. `placed` matters to traced lenses, whose distortion moves the light: a scene's px are those
+    of the ideal camera, or those of the image (a recording's corners), where the distortion is in them already.
+    """
 
     scene: Scene
     exposure_s: float
@@ -66,10 +68,11 @@ def expected_electrons(
     """Mean electrons (rows, cols) of every pixel, light and dark current, after the effects on charge; not yet clipped.
 
     Scenes that aren't uniform or straight edges are drawn by area on `oversample` x `oversample` samples a pixel, with
-    `margin_px` around the frame, and blurred channel by channel with the channel's transfer function. The light beyond the
-    margin is taken as the scene's other end. On random cells of 2 px at f/4 and 3 um pixels, 2, 3, 4, 6 samples a pixel leave
-    0.6, 0.2, 0.1, 0.05 % of white rms; a frame of 480 x 640 takes 0.5, 1.1, 2.4 s of one core at 2, 3, 4. `source`: factor on the
-    scene's light, such as `unsteady_source` of the frame that is drawn.
+    `margin_px` around the frame, and blurred channel by channel with the channel's transfer function. The light beyond
+    the margin is taken as the scene's other end. On random cells of 2 px at f/4 and 3 um pixels, 2, 3, 4, 6 samples a
+    pixel leave
+    0.6, 0.2, 0.1, 0.05 % of white rms; a frame of 480 x 640 takes 0.5, 1.1, 2.4 s of one core at 2, 3, 4. `source`:
+    factor on the scene's light, such as `unsteady_source` of the frame that is drawn.
     """
     check_overlap(camera, exposure.scene)
     light = scene_light(
@@ -127,8 +130,10 @@ def scene_light(
 def collected_electrons(
     light: SceneLight, camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, source: float = 1.0
 ) -> FloatArray:
-    """`expected_electrons` of a scene whose light is known. `source`: factor on the scene's light at this time, beside the effects'.
-    Light of the room is collected as long as the source's: for the time that the shutter is really open."""
+    """`expected_electrons` of a scene whose light is known. `source`: factor on the scene's light at this time, beside
+    the effects'. Light of the room is collected as long as the source's: for the time that the shutter is really
+    open.
+    """
     before_lens, charge = light_of(camera, effects), charge_of(camera, effects)
     source *= before_lens.source(exposure.elapsed_s)
     if exposure.magnification != 0.0:
@@ -177,13 +182,16 @@ def grows_with_exposure(camera: CameraModel, effects: Sequence[Effect]) -> bool:
 def screen_light(
     camera: CameraModel, share: FloatArray, x_um: FloatArray, y_um: FloatArray, effects: Sequence[Effect]
 ) -> FloatArray:
-    """Light of a screen, 0..1 of its lit state, where a pattern asks for `share` (rows, cols); places on the sensor in equal steps (um
-    from its centre)."""
+    """Light of a screen, 0..1 of its lit state, where a pattern asks for `share` (rows, cols); places on the sensor in
+    equal steps (um from its centre).
+    """
     return light_of(camera, effects).show_share(share, x_um, y_um)
 
 
 def with_reflections(camera: CameraModel, image: FloatArray, effects: Sequence[Effect]) -> FloatArray:
-    """A channel's whole image (rows, cols), in any unit, with what the lens makes of it as a whole, such as a reflection of it."""
+    """A channel's whole image (rows, cols), in any unit, with what the lens makes of it as a whole, such as a
+    reflection of it.
+    """
     return image_of(camera, effects).with_copies(image)
 
 
@@ -204,8 +212,9 @@ def charge_response(camera: CameraModel, shape: tuple[int, int], effects: Sequen
 
 
 def pair_gain_factor(camera: CameraModel, effects: Sequence[Effect]) -> float:
-    """Factor on the right camera's signal over the left one's in a scene that both see, against what their own captures of uniform light
-    say."""
+    """Factor on the right camera's signal over the left one's in a scene that both see, against what their own captures
+    of uniform light say.
+    """
     return float(np.prod(light_of(camera, effects).pair_gain))
 
 
@@ -215,7 +224,9 @@ def right_delay_s(camera: CameraModel, effects: Sequence[Effect]) -> float:
 
 
 def check_overlap(camera: CameraModel, scene: Scene) -> None:
-    """Raises ValueError for a scene that sheds light, none of which any channel can see: most likely a unit was mistaken."""
+    """Raises ValueError for a scene that sheds light, none of which any channel can see: most likely a unit was
+    mistaken.
+    """
     lights = [value for item in vars(scene).values() for value in (item if isinstance(item, tuple) else (item,))]
     spectra = [light for light in lights if isinstance(light, Spectrum)]
     if isinstance(scene, SpectralImage):
@@ -227,7 +238,8 @@ def check_overlap(camera: CameraModel, scene: Scene) -> None:
     if shining and all(min(high, lit[1]) <= max(low, lit[0]) for low, high in seen):
         low, high = min(span[0] for span in seen), max(span[1] for span in seen)
         raise ValueError(
-            f"the scene's light lies at {lit[0]:g} to {lit[1]:g} nm, outside the limits {low:g} to {high:g} nm of the quantum efficiency: give wavelengths in nm, or a curve that reaches the light"
+            f"the scene's light lies at {lit[0]:g} to {lit[1]:g} nm, outside the limits {low:g} to {high:g} nm of the "
+            "quantum efficiency: give wavelengths in nm, or a curve that reaches the light"
         )
 
 
@@ -246,19 +258,23 @@ def _span_nm(curves: Sequence[Spectrum]) -> tuple[float, float]:
 def check_not_saturated(camera: CameraModel, exposure: Exposure, electrons: FloatArray) -> None:
     """Raises ValueError where an exposure saturates every pixel: nothing of the scene would be left in the frame.
 
-    `electrons`: of `expected_electrons`. The limit is the full well, or what the converter reads at the gain. (The physics of
-    clipping is in `expected` and `sample` all the same: whoever simulates calls this first.)
+    `electrons`: of `expected_electrons`. The limit is the full well, or what the converter reads at the gain.
+    (The physics of clipping is in `predict_frame` and `sample` all the same: whoever simulates calls this first.)
     """
     limit = sensor.capacity_e(camera, exposure.gain_db)
     darkest = float(np.min(electrons))
     if darkest >= limit:
         raise ValueError(
-            f"exposure {exposure.exposure_s:g} s saturates all pixels: the darkest collects {darkest:.4g} e, and the limit is {limit:.4g} e at {exposure.gain_db:g} dB; expose {0.5 * exposure.exposure_s * limit / darkest:.2g} s, lower the gain or dim the light"
+            f"exposure {exposure.exposure_s:g} s saturates all pixels: the darkest collects {darkest:.4g} e, and the "
+            f"limit is {limit:.4g} e at {exposure.gain_db:g} dB; expose "
+            f"{0.5 * exposure.exposure_s * limit / darkest:.2g} s, lower the gain or dim the light"
         )
 
 
 def dark_electrons(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = ()) -> FloatArray | float:
-    """Mean electrons of the dark current in one exposure, at its temperature; (rows, cols) where effects tell pixels apart."""
+    """Mean electrons of the dark current in one exposure, at its temperature; (rows, cols) where effects tell pixels
+    apart.
+    """
     rate: FloatArray | float = sensor.dark_current_e_per_s(camera, exposure.temperature_c)
     return charge_of(camera, effects).dark_e_per_s(rate, exposure.temperature_c) * exposure.exposure_s
 
@@ -266,7 +282,7 @@ def dark_electrons(camera: CameraModel, exposure: Exposure, effects: Sequence[Ef
 def moments(
     camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 3, margin_px: int = 32
 ) -> tuple[FloatArray, FloatArray]:
-    """`expected` (DN) and `variance` (DN^2) at the price of one."""
+    """`predict_frame` (DN) and `variance` (DN^2) at the price of one."""
     electrons = expected_electrons(camera, exposure, effects, oversample=oversample, margin_px=margin_px)
     return sensor.dn_moments(electrons, camera, exposure.gain_db, read_out(camera, exposure, effects))
 
@@ -274,7 +290,9 @@ def moments(
 def predict_frame(
     camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 3, margin_px: int = 32
 ) -> FloatArray:
-    """Mean frame (rows, cols) in DN of a camera whose pixels are all alike; clipping and rounding are averaged over noise."""
+    """Mean frame (rows, cols) in DN of a camera whose pixels are all alike; clipping and rounding are averaged over
+    noise.
+    """
     return moments(camera, exposure, effects, oversample=oversample, margin_px=margin_px)[0]
 
 
@@ -327,12 +345,12 @@ def expected_sequence(
     drawn: bool = False,
 ) -> Iterator[FloatArray]:
     """Mean electrons (rows, cols) that are read in each exposure of a sequence, one after the other: charge that
-    isn't read with a frame (image lag) is read with the next. The first follows empty pixels; an exposure that is the same object
-    as the one before is drawn once.
+    isn't read with a frame (image lag) is read with the next. The first follows empty pixels; an exposure that is the
+    same object as the one before is drawn once.
 
-    Drawing every frame's electrons from these means on their own is exact: of Poisson electrons that are told apart one by
-    one, those read and those that stay are independent Poisson variables. `drawn`: of frames with an unsteady source's light as it was
-    in each, not of its mean.
+    Drawing every frame's electrons from these means on their own is exact: of Poisson electrons that are told apart one
+    by one, those read and those that stay are independent Poisson variables. `drawn`: of frames with an unsteady
+    source's light as it was in each, not of its mean.
     """
     before: Exposure | None = None
     new: FloatArray = np.zeros(())
@@ -358,7 +376,9 @@ def sample_sequence(
     oversample: int = 3,
     margin_px: int = 32,
 ) -> Iterator[NDArray[np.uint16]]:
-    """Raw frames (rows, cols) of exposures taken one after the other, drawn as `sample` does from `expected_sequence`."""
+    """Raw frames (rows, cols) of exposures taken one after the other, drawn as `sample` does from
+    `expected_sequence`.
+    """
     every = list(exposures)
     means = expected_sequence(camera, every, effects, oversample=oversample, margin_px=margin_px, drawn=True)
     for exposure, electrons in zip(every, means, strict=True):
@@ -383,7 +403,8 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
     def draw_disturbances(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         return sum((one.draw(shape, rng) for one in disturbances), np.zeros((1, 1)))
 
-    # Only where there is a law something acts, so that effects elsewhere leave the read-out the baseline's to the last bit.
+    # Only where there is a law something acts, so that effects elsewhere leave the read-out the baseline's to the last
+    # bit.
     shape = camera.rows, camera.cols
     return ReadOut(
         signal.read if signal.response else None,
@@ -399,8 +420,9 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
 
 
 def _scatter_light(image: FloatArray, state: Image, shade: FloatArray) -> FloatArray:
-    """A channel's irradiance with its reflections, the fall-off, and what is scattered evenly. A traced lens's image is a mosaic already:
-    colour by colour."""
+    """A channel's irradiance with its reflections, the fall-off, and what is scattered evenly. A traced lens's image is
+    a mosaic already: colour by colour.
+    """
     traced = isinstance(state.camera.lens.imaging, TracedLens)
 
     def colours(frame: FloatArray) -> list[FloatArray]:

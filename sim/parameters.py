@@ -36,9 +36,10 @@ class Quantity:
     `prior` is (centre, one standard deviation) of a normal distribution in the parameter's own unit, or None for a
     flat prior between the bounds. `absent` is the value that means that the effect isn't there. `linear_power` says in
     which power of the parameter the prediction has a slope at `absent`: 2 for a displacement d, which acts as d^2.
-    `logarithmic`: positive, and fitted as its logarithm, as predictions depend on its product with another. `dispensable`: a
-    refinement, that stays at `absent` where a fit without it is worth nearly as much. `smooth_over`: predictions follow the parameter
-    smoothly over changes of this size, and unevenly over smaller ones. Of a tuple, each value is within the bounds.
+    `logarithmic`: positive, and fitted as its logarithm, as predictions depend on its product with another.
+    `dispensable`: a refinement, that stays at `absent` where a fit without it is worth nearly as much. `smooth_over`:
+    predictions follow the parameter smoothly over changes of this size, and unevenly over smaller ones. Of a tuple,
+    each value is within the bounds.
     """
 
     unit: str
@@ -64,11 +65,13 @@ class Quantity:
             if isinstance(value, int | float):
                 if self.lower is not None and value < self.lower:
                     raise ValueError(
-                        f"{self.meaning}: {value}{unit} is below the lower limit {self.lower}{unit}; give a value within the limits"
+                        f"{self.meaning}: {value}{unit} is below the lower limit {self.lower}{unit}; give a value "
+                        "within the limits"
                     )
                 if self.upper is not None and value > self.upper:
                     raise ValueError(
-                        f"{self.meaning}: {value}{unit} is above the upper limit {self.upper}{unit}; give a value within the limits"
+                        f"{self.meaning}: {value}{unit} is above the upper limit {self.upper}{unit}; give a value "
+                        "within the limits"
                     )
 
         return core_schema.no_info_after_validator_function(check, handler(source))

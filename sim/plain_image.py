@@ -1,4 +1,6 @@
-"""Images of scenes behind a lens that blurs alike everywhere: electrons a second of every channel, before the fall-off of light."""
+"""Images of scenes behind a lens that blurs alike everywhere: electrons a second of every channel, before the fall-off
+of light.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ from sim.spectrum import FloatArray, Spectrum, lagrange_shares
 from sim.stages import ComplexArray, image_of, light_of
 from sim.uniform import electron_rate
 
-#: Wavelengths at which a whole frame's transfer function is averaged: within 1e-3 near the cutoff, where little contrast is left.
+#: Wavelengths at which a whole frame's transfer function is averaged: within 1e-3 near the cutoff, where little
+#: contrast is left.
 FRAME_WAVELENGTHS = 5
 
 #: How near wavelengths land to each other that are moved as one.
@@ -36,8 +39,10 @@ MIDDLE_NM = 550.0
 
 
 class KeptTransfers:
-    """The transfers that whole frames were blurred with, for the next scene in the same lights; of one camera with one set of
-    effects. The latest `most` are kept, one a channel and light, of 12 MB at 480 x 640 px and 3 samples a pixel."""
+    """The transfers that whole frames were blurred with, for the next scene in the same lights; of one camera with one
+    set of effects. The latest `most` are kept, one a channel and light, of 12 MB at 480 x 640 px and 3 samples a
+    pixel.
+    """
 
     def __init__(self, most: int = 3) -> None:
         self._kept: OrderedDict[Hashable, list[NDArray[np.complex64]]] = OrderedDict()
@@ -61,7 +66,9 @@ def plain_images(
     margin_px: int,
     transfers: KeptTransfers | None = None,
 ) -> dict[str, FloatArray]:
-    """Electrons a second of every channel behind a lens that blurs alike everywhere, (rows, cols) each, before cos^4."""
+    """Electrons a second of every channel behind a lens that blurs alike everywhere, (rows, cols) each, before
+    cos^4.
+    """
     shape = camera.rows, camera.cols
     if isinstance(scene, UniformField):
         images = {c: _uniform_image(camera, c, scene, effects) for c in camera.channels}
@@ -80,8 +87,9 @@ def plain_images(
 def _field_of_rates(
     camera: CameraModel, channel: str, lights: Sequence[LitSurface], effects: Sequence[Effect], kind: str
 ) -> list[CubicSpline] | None:
-    """Electron rates relative to the axis as functions of sin^2 of the chief ray's angle, one a light, where an effect's
-    transmittance depends on the angle; None where none does."""
+    """Electron rates relative to the axis as functions of sin^2 of the chief ray's angle, one a light, where an
+    effect's transmittance depends on the angle; None where none does.
+    """
     if not image_of(camera, effects).transmittance:
         return None
     corners = sin_theta_at(
@@ -106,7 +114,9 @@ def _uniform_image(camera: CameraModel, channel: str, scene: UniformField, effec
 
 
 def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Sequence[Effect]) -> FloatArray:
-    """Straight edges need no drawing: every pixel takes the profile of the nearest region's edge at its own distance."""
+    """Straight edges need no drawing: every pixel takes the profile of the nearest region's edge at its own
+    distance.
+    """
     if not scene.regions:
         raise ValueError("a knife edge with no region shows nothing: give at least one edge region")
     row, col = np.meshgrid(np.arange(camera.rows, dtype=float), np.arange(camera.cols, dtype=float), indexing="ij")
@@ -136,7 +146,8 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
         row0, col0, row1, col1 = edge.region
         middle = 0.5 * (row0 + row1 - 1), 0.5 * (col0 + col1 - 1)
         if moves:
-            # by place as the channel's mean wavelength is moved; what others differ from that, alike over a region, blurs
+            # by place as the channel's mean wavelength is moved; what others differ from that, alike over a region,
+            # blurs
             distance, angle_deg = _bent_edge(edge.distance_px(*from_px), middle)
             distance = distance[mine]
         else:
@@ -162,8 +173,10 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
 
 
 def _posed_edge_images(camera: CameraModel, scene: PosedEdges, effects: Sequence[Effect]) -> dict[str, FloatArray]:
-    """Electrons a second of every channel, before cos^4: a pixel sees the profile of its edge at its own distance, and lens and
-    perspective bend distance and slope along the edge. The transfer is that of the place where the edge's middle is seen."""
+    """Electrons a second of every channel, before cos^4: a pixel sees the profile of its edge at its own distance, and
+    lens and perspective bend distance and slope along the edge. The transfer is that of the place where the edge's
+    middle is seen.
+    """
     moves = image_of(camera, effects).moves
     margin = _margin_for(camera, effects, 1)
     axes = [np.arange(-margin, n + margin, dtype=float) for n in (camera.rows, camera.cols)]
@@ -187,7 +200,9 @@ def _posed_edge_images(camera: CameraModel, scene: PosedEdges, effects: Sequence
             use = mine == index
             if not np.any(use):
                 continue
-            at = np.array([np.clip(float(v), 0.0, n - 1.0) for v, n in zip(scene.warp().to_camera(*edge.centre_mm), (camera.rows, camera.cols), strict=True)])  # fmt: skip
+            at = np.array([np.clip(float(v), 0.0, n - 1.0) for v,
+                           n in zip(scene.warp().to_camera(*edge.centre_mm), (camera.rows, camera.cols),
+                                    strict=True)])  # fmt: skip
             if place is None:
                 near = tuple(np.rint(at).astype(int) + margin)
                 angle_deg = float(np.rad2deg(np.arctan2(down[near], across[near])))
@@ -239,9 +254,10 @@ def _blurred_images(
 ) -> dict[str, FloatArray]:
     """Electrons a second (rows, cols) of every channel, of a scene drawn by area and convolved, before cos^4.
 
-    With OTF_k at a few wavelengths, w_lk the share of light l's electrons that goes with each, and F the Fourier transform,
-    the image is sum_k OTF_k F[sum_l w_lk picture_l]. The ground's picture is 1 minus all others', so that only the
-    differences to the ground are transformed. `kept`: transfers of scenes before in the same lights, and those of this one.
+    With OTF_k at a few wavelengths, w_lk the share of light l's electrons that goes with each, and F the Fourier
+    transform, the image is sum_k OTF_k F[sum_l w_lk picture_l]. The ground's picture is 1 minus all others', so that
+    only the differences to the ground are transformed. `kept`: transfers of scenes before in the same lights, and those
+    of this one.
     """
     drawing = draw(scene, grid)
     if isinstance(scene, ScreenPattern):
@@ -337,8 +353,8 @@ def _cube_images(
 ) -> dict[str, FloatArray]:
     """Electrons a second (rows, cols) of every channel, of a cube of spectra, before cos^4.
 
-    As in `_blurred_images`, image = sum_k OTF_k F[sum_b w_bk band_b]: a cube of any number of bands becomes one picture a
-    wavelength of the rule. A cube whose samples are the camera's pixels needs no finer grid: its transfer is folded.
+    As in `_blurred_images`, image = sum_k OTF_k F[sum_b w_bk band_b]: a cube of any number of bands becomes one picture
+    a wavelength of the rule. A cube whose samples are the camera's pixels needs no finer grid: its transfer is folded.
     """
     moves = image_of(camera, effects).moves
     blur = Blur(camera, effects, collected=True)
@@ -377,7 +393,9 @@ def _cube_images(
 def _node_pictures(
     camera: CameraModel, channel: str, scene: SpectralImage, effects: Sequence[Effect]
 ) -> tuple[FloatArray, NDArray[np.float32]]:
-    """Wavelengths (nm) of the frame's rule, and the electrons a second that the cube's samples give at each: (nodes, rows, cols)."""
+    """Wavelengths (nm) of the frame's rule, and the electrons a second that the cube's samples give at each:
+    (nodes, rows, cols).
+    """
     lights: list[LitSurface] = [(band, None) for band in scene.bands()]
     wavelength_nm, weight = detect_light(camera, channel, lights, effects, scene.kind)
     weight = weight * collection_m2_sr(camera)
@@ -398,7 +416,9 @@ def _node_pictures(
 
 
 def _folded_transfer(blur: Blur, wavelength_nm: float, shape: tuple[int, int]) -> FloatArray | ComplexArray:
-    """The transfer of lens and effects with the pixel's aperture and a picture's square of one pixel, folded onto samples of one pixel."""
+    """The transfer of lens and effects with the pixel's aperture and a picture's square of one pixel, folded onto
+    samples of one pixel.
+    """
     from sim.optics.fold import fold_diffraction, fold_transfer  # here: the compiler's library takes a while to load
 
     camera, imaging = blur.camera, blur.camera.lens.imaging
@@ -414,9 +434,11 @@ def _folded_transfer(blur: Blur, wavelength_nm: float, shape: tuple[int, int]) -
 
 
 def pixel_on_grid(camera: CameraModel, grid: Grid) -> tuple[FloatArray, FloatArray, ComplexArray, ComplexArray]:
-    """Frequencies fy (n, 1) and fx (1, n), cy/px, of a drawing's transform, and the factors on each that make samples pixels.
+    """Frequencies fy (n, 1) and fx (1, n), cy/px, of a drawing's transform, and the factors on each that make samples
+    pixels.
 
-    The pixel's aperture; a sample is a mean over its square, which is undone; a pixel's centre lies between even samples.
+    The pixel's aperture; a sample is a mean over its square, which is undone; a pixel's centre lies between even
+    samples.
     """
     s = grid.oversample
     ny, nx = grid.shape
@@ -455,7 +477,9 @@ def _mean_wavelength(
 def _unmoved_px(
     camera: CameraModel, row: FloatArray, col: FloatArray, wavelength_nm: float, effects: Sequence[Effect]
 ) -> tuple[FloatArray, FloatArray]:
-    """The places p with p + shift(p) = (row, col), by fixed-point steps to 1e-4 px: shifts change by less than they are."""
+    """The places p with p + shift(p) = (row, col), by fixed-point steps to 1e-4 px: shifts change by less than they
+    are.
+    """
     from_row, from_col = row, col
     for _ in range(40):
         down, right = _shift_px(camera, from_row, from_col, wavelength_nm, effects)
@@ -466,7 +490,8 @@ def _unmoved_px(
         if step > camera.rows + camera.cols:
             break
     raise ValueError(
-        f"light is moved by {max(np.max(np.abs(down)), np.max(np.abs(right))):.3g} px, and by steps of {step:.3g} px back no place is found that it comes from: the distortion folds the image; give less of it"
+        f"light is moved by {max(np.max(np.abs(down)), np.max(np.abs(right))):.3g} px, and by steps of {step:.3g} px "
+        "back no place is found that it comes from: the distortion folds the image; give less of it"
     )
 
 

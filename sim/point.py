@@ -1,7 +1,8 @@
-"""The entry for a point of the image: what blurs it. Transfer functions, edges' profiles, kernels, displaced light, veils.
+"""The entry for a point of the image: what blurs it. Transfer functions, edges' profiles, kernels, displaced light,
+veils.
 
-Frequencies are cy/px, fx along columns (to the right), fy along rows (down). Without effects, or with effects at their absent
-values, the result is the baseline bit for bit.
+Frequencies are cy/px, fx along columns (to the right), fy along rows (down). Without effects, or with effects at their
+absent values, the result is the baseline bit for bit.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ TRANSFER = frozenset(
 #: Those that a transfer function at a place depends on, where wavelengths land apart.
 TRANSFER_AT = TRANSFER | {"image.shift"}
 
-#: Wavelengths at which an optical transfer function is averaged over light and sensitivity (Gauss's rule for that weight): within
-#: 1e-4 of a 1 nm sum.
+#: Wavelengths at which an optical transfer function is averaged over light and sensitivity
+#: (Gauss's rule for that weight): within 1e-4 of a 1 nm sum.
 OTF_WAVELENGTHS = 10
 
 #: Sum of the magnitudes of a sight's shares beyond which the nodes don't stand for its light: it lies beside them.
@@ -59,9 +60,10 @@ class Blur:
     def __init__(
         self, camera: CameraModel, effects: Sequence[Acts] = (), *, collected: bool = False, moving: bool = True
     ) -> None:
-        """`collected`: what frames are drawn with: without light that is scattered evenly over the frame, without what moves charge between
-        pixels, and without filters on the chip. `moving`: with what moves charge between pixels, as among pixels of one colour; `mixed` has it
-        for a mosaic."""
+        """`collected`: what frames are drawn with: without light that is scattered evenly over the frame, without what
+        moves charge between pixels, and without filters on the chip. `moving`: with what moves charge between pixels,
+        as among pixels of one colour; `mix_channels` has it for a mosaic.
+        """
         self.camera = camera
         image = image_of(camera, effects)
         self.image: Image = image.remove_veil() if collected else image
@@ -128,7 +130,9 @@ def varies_over_field(camera: CameraModel, effects: Sequence[Acts]) -> bool:
 def displaced_um(
     camera: CameraModel, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, effects: Sequence[Acts]
 ) -> tuple[FloatArray, FloatArray] | None:
-    """How far (dx, dy) effects let light of one wavelength land from the place where the baseline has it; None where they don't."""
+    """How far (dx, dy) effects let light of one wavelength land from the place where the baseline has it; None where
+    they don't.
+    """
     image = image_of(camera, effects)
     if not image.moves:
         return None
@@ -145,10 +149,12 @@ def dispersal(
     effects: Sequence[Acts],
     places_um: Sequence[tuple[float, float]],
 ) -> ComplexArray | None:
-    """Factors on the transfer functions of single wavelengths, (sights, wavelengths, *frequencies), by which a sight's wavelengths land
-    apart: the mean over places of exp(-2 pi i f (s(wavelength) - s(mean wavelength))), s the shift of light that lands off.
+    """Factors on the transfer functions of single wavelengths, (sights, wavelengths, *frequencies), by which a sight's
+    wavelengths land apart: the mean over places of exp(-2 pi i f (s(wavelength) - s(mean wavelength))), s the shift of
+    light that lands off.
 
-    `shares`: how much each wavelength (nm) counts for each sight, (sights, wavelengths), sum 1. None where all land together.
+    `shares`: how much each wavelength (nm) counts for each sight, (sights, wavelengths), sum 1. None where all land
+    together.
     """
     image = image_of(camera, effects)
     if not image.moves:
@@ -180,8 +186,9 @@ def detected_transfer(
     effects: Sequence[Acts],
     places_um: Sequence[tuple[float, float]],
 ) -> ComplexArray:
-    """Transfer functions of sights, (sights, *frequencies), of those of single wavelengths, (wavelengths, *frequencies): the sum over
-    wavelengths of share x transfer x `dispersal`."""
+    """Transfer functions of sights, (sights, *frequencies), of those of single wavelengths,
+    (wavelengths, *frequencies): the sum over wavelengths of share x transfer x `dispersal`.
+    """
     apart = dispersal(camera, wavelength_nm, shares, fx_cy_per_px, fy_cy_per_px, effects, places_um)
     if apart is None:
         return np.asarray(np.tensordot(shares, transfers, 1), complex)
@@ -201,11 +208,12 @@ def mix_channels(
     fy_cy_per_px: FloatArray,
     effects: Sequence[Acts],
 ) -> ComplexArray:
-    """Transfer functions of a mosaic's channels after charge has moved between pixels, (channels, *frequencies), from those before and each
-    channel's mean signal before, (channels,), on any scale.
+    """Transfer functions of a mosaic's channels after charge has moved between pixels, (channels, *frequencies), from
+    those before and each channel's mean signal before, (channels,), on any scale.
 
-    T'_c(f) = sum_n k_n s_n T_n(f) exp(-2 pi i f n) / sum_n k_n s_n, over the offsets n of the kernel k of all moves together; s_n and T_n are of
-    the channel from which charge moves by n to a pixel of channel c. Of a channel with several phases in the mosaic, their mean.
+    T'_c(f) = sum_n k_n s_n T_n(f) exp(-2 pi i f n) / sum_n k_n s_n, over the offsets n of the kernel k of all moves
+    together; s_n and T_n are of the channel from which charge moves by n to a pixel of channel c. Of a channel with
+    several phases in the mosaic, their mean.
     """
     from scipy.signal import convolve2d  # here: the library takes a while to load
 
@@ -243,7 +251,9 @@ def halos(camera: CameraModel, effects: Sequence[Acts]) -> list[tuple[float, flo
 def wide_contrast(
     camera: CameraModel, effects: Sequence[Acts], frequency_cy_per_px: FloatArray | float = np.inf
 ) -> FloatArray:
-    """Contrast that veils and halos leave at a frequency that the frame holds; as it stands to anything smaller than the halos."""
+    """Contrast that veils and halos leave at a frequency that the frame holds; as it stands to anything smaller than
+    the halos.
+    """
     left: FloatArray = np.ones(np.shape(frequency_cy_per_px))
     for veil in image_of(camera, effects).veils:
         kept = np.exp(-2.0 * np.square(np.pi * veil.halo_std_um / camera.pixel_pitch_um * frequency_cy_per_px))
@@ -264,12 +274,15 @@ def optical_transfer(
     place_um: tuple[float, float] = (0.0, 0.0),
     collected: bool = False,
 ) -> ComplexArray:
-    """Optical transfer function of one channel, 1 at zero frequency; complex, of the broadcast shape of fx and fy (cy/px).
+    """Optical transfer function of one channel, 1 at zero frequency; complex, of the broadcast shape of fx and fy
+    (cy/px).
 
-    The average of the lens's transfer (`Lens.imaging`) x the effects', weighted by the detected electrons (light x responsivity) over
-    wavelength, times the pixel's aperture. `radiance` None: light of equal energy at every wavelength. `place_um`: where, for path
-    errors that change over the field and wavelengths that land apart (about where the mean wavelength lands). `collected`: as the pixels collect it, before light that is scattered over the whole frame is added, charge moves
-    between pixels and filters on the chip act: what a frame is drawn with, in which these act on the pixels themselves.
+    The average of the lens's transfer (`Lens.imaging`) x the effects', weighted by the detected electrons
+    (light x responsivity) over wavelength, times the pixel's aperture. `radiance` None: light of equal energy at every
+    wavelength. `place_um`: where, for path errors that change over the field and wavelengths that land apart
+    (about where the mean wavelength lands). `collected`: as the pixels collect it, before light that is scattered over
+    the whole frame is added, charge moves between pixels and filters on the chip act: what a frame is drawn with, in
+    which these act on the pixels themselves.
     """
     fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_px, float), np.asarray(fy_cy_per_px, float))
     mixing = not collected and mixes_colours(camera, effects)
@@ -297,13 +310,14 @@ def common_wavelengths(
     kind: str = "slanted_edge",
     count: int = OTF_WAVELENGTHS,
 ) -> tuple[FloatArray, FloatArray]:
-    """Wavelengths (nm), at most `count`, that serve several sights (channel, light) at once, and how much each counts for each
-    of them, (sights, wavelengths): sum 1 over a sight.
+    """Wavelengths (nm), at most `count`, that serve several sights (channel, light) at once, and how much each counts
+    for each of them, (sights, wavelengths): sum 1 over a sight.
 
-    Gauss's nodes for the sights' mean spectral weight without effects, so that transfers at the nodes are the same whatever effects do to
-    the light's colours; with effects where these put light beside the nodes or let wavelengths land apart; the shares integrate the polynomial through the nodes, so
-    that they may be below 0. Transfers of broad and narrow lights come out as by a sight's own nodes (2e-8 at 10 nodes; near a lens's
-    cutoff, which is no polynomial in the wavelength, 5e-4).
+    Gauss's nodes for the sights' mean spectral weight without effects, so that transfers at the nodes are the same
+    whatever effects do to the light's colours; with effects where these put light beside the nodes or let wavelengths
+    land apart; the shares integrate the polynomial through the nodes, so that they may be below 0. Transfers of broad
+    and narrow lights come out as by a sight's own nodes (2e-8 at 10 nodes; near a lens's cutoff, which is no polynomial
+    in the wavelength, 5e-4).
     """
     found = _seen_light(camera, sights, effects, kind)
     # what lets wavelengths land apart turns fast with the wavelength: at nodes of another light, ten are too few
@@ -317,7 +331,9 @@ def common_wavelengths(
 
 
 def _pooled_nodes(seen: Sequence[tuple[FloatArray, FloatArray]], count: int) -> FloatArray:
-    """Gauss's nodes for the mean weight of several sights; these have most of their wavelengths in common: each once."""
+    """Gauss's nodes for the mean weight of several sights; these have most of their wavelengths in common: each
+    once.
+    """
     position, which = np.unique(np.concatenate([at for at, _ in seen]), return_inverse=True)
     pooled = np.bincount(which, np.concatenate([part for _, part in seen])) / len(seen)
     return gauss_rule(position, pooled, count)[0]
@@ -330,8 +346,9 @@ def wavelength_shares(
     effects: Sequence[Acts] = (),
     kind: str = "slanted_edge",
 ) -> FloatArray:
-    """How much each of `wavelength_nm` (ascending) counts for each of several sights (channel, light) in a mean over the light that it
-    detects, (sights, wavelengths), of what is linear between them: sum 1 over a sight."""
+    """How much each of `wavelength_nm` (ascending) counts for each of several sights (channel, light) in a mean over
+    the light that it detects, (sights, wavelengths), of what is linear between them: sum 1 over a sight.
+    """
     seen = _seen_light(camera, sights, effects, kind)
     return np.array([linear_shares(at, part, wavelength_nm) for at, part in seen])
 
@@ -360,8 +377,9 @@ def transfer_at(
     place_um: tuple[float, float] = (0.0, 0.0),
     moving: bool = True,
 ) -> FloatArray | ComplexArray:
-    """Transfer of lens, pixel and effects at one wavelength, of the broadcast shape of fx and fy (cy/px). `place_um` matters to
-    path errors that change over the field; `moving` as in `Blur`."""
+    """Transfer of lens, pixel and effects at one wavelength, of the broadcast shape of fx and fy (cy/px). `place_um`
+    matters to path errors that change over the field; `moving` as in `Blur`.
+    """
     blur = Blur(camera, effects, moving=moving)
     transfer = blur.at(wavelength_nm, fx_cy_per_px, fy_cy_per_px, place_um)
     return transfer * aperture_otf(fx_cy_per_px, fy_cy_per_px, camera.fill_factor)
@@ -412,8 +430,8 @@ def edge_profile(
     series = np.zeros(samples // 2 + 1, complex)
     series[1:count] = transfer / (2j * np.pi * np.arange(1, count))
     profile = fft.irfft(series, samples) * samples
-    # The term at zero frequency is half of (2 d Re H + Im H' / pi) / period. Both are limits from above: a veil wider than
-    # the period, a spike at zero frequency, lies even on both sides.
+    # The term at zero frequency is half of (2 d Re H + Im H' / pi) / period. Both are limits from above: a veil wider
+    # than the period, a spike at zero frequency, lies even on both sides.
     ramp = float(np.real(2.0 * transfer[0] - transfer[1]))
     level = 0.5 + float(np.imag(transfer[0])) / (2.0 * np.pi)
     step = period / samples
@@ -434,9 +452,10 @@ def kernel(
 ) -> FloatArray:
     """Point spread function with the pixel's aperture, (support, support) samples of 1/oversample px, sum 1.
 
-    A sample is the response of the middle pixel to light spread evenly over the sample's square: what light of that square
-    does there. So the kernel convolves a picture drawn by area; element [half + i, half + j] is the answer i down and j to the
-    right of the light. `support` is odd; `oversample` below 1 gives the coarse grid of a mosaic's plane (1/2).
+    A sample is the response of the middle pixel to light spread evenly over the sample's square: what light of that
+    square does there. So the kernel convolves a picture drawn by area; element [half + i, half + j] is the answer i
+    down and j to the right of the light. `support` is odd; `oversample` below 1 gives the coarse grid of a mosaic's
+    plane (1/2).
     """
     if support < 1 or support % 2 == 0:
         raise ValueError(f"support {support} of the kernel has to be odd and at least 1: take {support + 1}")

@@ -33,13 +33,15 @@ class Spectrum(Frozen):
     def _check(self) -> Self:
         if len(self.wavelength_nm) != len(self.value) or not self.value:
             raise ValueError(
-                f"{len(self.wavelength_nm)} wavelengths and {len(self.value)} values: give as many of the one as of the other"
+                f"{len(self.wavelength_nm)} wavelengths and {len(self.value)} values: give as many of the one as of "
+                "the other"
             )
         steps = np.diff(self.wavelength_nm)
         if np.any(steps <= 0):
             at = int(np.argmax(steps <= 0))
             raise ValueError(
-                f"wavelengths must ascend: {self.wavelength_nm[at + 1]} nm follows {self.wavelength_nm[at]} nm; sort the rows"
+                f"wavelengths must ascend: {self.wavelength_nm[at + 1]} nm follows {self.wavelength_nm[at]} nm; sort "
+                "the rows"
             )
         return self
 
@@ -65,7 +67,9 @@ class Spectrum(Frozen):
         return np.interp(wanted, *self.arrays, left=0.0, right=0.0)
 
     def integral(self, lower_nm: float = -np.inf, upper_nm: float = np.inf) -> float:
-        """Integral over wavelength (value's unit x nm) between two wavelengths, exact for the piecewise linear curve."""
+        """Integral over wavelength (value's unit x nm) between two wavelengths, exact for the piecewise linear
+        curve.
+        """
         knots, value = self.arrays
         lower, upper = max(lower_nm, knots[0]), min(upper_nm, knots[-1])
         if lower >= upper:
@@ -150,10 +154,12 @@ def quadrature(spectra: Iterable[Spectrum], step_nm: float = 5.0) -> tuple[Float
 
 
 def gauss_rule(position: FloatArray, weight: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Gauss's quadrature for a discrete weight: at most `count` nodes and shares with the same moments up to 2 count - 1.
+    """Gauss's quadrature for a discrete weight: at most `count` nodes and shares with the same moments up to 2
+    count - 1.
 
-    Lanczos's tridiagonal matrix of the positions in the weight's inner product; nodes are its eigenvalues, shares the squares
-    of the eigenvectors' first entries (Golub and Welsch 1969). `position` ascends; weights are >= 0 and add up to 1.
+    Lanczos's tridiagonal matrix of the positions in the weight's inner product; nodes are its eigenvalues, shares the
+    squares of the eigenvectors' first entries (Golub and Welsch 1969). `position` ascends; weights are >= 0 and add up
+    to 1.
     """
     used = weight > 0
     x, w = position[used], weight[used]
@@ -181,8 +187,9 @@ def gauss_rule(position: FloatArray, weight: FloatArray, count: int) -> tuple[Fl
 
 
 def linear_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray) -> FloatArray:
-    """(nodes,): how much each of the nodes, ascending, counts in sum weight x g, for g given at the nodes and linear between them;
-    positions beyond count for the outermost. The shares add up to the weights' sum."""
+    """(nodes,): how much each of the nodes, ascending, counts in sum weight x g, for g given at the nodes and linear
+    between them; positions beyond count for the outermost. The shares add up to the weights' sum.
+    """
     left = np.clip(np.searchsorted(nodes, position) - 1, 0, len(nodes) - 2)
     on = np.clip((position - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
     lower, upper = np.bincount(left, weight * (1.0 - on), len(nodes)), np.bincount(left + 1, weight * on, len(nodes))
@@ -190,8 +197,9 @@ def linear_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray) -
 
 
 def lagrange_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray) -> FloatArray:
-    """(curves, nodes): how much each node counts in sum weight x g, for g given at the nodes only and taken as the polynomial
-    through them. `weight` is (curves, positions); the shares of a curve add up to its sum, exactly."""
+    """(curves, nodes): how much each node counts in sum weight x g, for g given at the nodes only and taken as the
+    polynomial through them. `weight` is (curves, positions); the shares of a curve add up to its sum, exactly.
+    """
     # the barycentric form: as exact as the products, at a cost of nodes x positions (Berrut and Trefethen 2004)
     apart = (nodes[:, None] - nodes) / max(float(np.ptp(nodes)), 1e-300)
     np.fill_diagonal(apart, 1.0)

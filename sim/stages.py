@@ -1,13 +1,15 @@
-"""The stages of the chain of light, each with its state: what the camera model leaves to effects, as laws that act one after the other.
+"""The stages of the chain of light, each with its state: what the camera model leaves to effects, as laws that act one
+after the other.
 
     Light (what reaches the lens) -> Image (irradiance by wavelength and place) -> Charge (electrons in the pixels)
     -> Signal (after read-out) -> Codes
 
-A state is immutable. Its fields are tuples of laws; a state without laws is the baseline. An effect takes the state of its stage
-and returns it with a law added (`State.adding`). The methods of a state apply its laws in their order. Only `sim` applies them: other
-code asks the three entries `sim.uniform`, `sim.point` and `sim.frame`.
+A state is immutable. Its fields are tuples of laws; a state without laws is the baseline. An effect takes the state of
+its stage and returns it with a law added (`State.adding`). The methods of a state apply its laws in their order. Only
+`sim` applies them: other code asks the three entries `sim.uniform`, `sim.point` and `sim.frame`.
 
-Places are in um from the sensor's centre, x along columns (to the right), y along rows (down). Frequencies follow the same axes.
+Places are in um from the sensor's centre, x along columns (to the right), y along rows (down). Frequencies follow the
+same axes.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ class State:
     camera: CameraModel
 
     def add_laws(self, **laws: Any) -> Self:
-        """This state with one more law in each field that is named. Raises TypeError for a field that the stage doesn't have."""
+        """This state with one more law in each field that is named. Raises TypeError for a field that the stage doesn't
+        have.
+        """
         changed: dict[str, Any] = {name: (*getattr(self, name), law) for name, law in laws.items()}
         return replace(self, **changed)
 
@@ -50,7 +54,9 @@ class State:
 
 @dataclass(frozen=True)
 class Unsteadiness:
-    """A factor on the source that differs at random from frame to frame: normal about 1, the same for a frame whenever it is asked for."""
+    """A factor on the source that differs at random from frame to frame: normal about 1, the same for a frame whenever
+    it is asked for.
+    """
 
     relative_std: float
     seed: int
@@ -63,8 +69,9 @@ class Unsteadiness:
 
 @dataclass(frozen=True)
 class RowLight:
-    """Light that changes while a frame is taken. `factors`: (number of rows, exposure_s, elapsed_s) -> factor (rows,) on the source's
-    light, periodic in elapsed_s with `period_s`."""
+    """Light that changes while a frame is taken. `factors`: (number of rows, exposure_s, elapsed_s) -> factor (rows,)
+    on the source's light, periodic in elapsed_s with `period_s`.
+    """
 
     period_s: float
     factors: Callable[[int, float, float], FloatArray]
@@ -127,8 +134,9 @@ class Light(State):
 
 @dataclass(frozen=True)
 class Veil:
-    """Light that the lens scatters: `even_share` of it evenly over the frame, `halo_share` about its place by a normal distribution of
-    `halo_std_um`, too wide for an edge's surroundings to show and narrower than the frame."""
+    """Light that the lens scatters: `even_share` of it evenly over the frame, `halo_share` about its place by a normal
+    distribution of `halo_std_um`, too wide for an edge's surroundings to show and narrower than the frame.
+    """
 
     even_share: float
     halo_share: float = 0.0
@@ -139,11 +147,12 @@ class Veil:
 class Image(State):
     """Irradiance on the sensor by wavelength and place.
 
-    `transmittance`: (wavelength_nm, sine of the chief ray's angle) -> factor. `pupil`: wavelength_nm -> path error; `pupil_at`:
-    (wavelength_nm, x_um, y_um) -> path error at a place: path errors add up before the transfer function is formed. `transfer`: (fx, fy
-    in cy/um, wavelength_nm) -> factor on the optical transfer function, 1 at zero frequency. `veils`: scattered light. `shading`:
-    (x_um, y_um) -> factor. `shift`: (x_um, y_um, wavelength_nm) -> (dx, dy) in um by which light lands off. `copies`: whole image of a
-    channel (rows, cols) -> image with reflections, linear in it.
+    `transmittance`: (wavelength_nm, sine of the chief ray's angle) -> factor. `pupil`: wavelength_nm -> path error;
+    `pupil_at`: (wavelength_nm, x_um, y_um) -> path error at a place: path errors add up before the transfer function is
+    formed. `transfer`: (fx, fy in cy/um, wavelength_nm) -> factor on the optical transfer function, 1 at zero
+    frequency. `veils`: scattered light. `shading`: (x_um, y_um) -> factor. `shift`: (x_um, y_um, wavelength_nm) -> (dx,
+    dy) in um by which light lands off. `copies`: whole image of a channel (rows, cols) -> image with reflections,
+    linear in it.
     """
 
     transmittance: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
@@ -228,8 +237,9 @@ class Image(State):
         return replace(self, veils=tuple(replace(veil, even_share=0.0) for veil in self.veils))
 
     def add_veil(self, image: FloatArray) -> FloatArray:
-        """A channel's irradiance (rows, cols) with what is scattered evenly over the frame: (1 - s) I + s <I>. Scattered light has met
-        the lens's fall-off already and has none of its own."""
+        """A channel's irradiance (rows, cols) with what is scattered evenly over the frame: (1 - s) I + s <I>.
+        Scattered light has met the lens's fall-off already and has none of its own.
+        """
         return reduce(lambda v, veil: v + veil.even_share * (np.mean(v) - v), self.veils, image)
 
     def with_copies(self, image: FloatArray) -> FloatArray:
@@ -241,14 +251,16 @@ class Image(State):
 class Charge(State):
     """Electrons in the pixels: where they come from and where they end up.
 
-    `exposure_s`: time asked for -> time in which light is collected. `collected`: electrons of light (rows, cols) -> electrons, pixel by
-    pixel. `dark_current`: (e/s, sensor temperature) -> e/s, of all
-    pixels or of each (rows, cols). `defects`: pixels with additional dark current. `transfer`: (fx, fy in cy/um, wavelength_nm) ->
-    factor on the transfer function, alike for all colours. `kernels`: where the charge of a pixel ends up, (odd, odd) of sum 1: they
-    act on whole frames, and on transfer functions (`sim.point.mix_channels` for a mosaic). `exchange`: mean electrons (rows, cols) -> the same after
-    neighbours have exchanged charge by how much they hold. `overflow`: mean electrons (rows, cols) -> the same
-    after full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame. `variance_e2`: (mean electrons,
-    shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of the shot noise with each of the four next pixels.
+    `exposure_s`: time asked for -> time in which light is collected. `collected`: electrons of light
+    (rows, cols) -> electrons, pixel by pixel. `dark_current`: (e/s, sensor temperature) -> e/s, of all
+    pixels or of each (rows, cols). `defects`: pixels with additional dark current. `transfer`:
+    (fx, fy in cy/um, wavelength_nm) -> factor on the transfer function, alike for all colours. `kernels`: where the
+    charge of a pixel ends up, (odd, odd) of sum 1: they act on whole frames, and on transfer functions
+    (`sim.point.mix_channels` for a mosaic). `exchange`: mean electrons (rows, cols) -> the same after neighbours have
+    exchanged charge by how much they hold. `overflow`: mean electrons (rows, cols) -> the same after full wells have
+    run over. `lag`: electrons collected -> electrons that stay for the next frame. `variance_e2`:
+    (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of the shot noise
+    with each of the four next pixels.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
@@ -289,8 +301,9 @@ class Charge(State):
         return value
 
     def move_charge(self, electrons: FloatArray) -> FloatArray:
-        """Electrons of a whole frame (rows, cols) where they end up. The frame goes on as its mirror image about the outermost pixels'
-        centres, which keeps the mosaic's phases."""
+        """Electrons of a whole frame (rows, cols) where they end up. The frame goes on as its mirror image about the
+        outermost pixels' centres, which keeps the mosaic's phases.
+        """
         mixed = reduce(
             lambda value, kernel: np.asarray(convolve(value, kernel, mode="mirror")), self.kernels, electrons
         )
@@ -372,7 +385,9 @@ class Signal(State):
 
 @dataclass(frozen=True)
 class Telegraph:
-    """Random telegraph noise: each pixel of `jumps` is read with +(1 - p) A in a share p of the frames, else with -p A, anew in every frame."""
+    """Random telegraph noise: each pixel of `jumps` is read with +(1 - p) A in a share p of the frames, else with -p A,
+    anew in every frame.
+    """
 
     jumps: Jumps
 
@@ -405,7 +420,9 @@ class Codes(State):
 
 
 def kernel_otf(kernel: FloatArray, fx_cy_per_px: FloatArray, fy_cy_per_px: FloatArray) -> FloatArray | ComplexArray:
-    """Transfer function sum_ij k_ij exp(-2 pi i (fx (j - c) + fy (i - c))) of a kernel (odd, odd); real where the kernel is symmetric."""
+    """Transfer function sum_ij k_ij exp(-2 pi i (fx (j - c) + fy (i - c))) of a kernel (odd, odd); real where the
+    kernel is symmetric.
+    """
     half = kernel.shape[0] // 2, kernel.shape[1] // 2
     even = np.array_equal(kernel, kernel[::-1, ::-1])
     total: FloatArray | ComplexArray = np.zeros(np.broadcast_shapes(np.shape(fx_cy_per_px), np.shape(fy_cy_per_px)))

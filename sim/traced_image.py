@@ -36,9 +36,10 @@ def traced_image(
 ) -> FloatArray:
     """Electrons a second behind a traced lens: every pixel that of its own channel, (rows, cols).
 
-    A sum over few pictures: each blurred channel by channel with the point spread functions of its light (summed over the
-    table's wavelengths as it is detected). The effects' `transfer`, alike all over the frame, acts on the picture in the image
-    before it is blurred: the two commute but for what the lens changes within the reach of the effect, some 1e-3 of the blur.
+    A sum over few pictures: each blurred channel by channel with the point spread functions of its light
+    (summed over the table's wavelengths as it is detected). The effects' `transfer`, alike all over the frame, acts on
+    the picture in the image before it is blurred: the two commute but for what the lens changes within the reach of the
+    effect, some 1e-3 of the blur.
     """
     # here: the compiler's library takes a while to load
     from sim.optics.distorted import distort
@@ -49,7 +50,8 @@ def traced_image(
 
     if image_of(camera, effects).moves:
         raise ValueError(
-            "an effect moves the light of a traced lens, which does that itself: leave distortion and lateral colour to the prescription, or image by another model"
+            "an effect moves the light of a traced lens, which does that itself: leave distortion and lateral colour "
+            "to the prescription, or image by another model"
         )
     axis = optical_axis_px(camera)
     frame = ImageFrame(camera.rows, camera.cols, camera.pixel_pitch_um, camera.fill_factor, axis)
@@ -87,8 +89,9 @@ def traced_image(
 def _pictures_by_rank(
     camera: CameraModel, table: LensTable, scene: Scene, effects: Sequence[Effect], grid: Grid
 ) -> tuple[FloatArray, FloatArray, Iterator[FloatArray]]:
-    """A scene as an even ground (channels, F, W) and pictures on a grid with their lights (pictures, channels, F, W): the fewest
-    that leave 1e-4 of the strongest's light."""
+    """A scene as an even ground (channels, F, W) and pictures on a grid with their lights (pictures, channels, F, W):
+    the fewest that leave 1e-4 of the strongest's light.
+    """
     if isinstance(scene, SpectralImage):
         rows, cols, bands = scene.radiance.shape
         lights: list[LitSurface] = [(band, None) for band in scene.bands()]
@@ -140,8 +143,10 @@ def _on_grid(grid: Grid, layers: Sequence[Layer], factors: Sequence[float]) -> F
 def _table_light(
     camera: CameraModel, table: LensTable, lights: Sequence[LitSurface], effects: Sequence[Effect], kind: str
 ) -> FloatArray:
-    """Electrons a second that each light gives every channel at every field and wavelength of a table, on an even field and
-    without relative illumination: (lights, channels, F, W). Between the table's wavelengths its functions are linear."""
+    """Electrons a second that each light gives every channel at every field and wavelength of a table, on an even field
+    and without relative illumination: (lights, channels, F, W). Between the table's wavelengths its functions are
+    linear.
+    """
     radius_mm = np.hypot(*table.chief_mm.T)
     sine = radius_mm / np.hypot(radius_mm, table.focal_length_mm)
     out = np.empty((len(lights), len(camera.channels), sine.size, table.wavelength_nm.size))
@@ -155,7 +160,9 @@ def _table_light(
 
 
 def _effects_transfer(blur: Blur, table: LensTable, light: FloatArray, grid: Grid) -> NDArray[np.inexact]:
-    """Product of the effects' transfers on a grid's frequencies, averaged over the table's wavelengths with `light` (W,)."""
+    """Product of the effects' transfers on a grid's frequencies, averaged over the table's wavelengths with `light`
+    (W,).
+    """
     fy, fx, _, _ = pixel_on_grid(blur.camera, grid)
     share = np.abs(light) / max(float(np.sum(np.abs(light))), 1e-300)
     nodes, share = gauss_rule(table.wavelength_nm, share, FRAME_WAVELENGTHS)

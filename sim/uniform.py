@@ -1,4 +1,6 @@
-"""The entry for uniform light: one pixel of each channel. Rates, levels, darks, patches, and the noise of all of these."""
+"""The entry for uniform light: one pixel of each channel. Rates, levels, darks, patches, and the noise of all of
+these.
+"""
 
 from __future__ import annotations
 
@@ -43,8 +45,8 @@ GOLDEN_RATIO = 0.5 * (np.sqrt(5.0) - 1.0)
 def noise_values(points: int) -> FloatArray:
     """Values of equal weight that stand for a normal variable of mean 0 and standard deviation 1, (points, values).
 
-    At each point, the quantiles (i + s) / k, i = 0..k - 1. The offset s differs from point to point by the golden ratio, so that points
-    whose levels are alike sample the distribution k x points times.
+    At each point, the quantiles (i + s) / k, i = 0..k - 1. The offset s differs from point to point by the golden
+    ratio, so that points whose levels are alike sample the distribution k x points times.
     """
     count = int(np.clip(NOISE_VALUES // points, LEAST_AT_A_POINT, MOST_AT_A_POINT))
     offset = (0.5 + GOLDEN_RATIO * np.arange(points)) % 1.0
@@ -54,8 +56,9 @@ def noise_values(points: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class FieldPoints:
-    """Points on the sensor that stand for a part of the frame or all of it: (points,) um from the optical axis, and the light there, 1
-    on axis."""
+    """Points on the sensor that stand for a part of the frame or all of it: (points,) um from the optical axis, and the
+    light there, 1 on axis.
+    """
 
     x_um: FloatArray
     y_um: FloatArray
@@ -63,8 +66,9 @@ class FieldPoints:
 
     @staticmethod
     def of(camera: CameraModel, rows: int = 8, cols: int = 10) -> FieldPoints:
-        """The whole frame: Gauss's points and equal areas would differ by less than 1e-5 of a cos^4 field's mean on 8 x 10 cells'
-        centres."""
+        """The whole frame: Gauss's points and equal areas would differ by less than 1e-5 of a cos^4 field's mean on
+        8 x 10 cells' centres.
+        """
         row = (np.arange(rows) + 0.5) / rows * camera.rows - 0.5
         col = (np.arange(cols) + 0.5) / cols * camera.cols - 0.5
         grid_row, grid_col = (g.ravel() for g in np.meshgrid(row, col, indexing="ij"))
@@ -91,10 +95,10 @@ def electron_rate(
 ) -> float:
     """Electrons a second of one pixel of `channel` on axis, in a uniform field of `radiance` (W sr^-1 m^-2 nm^-1).
 
-    pi / (1 + 4 N^2 (1 + |m|)^2) x pitch^2 x fill_factor x integral of radiance x wavelength / (h c) x responsivity. `kind` is
-    the capture's, for effects on the rig. Off axis, `sin_theta` only enters the effects' transmittance: multiply by
-    `sim.optics.illumination.relative_illumination` for the fall-off. `reflectance` stands for a chart's patch under a light
-    whose radiance on a perfect diffuser is `radiance`. Raises ValueError for radiance below 0.
+    pi / (1 + 4 N^2 (1 + |m|)^2) x pitch^2 x fill_factor x integral of radiance x wavelength / (h c) x responsivity.
+    `kind` is the capture's, for effects on the rig. Off axis, `sin_theta` only enters the effects' transmittance:
+    multiply by `sim.optics.illumination.relative_illumination` for the fall-off. `reflectance` stands for a chart's
+    patch under a light whose radiance on a perfect diffuser is `radiance`. Raises ValueError for radiance below 0.
     """
     _, weight = detect_light(camera, channel, [(radiance, reflectance)], effects, kind, sin_theta)
     return float(np.sum(weight)) * collection_m2_sr(camera, magnification)
@@ -173,7 +177,9 @@ class Uniform:
         return self._charge.collected_s(exposure_s)
 
     def ambient_e(self, channel: str, exposure_s: float) -> float:
-        """Electrons that light beside the source makes while the shutter is open, which is the time that light is collected."""
+        """Electrons that light beside the source makes while the shutter is open, which is the time that light is
+        collected.
+        """
         return self._light.ambient(channel) * self._charge.collected_s(exposure_s)
 
     def row_factors(self, rows: int, exposure_s: float, elapsed_s: float) -> FloatArray:
@@ -182,7 +188,9 @@ class Uniform:
         return np.ones(rows) if factors is None else factors
 
     def row_factors_by_phase(self, rows: int, exposure_s: float, phases: int) -> FloatArray:
-        """The same (phases, rows) of frames that begin at `phases` equally spaced times of one period, the longest of several."""
+        """The same (phases, rows) of frames that begin at `phases` equally spaced times of one period, the longest of
+        several.
+        """
         period_s = max((law.period_s for law in self._light.rows), default=0.0)
         begins_s = period_s * np.arange(phases) / phases
         return np.array([self.row_factors(rows, exposure_s, float(t)) for t in begins_s])
@@ -197,9 +205,10 @@ class Uniform:
         field: FieldPoints,
         elapsed_s: FloatArray | float = 0.0,
     ) -> dict[str, FloatArray]:
-        """Mean electrons (..., points of `field`) by channel of light with `rates` (e/s on axis, with the effects on radiance and
-        transmittance in them), dark current included. Rates, exposures and times of several captures have the same shape (...).
-        `field` is that of `Uniform.field`."""
+        """Mean electrons (..., points of `field`) by channel of light with `rates` (e/s on axis, with the effects on
+        radiance and transmittance in them), dark current included. Rates, exposures and times of several captures have
+        the same shape (...). `field` is that of `Uniform.field`.
+        """
         collected_s = _of_each(self._charge.collected_s, exposure_s)
         source_s = _of_each(self._light.source, elapsed_s) * collected_s
         typical_s = source_s * float(np.mean(field.light))
@@ -213,7 +222,7 @@ class Uniform:
         return found
 
     def _mix_captures(self, electrons: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """`mixing` of every capture."""
+        """`mixing_factors` of every capture."""
         if not self._charge.mixes:
             return {}
         level = dict(zip(electrons, np.broadcast_arrays(*electrons.values()), strict=True))
@@ -222,8 +231,9 @@ class Uniform:
         return {c: np.array([one[c] for one in each]).reshape(shape) for c in electrons}
 
     def mixing_factors(self, electrons: Mapping[str, float]) -> dict[str, float]:
-        """Factor on each channel's mean by charge that moves between neighbouring pixels, from a small uniform mosaic of these electrons;
-        empty where none moves."""
+        """Factor on each channel's mean by charge that moves between neighbouring pixels, from a small uniform mosaic
+        of these electrons; empty where none moves.
+        """
         if not self._charge.mixes:
             return {}
         cfa, size, inner = self.camera.cfa, 12, slice(4, 8)
@@ -238,8 +248,9 @@ class Uniform:
         return factors
 
     def exchanged_e(self, squares: FloatArray) -> FloatArray:
-        """Change (n,) of the middle pixels' electrons by charge that unequal neighbours exchange. `squares`: (n, k, k) of k x k pixels, k
-        odd, that hold all which the middle one exchanges charge with."""
+        """Change (n,) of the middle pixels' electrons by charge that unequal neighbours exchange. `squares`: (n, k, k)
+        of k x k pixels, k odd, that hold all which the middle one exchanges charge with.
+        """
         count, size, _ = squares.shape
         row = np.concatenate(list(squares), axis=1)
         after = reduce(lambda value, law: law(value), self._charge.exchange, row)
@@ -256,7 +267,9 @@ class Uniform:
         return bool(self._charge.dark_current)
 
     def dark_e_per_s(self, temperature_c: float | None) -> FloatArray:
-        """Dark current of every pixel (rows, cols), defective ones as the others, where the camera states it for that temperature."""
+        """Dark current of every pixel (rows, cols), defective ones as the others, where the camera states it for that
+        temperature.
+        """
         rate = self._charge.even_dark_e_per_s(self.camera.dark_current_e_per_s, temperature_c)
         return np.broadcast_to(np.asarray(rate, float), (self.camera.rows, self.camera.cols))
 
@@ -337,8 +350,9 @@ class Uniform:
         return self._codes.convert(dn)
 
     def mean_dn(self, electrons: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Mean DN (...) above the black level over the points, by channel, after read-out of (..., points); codes are averaged over
-        shot and read noise."""
+        """Mean DN (...) above the black level over the points, by channel, after read-out of (..., points); codes are
+        averaged over shot and read noise.
+        """
         camera, means = self.camera, {}
         for channel, value in electrons.items():
             dn = camera.conversion_gain_dn_per_e * self.response(value)

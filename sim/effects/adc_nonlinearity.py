@@ -14,8 +14,9 @@ from sim.stages import Codes
 
 
 class AdcNonlinearity(Effect):
-    """A successive-approximation converter: where one of the three highest bits is set, the code is off by that bit's error; offset and
-    gain as without: nothing at codes 0 and 2^bits. Jumps stand at multiples of 2^(bits-3)."""
+    """A successive-approximation converter: where one of the three highest bits is set, the code is off by that bit's
+    error; offset and gain as without: nothing at codes 0 and 2^bits. Jumps stand at multiples of 2^(bits-3).
+    """
 
     name: ClassVar[str] = "adc_nonlinearity"
     title: ClassVar[str] = "ADC nonlinearity"

@@ -1,4 +1,6 @@
-"""Converter ripple: an integral nonlinearity that repeats over the codes, as folding and interpolating converters have."""
+"""Converter ripple: an integral nonlinearity that repeats over the codes, as folding and interpolating converters
+have.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,9 @@ SHORTEST_DN = 16.0  # period: shorter ones are single codes
 
 
 class AdcRipple(Effect):
-    """Code + a sin(2 pi code / p) + b cos(2 pi code / p): levels lie off by up to sqrt(a^2 + b^2), and codes are wider and narrower in
-    turn, by 2 pi sqrt(a^2 + b^2) / p of their width."""
+    """Code + a sin(2 pi code / p) + b cos(2 pi code / p): levels lie off by up to sqrt(a^2 + b^2), and codes are wider
+    and narrower in turn, by 2 pi sqrt(a^2 + b^2) / p of their width.
+    """
 
     name: ClassVar[str] = "adc_ripple"
     title: ClassVar[str] = "ADC ripple"
@@ -34,7 +37,8 @@ class AdcRipple(Effect):
     )
     shapes: ClassVar[frozenset[str]] = frozenset({"period_dn"})
     sentence: ClassVar[str] = (
-        "The converter's characteristic has a ripple: levels lie above and below their line in turn, at fixed codes, and the noise's slope goes with it."
+        "The converter's characteristic has a ripple: levels lie above and below their line in turn, at fixed codes, "
+        "and the noise's slope goes with it."
     )
 
     sine_dn: Annotated[

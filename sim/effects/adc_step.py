@@ -14,15 +14,16 @@ from sim.spectrum import FloatArray
 from sim.stages import Codes
 
 PLACES = 64  # parts of the range, at whose borders a step is looked for first
-#: The counts of single codes change with the place within a code, and do so anew in the next one: only over several codes is the place told.
+#: The counts of single codes change with the place within a code, and do so anew in the next one: only over several
+#: codes is the place told.
 SMOOTH_OVER_DN = 4.0
 
 
 class AdcStep(Effect):
     """Code + s from one code on; offset and gain as without: nothing at codes 0 and 2^bits.
 
-    A comparator of a flash or subranging converter is off, or two ranges of a dual-gain read-out don't join. Unlike a bit's, its step may
-    stand at any code.
+    A comparator of a flash or subranging converter is off, or two ranges of a dual-gain read-out don't join. Unlike a
+    bit's, its step may stand at any code.
     """
 
     name: ClassVar[str] = "adc_step"
@@ -37,7 +38,8 @@ class AdcStep(Effect):
     )
     shapes: ClassVar[frozenset[str]] = frozenset({"code_dn"})
     sentence: ClassVar[str] = (
-        "The converter's characteristic has a step at one code: levels on either side don't join, and codes are missing or come twice there."
+        "The converter's characteristic has a step at one code: levels on either side don't join, and codes are "
+        "missing or come twice there."
     )
 
     step_dn: Annotated[

@@ -12,7 +12,9 @@ from sim.stages import Light
 
 
 class AmbientLight(Effect):
-    """Electrons a second added while the shutter is open: e in green (and in a camera without colour), e sqrt(c) in red, e / sqrt(c) in blue."""
+    """Electrons a second added while the shutter is open: e in green (and in a camera without colour), e sqrt(c) in
+    red, e / sqrt(c) in blue.
+    """
 
     name: ClassVar[str] = "ambient_light"
     family: ClassVar[Family] = Family.FIELD_OF_LIGHT
@@ -21,7 +23,8 @@ class AmbientLight(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "level", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"red_over_blue"})
     sentence: ClassVar[str] = (
-        "Light of the room reaches the sensor: all lit captures carry a signal that grows with the exposure and not with the source."
+        "Light of the room reaches the sensor: all lit captures carry a signal that grows with the exposure and not "
+        "with the source."
     )
 
     rate_e_per_s: Annotated[

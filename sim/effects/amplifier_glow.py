@@ -19,7 +19,9 @@ Corner = Literal["top_left", "top_right", "bottom_left", "bottom_right"]
 
 
 class AmplifierGlow(Effect):
-    """g exp(-r / r0) electrons a second on top, r from the outermost pixel of one corner; it glows while charge is collected."""
+    """g exp(-r / r0) electrons a second on top, r from the outermost pixel of one corner; it glows while charge is
+    collected.
+    """
 
     name: ClassVar[str] = "amplifier_glow"
     family: ClassVar[Family] = Family.DARK_SIGNAL
@@ -28,7 +30,8 @@ class AmplifierGlow(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "level", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"reach_mm"})
     sentence: ClassVar[str] = (
-        "The output stage glows: dark frames brighten with the exposure towards one corner, whatever is in front of the lens."
+        "The output stage glows: dark frames brighten with the exposure towards one corner, whatever is in front of "
+        "the lens."
     )
 
     glow_e_per_s: Annotated[

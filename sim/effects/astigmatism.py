@@ -20,17 +20,20 @@ class Astigmatism(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
     sentence: ClassVar[str] = (
-        "The lens is astigmatic: horizontal and vertical detail come to focus in different planes, so that their contrasts differ."
+        "The lens is astigmatic: horizontal and vertical detail come to focus in different planes, so that their "
+        "contrasts differ."
     )
 
     defocus_x_um: Annotated[
         float,
-        Quantity("um", "distance of the sensor from the focus of detail along columns", lower=0.0, upper=200.0, prior=(0.0, 20.0),
+        Quantity("um", "distance of the sensor from the focus of detail along columns", lower=0.0, upper=200.0,
+                 prior=(0.0, 20.0),
                  absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
     defocus_y_um: Annotated[
         float,
-        Quantity("um", "distance of the sensor from the focus of detail along rows, on the other side", lower=0.0, upper=200.0,
+        Quantity("um", "distance of the sensor from the focus of detail along rows, on the other side", lower=0.0,
+                 upper=200.0,
                  prior=(0.0, 20.0), absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
 

@@ -16,10 +16,11 @@ FOCUSED_NM = 550.0
 
 
 class AxialChromaticAberration(Effect):
-    """The sensor lies dz = a t + b t^2 from the focus of a wavelength, t = (wavelength - 550 nm) / 100 nm: W = dz / (8 N^2) rho^2.
+    """The sensor lies dz = a t + b t^2 from the focus of a wavelength, t = (wavelength - 550 nm) / 100 nm:
+    W = dz / (8 N^2) rho^2.
 
-    a is the primary spectrum, b what a corrected lens leaves. Alone, either acts by its square; with a defocus of the whole
-    lens the sign counts: one end of the spectrum comes into focus.
+    a is the primary spectrum, b what a corrected lens leaves. Alone, either acts by its square; with a defocus of the
+    whole lens the sign counts: one end of the spectrum comes into focus.
     """
 
     name: ClassVar[str] = "axial_chromatic_aberration"
@@ -28,18 +29,20 @@ class AxialChromaticAberration(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
     sentence: ClassVar[str] = (
-        "The lens doesn't focus all colours in one plane: some channels are sharper than others, and which ones they are changes "
-        "with the focus."
+        "The lens doesn't focus all colours in one plane: some channels are sharper than others, and which ones they "
+        "are changes with the focus."
     )
 
     slope_um: Annotated[
         float,
-        Quantity("um", "distance of sensor and focus at 650 nm, of the part that is linear in wavelength less 550 nm", lower=-100.0,
+        Quantity("um", "distance of sensor and focus at 650 nm, of the part that is linear in wavelength less 550 nm",
+                 lower=-100.0,
                  upper=100.0, prior=(0.0, 10.0), absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
     curvature_um: Annotated[
         float,
-        Quantity("um", "the same, of the part that is quadratic", lower=-100.0, upper=100.0, prior=(0.0, 10.0), absent=0.0,
+        Quantity("um", "the same, of the part that is quadratic", lower=-100.0, upper=100.0, prior=(0.0, 10.0),
+                 absent=0.0,
                  linear_power=2),
     ] = 0.0  # fmt: skip
 

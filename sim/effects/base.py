@@ -23,14 +23,15 @@ STAGES = {"light": "on_light", "image": "on_image", "charge": "on_charge", "sign
 
 
 class Effect(Frozen):
-    """Base of all effects. Parameters are fields annotated with `sim.parameters.Quantity` (unit, bounds, prior, `absent`,
-    `linear_power`), each with its `absent` value as default, so that `TheEffect()` is the baseline. Other fields are choices, which
-    no fit changes; each has a pydantic `Field` with a description.
+    """Base of all effects. Parameters are fields annotated with `sim.parameters.Quantity`
+    (unit, bounds, prior, `absent`, `linear_power`), each with its `absent` value as default, so that `TheEffect()` is
+    the baseline. Other fields are choices, which no fit changes; each has a pydantic `Field` with a description.
 
     The methods that an effect may write; each default changes nothing:
 
     - `on_light`: it changes what reaches the lens: source, screen, room, the two cameras' common scene.
-    - `on_image`: it changes the image on the sensor: transmittance, path error, transfer, shading, distortion, scattered light.
+    - `on_image`: it changes the image on the sensor: transmittance, path error, transfer, shading, distortion,
+      scattered light.
     - `on_charge`: it changes electrons in the pixels: how long they are collected, where they end up, their noise.
     - `on_signal`: it changes the read-out: response, offset, noise of lines and pixels, filters on the chip.
     - `on_codes`: it changes the converter.
@@ -49,11 +50,14 @@ class Effect(Frozen):
     form_tolerance: ClassVar[float] = 0.05
     #: What the effect doesn't depend on, of: f_number exposure wavelength field level orientation time.
     invariances: ClassVar[frozenset[str]] = frozenset()
-    #: Parameters that shape the effect without sizing it (a filter's edge): a score takes them from the prototype as they are.
+    #: Parameters that shape the effect without sizing it (a filter's edge): a score takes them from the prototype as
+    #: they are.
     shapes: ClassVar[frozenset[str]] = frozenset()
-    #: Other forms of the law, one standard deviation from this one: values of fields that no fit changes, each by itself.
+    #: Other forms of the law, one standard deviation from this one: values of fields that no fit changes, each by
+    #: itself.
     forms: ClassVar[Mapping[str, object]] = {}
-    #: Whether a diagnosis looks for it. False: a part that a camera is known to have, or a term of the diagnosis itself.
+    #: Whether a diagnosis looks for it. False: a part that a camera is known to have, or a term of the diagnosis
+    #: itself.
     is_candidate: ClassVar[bool] = True
     #: One sentence for the report: what physics was left out and how that shows.
     sentence: ClassVar[str]
@@ -91,8 +95,9 @@ class Effect(Frozen):
         return cls(**values)
 
     def log_prior(self) -> float:
-        """Logarithm of this combination's prior probability over that of the single parameters' priors, at most 0: hardware has its
-        habits, that a rival with as many parameters hasn't."""
+        """Logarithm of this combination's prior probability over that of the single parameters' priors, at most 0:
+        hardware has its habits, that a rival with as many parameters hasn't.
+        """
         return 0.0
 
     @classmethod
@@ -100,9 +105,9 @@ class Effect(Frozen):
         """Small or typical instances whose change of the prediction is the effect's signature in the score test.
 
         Each inner tuple is one set of signatures that may be combined with coefficients >= 0 (a two-sided parameter
-        gives both signs). Several inner tuples are alternatives (an effect without a derivative at `absent`, such as a filter's
-        edge, gives one for each place it may lie). The default is one set: 0.3 standard deviations of each parameter's prior from
-        `absent`, within its bounds.
+        gives both signs). Several inner tuples are alternatives (an effect without a derivative at `absent`, such as a
+        filter's edge, gives one for each place it may lie). The default is one set: 0.3 standard deviations of each
+        parameter's prior from `absent`, within its bounds.
         """
         steps: list[Self] = []
         for field, quantity in cls.quantities_of(camera).items():
@@ -120,7 +125,8 @@ class Effect(Frozen):
 
     @classmethod
     def limits(cls, camera: CameraModel) -> dict[str, tuple[float, float]]:
-        """Return bounds (lower, upper) that hardware sets to parameters of this camera, by field name, in the field's unit.
+        """Return bounds (lower, upper) that hardware sets to parameters of this camera, by field name, in the field's
+        unit.
 
         They lie within the declared ones. The default sets none.
         """
@@ -138,8 +144,8 @@ class Effect(Frozen):
     def other_forms(self) -> tuple[Self, ...]:
         """Return this effect by each of the other `forms` of its law.
 
-        A diagnosis marginalises over the difference of each form from this one, with a standard normal coefficient. It is part of the
-        law's error beside `form_tolerance`, and unlike that has the form's own shape.
+        A diagnosis marginalises over the difference of each form from this one, with a standard normal coefficient. It
+        is part of the law's error beside `form_tolerance`, and unlike that has the form's own shape.
         """
         others = ((name, value) for name, value in type(self).forms.items() if getattr(self, name) != value)
         return tuple(self.model_copy(update={name: value}) for name, value in others)

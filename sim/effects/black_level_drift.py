@@ -22,7 +22,8 @@ class BlackLevelDrift(Effect):
         {"f_number", "exposure", "wavelength", "field", "level", "orientation"}
     )
     sentence: ClassVar[str] = (
-        "The black level drifts: all captures carry an additional offset that grows with time or temperature and not with light."
+        "The black level drifts: all captures carry an additional offset that grows with time or temperature and not "
+        "with light."
     )
 
     drift_dn_per_min: Annotated[

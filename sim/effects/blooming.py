@@ -26,7 +26,8 @@ class Blooming(Effect):
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "time"})
     sentence: ClassVar[str] = (
-        "Pixels beyond their full well overflow: bright streaks stand above and below saturated places, along the columns alone."
+        "Pixels beyond their full well overflow: bright streaks stand above and below saturated places, along the "
+        "columns alone."
     )
 
     share_percent: Annotated[

@@ -18,15 +18,16 @@ NEXT_LESS_OWN = np.array([[0.0, 1.0, 0.0], [1.0, -4.0, 1.0], [0.0, 1.0, 0.0]])
 
 
 class BrighterFatter(Effect):
-    """Temporal variance e (1 - a x) while the mean stays, x = e / full well: charge already collected repels the next, which
-    goes to the neighbours and so has them share noise: correlation (b / 4) x with each of the four next ones.
+    """Temporal variance e (1 - a x) while the mean stays, x = e / full well: charge already collected repels the next,
+    which goes to the neighbours and so has them share noise: correlation (b / 4) x with each of the four next ones.
 
-    Where all that a pixel loses goes to these four b is a (charge is conserved: the covariances of all pixels sum up to e). Part of
-    it lands farther away, or in the depth of other pixels, so that both are free.
+    Where all that a pixel loses goes to these four b is a (charge is conserved: the covariances of all pixels sum up to
+    e). Part of it lands farther away, or in the depth of other pixels, so that both are free.
 
-    Means move between unequal neighbours, such as the colours of a mosaic in even light: the border between pixels of e and f electrons
-    moves in proportion to e - f and takes the light that falls there, (e + f) / 2, along, so that the fuller one loses
-    c / (4 W) (e^2 - f^2), W the full well. If borders are all there is, a and b are 4 c. Walls of charge between colours make c smaller.
+    Means move between unequal neighbours, such as the colours of a mosaic in even light: the border between pixels of e
+    and f electrons moves in proportion to e - f and takes the light that falls there, (e + f) / 2, along, so that the
+    fuller one loses c / (4 W) (e^2 - f^2), W the full well. If borders are all there is, a and b are 4 c. Walls of
+    charge between colours make c smaller.
     """
 
     name: ClassVar[str] = "brighter_fatter"
@@ -38,7 +39,8 @@ class BrighterFatter(Effect):
         {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
     )
     sentence: ClassVar[str] = (
-        "Full pixels repel charge: the noise of bright flats is lower than photon statistics say while their mean is on its line, and the missing variance appears as covariance of neighbours."
+        "Full pixels repel charge: the noise of bright flats is lower than photon statistics say while their mean is "
+        "on its line, and the missing variance appears as covariance of neighbours."
     )
 
     loss_percent: Annotated[

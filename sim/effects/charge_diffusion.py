@@ -29,13 +29,14 @@ class ChargeDiffusion(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "level", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"wavelength_power"})
     sentence: ClassVar[str] = (
-        "Charge diffuses to neighbouring pixels before it is collected: contrast falls as a Gaussian of spatial frequency, "
-        "alike in all directions, at all f-numbers, and never less in red than in blue."
+        "Charge diffuses to neighbouring pixels before it is collected: contrast falls as a Gaussian of spatial "
+        "frequency, alike in all directions, at all f-numbers, and never less in red than in blue."
     )
 
     length_um: Annotated[
         float,
-        Quantity("um", "standard deviation of the sideways drift at 550 nm", lower=0.0, upper=10.0, prior=(0.0, 0.7), absent=0.0,
+        Quantity("um", "standard deviation of the sideways drift at 550 nm", lower=0.0, upper=10.0, prior=(0.0, 0.7),
+                 absent=0.0,
                  linear_power=2),
     ] = 0.0  # fmt: skip
     wavelength_power: Annotated[

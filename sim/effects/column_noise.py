@@ -15,8 +15,10 @@ from sim.stages import Signal
 
 
 class ColumnNoise(Effect):
-    """On top of the camera's own: fixed offsets of a standard deviation, drawn once by `pattern_seed`, of mean 0 over the columns;
-    a difference of odd columns from even ones, which two ways of read-out leave; a normal variable a column and frame."""
+    """On top of the camera's own: fixed offsets of a standard deviation, drawn once by `pattern_seed`, of mean 0 over
+    the columns; a difference of odd columns from even ones, which two ways of read-out leave; a normal variable a
+    column and frame.
+    """
 
     name: ClassVar[str] = "column_noise"
     family: ClassVar[Family] = Family.LINE_NOISE

@@ -12,10 +12,11 @@ from sim.stages import Image
 
 
 class Coma(Effect):
-    """Path error W131 rho^2 (x, y) over the pupil along a direction, alike all over the field, as a decentred element makes it.
+    """Path error W131 rho^2 (x, y) over the pupil along a direction, alike all over the field, as a decentred element
+    makes it.
 
-    The spread is lopsided, so that the transfer function gets a phase. Its part in proportion to frequency only moves the image; the
-    rest grows in proportion to W131, the loss of contrast as its square.
+    The spread is lopsided, so that the transfer function gets a phase. Its part in proportion to frequency only moves
+    the image; the rest grows in proportion to W131, the loss of contrast as its square.
     """
 
     name: ClassVar[str] = "coma"
@@ -24,12 +25,14 @@ class Coma(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
     sentence: ClassVar[str] = (
-        "The lens has coma: points have a tail to one side, so that edges are lopsided along one direction and even across it."
+        "The lens has coma: points have a tail to one side, so that edges are lopsided along one direction and even "
+        "across it."
     )
 
     w131_x_um: Annotated[
         float,
-        Quantity("um", "path error at the pupil's rim along columns", lower=-5.0, upper=5.0, prior=(0.0, 0.3), absent=0.0),
+        Quantity("um", "path error at the pupil's rim along columns", lower=-5.0, upper=5.0, prior=(0.0, 0.3),
+                 absent=0.0),
     ] = 0.0  # fmt: skip
     w131_y_um: Annotated[
         float,

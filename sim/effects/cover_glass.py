@@ -14,10 +14,11 @@ from sim.stages import Image
 
 
 class CoverGlass(Effect):
-    """Spherical aberration W040 = t (n^2 - 1) / (128 n^3 N^4), in the new focus, or with t (1 - 1/n) of defocus in the old one.
+    """Spherical aberration W040 = t (n^2 - 1) / (128 n^3 N^4), in the new focus, or with t (1 - 1/n) of defocus in the
+    old one.
 
-    A component that a camera is known to have. What it does is spherical aberration, so that captures can't tell the two apart: a
-    diagnosis doesn't look for it. A plate that stands in a lens's prescription is traced with it.
+    A component that a camera is known to have. What it does is spherical aberration, so that captures can't tell the
+    two apart: a diagnosis doesn't look for it. A plate that stands in a lens's prescription is traced with it.
     """
 
     name: ClassVar[str] = "cover_glass"
@@ -27,8 +28,8 @@ class CoverGlass(Effect):
     form_tolerance: ClassVar[float] = 0.06
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
     sentence: ClassVar[str] = (
-        "A glass plate stands before the sensor that the lens wasn't computed with: it adds spherical aberration, the more the "
-        "wider the aperture."
+        "A glass plate stands before the sensor that the lens wasn't computed with: it adds spherical aberration, the "
+        "more the wider the aperture."
     )
 
     thickness_mm: Annotated[

@@ -15,9 +15,10 @@ from sim.stages import Charge
 
 
 class Crosstalk(Effect):
-    """A share c (1 + r) of each pixel's charge goes to each neighbour in its row, c (1 - r) to each in its column, c k to each across a
-    corner: colours mix in uniform light, and the OTF factor is the kernel's cosine sum. Each electron goes its own way: the noise
-    stays white."""
+    """A share c (1 + r) of each pixel's charge goes to each neighbour in its row, c (1 - r) to each in its column, c k
+    to each across a corner: colours mix in uniform light, and the OTF factor is the kernel's cosine sum. Each electron
+    goes its own way: the noise stays white.
+    """
 
     name: ClassVar[str] = "crosstalk"
     family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
@@ -26,7 +27,8 @@ class Crosstalk(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time", "field"})
     shapes: ClassVar[frozenset[str]] = frozenset({"row_excess", "corner_share"})
     sentence: ClassVar[str] = (
-        "Charge or light leaks into neighbouring pixels: each colour responds where only its neighbours should, and contrast falls."
+        "Charge or light leaks into neighbouring pixels: each colour responds where only its neighbours should, and "
+        "contrast falls."
     )
 
     share_percent: Annotated[

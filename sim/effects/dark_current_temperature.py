@@ -12,7 +12,9 @@ from sim.stages import Charge
 
 
 class DarkCurrentTemperature(Effect):
-    """Dark current x 2^(k (T - T_reference)), the camera's reference temperature; on top of what its own doubling says."""
+    """Dark current x 2^(k (T - T_reference)), the camera's reference temperature; on top of what its own doubling
+    says.
+    """
 
     name: ClassVar[str] = "dark_current_temperature"
     family: ClassVar[Family] = Family.DARK_SIGNAL
@@ -20,7 +22,8 @@ class DarkCurrentTemperature(Effect):
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "orientation"})
     sentence: ClassVar[str] = (
-        "The sensor's temperature changed: dark charge, mean and noise together, grows with the exposure and doubles every few degrees."
+        "The sensor's temperature changed: dark charge, mean and noise together, grows with the exposure and doubles "
+        "every few degrees."
     )
 
     doublings_per_c: Annotated[

@@ -13,8 +13,8 @@ from sim.stages import Image
 
 
 class Decentre(Effect):
-    """Brown's tangential distortion: with x, y from the optical axis in units of half the frame's diagonal R, light lands off by
-    a (3 x^2 + y^2) + 2 b x y along columns and b (x^2 + 3 y^2) + 2 a x y along rows.
+    """Brown's tangential distortion: with x, y from the optical axis in units of half the frame's diagonal R, light
+    lands off by a (3 x^2 + y^2) + 2 b x y along columns and b (x^2 + 3 y^2) + 2 a x y along rows.
 
     (a, b) = R^2 / f (p2, p1) of OpenCV's model. The coma that comes with it blurs, and isn't part of this effect.
     """
@@ -25,8 +25,8 @@ class Decentre(Effect):
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})
     sentence: ClassVar[str] = (
-        "An element of the lens is off centre: corners lie off across the radius as well as along it, on one side of the frame "
-        "more than on the other."
+        "An element of the lens is off centre: corners lie off across the radius as well as along it, on one side of "
+        "the frame more than on the other."
     )
 
     shift_x_um: Annotated[

@@ -18,7 +18,8 @@ SPHERICAL_SHARE = 0.1
 
 
 class Defocus(Effect):
-    """Path error W020 = dz / (8 N^2) at the pupil's rim: the OTF of a circular pupil with a quadratic path error (Hopkins).
+    """Path error W020 = dz / (8 N^2) at the pupil's rim: the OTF of a circular pupil with a quadratic path error
+    (Hopkins).
 
     Away from its focus a lens has some spherical aberration, too: W = W020 (r^2 + s (r^4 - r^2)).
     """
@@ -30,8 +31,8 @@ class Defocus(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
     forms: ClassVar[Mapping[str, object]] = {"spherical_share": SPHERICAL_SHARE}
     sentence: ClassVar[str] = (
-        "The sensor is not in the image plane: contrast falls alike in all directions, with the shape of a defocused pupil, "
-        "and would come back on stopping down."
+        "The sensor is not in the image plane: contrast falls alike in all directions, with the shape of a defocused "
+        "pupil, and would come back on stopping down."
     )
 
     defocus_um: Annotated[

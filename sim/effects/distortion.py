@@ -18,11 +18,11 @@ from sim.stages import Image
 
 
 class Distortion(Effect):
-    """Radial, of the third order: light lands at r (1 + k (r / R)^2), on top of what the camera's geometry says, R half the frame's
-    diagonal, r from the optical axis.
+    """Radial, of the third order: light lands at r (1 + k (r / R)^2), on top of what the camera's geometry says, R half
+    the frame's diagonal, r from the optical axis.
 
-    `geometry` is for scenes that an ideal pinhole placed: its whole distortion (k1 k2 p1 p2 k3) acts on top. Scenes that are
-    projected by the camera's geometry have it already.
+    `geometry` is for scenes that an ideal pinhole placed: its whole distortion (k1 k2 p1 p2 k3) acts on top. Scenes
+    that are projected by the camera's geometry have it already.
     """
 
     name: ClassVar[str] = "distortion"

@@ -20,8 +20,9 @@ PLACES_PX = (-12.0, -6.0, -2.5, 0.0, 2.5, 6.0, 12.0)
 class DoubleImage(Effect):
     """H = (1 - q) + q exp(-2 pi i (fx dx + fy dy)): a share q of the light lands at (dx, dy), in focus.
 
-    A tilted cover glass or filter of thickness t, index n and wedge or tilt a sends the light that its two faces reflect aside by about
-    2 t a / n; uncoated faces reflect 4 % each, 0.16 % both, and cemented or coated ones otherwise.
+    A tilted cover glass or filter of thickness t, index n and wedge or tilt a sends the light that its two faces
+    reflect aside by about 2 t a / n; uncoated faces reflect 4 % each, 0.16 % both, and cemented or coated ones
+    otherwise.
     """
 
     name: ClassVar[str] = "double_image"
@@ -31,8 +32,8 @@ class DoubleImage(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"displacement_x_px", "displacement_y_px"})
     sentence: ClassVar[str] = (
-        "A second image lies beside the first, by reflection between the faces of a plate: contrast oscillates with spatial frequency, the faster "
-        "the farther the copy lies."
+        "A second image lies beside the first, by reflection between the faces of a plate: contrast oscillates with "
+        "spatial frequency, the faster the farther the copy lies."
     )
 
     share_percent: Annotated[

@@ -21,7 +21,8 @@ class ExposureOffset(Effect):
         {"f_number", "wavelength", "field", "level", "orientation", "time"}
     )
     sentence: ClassVar[str] = (
-        "The exposure is off by a constant time: the share of signal that is missing or too much grows as exposures get short."
+        "The exposure is off by a constant time: the share of signal that is missing or too much grows as exposures "
+        "get short."
     )
 
     offset_us: Annotated[

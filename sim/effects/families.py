@@ -1,4 +1,6 @@
-"""The families of effects: what a lab calls the physics, where a single law doesn't hold exactly or several fit alike."""
+"""The families of effects: what a lab calls the physics, where a single law doesn't hold exactly or several fit
+alike.
+"""
 
 from __future__ import annotations
 
@@ -57,8 +59,8 @@ _TOLD = {
     Family.ISOTROPIC_CONTRAST: _Told(
         "loss of contrast, alike in all directions",
         "Fine detail has less contrast than lens and pixels leave it, alike in all directions.",
-        "slanted edges at another f-number (diffraction and defocus change with it, a filter doesn't), in narrowband light (diffusion grows to "
-        "the red), and at frequencies where a filter's contrast passes zero",
+        "slanted edges at another f-number (diffraction and defocus change with it, a filter doesn't), in narrowband "
+        "light (diffusion grows to the red), and at frequencies where a filter's contrast passes zero",
     ),
     Family.DIRECTIONAL_CONTRAST: _Told(
         "loss of contrast along a direction",
@@ -81,17 +83,20 @@ _TOLD = {
     Family.RESPONSE: _Told(
         "response to light",
         "Signals aren't in proportion to the light, or pixels of one colour answer it differently.",
-        "the same levels once by exposure and once by the light's radiance: the camera's response follows the signal, the shutter follows the time",
+        "the same levels once by exposure and once by the light's radiance: the camera's response follows the signal, "
+        "the shutter follows the time",
     ),
     Family.CONVERTER: _Told(
         "converter",
         "The converter's codes are unequal.",
-        "many flat frames over the whole range of codes: wrong bit weights are steps at their codes, a ripple returns with its period",
+        "many flat frames over the whole range of codes: wrong bit weights are steps at their codes, a ripple returns "
+        "with its period",
     ),
     Family.DEFECTIVE_PIXELS: _Told(
         "defective pixels",
         "A few pixels, always the same ones, are far from the others.",
-        "dark frames at two exposures, with many repeats: a hot pixel grows with the exposure, a blinking one changes from repeat to repeat",
+        "dark frames at two exposures, with many repeats: a hot pixel grows with the exposure, a blinking one changes "
+        "from repeat to repeat",
     ),
     Family.LINE_NOISE: _Told(
         "line noise",
@@ -101,12 +106,14 @@ _TOLD = {
     Family.DARK_SIGNAL: _Told(
         "dark signal and offset",
         "Dark frames aren't at their level: it moves with time or temperature, or is uneven over the frame.",
-        "dark frames at two exposures and two temperatures, and again at the end: an offset doesn't grow with the exposure",
+        "dark frames at two exposures and two temperatures, and again at the end: an offset doesn't grow with the "
+        "exposure",
     ),
     Family.CHARGE_BETWEEN_NEIGHBOURS: _Told(
         "charge between neighbours",
         "Charge, or the signal that it makes, is shared between neighbouring pixels.",
-        "flat pairs from dark to full: coupling shares noise in proportion at every level, repelled charge the more the fuller the pixels are",
+        "flat pairs from dark to full: coupling shares noise in proportion at every level, repelled charge the more "
+        "the fuller the pixels are",
     ),
     Family.FRAME_MEMORY: _Told("memory of the last frame", "A frame holds a part of the one before."),
     Family.ON_CHIP_PROCESSING: _Told(
@@ -117,7 +124,8 @@ _TOLD = {
     Family.SOURCE_IN_TIME: _Told(
         "source in time",
         "The source's light isn't constant while the recordings are taken.",
-        "one setting repeated often, in equal steps of time, at a short and a long exposure: drift follows the clock, flicker the exposure",
+        "one setting repeated often, in equal steps of time, at a short and a long exposure: drift follows the clock, "
+        "flicker the exposure",
     ),
     Family.SOURCE_IN_WAVELENGTH: _Told(
         "source in wavelength",

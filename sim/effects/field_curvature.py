@@ -13,10 +13,11 @@ from sim.stages import Image
 
 
 class FieldCurvature(Effect):
-    """The sensor lies dz = c r^2 + a x + b y from the focus, x, y from its centre in half diagonals: W = dz / (8 N^2) rho^2.
+    """The sensor lies dz = c r^2 + a x + b y from the focus, x, y from its centre in half diagonals: W = dz / (8 N^2)
+    rho^2.
 
-    `transfer` is that of one place, the centre unless `at_place` says another: edges and kernels show it, whole frames are drawn
-    as the centre is.
+    `transfer` is that of one place, the centre unless `at_place` says another: edges and kernels show it, whole frames
+    are drawn as the centre is.
     """
 
     name: ClassVar[str] = "field_curvature"
@@ -25,17 +26,20 @@ class FieldCurvature(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
     sentence: ClassVar[str] = (
-        "The plane of focus is bowed or tilted against the sensor: the image is sharp in some places and out of focus in others."
+        "The plane of focus is bowed or tilted against the sensor: the image is sharp in some places and out of focus "
+        "in others."
     )
 
     curvature_um: Annotated[
         float,
-        Quantity("um", "distance of sensor and focus half a diagonal from the centre, of the part that is quadratic in the radius", lower=-200.0,
+        Quantity("um", "distance of sensor and focus half a diagonal from the centre, of the part that is quadratic in "
+                       "the radius", lower=-200.0,
                  upper=200.0, prior=(0.0, 20.0), absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
     tilt_x_um: Annotated[
         float,
-        Quantity("um", "the same along columns, of the part that is linear", lower=-200.0, upper=200.0, prior=(0.0, 20.0),
+        Quantity("um", "the same along columns, of the part that is linear", lower=-200.0, upper=200.0,
+                 prior=(0.0, 20.0),
                  absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
     tilt_y_um: Annotated[
@@ -45,7 +49,8 @@ class FieldCurvature(Effect):
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
-        # a defocus that grows from place to place is no small change of the same with the other sign beside another term
+        # a defocus that grows from place to place is no small change of the same with the other sign beside another
+        # term
         return tuple(
             (cls(curvature_um=6.0), cls(tilt_x_um=sign_x * 6.0), cls(tilt_y_um=sign_y * 6.0))
             for sign_x in (1.0, -1.0)

@@ -1,4 +1,6 @@
-"""Ghost: light that goes back from the sensor and is reflected again by the lens lies over the image, turned about the axis."""
+"""Ghost: light that goes back from the sensor and is reflected again by the lens lies over the image, turned about the
+axis.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ BLUR_PX = 2.0  # a reflection is seldom in focus
 
 
 class Ghost(Effect):
-    """I'(r) = I(r) + q I(-r), r from the frame's middle, the copy blurred by 2 px: two reflections turn the image by half a turn."""
+    """I'(r) = I(r) + q I(-r), r from the frame's middle, the copy blurred by 2 px: two reflections turn the image by
+    half a turn.
+    """
 
     name: ClassVar[str] = "ghost"
     family: ClassVar[Family] = Family.COPIES_AND_VEILS
@@ -25,8 +29,8 @@ class Ghost(Effect):
     form_tolerance: ClassVar[float] = 0.3
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
     sentence: ClassVar[str] = (
-        "Light that the sensor sends back is reflected again by the lens: a weak copy of the scene lies over it, turned by half a "
-        "turn about the axis."
+        "Light that the sensor sends back is reflected again by the lens: a weak copy of the scene lies over it, "
+        "turned by half a turn about the axis."
     )
 
     share_percent: Annotated[

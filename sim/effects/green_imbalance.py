@@ -13,17 +13,21 @@ from sim.stages import Charge
 
 
 class GreenImbalance(Effect):
-    """Light of G on red rows x (1 + a / 2), on blue rows x (1 - a / 2): a checker in even light, the greens' mean as before."""
+    """Light of G on red rows x (1 + a / 2), on blue rows x (1 - a / 2): a checker in even light, the greens' mean as
+    before.
+    """
 
     name: ClassVar[str] = "green_imbalance"
     family: ClassVar[Family] = Family.RESPONSE
     reference: ClassVar[str] = (
-        "J. Nakamura (ed.), Image Sensors and Signal Processing for Digital Still Cameras, CRC Press 2006, green imbalance"
+        "J. Nakamura (ed.), Image Sensors and Signal Processing for Digital Still Cameras, CRC Press 2006, green "
+        "imbalance"
     )
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
     sentence: ClassVar[str] = (
-        "The two greens differ: in even light green pixels on red rows and on blue rows have different signals, in one ratio at all levels."
+        "The two greens differ: in even light green pixels on red rows and on blue rows have different signals, in one "
+        "ratio at all levels."
     )
 
     imbalance_percent: Annotated[

@@ -15,8 +15,9 @@ from sim.stages import Charge
 
 
 class HotPixels(Effect):
-    """A share of the pixels, `pattern_seed` says which, has additional dark current, gamma distributed about its mean: a relative
-    spread of 1 is an exponential distribution, 0 are pixels that are all alike."""
+    """A share of the pixels, `pattern_seed` says which, has additional dark current, gamma distributed about its mean:
+    a relative spread of 1 is an exponential distribution, 0 are pixels that are all alike.
+    """
 
     name: ClassVar[str] = "hot_pixels"
     family: ClassVar[Family] = Family.DEFECTIVE_PIXELS
@@ -27,7 +28,8 @@ class HotPixels(Effect):
     )
     shapes: ClassVar[frozenset[str]] = frozenset({"share_ppm", "relative_spread"})
     sentence: ClassVar[str] = (
-        "A few pixels are hot: always the same ones, they collect dark charge that grows with the exposure and stands far above the rest."
+        "A few pixels are hot: always the same ones, they collect dark charge that grows with the exposure and stands "
+        "far above the rest."
     )
 
     excess_e_per_s: Annotated[

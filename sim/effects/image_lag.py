@@ -11,8 +11,9 @@ from sim.stages import Charge
 
 
 class ImageLag(Effect):
-    """Read: (1 - q) (x_t + l_t), left: l_(t+1) = q (x_t + l_t). In steady light nothing changes; after it q^k of it is still there
-    in the k-th dark frame, and the first frame of a series lacks q."""
+    """Read: (1 - q) (x_t + l_t), left: l_(t+1) = q (x_t + l_t). In steady light nothing changes; after it q^k of it is
+    still there in the k-th dark frame, and the first frame of a series lacks q.
+    """
 
     name: ClassVar[str] = "image_lag"
     family: ClassVar[Family] = Family.FRAME_MEMORY
@@ -24,7 +25,8 @@ class ImageLag(Effect):
         {"f_number", "exposure", "wavelength", "field", "level", "orientation"}
     )
     sentence: ClassVar[str] = (
-        "Image lag: a share of a frame's charge is read with the next frame, so that a dark frame after a bright one shows a faint copy of it."
+        "Image lag: a share of a frame's charge is read with the next frame, so that a dark frame after a bright one "
+        "shows a faint copy of it."
     )
 
     lag_percent: Annotated[

@@ -15,8 +15,8 @@ from sim.stages import Image
 
 
 class InfraredCutFilter(Effect):
-    """Transmittance 1 / (1 + exp(u + steepening u^3)), u = (wavelength - cut) / width: density grows linearly behind the edge, as
-    behind the edge of an interference filter's stop band, or faster.
+    """Transmittance 1 / (1 + exp(u + steepening u^3)), u = (wavelength - cut) / width: density grows linearly behind
+    the edge, as behind the edge of an interference filter's stop band, or faster.
 
     Of a filter that is known to be such a coating, `effective_index` (1.5 to 2.1 are usual) has its edge move to
     cut sqrt(1 - sin^2 / n^2) at the chief ray's angle; without it the edge stays, as that of glass does.

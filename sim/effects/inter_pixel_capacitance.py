@@ -12,15 +12,18 @@ from sim.stages import Charge
 
 
 class InterPixelCapacitance(Crosstalk):
-    """The kernel of `Crosstalk` on what the pixels hold, noise and all: the image and its colours mix as by charge that goes
-    astray, and neighbours' shot noise is correlated, 2 c / (1 - 4 c) at all levels of light; read noise comes after."""
+    """The kernel of `Crosstalk` on what the pixels hold, noise and all: the image and its colours mix as by charge that
+    goes astray, and neighbours' shot noise is correlated, 2 c / (1 - 4 c) at all levels of light; read noise comes
+    after.
+    """
 
     name: ClassVar[str] = "inter_pixel_capacitance"
     title: ClassVar[str] = "inter-pixel capacitance"
     family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = "A. C. Moore, Z. Ninkov, W. J. Forrest, Optical Engineering 45, 076402 (2006)"
     sentence: ClassVar[str] = (
-        "Neighbouring pixels share their voltages: contrast falls, colours mix, and shot noise is correlated between neighbours at all levels of light, but read noise isn't."
+        "Neighbouring pixels share their voltages: contrast falls, colours mix, and shot noise is correlated between "
+        "neighbours at all levels of light, but read noise isn't."
     )
 
     def log_prior(self) -> float:

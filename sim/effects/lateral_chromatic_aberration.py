@@ -16,10 +16,11 @@ REFERENCE_NM = 550.0
 
 
 class LateralChromaticAberration(Effect):
-    """Shift outwards by r / R (a t + b t^2), t = (wavelength - 550 nm) / 100 nm, r from the optical axis, R half the frame's diagonal.
+    """Shift outwards by r / R (a t + b t^2), t = (wavelength - 550 nm) / 100 nm, r from the optical axis, R half the
+    frame's diagonal.
 
-    a is the primary spectrum, b what a corrected lens leaves. Within a channel's band the shift is a blur, along the radius. The
-    term in r^3 that wide lenses add is left to the form tolerance.
+    a is the primary spectrum, b what a corrected lens leaves. Within a channel's band the shift is a blur, along the
+    radius. The term in r^3 that wide lenses add is left to the form tolerance.
     """
 
     name: ClassVar[str] = "lateral_chromatic_aberration"
@@ -28,17 +29,20 @@ class LateralChromaticAberration(Effect):
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "time"})
     sentence: ClassVar[str] = (
-        "The lens images colours at different scales: towards the corners red and blue detail lies further out or in than green."
+        "The lens images colours at different scales: towards the corners red and blue detail lies further out or in "
+        "than green."
     )
 
     slope_um: Annotated[
         float,
-        Quantity("um", "shift in the frame's corner at 650 nm, of the part that is linear in wavelength less 550 nm", lower=-50.0,
+        Quantity("um", "shift in the frame's corner at 650 nm, of the part that is linear in wavelength less 550 nm",
+                 lower=-50.0,
                  upper=50.0, prior=(0.0, 2.0), absent=0.0),
     ] = 0.0  # fmt: skip
     curvature_um: Annotated[
         float,
-        Quantity("um", "the same, of the part that is quadratic", lower=-50.0, upper=50.0, prior=(0.0, 2.0), absent=0.0),
+        Quantity("um", "the same, of the part that is quadratic", lower=-50.0, upper=50.0, prior=(0.0, 2.0),
+                 absent=0.0),
     ] = 0.0  # fmt: skip
 
     def on_image(self, image: Image) -> Image:

@@ -52,9 +52,12 @@ def candidates() -> tuple[type[Effect], ...]:
 
 #: Any camera with a mosaic: which laws an effect adds doesn't depend on it.
 _CAMERA = CameraModel(
-    rows=16, cols=24, pixel_pitch_um=3.0, fill_factor=1.0, cfa="RGGB", bit_depth=12, black_level_dn=64.0, white_level_dn=4095.0,
-    conversion_gain_dn_per_e=0.4, full_well_e=1e4, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=1.0, prnu_percent=1.0,
-    quantum_efficiency={c: Spectrum.of((400.0, 700.0), (0.5, 0.5)) for c in "RGB"}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
+    rows=16, cols=24, pixel_pitch_um=3.0, fill_factor=1.0, cfa="RGGB", bit_depth=12, black_level_dn=64.0,
+    white_level_dn=4095.0,
+    conversion_gain_dn_per_e=0.4, full_well_e=1e4, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=1.0,
+    prnu_percent=1.0,
+    quantum_efficiency={c: Spectrum.of((400.0, 700.0), (0.5, 0.5)) for c in "RGB"},
+    lens=Lens(f_number=4.0, focal_length_mm=8.0),
 )  # fmt: skip
 
 
@@ -72,7 +75,8 @@ def may_change(kind: type[Effect]) -> frozenset[str]:
 
 
 def typical(kind: type[Effect]) -> Effect:
-    """An instance of usual size: its first prototype, with each parameter that sizes it one standard deviation of its prior from `absent`.
+    """An instance of usual size: its first prototype, with each parameter that sizes it one standard deviation of its
+    prior from `absent`.
 
     Parameters without a prior stay at the prototype's value.
     """

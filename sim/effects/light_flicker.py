@@ -13,15 +13,16 @@ from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light, RowLight
 
-#: Times from row to row that are tried first, 5 to 400 us: of rolling shutters from 2000 rows in 10 ms to 100 in 40 ms. Their ratio is 1.2,
-#: as rows tell bands whose number in a frame differs by half of one.
+#: Times from row to row that are tried first, 5 to 400 us: of rolling shutters from 2000 rows in 10 ms to 100 in 40 ms.
+#: Their ratio is 1.2, as rows tell bands whose number in a frame differs by half of one.
 LINE_TIMES_US = tuple(5.0 * 1.2**k for k in range(25))
 
 
 class LightFlicker(Effect):
-    """Light x (1 + m sinc(f T) cos(2 pi f (t + T / 2))), T the exposure and t its begin: the frame's, and a line time later for each
-    row. Bands that vanish where T is a multiple of 1 / f. The line time of a global shutter is 0, whatever is given: frames flicker as
-    a whole."""
+    """Light x (1 + m sinc(f T) cos(2 pi f (t + T / 2))), T the exposure and t its begin: the frame's, and a line time
+    later for each row. Bands that vanish where T is a multiple of 1 / f. The line time of a global shutter is 0,
+    whatever is given: frames flicker as a whole.
+    """
 
     name: ClassVar[str] = "light_flicker"
     family: ClassVar[Family] = Family.SOURCE_IN_TIME
@@ -30,7 +31,8 @@ class LightFlicker(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level"})
     shapes: ClassVar[frozenset[str]] = frozenset({"frequency_hz", "line_time_us"})
     sentence: ClassVar[str] = (
-        "The light flickers: dark and bright bands move over the rows from frame to frame, and vanish at exposures of whole periods."
+        "The light flickers: dark and bright bands move over the rows from frame to frame, and vanish at exposures of "
+        "whole periods."
     )
 
     modulation_percent: Annotated[

@@ -21,9 +21,10 @@ Along = Literal["frequency_cy_per_um", "radius_um", "signal_e", "variance_signal
 class ModelDiscrepancy(Effect):
     """A factor 1 + strength (f(x) - 1) on one stage: f linear between `at`, held beyond.
 
-    `along` says on what, and what x is: `frequency_cy_per_um`, on the transfer function, alike in all directions; `radius_um`, on
-    the light by the distance from the optical axis; `signal_e`, on the mean signal; `variance_signal_e`, on the temporal variance by
-    the mean signal. It describes and predicts; it explains nothing, so that a diagnosis never looks for it.
+    `along` says on what, and what x is: `frequency_cy_per_um`, on the transfer function, alike in all directions;
+    `radius_um`, on the light by the distance from the optical axis; `signal_e`, on the mean signal;
+    `variance_signal_e`, on the temporal variance by the mean signal. It describes and predicts; it explains nothing, so
+    that a diagnosis never looks for it.
     """
 
     name: ClassVar[str] = "model_discrepancy"
@@ -32,8 +33,8 @@ class ModelDiscrepancy(Effect):
     reference: ClassVar[str] = "M. C. Kennedy and A. O'Hagan, J. R. Statist. Soc. B 63, 425 (2001)"
     form_tolerance: ClassVar[float] = 0.2
     sentence: ClassVar[str] = (
-        "Recordings depart from the model here by more than their noise, and no effect of the library says why: a smooth factor "
-        "describes it."
+        "Recordings depart from the model here by more than their noise, and no effect of the library says why: a "
+        "smooth factor describes it."
     )
 
     along: Annotated[Along, Field(description="stage and axis")] = "frequency_cy_per_um"

@@ -14,8 +14,9 @@ from sim.stages import Light
 
 
 class NonUniformIllumination(Effect):
-    """Light factor 1 + s + k s^2 / g, s = gx x + gy y and g = |(gx, gy)|, x and y from -1 to 1 across the frame: a slope, with a bow along
-    it as a lamp beside the axis leaves it."""
+    """Light factor 1 + s + k s^2 / g, s = gx x + gy y and g = |(gx, gy)|, x and y from -1 to 1 across the frame: a
+    slope, with a bow along it as a lamp beside the axis leaves it.
+    """
 
     name: ClassVar[str] = "non_uniform_illumination"
     title: ClassVar[str] = "non-uniform illumination"

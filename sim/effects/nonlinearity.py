@@ -17,7 +17,9 @@ TOE = 0.1
 
 
 class Nonlinearity(Effect):
-    """electrons (1 + a x + b x^2 + c exp(-x / 0.1)) with x = electrons / full well; a, b in percent at full well, c at none."""
+    """electrons (1 + a x + b x^2 + c exp(-x / 0.1)) with x = electrons / full well; a, b in percent at full well, c at
+    none.
+    """
 
     name: ClassVar[str] = "nonlinearity"
     family: ClassVar[Family] = Family.RESPONSE

@@ -1,4 +1,6 @@
-"""What the effects that process raw data share: a 3 x 3 filter of each colour's plane, which colours the noise with the image."""
+"""What the effects that process raw data share: a 3 x 3 filter of each colour's plane, which colours the noise with the
+image.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,12 @@ CornerShare = Annotated[
 
 
 class OnChipFilter(Effect):
-    """plane + k (plane - blurred), the blur a 3 x 3 mean of the pixels of one colour: a share (1 - s) / 4 of each of the four
-    next ones and s / 4 of each of the four across corners, against the pixel itself: s = 0 a cross, 1/3 a binomial, 1/2 a box.
+    """plane + k (plane - blurred), the blur a 3 x 3 mean of the pixels of one colour: a share (1 - s) / 4 of each of
+    the four next ones and s / 4 of each of the four across corners, against the pixel itself: s = 0 a cross, 1/3 a
+    binomial, 1/2 a box.
 
-    k > 0 sharpens, k < 0 smooths. Signal, fixed pattern and noise go through it alike: neighbours' noise is correlated in the same
-    proportion at all levels and in the dark.
+    k > 0 sharpens, k < 0 smooths. Signal, fixed pattern and noise go through it alike: neighbours' noise is correlated
+    in the same proportion at all levels and in the dark.
     """
 
     form_tolerance: ClassVar[float] = 0.1

@@ -11,15 +11,17 @@ from sim.parameters import Quantity
 
 
 class OnChipSharpening(OnChipFilter):
-    """OTF factor 1 + k (1 - B), B the transfer of a mean over the eight pixels of one colour around; the noise with it, so that
-    what neighbours have in common is negative."""
+    """OTF factor 1 + k (1 - B), B the transfer of a mean over the eight pixels of one colour around; the noise with it,
+    so that what neighbours have in common is negative.
+    """
 
     name: ClassVar[str] = "on_chip_sharpening"
     title: ClassVar[str] = "on-chip sharpening"
     family: ClassVar[Family] = Family.ON_CHIP_PROCESSING
     reference: ClassVar[str] = "ISO 12233:2023, annex on sharpening"
     sentence: ClassVar[str] = (
-        "The camera sharpens on the chip: contrast rises above what optics and pixel allow, and the noise of neighbouring pixels is anticorrelated, in light and in the dark."
+        "The camera sharpens on the chip: contrast rises above what optics and pixel allow, and the noise of "
+        "neighbouring pixels is anticorrelated, in light and in the dark."
     )
 
     strength: Annotated[

@@ -11,15 +11,17 @@ from sim.parameters import Quantity
 
 
 class OnChipSmoothing(OnChipFilter):
-    """OTF factor 1 - k (1 - B), B the transfer of a mean over the eight pixels of one colour around; the noise with it, so that
-    neighbours have noise in common, in the same proportion at all levels."""
+    """OTF factor 1 - k (1 - B), B the transfer of a mean over the eight pixels of one colour around; the noise with it,
+    so that neighbours have noise in common, in the same proportion at all levels.
+    """
 
     name: ClassVar[str] = "on_chip_smoothing"
     title: ClassVar[str] = "on-chip smoothing"
     family: ClassVar[Family] = Family.ON_CHIP_PROCESSING
     reference: ClassVar[str] = "ISO 15739:2023, annex on noise filtering"
     sentence: ClassVar[str] = (
-        "The camera smooths on the chip: contrast falls alike at all apertures, and the noise of neighbouring pixels is correlated, in light and in the dark."
+        "The camera smooths on the chip: contrast falls alike at all apertures, and the noise of neighbouring pixels "
+        "is correlated, in light and in the dark."
     )
 
     strength: Annotated[

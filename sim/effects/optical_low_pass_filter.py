@@ -15,19 +15,21 @@ from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import ComplexArray, Image
 
-#: Difference of the two beams over their sum behind a plate that isn't cut at exactly 45 degrees, or in light that is partly polarised.
+#: Difference of the two beams over their sum behind a plate that isn't cut at exactly 45 degrees, or in light that is
+#: partly polarised.
 BEAM_IMBALANCE = 0.08
-#: Ratios of the displacements' squares between which two plates aren't nearly alike and one isn't alone, and what that costs.
+#: Ratios of the displacements' squares between which two plates aren't nearly alike and one isn't alone, and what that
+#: costs.
 UNALIKE, UNUSUAL_NATS = (0.002, 0.02, 0.35, 0.55), -4.0
 
 
 class OpticalLowPassFilter(Effect):
     """OTF factor cos(pi fx dx) cos(pi fy dy).
 
-    A plate of thickness t cut at 45 degrees displaces by d = t (ne^2 - no^2) / (ne^2 + no^2); quartz: 5.88e-3 t at 589 nm
-    (`sim.optics.filters`). The cosine is exact; what a data sheet doesn't give has forms of its own: the dispersion of the plate (quartz:
-    4 % more at 400 nm, 1 % less at 700 nm), and two beams that aren't equally bright. Of a filter that is known to be of quartz, `plate`
-    says so, and d follows its dispersion from the stated one at 589 nm.
+    A plate of thickness t cut at 45 degrees displaces by d = t (ne^2 - no^2) / (ne^2 + no^2); quartz: 5.88e-3 t at 589
+    nm (`sim.optics.filters`). The cosine is exact; what a data sheet doesn't give has forms of its own: the dispersion
+    of the plate (quartz: 4 % more at 400 nm, 1 % less at 700 nm), and two beams that aren't equally bright. Of a filter
+    that is known to be of quartz, `plate` says so, and d follows its dispersion from the stated one at 589 nm.
     """
 
     name: ClassVar[str] = "optical_low_pass_filter"
@@ -76,7 +78,9 @@ class OpticalLowPassFilter(Effect):
     ] = 0.0
 
     def log_prior(self) -> float:
-        """Filters are made of one plate, or of two nearly alike: not of a thick one and one of a third of its strength."""
+        """Filters are made of one plate, or of two nearly alike: not of a thick one and one of a third of its
+        strength.
+        """
         low, high = sorted((self.displacement_x_um**2, self.displacement_y_um**2))
         return float(np.interp(low / high, UNALIKE, (0.0, UNUSUAL_NATS, UNUSUAL_NATS, 0.0))) if high > 0 else 0.0
 

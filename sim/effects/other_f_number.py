@@ -19,8 +19,8 @@ LEAST_TRANSFER = 1e-6  # of the stated lens: below, there is nothing to scale
 class OtherFNumber(Effect):
     """Diffraction at N ratio in place of N: factor OTF(f, N ratio) / OTF(f, N) of perfect lenses.
 
-    A pixel pitch that is stated wrongly does the same, as all is seen in pixels. Either is a mistake in what is stated, not physics
-    that a model lacks: a diagnosis doesn't name it, but gives no name to what it explains better.
+    A pixel pitch that is stated wrongly does the same, as all is seen in pixels. Either is a mistake in what is stated,
+    not physics that a model lacks: a diagnosis doesn't name it, but gives no name to what it explains better.
     """
 
     name: ClassVar[str] = "other_f_number"
@@ -31,8 +31,8 @@ class OtherFNumber(Effect):
     form_tolerance: ClassVar[float] = 0.03
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
     sentence: ClassVar[str] = (
-        "The lens's diffraction is that of another f-number than the stated one, or the pixels' pitch is another: contrast falls, or "
-        "rises, in proportion to frequency."
+        "The lens's diffraction is that of another f-number than the stated one, or the pixels' pitch is another: "
+        "contrast falls, or rises, in proportion to frequency."
     )
 
     ratio: Annotated[

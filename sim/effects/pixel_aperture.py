@@ -21,7 +21,8 @@ NULL = 1e-6  # of a transfer
 LEAST_SIDE = 0.05
 
 
-#: Change of the side (um) from which on an aperture may be a disc, or have soft borders: a smaller one is the stated square, nearly.
+#: Change of the side (um) from which on an aperture may be a disc, or have soft borders: a smaller one is the stated
+#: square, nearly.
 FORMED_UM = 0.3
 #: Standard deviation of a soft border, in sides.
 SOFT_SHARE = 0.06
@@ -30,7 +31,8 @@ SOFT_SHARE = 0.06
 class PixelAperture(Effect):
     """Side of the square aperture changed by a few um: OTF factor sinc(w' fx) sinc(w' fy) / (sinc(w fx) sinc(w fy)).
 
-    An aperture is never wider than the pitch. Other forms of it: a disc of the same area, 2 J1(q) / q; and soft borders, as of a microlens.
+    An aperture is never wider than the pitch. Other forms of it: a disc of the same area, 2 J1(q) / q; and soft
+    borders, as of a microlens.
     """
 
     name: ClassVar[str] = "pixel_aperture"
@@ -42,7 +44,8 @@ class PixelAperture(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
     forms: ClassVar[Mapping[str, object]] = {"disc_share": 1.0, "soft_share": SOFT_SHARE}
     sentence: ClassVar[str] = (
-        "The pixel's aperture differs from the stated one: contrast at high frequencies differs alike in all colours and at all f-numbers."
+        "The pixel's aperture differs from the stated one: contrast at high frequencies differs alike in all colours "
+        "and at all f-numbers."
     )
 
     side_change_um: Annotated[
@@ -85,7 +88,8 @@ class PixelAperture(Effect):
                 own = (1.0 - disc_share) * own + disc_share * disc
             own = own * np.exp(-2.0 * (np.pi * soft_share * new) ** 2 * (fx**2 + fy**2))
             stated = np.sinc(side * fx) * np.sinc(side * fy)
-            # at the stated aperture's nulls the ratio has no value, beside them it is large: the pixel's own transfer makes up for it
+            # at the stated aperture's nulls the ratio has no value, beside them it is large: the pixel's own transfer
+            # makes up for it
             is_null = (np.abs(np.sinc(side * fx)) <= NULL) | (np.abs(np.sinc(side * fy)) <= NULL)
             return np.asarray(np.where(is_null, 1.0, own / np.where(is_null, 1.0, stated)))
 

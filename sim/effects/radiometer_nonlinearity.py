@@ -12,14 +12,16 @@ from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light
 
-#: W sr^-1 m^-2 nm^-1 at which the reading is right: that of a lamp in a sphere. Any other level is a factor on everything, which the
-#: scale of the sensitivity takes.
+#: W sr^-1 m^-2 nm^-1 at which the reading is right: that of a lamp in a sphere. Any other level is a factor on
+#: everything, which the scale of the sensitivity takes.
 RIGHT_AT = 0.01
 
 
 class RadiometerNonlinearity(Effect):
-    """The true radiance of narrowband light that was read as L, of peak P, is L exp(a (p^q - 1) / q), p = P / 0.01: a power of the level, p^a, for q = 0, and
-    for q = 1 an error in proportion to the level, as of a detector that begins to saturate."""
+    """The true radiance of narrowband light that was read as L, of peak P, is L exp(a (p^q - 1) / q), p = P / 0.01: a
+    power of the level, p^a, for q = 0, and for q = 1 an error in proportion to the level, as of a detector that begins
+    to saturate.
+    """
 
     name: ClassVar[str] = "radiometer_nonlinearity"
     family: ClassVar[Family] = Family.SOURCE_IN_WAVELENGTH
@@ -28,7 +30,8 @@ class RadiometerNonlinearity(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"growth"})
     sentence: ClassVar[str] = (
-        "The radiometer isn't linear: the sensitivity that is measured follows the level of the light and not its wavelength, alike in all channels."
+        "The radiometer isn't linear: the sensitivity that is measured follows the level of the light and not its "
+        "wavelength, alike in all channels."
     )
 
     exponent_percent: Annotated[
@@ -44,7 +47,8 @@ class RadiometerNonlinearity(Effect):
     ] = 0.0
     growth: Annotated[
         float,
-        Quantity("1", "power of the level with which the error grows", lower=0.0, upper=1.5, prior=(0.0, 0.5), absent=0.0, dispensable=True),
+        Quantity("1", "power of the level with which the error grows", lower=0.0, upper=1.5, prior=(0.0, 0.5),
+                 absent=0.0, dispensable=True),
     ] = 0.0  # fmt: skip
 
     def on_light(self, light: Light) -> Light:

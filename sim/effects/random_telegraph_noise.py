@@ -15,9 +15,11 @@ from sim.stages import Signal
 
 
 class RandomTelegraphNoise(Effect):
-    """A share of the pixels, `pattern_seed` says which, jumps between two levels at a distance A, anew in every frame (traps much
-    faster than the frame rate): it is read with +(1 - p) A in a share p of the frames, else with -p A. Mean 0, variance p (1 - p) A^2, two
-    peaks in a pixel's histogram. A is the same in all (relative spread 0), or gamma distributed about its mean."""
+    """A share of the pixels, `pattern_seed` says which, jumps between two levels at a distance A, anew in every frame
+    (traps much faster than the frame rate): it is read with +(1 - p) A in a share p of the frames, else with -p A. Mean
+    0, variance p (1 - p) A^2, two peaks in a pixel's histogram. A is the same in all (relative spread 0), or gamma
+    distributed about its mean.
+    """
 
     name: ClassVar[str] = "random_telegraph_noise"
     family: ClassVar[Family] = Family.DEFECTIVE_PIXELS
@@ -28,7 +30,8 @@ class RandomTelegraphNoise(Effect):
     )
     shapes: ClassVar[frozenset[str]] = frozenset({"share_percent", "relative_spread", "high_share"})
     sentence: ClassVar[str] = (
-        "A few pixels blink: always the same ones jump between two levels, with far more temporal noise than their neighbours."
+        "A few pixels blink: always the same ones jump between two levels, with far more temporal noise than their "
+        "neighbours."
     )
 
     amplitude_e: Annotated[

@@ -15,8 +15,9 @@ from sim.stages import Signal
 
 
 class RowNoise(Effect):
-    """A normal variable a row and frame, and one a row for good, on top of the camera model's own row noise: covariance s^2 along a
-    row; rows that are n apart have c^n of it in common."""
+    """A normal variable a row and frame, and one a row for good, on top of the camera model's own row noise: covariance
+    s^2 along a row; rows that are n apart have c^n of it in common.
+    """
 
     name: ClassVar[str] = "row_noise"
     family: ClassVar[Family] = Family.LINE_NOISE
@@ -25,7 +26,8 @@ class RowNoise(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"correlation"})
     sentence: ClassVar[str] = (
-        "Each row is read with a disturbance of its own: row means scatter far more than the noise of single pixels explains."
+        "Each row is read with a disturbance of its own: row means scatter far more than the noise of single pixels "
+        "explains."
     )
 
     noise_e: Annotated[

@@ -20,9 +20,11 @@ SURE_POWER = 0.3  # |ln exponent| from which on these odds are 0
 
 
 class ScreenGamma(Effect):
-    """Light = (drive blurred by a Gaussian of `rim_px`) ** exponent, as a share of the lit state. A pattern of lit and dark cells has
-    grey levels only at the borders of cells, where the screen resamples it: the larger the exponent and the wider the borders, the
-    smaller are lit cells. The width of the borders isn't stated, and drawings assume one sample: the exponent is good to tens of per cent."""
+    """Light = (drive blurred by a Gaussian of `rim_px`) ** exponent, as a share of the lit state. A pattern of lit and
+    dark cells has grey levels only at the borders of cells, where the screen resamples it: the larger the exponent and
+    the wider the borders, the smaller are lit cells. The width of the borders isn't stated, and drawings assume one
+    sample: the exponent is good to tens of per cent.
+    """
 
     name: ClassVar[str] = "screen_gamma"
     family: ClassVar[Family] = Family.SCREEN
@@ -33,8 +35,8 @@ class ScreenGamma(Effect):
     )
     shapes: ClassVar[frozenset[str]] = frozenset({"rim_px"})
     sentence: ClassVar[str] = (
-        "The screen's light isn't in proportion to its drive: the grey levels at the borders of cells are wrong, and lit cells look "
-        "smaller or larger than drawn."
+        "The screen's light isn't in proportion to its drive: the grey levels at the borders of cells are wrong, and "
+        "lit cells look smaller or larger than drawn."
     )
 
     exponent: Annotated[
@@ -47,7 +49,8 @@ class ScreenGamma(Effect):
         float,
         Quantity(
             "px",
-            "standard deviation of the blur at the borders of cells, as the screen resamples its picture, in the camera's pixels",
+            "standard deviation of the blur at the borders of cells, as the screen resamples its picture, in the "
+            "camera's pixels",
             lower=0.0,
             upper=1.5,
             prior=(0.0, 0.3),

@@ -16,8 +16,10 @@ from sim.stages import Light
 
 
 class ScreenPixelStructure(Effect):
-    """Factor 1 + a cos(2 pi x / p) cos(2 pi y / p) on a lit screen's light, x and y from the frame's centre, p the period at the
-    sensor (px), which a drawing has to choose and a fit doesn't ask for: the grid's first harmonic, which is what a lens passes. Where it is finer than half the pixels it beats."""
+    """Factor 1 + a cos(2 pi x / p) cos(2 pi y / p) on a lit screen's light, x and y from the frame's centre, p the
+    period at the sensor (px), which a drawing has to choose and a fit doesn't ask for: the grid's first harmonic, which
+    is what a lens passes. Where it is finer than half the pixels it beats.
+    """
 
     name: ClassVar[str] = "screen_pixel_structure"
     family: ClassVar[Family] = Family.SCREEN

@@ -14,7 +14,9 @@ from sim.stages import Light
 
 
 class SecondOrderLight(Effect):
-    """Narrowband radiance L(w) + 2 r L(2 w): a line read at w0 brings r of its power along at w0 / 2, in half the width."""
+    """Narrowband radiance L(w) + 2 r L(2 w): a line read at w0 brings r of its power along at w0 / 2, in half the
+    width.
+    """
 
     name: ClassVar[str] = "second_order_light"
     title: ClassVar[str] = "second-order light"
@@ -23,7 +25,8 @@ class SecondOrderLight(Effect):
     form_tolerance: ClassVar[float] = 0.15
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
     sentence: ClassVar[str] = (
-        "The monochromator lets its second order through: from twice the shortest wavelength on, channels that are sensitive at half the wavelength respond."
+        "The monochromator lets its second order through: from twice the shortest wavelength on, channels that are "
+        "sensitive at half the wavelength respond."
     )
 
     share_percent: Annotated[

@@ -17,7 +17,9 @@ SETTLES_NEVER_MIN = 1e4
 
 
 class SourceDrift(Effect):
-    """Radiance factor 1 + a T (1 - exp(-t / T)): in proportion to the time at first, settled after a few T. 1 + a t for long T."""
+    """Radiance factor 1 + a T (1 - exp(-t / T)): in proportion to the time at first, settled after a few T. 1 + a t for
+    long T.
+    """
 
     name: ClassVar[str] = "source_drift"
     family: ClassVar[Family] = Family.SOURCE_IN_TIME

@@ -13,7 +13,8 @@ from sim.stages import Light, Unsteadiness
 
 
 class SourceInstability(Effect):
-    """Radiance factor 1 + s z in each frame, z normal and anew in each: levels scatter, alike at all exposures; no frame's picture does.
+    """Radiance factor 1 + s z in each frame, z normal and anew in each: levels scatter, alike at all exposures; no
+    frame's picture does.
 
     An arc that wanders, a supply that isn't regulated, or a shutter whose time isn't repeatable.
     """
@@ -26,7 +27,8 @@ class SourceInstability(Effect):
         {"f_number", "exposure", "wavelength", "field", "level", "orientation", "time"}
     )
     sentence: ClassVar[str] = (
-        "The light is unsteady: repeats of one setting scatter in their level, all pixels of a frame together, by far more than their noise."
+        "The light is unsteady: repeats of one setting scatter in their level, all pixels of a frame together, by far "
+        "more than their noise."
     )
 
     instability_percent: Annotated[

@@ -20,7 +20,8 @@ class SphericalAberration(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
     sentence: ClassVar[str] = (
-        "The lens has spherical aberration: a sharp core with a halo, alike in all directions, that stopping down removes."
+        "The lens has spherical aberration: a sharp core with a halo, alike in all directions, that stopping down "
+        "removes."
     )
 
     w040_um: Annotated[

@@ -13,8 +13,8 @@ from sim.stages import Light
 class StereoGainMismatch(Effect):
     """I_right = (1 + a) I_left in every scene that both see, beyond what either side's captures of uniform light say.
 
-    What both sides' sensitivities differ by is each camera's own and no mismatch: this is what changes between calibration and
-    use, an automatic gain, an iris that was turned, a window before one side.
+    What both sides' sensitivities differ by is each camera's own and no mismatch: this is what changes between
+    calibration and use, an automatic gain, an iris that was turned, a window before one side.
     """
 
     name: ClassVar[str] = "stereo_gain_mismatch"
@@ -25,13 +25,14 @@ class StereoGainMismatch(Effect):
         {"exposure", "wavelength", "field", "level", "orientation", "time"}
     )
     sentence: ClassVar[str] = (
-        "The ratio of the right camera's signal to the left one's in the same scene differs from that in uniform light, "
-        "by one factor over the whole scene."
+        "The ratio of the right camera's signal to the left one's in the same scene differs from that in uniform "
+        "light, by one factor over the whole scene."
     )
 
     gain_percent: Annotated[
         float,
-        Quantity("%", "right over left, beyond both calibrations", lower=-60.0, upper=150.0, prior=(0.0, 3.0), absent=0.0),
+        Quantity("%", "right over left, beyond both calibrations", lower=-60.0, upper=150.0, prior=(0.0, 3.0),
+                 absent=0.0),
     ] = 0.0  # fmt: skip
 
     def on_light(self, light: Light) -> Light:

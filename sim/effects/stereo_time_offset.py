@@ -11,7 +11,9 @@ from sim.stages import Light
 
 
 class StereoTimeOffset(Effect):
-    """The right camera captures later by dt: what moves by v in its picture lies off by v dt; what stands still shows nothing."""
+    """The right camera captures later by dt: what moves by v in its picture lies off by v dt; what stands still shows
+    nothing.
+    """
 
     name: ClassVar[str] = "stereo_time_offset"
     family: ClassVar[Family] = Family.GEOMETRY
@@ -19,13 +21,14 @@ class StereoTimeOffset(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "time"})
     sentence: ClassVar[str] = (
-        "The right camera captures at another time than the left one: boards that move lie off their place in proportion to their "
-        "speed."
+        "The right camera captures at another time than the left one: boards that move lie off their place in "
+        "proportion to their speed."
     )
 
     delay_ms: Annotated[
         float,
-        Quantity("ms", "by how much the right camera is later", lower=-1000.0, upper=1000.0, prior=(0.0, 10.0), absent=0.0),
+        Quantity("ms", "by how much the right camera is later", lower=-1000.0, upper=1000.0, prior=(0.0, 10.0),
+                 absent=0.0),
     ] = 0.0  # fmt: skip
 
     def on_light(self, light: Light) -> Light:

@@ -22,7 +22,8 @@ class StrayLight(Effect):
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
     sentence: ClassVar[str] = (
-        "The monochromator leaks light of all wavelengths: channels respond where they should be blind, in proportion to the lamp."
+        "The monochromator leaks light of all wavelengths: channels respond where they should be blind, in proportion "
+        "to the lamp."
     )
 
     share_percent: Annotated[

@@ -12,8 +12,9 @@ from sim.stages import Image, Veil
 
 
 class VeilingGlare(Effect):
-    """I' = (1 - g) I + g (1 - h) <I> + g h N * I: OTF 1 at zero frequency, 1 - g at every other that a frame holds but for the
-    lowest, where a share h of the veil lies about its source, by a normal distribution N."""
+    """I' = (1 - g) I + g (1 - h) <I> + g h N * I: OTF 1 at zero frequency, 1 - g at every other that a frame holds but
+    for the lowest, where a share h of the veil lies about its source, by a normal distribution N.
+    """
 
     name: ClassVar[str] = "veiling_glare"
     family: ClassVar[Family] = Family.COPIES_AND_VEILS
@@ -22,8 +23,8 @@ class VeilingGlare(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"halo_share", "halo_reach"})
     sentence: ClassVar[str] = (
-        "Light scattered in the lens veils the frame: dark patches and dark squares are raised by a share of the light around them, "
-        "while uniform fields stay as they are."
+        "Light scattered in the lens veils the frame: dark patches and dark squares are raised by a share of the light "
+        "around them, while uniform fields stay as they are."
     )
 
     share_percent: Annotated[
@@ -34,11 +35,13 @@ class VeilingGlare(Effect):
     ] = 0.0
     halo_share: Annotated[
         float,
-        Quantity("1", "of that light: what stays about its source", lower=0.0, upper=1.0, prior=(0.0, 0.5), absent=0.0, dispensable=True),
+        Quantity("1", "of that light: what stays about its source", lower=0.0, upper=1.0, prior=(0.0, 0.5), absent=0.0,
+                 dispensable=True),
     ] = 0.0  # fmt: skip
     halo_reach: Annotated[
         float,
-        Quantity("1", "standard deviation of what stays, in half diagonals", lower=0.2, upper=1.0, prior=(0.35, 0.15), absent=0.35, dispensable=True),
+        Quantity("1", "standard deviation of what stays, in half diagonals", lower=0.2, upper=1.0, prior=(0.35, 0.15),
+                 absent=0.35, dispensable=True),
     ] = 0.35  # fmt: skip
 
     @classmethod

@@ -18,8 +18,9 @@ EXPONENTS = (1.0, 2.0, 4.0)
 
 
 class Vignetting(Effect):
-    """Light factor 1 - v (r / r_corner)^p: p = 2 where the exit pupil shrinks, about 1 where a stop in front or behind cuts it (two discs
-    that part), 4 and more where a mount's rim only reaches the corners."""
+    """Light factor 1 - v (r / r_corner)^p: p = 2 where the exit pupil shrinks, about 1 where a stop in front or behind
+    cuts it (two discs that part), 4 and more where a mount's rim only reaches the corners.
+    """
 
     name: ClassVar[str] = "vignetting"
     family: ClassVar[Family] = Family.FIELD_OF_LIGHT

@@ -15,8 +15,10 @@ from sim.stages import Image
 
 
 class VignettingDecentre(Effect):
-    """Light factor 1 - v (rho^p - rho_0^p), rho the distance from (x0, y0) and rho_0 that of the sensor's centre from there, in half
-    diagonals: 1 at the centre, as without it. All of a small offset is a slope, which uneven illumination has as well."""
+    """Light factor 1 - v (rho^p - rho_0^p), rho the distance from (x0, y0) and rho_0 that of the sensor's centre from
+    there, in half diagonals: 1 at the centre, as without it. All of a small offset is a slope, which uneven
+    illumination has as well.
+    """
 
     name: ClassVar[str] = "vignetting_decentre"
     family: ClassVar[Family] = Family.FIELD_OF_LIGHT
@@ -25,7 +27,8 @@ class VignettingDecentre(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"centre_x", "centre_y", "exponent"})
     sentence: ClassVar[str] = (
-        "The lens vignettes about a point beside the sensor's middle: flat fields fall off around another place than the centre, alike in all channels."
+        "The lens vignettes about a point beside the sensor's middle: flat fields fall off around another place than "
+        "the centre, alike in all channels."
     )
 
     fall_off_percent: Annotated[

@@ -21,7 +21,8 @@ class WavelengthOffset(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation"})
     sentence: ClassVar[str] = (
-        "The wavelength scale is shifted: the measured sensitivities differ from the maker's curves, with opposite signs on rising and falling slopes."
+        "The wavelength scale is shifted: the measured sensitivities differ from the maker's curves, with opposite "
+        "signs on rising and falling slopes."
     )
 
     offset_nm: Annotated[

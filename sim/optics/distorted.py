@@ -18,9 +18,9 @@ Float32Array = NDArray[np.float32]
 def distort(picture: FloatArray, source: Grid, target: Grid, table: LensTable, frame: ImageFrame) -> Float32Array:
     """A picture on the ideal grid `source` resampled to where the lens images it, on the grid `target`.
 
-    The light of a sample is its value times the area that its square has in the image. It is distributed around the image point with
-    the weights of a cubic B-spline, which add up to 1, so that light is conserved; `superpose` undoes the spline's blur. A uniform
-    picture stays uniform. Light that falls off the target is dropped.
+    The light of a sample is its value times the area that its square has in the image. It is distributed around the
+    image point with the weights of a cubic B-spline, which add up to 1, so that light is conserved; `superpose` undoes
+    the spline's blur. A uniform picture stays uniform. Light that falls off the target is dropped.
     """
     lens = field_mapping(table)
     row, col = source.axes_px()
@@ -63,7 +63,9 @@ def _visible(
 
 @njit(cache=True)
 def _distribute(out, picture, node_row, node_col, step):  # type: ignore[no-untyped-def]
-    """Distribute the light of every sample (value x determinant of the map) around its image point; the map is bilinear between nodes."""
+    """Distribute the light of every sample (value x determinant of the map) around its image point; the map is bilinear
+    between nodes.
+    """
     ny, nx = picture.shape
     inverse = 1.0 / step
     for i in range(ny):

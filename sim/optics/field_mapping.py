@@ -1,4 +1,5 @@
-"""How a traced lens maps the field: from ideal image points to real ones and back, and smooth functions of the field in the image.
+"""How a traced lens maps the field: from ideal image points to real ones and back, and smooth functions of the field in
+the image.
 
 Lengths are in um from the optical axis, x along columns (right), y along rows (down).
 """
@@ -20,8 +21,9 @@ from sim.spectrum import FloatArray
 
 @dataclass(frozen=True)
 class ImageFrame:
-    """The pixels of an image: `rows` x `cols` of `pitch_um` with the optical axis at px `axis` [row, col]; the light-sensitive
-    part is a centred square that takes `fill_factor` of the area."""
+    """The pixels of an image: `rows` x `cols` of `pitch_um` with the optical axis at px `axis` [row, col]; the
+    light-sensitive part is a centred square that takes `fill_factor` of the area.
+    """
 
     rows: int
     cols: int
@@ -39,10 +41,12 @@ class ImageFrame:
 
 
 class FieldMapping:
-    """Distortion of a traced lens: from the ideal image point f tan(theta) to the centre of its point spread window, and back.
+    """Distortion of a traced lens: from the ideal image point f tan(theta) to the centre of its point spread window,
+    and back.
 
-    A symmetric lens has a function of the radius, any other lens one of the plane. Beyond the table's outermost field the function is extrapolated
-    (linearly along the radius, or by the shift at the border); such points are `outside`.
+    A symmetric lens has a function of the radius, any other lens one of the plane. Beyond the table's outermost field
+    the function is extrapolated (linearly along the radius, or by the shift at the border); for such points
+    `lies_outside` is true.
     """
 
     def __init__(self, table: LensTable) -> None:
@@ -102,14 +106,17 @@ class FieldMapping:
         return np.asarray(~(within_x & (y_um >= self._y[0]) & (y_um <= self._y[-1])))
 
     def heights(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """For a symmetric lens: dense image radii (um, ascending), and the fractional index of each among `count` refined field heights."""
+        """For a symmetric lens: dense image radii (um, ascending), and the fractional index of each among `count`
+        refined field heights.
+        """
         ideal, real = self._dense
         place = np.interp(ideal, self._ideal, np.linspace(0.0, count - 1.0, self._ideal.size))
         return real, place
 
     def radial(self, most_um2: float) -> tuple[FloatArray, FloatArray, float]:
-        """For a symmetric lens: ratio of real and ideal radius, ratio of areas, and the step (um^2) of the 8192 squared ideal radii up to
-        `most_um2` at which both are given."""
+        """For a symmetric lens: ratio of real and ideal radius, ratio of areas, and the step (um^2) of the 8192 squared
+        ideal radii up to `most_um2` at which both are given.
+        """
         ideal, real = self._dense
         square = np.linspace(0.0, most_um2 * 1.001, 8192)
         curve = CubicSpline(ideal[1:] ** 2, real[1:] / ideal[1:])
@@ -168,7 +175,8 @@ def exceeds_field(frame: ImageFrame, lens: FieldMapping) -> bool:
 def illumination(
     table: LensTable, weight: FloatArray, frame: ImageFrame, first: tuple[int, int] = (0, 0), period: int = 1
 ) -> FloatArray:
-    """Image of a uniform field: the sum over wavelengths of weight x relative illumination, at every `period`-th row and column from pixel `first` on.
+    """Image of a uniform field: the sum over wavelengths of weight x relative illumination, at every `period`-th row
+    and column from pixel `first` on.
 
     `weight` (F, W): light by field point and wavelength of the table, filters included.
     """
@@ -187,7 +195,9 @@ def over_field(table: LensTable, value: FloatArray, x_um: FloatArray, y_um: Floa
 
 
 def field_function(table: LensTable, value: FloatArray) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """`over_field` as a function of points: cubic splines over the squared height, or over rows and columns of the field grid; constant beyond."""
+    """`over_field` as a function of points: cubic splines over the squared height, or over rows and columns of the
+    field grid; constant beyond.
+    """
     lens = field_mapping(table)
     if table.symmetric:
         square = (table.focal_length_mm * 1e3 * np.tan(np.deg2rad(table.field_deg[:, 1]))) ** 2

@@ -44,7 +44,9 @@ def fold_transfer(
 
 
 def fold_diffraction(shape: tuple[int, int], fill_factor: float, cutoff_cy_per_px: float) -> FloatArray:
-    """`folded` of a perfect lens with the given cutoff (pixel pitch / (wavelength f_number)), from a table along the radius."""
+    """`fold_transfer` of a perfect lens with the given cutoff (pixel pitch / (wavelength f_number)), from a table along
+    the radius.
+    """
     table = diffraction_otf(np.arange(RADIAL_SAMPLES + 2) / RADIAL_SAMPLES, 1e3, 1.0)
     fy, fx = fft.fftfreq(shape[0]), fft.rfftfreq(shape[1])
     orders = np.array(_orders(cutoff_cy_per_px), float)

@@ -1,4 +1,6 @@
-"""Refractive indices by name, from the catalogues of the refractiveindex.info database (offline), and of model glasses."""
+"""Refractive indices by name, from the catalogues of the refractiveindex.info database (offline), and of model
+glasses.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,8 @@ _PLASTICS = {
 
 
 def model_index(glass: GlassName, wavelength_nm: ArrayLike) -> FloatArray:
-    """Index of a model glass: Conrady's n = a + b / w + c / w^3.5 (w in um) through nd, nF - nC = (nd - 1) / Vd and Pg,F.
+    """Index of a model glass: Conrady's n = a + b / w + c / w^3.5 (w in um) through nd, nF - nC = (nd - 1) / Vd and
+    Pg,F.
 
     The partial dispersion is that of Schott's normal line plus the glass's own deviation:
     Pg,F = (ng - nF) / (nF - nC) = 0.6438 - 0.001682 Vd + dPg,F.
@@ -106,8 +109,8 @@ def refractive_index(
     lower, upper = material.get_wl_range()
     if w.size and not (lower - 1e-6 <= w.min() and w.max() <= upper + 1e-6):
         raise PrescriptionError(
-            f"{where}: the glass {glass.name} is known from {lower:g} to {upper:g} nm, {w.min():g} to {w.max():g} nm is "
-            "asked for; trace fewer wavelengths or another glass"
+            f"{where}: the glass {glass.name} is known from {lower:g} to {upper:g} nm, {w.min():g} to {w.max():g} nm "
+            "is asked for; trace fewer wavelengths or another glass"
         )
     return np.asarray(material.get_refractive_index(w), float)
 

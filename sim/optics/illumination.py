@@ -46,7 +46,8 @@ class RadialIllumination(Frozen):
             raise ValueError(f"radii {list(radius[:4])} mm have to ascend from 0: sort them, and begin on the axis")
         if abs(value[0] - 1.0) > 1e-6 or min(value) < 0:
             raise ValueError(
-                f"relative illumination is {value[0]:g} on the axis and {min(value):g} at least: divide by its value on the axis, and leave out what is below 0"
+                f"relative illumination is {value[0]:g} on the axis and {min(value):g} at least: divide by its value "
+                "on the axis, and leave out what is below 0"
             )
         return self
 
@@ -76,7 +77,8 @@ class MeasuredIllumination(Frozen):
         lengths = {len(row) for row in self.values}
         if len(self.values) < 2 or len(lengths) != 1 or min(lengths) < 2:
             raise ValueError(
-                f"an illumination map of {len(self.values)} rows of {sorted(lengths)} values: give two or more each way, rows of one length"
+                f"an illumination map of {len(self.values)} rows of {sorted(lengths)} values: give two or more each "
+                "way, rows of one length"
             )
         lowest = min(min(row) for row in self.values)
         if not lowest > 0:
@@ -89,8 +91,9 @@ class MeasuredIllumination(Frozen):
     def from_flat(cls, flat: FloatArray, degree: int = 6, nodes: tuple[int, int] = (25, 33)) -> Self:
         """The map of a flat field (rows, cols): any unit, dark subtracted, one channel or an even mosaic's mean.
 
-        A polynomial of total degree `degree` in x and y through the means of square blocks, by least squares: noise and dust
-        average out, and so does anything sharper than about 1/degree of the frame. Raises ValueError for a flat that isn't positive on average.
+        A polynomial of total degree `degree` in x and y through the means of square blocks, by least squares: noise and
+        dust average out, and so does anything sharper than about 1/degree of the frame. Raises ValueError for a flat
+        that isn't positive on average.
         """
         rows, cols = flat.shape
         size = 2 * max(1, min(rows, cols) // 96)
@@ -138,7 +141,9 @@ Illumination = Annotated[CosineFourth | RadialIllumination | MeasuredIlluminatio
 
 
 def irradiance_factor(f_number: float, magnification: float = 0.0) -> float:
-    """Image irradiance over scene radiance (sr) of a lossless lens on axis: pi / (1 + 4 N^2 (1 + |m|)^2), as in ISETCam."""
+    """Image irradiance over scene radiance (sr) of a lossless lens on axis: pi / (1 + 4 N^2 (1 + |m|)^2), as in
+    ISETCam.
+    """
     return np.pi / (1.0 + 4.0 * f_number**2 * (1.0 + abs(magnification)) ** 2)
 
 

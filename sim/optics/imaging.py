@@ -62,14 +62,17 @@ class DiffractionLimited(Frozen):
 
 
 class ZernikePupil(Frozen):
-    """A lens whose circular pupil has a path error (OPD) given by Zernike coefficients, in um the same at all wavelengths.
+    """A lens whose circular pupil has a path error (OPD) given by Zernike coefficients, in um the same at all
+    wavelengths.
 
-    W(rho, phi) = sum_j c_j Z_j(rho, phi), Z_j of rms 1 over the pupil, phi from the columns' direction towards the rows'; the
-    phase is 2 pi W / wavelength. `coefficients` begin with the index scheme's first (`noll`: j = 1; `osa`, that is ANSI Z80.28:
-    j = 0; both piston) and are in um, or in waves at `reference_wavelength_nm`. A W that rises along x moves the image along +x.
+    W(rho, phi) = sum_j c_j Z_j(rho, phi), Z_j of rms 1 over the pupil, phi from the columns' direction towards the
+    rows'; the phase is 2 pi W / wavelength. `coefficients` begin with the index scheme's first
+    (`noll`: j = 1; `osa`, that is ANSI Z80.28: j = 0; both piston) and are in um, or in waves at
+    `reference_wavelength_nm`. A W that rises along x moves the image along +x.
 
-    Colours may differ: at `colour_wavelength_nm` (linear between, held beyond) the sensor lies `focus_shift_um` dz from the
-    focus (axial colour, W = dz / (8 N^2) rho^2 on top), and the image is moved by `image_shift_um` (x, y) (lateral colour).
+    Colours may differ: at `colour_wavelength_nm` (linear between, held beyond) the sensor lies `focus_shift_um` dz from
+    the focus (axial colour, W = dz / (8 N^2) rho^2 on top), and the image is moved by `image_shift_um` (x, y)
+    (lateral colour).
     """
 
     shift_variant: ClassVar[bool] = False
@@ -88,13 +91,15 @@ class ZernikePupil(Frozen):
     def _check(self) -> Self:
         if (self.unit == "waves") != (self.reference_wavelength_nm is not None):
             raise ValueError(
-                f"coefficients in {self.unit} with a reference wavelength of {self.reference_wavelength_nm} nm: waves need one, um none"
+                f"coefficients in {self.unit} with a reference wavelength of {self.reference_wavelength_nm} nm: waves "
+                "need one, um none"
             )
         _check_wavelengths(self.colour_wavelength_nm, empty=True)
         for name, given in (("focus_shift_um", self.focus_shift_um), ("image_shift_um", self.image_shift_um)):
             if given and len(given) != len(self.colour_wavelength_nm):
                 raise ValueError(
-                    f"{name} has {len(given)} entries for {len(self.colour_wavelength_nm)} of colour_wavelength_nm: give one a wavelength"
+                    f"{name} has {len(given)} entries for {len(self.colour_wavelength_nm)} of colour_wavelength_nm: "
+                    "give one a wavelength"
                 )
         return self
 
@@ -115,7 +120,8 @@ class ZernikePupil(Frozen):
             shift = float(np.interp(wavelength_nm, self.colour_wavelength_nm, self.focus_shift_um))
             total += seidel(defocus_um=shift / (8.0 * f_number**2))
         if self.image_shift_um:
-            x, y = (float(np.interp(wavelength_nm, self.colour_wavelength_nm, along)) for along in zip(*self.image_shift_um, strict=True))  # fmt: skip
+            x, y = (float(np.interp(wavelength_nm, self.colour_wavelength_nm,
+                                    along)) for along in zip(*self.image_shift_um, strict=True))  # fmt: skip
             total = total.plus({(1, 0): x / (2.0 * f_number), (0, 1): y / (2.0 * f_number)})
         return total
 
@@ -158,11 +164,13 @@ class MeasuredPsf(Frozen):
         for wavelength_nm, samples in zip(self.wavelength_nm, np.array(self.psf), strict=True):
             if samples.min() < 0:
                 raise ValueError(
-                    f"psf is {samples.min():g} at {wavelength_nm:g} nm, below the limit of 0: subtract no more than the background"
+                    f"psf is {samples.min():g} at {wavelength_nm:g} nm, below the limit of 0: subtract no more than "
+                    "the background"
                 )
             if abs(samples.sum() - 1.0) > SUM_TOLERANCE:
                 raise ValueError(
-                    f"psf adds up to {samples.sum():.6g} at {wavelength_nm:g} nm, which isn't 1 within {SUM_TOLERANCE:g}: divide it by its sum"
+                    f"psf adds up to {samples.sum():.6g} at {wavelength_nm:g} nm, which isn't 1 within "
+                    f"{SUM_TOLERANCE:g}: divide it by its sum"
                 )
         return self
 
@@ -213,9 +221,11 @@ class MeasuredOtf(Frozen):
     def _check(self) -> Self:
         _check_wavelengths(self.wavelength_nm)
         x, y = np.array(self.frequency_x_cy_per_um), np.array(self.frequency_y_cy_per_um)
-        if x.size < 2 or x[0] != 0.0 or np.any(np.diff(x) <= 0) or np.any(np.diff(y) <= 0) or 0.0 not in [*y, *([0.0] if not y.size else [])]:  # fmt: skip
+        if x.size < 2 or x[0] != 0.0 or np.any(np.diff(x) <= 0) or np.any(np.diff(y) <= 0) or 0.0 not in [*y,
+                                                                                                          *([0.0] if not y.size else [])]:  # fmt: skip
             raise ValueError(
-                f"frequencies {x[:3].tolist()}... and {y[:3].tolist()}... cy/um have to ascend, from 0 along x and from or through 0 along y: sort them, and give the transfer at 0"
+                f"frequencies {x[:3].tolist()}... and {y[:3].tolist()}... cy/um have to ascend, from 0 along x and "
+                "from or through 0 along y: sort them, and give the transfer at 0"
             )
         shape = max(y.size, 1), x.size
         _check_cube("modulus", self.modulus, len(self.wavelength_nm), shape)
@@ -223,12 +233,14 @@ class MeasuredOtf(Frozen):
             _check_cube("phase_rad", self.phase_rad, len(self.wavelength_nm), shape)
             if not y.size or y[0] == 0.0:
                 raise ValueError(
-                    "phase_rad is given with frequencies of one quadrant, where it has no sense: let frequency_y_cy_per_um run through 0"
+                    "phase_rad is given with frequencies of one quadrant, where it has no sense: let "
+                    "frequency_y_cy_per_um run through 0"
                 )
         values = np.array(self.modulus)
         if values.min() < 0 or values.max() > 1 + SUM_TOLERANCE:
             raise ValueError(
-                f"modulus runs from {values.min():g} to {values.max():g}, beyond the limits of 0 and 1: divide it by its value at zero frequency"
+                f"modulus runs from {values.min():g} to {values.max():g}, beyond the limits of 0 and 1: divide it by "
+                "its value at zero frequency"
             )
         zero = values[:, self.frequency_y_cy_per_um.index(0.0) if y.size else 0, 0]
         if np.any(np.abs(zero - 1.0) > SUM_TOLERANCE):
@@ -265,7 +277,8 @@ class MeasuredOtf(Frozen):
         across = np.abs(fy) if y[0] == 0.0 else fy * turned
         from scipy.interpolate import RegularGridInterpolator
 
-        table = RegularGridInterpolator((y, x), value if self.phase_rad else np.real(value), bounds_error=False, fill_value=0.0)  # fmt: skip
+        table = RegularGridInterpolator((y, x), value if self.phase_rad else np.real(value), bounds_error=False,
+                                        fill_value=0.0)  # fmt: skip
         found = table(np.stack([across, np.abs(fx)], axis=-1))
         return np.asarray(np.where(turned < 0, np.conj(found), found) * ratio)
 
@@ -297,7 +310,8 @@ class TracedLens(Frozen):
     def _needs_its_table(cls, data: Any) -> Any:
         if isinstance(data, dict) and "table" not in data:
             raise ValueError(
-                f"a traced lens (content hash {data.get('content_hash', 'not given')}) is made of its table alone: trace its prescription or load the table, and give that as `table`"
+                f"a traced lens (content hash {data.get('content_hash', 'not given')}) is made of its table alone: "
+                "trace its prescription or load the table, and give that as `table`"
             )
         return data
 
@@ -354,7 +368,8 @@ def _check_cube(
     shapes = {(len(plane), len(row)) for plane in cube for row in plane}
     if len(cube) != planes or len(shapes) != 1 or (0 in next(iter(shapes))):
         raise ValueError(
-            f"{name} holds {len(cube)} planes of the shapes {sorted(shapes)}: give {planes}, one a wavelength, with rows of one length"
+            f"{name} holds {len(cube)} planes of the shapes {sorted(shapes)}: give {planes}, one a wavelength, with "
+            "rows of one length"
         )
     if shape is not None and shapes != {shape}:
         raise ValueError(f"{name} has planes of {next(iter(shapes))}: {shape} (fy, fx) fits the frequencies")

@@ -1,7 +1,7 @@
 """Point spread functions of a lens table as sampled kernels, and the tiles of the image in which they are polynomials.
 
-The kernel of a source at s is, between 4 x 4 nodes of a tile, a cubic polynomial in the row and column of s: sum_n L_n(s) PSF_n. Tiles are
-cut in four until the polynomial's error is below a limit.
+The kernel of a source at s is, between 4 x 4 nodes of a tile, a cubic polynomial in the row and column of s: sum_n
+L_n(s) PSF_n. Tiles are cut in four until the polynomial's error is below a limit.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ KERNEL_ERROR = 2e-3
 LIGHT_ERROR = 1e-4
 #: Samples of the refined table in a period of the highest frequency that is left in it.
 SAMPLES_PER_PERIOD = 3.0
-#: Kernels are low-passed at the drawing's Nyquist frequency by a cosine from (1 - ROLL_OFF) to (1 + ROLL_OFF) of it, and extend over
-#: LEAST_REACH samples at least, for the ringing of that filter.
+#: Kernels are low-passed at the drawing's Nyquist frequency by a cosine from (1 - ROLL_OFF) to (1 + ROLL_OFF) of it,
+#: and extend over LEAST_REACH samples at least, for the ringing of that filter.
 ROLL_OFF = 0.3
 LEAST_REACH = 8.0
 #: Refinement of a symmetric lens's field heights.
@@ -69,10 +69,11 @@ class Tile:
 class Kernels:
     """Point spread functions of some channels, prepared to be rotated, placed and sampled.
 
-    `weight` (C, F, W): light by channel, field point and wavelength of the table. The table is summed over wavelength with its relative
-    illumination, cut to the circle of its window, low-passed to what the drawing's samples resolve, and refined: by Fourier series in the window, by cubic
-    splines over the field heights of a symmetric lens. `light` (C, F) is a source's total light, `lost` (C, F) the light outside the circle.
-    `distorted`: the pictures come from `distort`, whose blur is undone.
+    `weight` (C, F, W): light by channel, field point and wavelength of the table. The table is summed over wavelength
+    with its relative illumination, cut to the circle of its window, low-passed to what the drawing's samples resolve,
+    and refined: by Fourier series in the window, by cubic splines over the field heights of a symmetric lens. `light`
+    (C, F) is a source's total light, `lost` (C, F) the light outside the circle. `distorted`: the pictures come from
+    `distort`, whose blur is undone.
     """
 
     def __init__(
@@ -129,8 +130,8 @@ class Kernels:
                 fft.irfft2(spectrum, (n * refine, n * refine)), 0, -1
             )
         self.first_um = -0.5 * (n - 1) * table.sample_pitch_um - 2.0 * self.sample_um  # of the padded table's sample 0
-        # A fill factor of 1 is averaged in the kernels: their sums over pixels then conserve the light of every source. Other apertures
-        # don't conserve light and are averaged in the picture.
+        # A fill factor of 1 is averaged in the kernels: their sums over pixels then conserve the light of every source.
+        # Other apertures don't conserve light and are averaged in the picture.
         self.box = oversample if frame.fill_factor == 1.0 else 1
         reach = self.reach_um / self.step_um + 1.0 + 0.5 * (self.box - 1)
         self.size = int(np.ceil(2.0 * reach))
@@ -142,8 +143,9 @@ class Kernels:
         self._kept: dict[Tile, Float32Array] = {}
 
     def through_pixels(self, picture: Float32Array) -> Float32Array:
-        """A picture averaged over the pixels' aperture, the blur of its own samples and of `distort` undone; where the kernels hold the aperture, only the
-        latter."""
+        """A picture averaged over the pixels' aperture, the blur of its own samples and of `distort` undone; where the
+        kernels hold the aperture, only the latter.
+        """
         s, side, undo = self.oversample, np.sqrt(self.frame.fill_factor), self._undo
         if self.box > 1:
             side, undo = 0.0, undo - 1
@@ -158,7 +160,9 @@ class Kernels:
         return np.asarray(fft.irfft2(spectrum, shape, overwrite_x=True)[: picture.shape[0], : picture.shape[1]])
 
     def at(self, x_um: FloatArray, y_um: FloatArray) -> Float32Array:
-        """Kernels of sources at image points (N,): (N, C, size, size), the share of the light on the k-th sample's square that a pixel gets."""
+        """Kernels of sources at image points (N,): (N, C, size, size), the share of the light on the k-th sample's
+        square that a pixel gets.
+        """
         table, size = self.table, self.size - self.box + 1
         # The sample of index k lies (k - (size - 1) / 2) steps from the pixel's centre.
         offset = (np.arange(size) - 0.5 * (size - 1)) * self.step_um
@@ -179,14 +183,18 @@ class Kernels:
         return functions
 
     def at_nodes(self, tile: Tile) -> Float32Array:
-        """Kernels at a tile's nodes, (4, 4, C, size, size). Those that `tiles` computed are kept until they are asked for."""
+        """Kernels at a tile's nodes, (4, 4, C, size, size). Those that `tiles` computed are kept until they are asked
+        for.
+        """
         if tile in self._kept:
             return self._kept.pop(tile)
         nodes = self.at(*self.frame.um(*(a.ravel() for a in tile.place(*np.meshgrid(NODES, NODES, indexing="ij")))))
         return nodes.reshape(NODES.size, NODES.size, *nodes.shape[1:])
 
     def error(self, tile: Tile, at_nodes: Float32Array) -> float:
-        """Error of a tile's polynomials half way between nodes, relative to its limit: the largest at four positions."""
+        """Error of a tile's polynomials half way between nodes, relative to its limit: the largest at four
+        positions.
+        """
         nodes, worst = at_nodes.reshape(NODES.size**2, -1), 0.0
         down, across = (np.array(a) / DEGREE for a in ((0.5, 2.5, 0.5, 2.5), (0.5, 0.5, 2.5, 2.5)))
         wanted = self.at(*self.frame.um(*tile.place(down, across)))
@@ -253,8 +261,9 @@ def _pad_spectrum(spectrum: NDArray[np.complex64], n: int, refine: int) -> NDArr
 def _sample(  # type: ignore[no-untyped-def]  # noqa: PLR0912
     raw, down, across, columns, cosine, sine, offset, samples, first, step, radius
 ):
-    """Sample rotated kernels at minus the offsets: bilinear between the field points around (down, across), cubic B-splines
-    between samples. The y axis of a symmetric lens's table points along (sine, cosine) [x, y]."""
+    """Sample rotated kernels at minus the offsets: bilinear between the field points around (down, across), cubic
+    B-splines between samples. The y axis of a symmetric lens's table points along (sine, cosine) [x, y].
+    """
     channels = raw.shape[1]
     rows = samples.shape[0] // columns
     fields, shares = np.empty(4, np.int64), np.empty(4)

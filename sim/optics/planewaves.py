@@ -1,7 +1,7 @@
 """Point spread function and transfer function of traced rays: every ray is a plane wave at the image.
 
-U(x, y) = sum_j w_j exp(i k [OPL_j + L_j (x - x_j) + M_j (y - y_j)]), w_j = sqrt(J_j K_j) dA_j, with J = d(L, M)/d(pupil) at
-the image and K the light that a unit of the pupil's area takes in; k = 2 pi n / wavelength.
+U(x, y) = sum_j w_j exp(i k [OPL_j + L_j (x - x_j) + M_j (y - y_j)]), w_j = sqrt(J_j K_j) dA_j, with
+J = d(L, M)/d(pupil) at the image and K the light that a unit of the pupil's area takes in; k = 2 pi n / wavelength.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _WAVE_RESIDUAL = 2e-3
 class PupilRays:
     """The rays of one field point and wavelength at the image plane, with their shares in the pupil.
 
-    `x_mm`, `y_mm` are where a ray meets the image plane, `cosine_x`, `cosine_y` its direction there, `path_mm` its optical path,
-    `area` the light that the ray stands for (K dA) and `jacobian` J / K, d(L, M) by that light. `mirrored` says that a ray
-    at +x stands for its mirror image too (`area` is that of one of them). `rim_cosine_x`, `rim_cosine_y` trace the pupil's rim in
-    direction cosines, closed, once around.
+    `x_mm`, `y_mm` are where a ray meets the image plane, `cosine_x`, `cosine_y` its direction there, `path_mm` its
+    optical path, `area` the light that the ray stands for (K dA) and `jacobian` J / K, d(L, M) by that light.
+    `mirrored` says that a ray at +x stands for its mirror image too (`area` is that of one of them). `rim_cosine_x`,
+    `rim_cosine_y` trace the pupil's rim in direction cosines, closed, once around.
     """
 
     x_mm: FloatArray
@@ -110,9 +110,9 @@ def point_spread(
 ) -> FloatArray:
     """(samples, samples) intensities on points around `centre_mm`, rows along y, as shares of all that leaves the lens.
 
-    Parseval: sum of |U|^2 dx dy over the whole plane is (wavelength / n)^2 times the light in the pupil. Rays that meet the
-    image farther than `reach_mm` from the centre are left out, smoothly over the outer third of that distance: they send no
-    light into a window that lies well within, and the others need fewer rays to be summed right.
+    Parseval: sum of |U|^2 dx dy over the whole plane is (wavelength / n)^2 times the light in the pupil. Rays that meet
+    the image farther than `reach_mm` from the centre are left out, smoothly over the outer third of that distance: they
+    send no light into a window that lies well within, and the others need fewer rays to be summed right.
     """
     k, pitch = rays.wave_number_per_mm, pitch_um * 1e-3
     first = -0.5 * (samples - 1) * pitch
@@ -170,10 +170,10 @@ def transfer(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Complex OTF along x (sagittal) and along y (tangential) of an image about `origin_mm`; 1 at frequency 0.
 
-    Autocorrelation of the pupil in direction cosines: H(f) = integral A(s + a/2) A*(s - a/2) ds / integral |A|^2 ds, |a| =
-    f wavelength / n, A = sqrt(K / J) exp(2 pi i W / wavelength). W and sqrt(K / J) are Chebyshev sums fitted to the rays;
-    the overlap of the pupil with its shifted self is laid out by Gauss-Legendre nodes between its chords: no window cuts
-    anything off. Good where lines along the frequency cut the rim twice, which convex pupils grant.
+    Autocorrelation of the pupil in direction cosines: H(f) = integral A(s + a/2) A*(s - a/2) ds / integral |A|^2 ds,
+    |a| = f wavelength / n, A = sqrt(K / J) exp(2 pi i W / wavelength). W and sqrt(K / J) are Chebyshev sums fitted to the rays;
+    the overlap of the pupil with its shifted self is laid out by Gauss-Legendre nodes between its chords: no window
+    cuts anything off. Good where lines along the frequency cut the rim twice, which convex pupils grant.
     """
     wave = _FittedWave.of(rays, origin_mm)
     frequency = np.atleast_1d(np.asarray(frequency_lp_per_mm, float))

@@ -1,4 +1,6 @@
-"""Looking up a spline over share of the cutoff and direction, compiled. Imported where it's needed: the compiler takes a second."""
+"""Looking up a spline over share of the cutoff and direction, compiled. Imported where it's needed: the compiler takes
+a second.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,10 @@ from sim.spectrum import FloatArray
 def look_up(
     fx: FloatArray, fy: FloatArray, scale: float, pad: int, table: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
-    """Value at the frequencies fx, fy (both (n, m), any strides) of a cubic spline with coefficients `table` (pad + shares + pad,
-    angles); `scale` x frequency is the share of the cutoff, 0..1 over the rows between the pads. 1 from the cutoff on."""
+    """Value at the frequencies fx, fy (both (n, m), any strides) of a cubic spline with coefficients `table`
+    (pad + shares + pad, angles); `scale` x frequency is the share of the cutoff, 0..1 over the rows between the pads. 1
+    from the cutoff on.
+    """
     rows, columns = table.shape[0] - 2 * pad - 1, table.shape[1]
     turn = columns / (2.0 * math.pi)
     out = np.ones(fx.shape, np.complex128)

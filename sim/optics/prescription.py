@@ -1,4 +1,6 @@
-"""Lens prescriptions: sequential surfaces in mm, in the order of the light. Zemax's files are read by `sim.optics.zmx`."""
+"""Lens prescriptions: sequential surfaces in mm, in the order of the light. Zemax's files are read by
+`sim.optics.zmx`.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ class Aperture(Frozen):
 
 
 class GlassName(Frozen):
-    """A medium as a file names it: a catalogue's glass, or a model glass by nd, Vd and the deviation of its partial dispersion."""
+    """A medium as a file names it: a catalogue's glass, or a model glass by nd, Vd and the deviation of its partial
+    dispersion.
+    """
 
     name: str
     model: bool = False
@@ -42,10 +46,11 @@ class GlassName(Frozen):
 class Surface(Frozen):
     """One sequential surface. Sag z(r) = c r^2 / (1 + sqrt(1 - (1 + conic) c^2 r^2)) + sum of the asphere's terms.
 
-    `coefficients_mm` belong to r^2, r^4, ... of an even asphere and to r, r^2, r^3, ... of an odd one, so that the k-th has
-    the unit mm^(1 - power). `thickness_mm` leads to the next surface, `glass` is the medium behind (None: air). A
-    coordinate break has no sag: the frame of what follows is shifted by `decentre_mm` and turned by `tilt_deg` about x, y, z,
-    right-handed, each about the axis that the one before left (Zemax's order), or the other way round where `tilt_first`.
+    `coefficients_mm` belong to r^2, r^4, ... of an even asphere and to r, r^2, r^3, ... of an odd one, so that the k-th
+    has the unit mm^(1 - power). `thickness_mm` leads to the next surface, `glass` is the medium behind (None: air). A
+    coordinate break has no sag: the frame of what follows is shifted by `decentre_mm` and turned by `tilt_deg` about x,
+    y, z, right-handed, each about the axis that the one before left (Zemax's order), or the other way round where
+    `tilt_first`.
     """
 
     kind: SurfaceKind = "standard"
@@ -66,8 +71,8 @@ class Prescription(Frozen):
 
     `object_distance_mm` is that of the object before the first surface, None at infinity. `stop` is the stop's place in
     `surfaces`. Field points are (x, y) in what `field_kind` says. `paraxial_stop`: the stop is as large as the paraxial
-    marginal ray makes it, not the real one (Zemax's paraxial ray aiming). `stated_` values are the file's own, to compare
-    the traced lens with.
+    marginal ray makes it, not the real one (Zemax's paraxial ray aiming). `stated_` values are the file's own, to
+    compare the traced lens with.
     """
 
     name: str
@@ -88,7 +93,9 @@ class Prescription(Frozen):
 
     @property
     def is_centred(self) -> bool:
-        """Return whether the lens has one axis of rotation: no shift, no tilt, no aperture that isn't a circle about the axis."""
+        """Return whether the lens has one axis of rotation: no shift, no tilt, no aperture that isn't a circle about
+        the axis.
+        """
         return not any(
             any(surface.decentre_mm)
             or any(surface.tilt_deg)

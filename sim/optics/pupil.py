@@ -2,14 +2,15 @@
 sampling of the pupil, any frequency.
 
 H(f) = (1 / pi) integral over the overlap of two unit discs of exp(-2 pi i [W(p + s/2) - W(p - s/2)] / wavelength), with
-s = 2 wavelength f_number f: the discs' centres are |s| apart, 2 at the cutoff. A path error W = a x so moves the image by
-2 f_number a along +x. (H. H. Hopkins, Proc. R. Soc. A 231, 91 (1955); J. Goodman, Introduction to Fourier Optics, section 6.4.)
+s = 2 wavelength f_number f: the discs' centres are |s| apart, 2 at the cutoff. A path error W = a x so moves the image
+by 2 f_number a along +x. (H. H. Hopkins, Proc. R. Soc. A 231, 91 (1955); J. Goodman, Introduction to Fourier Optics,
+section 6.4.)
 
-One rule serves all: what H is of the perfect pupil's, the mean of that phase over the overlap, is smooth up to the cutoff
-and is what is integrated (Gauss-Legendre in coordinates in which the overlap's rim is no edge). A tilt is taken out as the phase
-it is; where W is quadratic the integral across is a sinc, and one along the frequency remains; where W depends on the
-radius only, one direction stands for all. For many frequencies the mean is integrated at few points of a polar grid and
-interpolated.
+One rule serves all: what H is of the perfect pupil's, the mean of that phase over the overlap, is smooth up to the
+cutoff and is what is integrated (Gauss-Legendre in coordinates in which the overlap's rim is no edge). A tilt is taken
+out as the phase it is; where W is quadratic the integral across is a sinc, and one along the frequency remains; where W
+depends on the radius only, one direction stands for all. For many frequencies the mean is integrated at few points of a
+polar grid and interpolated.
 """
 
 from __future__ import annotations
@@ -30,24 +31,27 @@ ComplexArray = NDArray[np.complex128]
 
 #: Path errors below this are rounding: 1e-12 um.
 NIL_UM = 1e-12
-#: More frequencies than `FEW` are interpolated, as integrating each would take longer; up to `SOME` along each direction where
-#: that has `MANY_A_DIRECTION` of them.
+#: More frequencies than `FEW` are interpolated, as integrating each would take longer; up to `SOME` along each
+#: direction where that has `MANY_A_DIRECTION` of them.
 FEW, SOME, MANY_A_DIRECTION = 600, 20_000, 40
-#: Steps of a table over the radius that lines are drawn through, to 1e-6; least steps of one over radius and angle, for splines.
+#: Steps of a table over the radius that lines are drawn through, to 1e-6; least steps of one over radius and angle, for
+#: splines.
 RADII_LINE = 4096
 RADII, ANGLES, PAD = 256, 256, 8
 #: Points that are summed at once: their arrays stay in the processor's cache.
 IN_CACHE = 20_000
 #: A polar grid is fine enough where the last coefficients of its expansion are below this.
 SETTLED = 1e-7
-#: Sizes of path errors, as the largest coefficient in waves, are tabulated by octaves: up to `FIRST_WAVES`, to twice that, and so on
-#: to the octave `LAST_OCTAVE`; each at `SIZES` sizes at most.
+#: Sizes of path errors, as the largest coefficient in waves, are tabulated by octaves: up to `FIRST_WAVES`, to twice
+#: that, and so on to the octave `LAST_OCTAVE`; each at `SIZES` sizes at most.
 FIRST_WAVES, LAST_OCTAVE, SIZES = 0.125, 3, 32
 
 
 @dataclass(frozen=True)
 class Wavefront:
-    """Path error in um over the pupil of radius 1: W(x, y) = sum of um x^i y^j over `terms` (i, j, um); x along columns, y along rows."""
+    """Path error in um over the pupil of radius 1: W(x, y) = sum of um x^i y^j over `terms` (i, j, um); x along
+    columns, y along rows.
+    """
 
     terms: tuple[tuple[int, int, float], ...]
 
@@ -168,7 +172,8 @@ def seidel(
     astigmatism_um: float = 0.0,
     astigmatism_deg: float = 0.0,
 ) -> Wavefront:
-    """W(x, y) = W020 r^2 + W040 r^4 + r^2 (W131x x + W131y y) + W222 u^2, u along `astigmatism_deg` from x; um at the rim.
+    """W(x, y) = W020 r^2 + W040 r^4 + r^2 (W131x x + W131y y) + W222 u^2, u along `astigmatism_deg` from x; um at the
+    rim.
 
     W020 = dz / (8 N^2) for a sensor that is dz away from the focus.
     """
@@ -191,8 +196,9 @@ def seidel(
 
 
 def zernike(n: int, m: int) -> Wavefront:
-    """Z_n^m as a polynomial, rms 1 over the pupil: sqrt((2 - [m = 0]) (n + 1)) R_n^|m|(rho) cos(m phi) or, for m < 0, sin(|m| phi);
-    phi from x towards y. (R. Noll, J. Opt. Soc. Am. 66, 207 (1976).)"""
+    """Z_n^m as a polynomial, rms 1 over the pupil: sqrt((2 - [m = 0]) (n + 1)) R_n^|m|(rho) cos(m phi) or, for m < 0,
+    sin(|m| phi); phi from x towards y. (R. Noll, J. Opt. Soc. Am. 66, 207 (1976).)
+    """
     a = abs(m)
     if n < a or (n - a) % 2:
         raise ValueError(f"there is no Zernike polynomial of order n = {n}, m = {m}: n - |m| has to be even and >= 0")
@@ -231,8 +237,9 @@ def osa_order(j: int) -> tuple[int, int]:
 def pupil_otf(
     fx_cy_per_um: ArrayLike, fy_cy_per_um: ArrayLike, wavelength_nm: float, f_number: float, wavefront: Wavefront
 ) -> ComplexArray:
-    """OTF of a circular pupil with path error `wavefront`, complex, of the broadcast shape of the frequencies; 0 beyond the
-    cutoff. To 1e-6 below 10 waves."""
+    """OTF of a circular pupil with path error `wavefront`, complex, of the broadcast shape of the frequencies; 0 beyond
+    the cutoff. To 1e-6 below 10 waves.
+    """
     fx, fy = np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float)
     perfect = diffraction_otf(np.hypot(fx, fy), wavelength_nm, f_number)
     return np.asarray(perfect * pupil_ratio(fx, fy, wavelength_nm, f_number, wavefront), complex)
@@ -241,7 +248,8 @@ def pupil_otf(
 def pupil_ratio(
     fx_cy_per_um: ArrayLike, fy_cy_per_um: ArrayLike, wavelength_nm: float, f_number: float, wavefront: Wavefront
 ) -> FloatArray | ComplexArray:
-    """OTF of a circular pupil with path error `wavefront` over that of the perfect one: the mean of the phase over the overlap.
+    """OTF of a circular pupil with path error `wavefront` over that of the perfect one: the mean of the phase over the
+    overlap.
 
     Of the broadcast shape of the frequencies; real where W(-p) = W(p); 1 beyond the cutoff, where both are 0.
     """
@@ -303,7 +311,9 @@ def _ratio_along(share: FloatArray, angle: float, wavelength_um: float, bend: Wa
 def _mean(
     share: FloatArray, cos: FloatArray, sin: FloatArray, wavelength_um: float, bend: Wavefront
 ) -> FloatArray | ComplexArray:
-    """Mean phase over the overlap at shares of the cutoff and directions (cos, sin), (K,) each; 1 from the cutoff on."""
+    """Mean phase over the overlap at shares of the cutoff and directions (cos, sin), (K,) each; 1 from the cutoff
+    on.
+    """
     half = np.clip(share, 0.0, 1.0 - 1e-9)
     waves = bend.range_um / wavelength_um
     if all(i + j == 2 for i, j, _ in bend.terms):
@@ -352,8 +362,10 @@ def _mean_of_quadratic(
 def _mean_of_any(
     half: FloatArray, cos: FloatArray, sin: FloatArray, wavelength_um: float, bend: Wavefront, nodes: int
 ) -> FloatArray | ComplexArray:
-    """Points (u, v) of one half of the overlap, u along the frequency: u + c = cos(theta), v = t sin(theta), |t| <= 1, so that
-    dA = sin^2(theta) d(theta) dt. At -p the difference of the even part of W has the other sign, that of the odd part the same."""
+    """Points (u, v) of one half of the overlap, u along the frequency: u + c = cos(theta), v = t sin(theta), |t| <= 1,
+    so that dA = sin^2(theta) d(theta) dt. At -p the difference of the even part of W has the other sign, that of the
+    odd part the same.
+    """
     even, odd = bend.part(0), bend.part(1)
     node, weight = _nodes(nodes)
     t, t_weight = 2.0 * node - 1.0, weight
@@ -403,8 +415,8 @@ def _to_series(count: int) -> FloatArray:
 def _series(angle: float, wavelength_um: float, bend: Wavefront) -> ComplexArray:
     """Chebyshev's expansion of the ratio in one direction over the share of the cutoff: smooth, so that few terms do.
 
-    At a share and in a direction the ratio depends on the path error in waves alone: a table over its size serves all wavelengths,
-    f-numbers and sizes of an error of one shape.
+    At a share and in a direction the ratio depends on the path error in waves alone: a table over its size serves all
+    wavelengths, f-numbers and sizes of an error of one shape.
     """
     waves = bend.size_um / wavelength_um
     octave = max(int(np.ceil(np.log2(waves / FIRST_WAVES))), 0)
@@ -423,7 +435,9 @@ def _waves_of(octave: int) -> tuple[float, float]:
 
 @lru_cache(maxsize=1024)
 def _octave(angle: float, shape: Wavefront, octave: int) -> ComplexArray | None:
-    """Chebyshev's coefficients over the size in waves of those over the share, (sizes, shares); None where `SIZES` don't do."""
+    """Chebyshev's coefficients over the size in waves of those over the share, (sizes, shares); None where `SIZES`
+    don't do.
+    """
     low, high = _waves_of(octave)
     count = 8
     while count <= SIZES:
@@ -464,8 +478,8 @@ def _line(angle: float, wavelength_um: float, bend: Wavefront) -> tuple[FloatArr
 def _polar_table(bend: Wavefront, wavelength_um: float) -> ComplexArray:
     """Spline coefficients (PAD + radii + PAD, angles) of the ratio over share 0..1 and angle 0..2 pi.
 
-    The ratio is smooth in both: Chebyshev's expansion in the share, Fourier's in the angle, over half a turn, as the ratio of the
-    other half is the conjugate. Both are doubled until the last coefficients are nil.
+    The ratio is smooth in both: Chebyshev's expansion in the share, Fourier's in the angle, over half a turn, as the
+    ratio of the other half is the conjugate. Both are doubled until the last coefficients are nil.
     """
     radii, angles = 16, 16
     while True:

@@ -126,7 +126,9 @@ def _rotation(tilt_deg: tuple[float, float, float], reverse: bool) -> FloatArray
 
 
 def frames(surfaces: Surfaces) -> tuple[FloatArray, FloatArray]:
-    """(vertices (surfaces, 3), axes (surfaces, 3, 3)) of every surface's frame in that of the first one before any break."""
+    """(vertices (surfaces, 3), axes (surfaces, 3, 3)) of every surface's frame in that of the first one before any
+    break.
+    """
     origin, axes = np.zeros(3), np.eye(3)
     vertices, turned = [], []
     for i in range(len(surfaces.kind)):
@@ -186,7 +188,9 @@ def sag(surfaces: Surfaces, i: int, square_mm2: float) -> tuple[float, bool]:
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, shape: Any, i: int) -> Any:
-    """Distance from (x, y) on the vertex plane to surface i along the direction, the place there, and the sag's slopes."""
+    """Distance from (x, y) on the vertex plane to surface i along the direction, the place there, and the sag's
+    slopes.
+    """
     c, k, kind = shape[i, CURVATURE], shape[i, CONIC], shape[i, KIND]
     t = 0.0
     if c != 0.0:
@@ -269,9 +273,9 @@ def trace_ray(  # noqa: PLR0912, PLR0915  (one loop, compiled as one)
 
     `field` is (finite, a, b, c, pupil z): direction (a, b, c) of a plane wave, or the object point (a, b, c) before the
     first vertex. PATH is the optical path in mm from the wave's plane through the entrance pupil's centre, or from the
-    object point, to the image surface. CLIP is the largest excess over an aperture, as a share of its radius: above 0 the
-    ray is clipped (it is traced on all the same). `points` (surfaces, 3) takes the ray's points in the surfaces' own
-    frames; give an empty array where they aren't wanted.
+    object point, to the image surface. CLIP is the largest excess over an aperture, as a share of its radius: above 0
+    the ray is clipped (it is traced on all the same). `points` (surfaces, 3) takes the ray's points in the surfaces'
+    own frames; give an empty array where they aren't wanted.
     """
     finite = field[0] != 0.0
     pupil_z = field[4]

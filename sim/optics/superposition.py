@@ -2,13 +2,14 @@
 
     image(x) = sum over sources s of light(s) PSF(x - s; field of s)
 
-The picture lies where the lens images it (`sim.optics.distorted`). It is averaged over the pixel's aperture first, as a lens changes too
-little across a pixel for the order to matter, and cut into tiles of sources. Within a tile the kernel of a source at s is a cubic polynomial
-in s, tap by tap (`sim.optics.kernels`). A polynomial in s is a polynomial in x of the same degree, so that a tile adds to a pixel a blend of
-sixteen sums over its sources. Kernels have the sum that the lens table states there, and only the requested pixels are computed.
+The picture lies where the lens images it (`sim.optics.distorted`). It is averaged over the pixel's aperture first, as a
+lens changes too little across a pixel for the order to matter, and cut into tiles of sources. Within a tile the kernel
+of a source at s is a cubic polynomial in s, tap by tap (`sim.optics.kernels`). A polynomial in s is a polynomial
+in x of the same degree, so that a tile adds to a pixel a blend of sixteen sums over its sources. Kernels have the sum
+that the lens table states there, and only the requested pixels are computed.
 
-Light outside the table's window, and in its corners, is spread as 1 / r^3, as an edge diffracts it. Energy is conserved: the light of a source arrives with the
-share 1, on or off the frame.
+Light outside the table's window, and in its corners, is spread as 1 / r^3, as an edge diffracts it. Energy is
+conserved: the light of a source arrives with the share 1, on or off the frame.
 """
 
 from __future__ import annotations
@@ -42,17 +43,19 @@ def superpose(
     image: FloatArray,
     tiles: Sequence[Tile] | None = None,
 ) -> None:
-    """Add to `image` (rows, cols) a picture on the image's grid, blurred by the kernels of every channel. Raises ValueError for a margin that is too narrow.
+    """Add to `image` (rows, cols) a picture on the image's grid, blurred by the kernels of every channel. Raises
+    ValueError for a margin that is too narrow.
 
-    `places`: for every channel of `kernels`, the first [row, col] of each of its lattices of `period` px; only those pixels change.
-    `tiles` None: those of `kernels.tiles`.
+    `places`: for every channel of `kernels`, the first [row, col] of each of its lattices of `period` px; only those
+    pixels change. `tiles` None: those of `kernels.tiles`.
     """
     frame, s = kernels.frame, grid.oversample
     half = (kernels.size - s) // 2  # samples before a pixel's first
     halo = kernels.halo_px
     if grid.margin_px < halo:
         raise ValueError(
-            f"the margin of {grid.margin_px} px is below the limit of {halo} px that the lens's window of {2 * kernels.radius_um:g} um asks for: take a wider margin"
+            f"the margin of {grid.margin_px} px is below the limit of {halo} px that the lens's window of "
+            f"{2 * kernels.radius_um:g} um asks for: take a wider margin"
         )
     seen = kernels.through_pixels(picture)
     taps = _taps_in_circle(kernels)
@@ -89,7 +92,9 @@ def superpose(
 
 
 def _taps_in_circle(kernels: Kernels) -> NDArray[np.int64]:
-    """(size, 2): for every row of a kernel, the first tap that may differ from 0 and the end of the last, in multiples of four."""
+    """(size, 2): for every row of a kernel, the first tap that may differ from 0 and the end of the last, in multiples
+    of four.
+    """
     away = np.arange(kernels.size) - 0.5 * (kernels.size - 1)
     radius = kernels.reach_um / kernels.step_um + (kernels.box - 1) / np.sqrt(2.0)
     wide = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
@@ -99,8 +104,9 @@ def _taps_in_circle(kernels: Kernels) -> NDArray[np.int64]:
 
 
 def _light_correction(kernels: Kernels, tile: Tile, shape: tuple[int, ...]) -> Float32Array | None:
-    """Factors on a tile's sources that replace the polynomials' light by the table's: at 17 x 17 points, linear between.
-    None where light may be negative, so that there is no ratio."""
+    """Factors on a tile's sources that replace the polynomials' light by the table's: at 17 x 17 points, linear
+    between. None where light may be negative, so that there is no ratio.
+    """
     if np.min(kernels.light) < 0 or np.min(np.sum(kernels.light - kernels.lost, axis=0)) <= 0:
         return None
     at = np.linspace(0.0, 1.0, 17)
@@ -118,10 +124,11 @@ def _light_correction(kernels: Kernels, tile: Tile, shape: tuple[int, ...]) -> F
 
 
 def _by_pixel(at_nodes: Float32Array, kernels: Kernels, height: int, width: int) -> Float32Array:
-    """A tile's kernels (4, 4, C, size, size) as polynomials in the position of the *pixel* instead of the source: (C, 4, 4, size, size).
+    """A tile's kernels (4, 4, C, size, size) as polynomials in the position of the *pixel* instead of the source:
+    (C, 4, 4, size, size).
 
-    With the nodes t_m, L_i(t + tau) = sum_m L_i(t_m + tau) L_m(t): a polynomial in the position of a source at tau from the pixel is one in
-    the position of the pixel.
+    With the nodes t_m, L_i(t + tau) = sum_m L_i(t_m + tau) L_m(t): a polynomial in the position of a source at tau from
+    the pixel is one in the position of the pixel.
     """
     tau_px = (np.arange(kernels.size) - 0.5 * (kernels.size - 1)) / kernels.oversample
     by_row, by_col = (
@@ -140,7 +147,9 @@ def _spread_wings(
     period: int,
     image: FloatArray,
 ) -> None:
-    """Add the light outside the table's circle of radius a: a / (2 pi r^3) per area beyond it, on cells of a few pixels."""
+    """Add the light outside the table's circle of radius a: a / (2 pi r^3) per area beyond it, on cells of a few
+    pixels.
+    """
     frame, table = kernels.frame, kernels.table
     if not np.any(np.abs(kernels.lost) > 1e-9 * np.abs(kernels.lost).max(initial=0.0)):
         return
@@ -170,7 +179,9 @@ def _spread_wings(
 
 
 def _wing(rows: int, cols: int, cell_um: float, radius_um: float) -> FloatArray:
-    """Share of a cell's light in every cell around it, (2 rows - 1, 2 cols - 1); near cells are averaged over 16 x 16 points."""
+    """Share of a cell's light in every cell around it, (2 rows - 1, 2 cols - 1); near cells are averaged over 16 x 16
+    points.
+    """
     y, x = (np.arange(1 - n, n) * cell_um for n in (rows, cols))
     r = np.hypot(y[:, None], x[None, :])
     out = np.where(r > 0, radius_um * cell_um**2 / (2.0 * np.pi * np.maximum(r, 1e-9) ** 3), 0.0)
@@ -195,17 +206,20 @@ def _bilinear(values: FloatArray, row: FloatArray, col: FloatArray) -> FloatArra
 
 @njit(cache=True, fastmath={"contract"})
 def _gather(image, columns, g, within, rows, cols, period, oversample, origin, row_range, col_range):  # type: ignore[no-untyped-def]
-    """Add a tile's light to the pixels of one lattice: kernels are interpolated for a row, then four sums a pixel along it.
+    """Add a tile's light to the pixels of one lattice: kernels are interpolated for a row, then four sums a pixel along
+    it.
 
-    `columns` [k, row, i] is the tile's column stride i + k: neighbouring pixels of the lattice lie side by side in it. `origin`:
-    its first row and column, in samples from the first that pixel 0 takes. `within`: a kernel's taps, row by row. `row_range`, `col_range`: where the tile lies, px.
+    `columns` [k, row, i] is the tile's column stride i + k: neighbouring pixels of the lattice lie side by side in it.
+    `origin`: its first row and column, in samples from the first that pixel 0 takes. `within`: a kernel's taps, row by
+    row. `row_range`, `col_range`: where the tile lies, px.
     """
     size = g.shape[2]
     stride = period * oversample
     count = (cols[1] - cols[0] + period - 1) // period
     if count <= 0:
         return
-    # unsigned offsets into one flat array are faster than views, which are reference-counted and check for negative indices
+    # unsigned offsets into one flat array are faster than views, which are reference-counted and check for negative
+    # indices
     flat = columns.ravel()
     plane, line = columns.shape[1] * columns.shape[2], columns.shape[2]
     blend = np.zeros((4, size, size + 4), np.float32)

@@ -1,4 +1,6 @@
-"""A lens prescription ready to be traced: first-order quantities, chief rays, open pupils with their wavefronts, field of view."""
+"""A lens prescription ready to be traced: first-order quantities, chief rays, open pupils with their wavefronts, field
+of view.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,8 @@ Focus = Literal["file", "best"]
 class FirstOrder:
     """Paraxial quantities at one wavelength; lengths in mm.
 
-    Positions: the entrance pupil's from the first surface, the exit pupil's and the back focus from the last one before the
-    image. `working_f_number` is 1 / (2 u') of the marginal ray, which at infinity is `f_number`.
+    Positions: the entrance pupil's from the first surface, the exit pupil's and the back focus from the last one before
+    the image. `working_f_number` is 1 / (2 u') of the marginal ray, which at infinity is `f_number`.
     """
 
     wavelength_nm: float
@@ -89,7 +91,9 @@ class OpticalSystem:
             self._index[float(w)] = np.ascontiguousarray(row)
 
     def _matrices(self, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
-        """Paraxial matrices on (y, n u): from the first vertex to the stop's plane, and from there behind the last surface."""
+        """Paraxial matrices on (y, n u): from the first vertex to the stop's plane, and from there behind the last
+        surface.
+        """
         index = self.index(wavelength_nm)
         surfaces = self.prescription.surfaces
         matrix, before = np.eye(2), np.eye(2)
@@ -159,8 +163,8 @@ class OpticalSystem:
             before, _ = self._matrices(self.primary_nm)
             radius = abs(before[0, 0]) * 0.5 * pupil_mm
             self.warnings.append(
-                f"the marginal ray on the axis {rt.OUTCOMES[int(out[rt.STATUS])]} at surface {int(out[rt.SURFACE]) + 1}; "
-                "the stop has its paraxial size"
+                f"the marginal ray on the axis {rt.OUTCOMES[int(out[rt.STATUS])]} at surface "
+                f"{int(out[rt.SURFACE]) + 1}; the stop has its paraxial size"
             )
         return radius
 
@@ -175,7 +179,8 @@ class OpticalSystem:
         focal = float(1.0 / power)
         if focal < 0:
             raise PrescriptionError(
-                f"the lens's focal length is {focal:g} mm, below the limit of 0: it makes no real image; check curvatures and glasses"
+                f"the lens's focal length is {focal:g} mm, below the limit of 0: it makes no real image; check "
+                "curvatures and glasses"
             )
         index = self.index(wavelength_nm)
         position = self._entrance_pupil_position(wavelength_nm)
@@ -232,7 +237,9 @@ class OpticalSystem:
         return self.field((0.0, 0.0))
 
     def field(self, tangent: tuple[float, float]) -> FloatArray:
-        """The tracer's description of a field point whose light travels along (tan x, tan y, 1) at the entrance pupil."""
+        """The tracer's description of a field point whose light travels along (tan x, tan y, 1) at the entrance
+        pupil.
+        """
         tx, ty = tangent
         distance = self.prescription.object_distance_mm
         if distance is None:

@@ -104,7 +104,9 @@ class LensTable:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read what `save` wrote. ValueError, in one line, for a file that isn't there, is damaged or isn't a lens table."""
+        """Read what `save` wrote. ValueError, in one line, for a file that isn't there, is damaged or isn't a lens
+        table.
+        """
         try:
             with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
                 values = {item.name: stored[item.name] for item in fields(cls)}

@@ -1,4 +1,6 @@
-"""The lens table of a prescription, computed by ray tracing: chief rays, illumination and point spread functions over field and wavelength."""
+"""The lens table of a prescription, computed by ray tracing: chief rays, illumination and point spread functions over
+field and wavelength.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +88,9 @@ def lens_table(
     progress: Progress | None = None,
     each: Each | None = None,
 ) -> LensTable:
-    """Trace a lens and compute its `LensTable`. `each`: see `OpticalTable.table`. PrescriptionError where it makes no image."""
+    """Trace a lens and compute its `LensTable`. `each`: see `OpticalTable.table`. PrescriptionError where it makes no
+    image.
+    """
     settings = settings or TableSettings()
     return OpticalTable(OpticalSystem(prescription, settings.focus), settings).table(progress, each)
 
@@ -206,9 +210,9 @@ class OpticalTable:
         w, f = divmod(int(np.argmin(share)), f_count)
         if share[w, f] < LEAST_SHARE:
             self.warnings.append(
-                f"{share[w, f]:.0%} of the light of {self.wavelengths[w]:g} nm at {field_angles(self.tangents[f])} arrives within the "
-                f"{n * self.pitch_um:g} um of its window, the least of all: the rest is in no picture of the table; "
-                "take more samples or a coarser pitch"
+                f"{share[w, f]:.0%} of the light of {self.wavelengths[w]:g} nm at {field_angles(self.tangents[f])} "
+                f"arrives within the {n * self.pitch_um:g} um of its window, the least of all: the rest is in no "
+                "picture of the table; take more samples or a coarser pitch"
             )
         axis = self._axis_index()
         # Everything is seen through the same unit of the entrance pupil; the image's own solid angle is what lights it.

@@ -35,10 +35,11 @@ _KINDS: dict[str, SurfaceKind] = {
 _MAXIMUM_SURFACES = 500
 
 _UNDERSTOOD_HEADER = frozenset([
-    "MODE", "UNIT", "ENPD", "FNUM", "OBNA", "FLOA", "OCOS", "ENVD", "GCAT", "FTYP", "XFLN", "YFLN", "VDXN", "VDYN", "VCXN", "VCYN", "VANN", "WAVM", "WAVL", "WAVN", "PWAV",
+    "MODE", "UNIT", "ENPD", "FNUM", "OBNA", "FLOA", "OCOS", "ENVD", "GCAT", "FTYP", "XFLN", "YFLN", "VDXN", "VDYN",
+    "VCXN", "VCYN", "VANN", "WAVM", "WAVL", "WAVN", "PWAV",
 ])  # fmt: skip
-# Settings of the program and of its pictures, solves (whose result is in the value itself) and analysis: they don't change
-# what light does.
+# Settings of the program and of its pictures, solves (whose result is in the value itself) and analysis: they don't
+# change what light does.
 _HARMLESS_HEADER = frozenset([
     "VERS", "NAME", "NOTE", "PFIL", "LANG", "GFAC", "RAIM", "PUSH", "SDMA", "OMMA", "ROPD", "HYPR", "PICB", "FWGN",
     "ZVDX", "ZVDY", "ZVCX", "ZVCY", "ZVAN", "WWGT", "WWGN", "POLS", "GLRS", "GSTD", "NSCD", "COFN", "BLNK", "XFLD",
@@ -90,9 +91,9 @@ def read_zmx(path: Path | str) -> Prescription:
 def parse_zmx(text: str, *, fallback_name: str = "lens") -> Prescription:
     """A prescription from the text of a `.zmx` file.
 
-    Surfaces STANDARD, EVENASPH, ODDASPHE and COORDBRK; apertures FLAP, CLAP, SQAP with OBDC; the system's aperture ENPD,
-    FNUM, OBNA or FLOA; fields FTYP, XFLN, YFLN; wavelengths WAVM or WAVL with PWAV; units MM, CM, IN, METER; catalogues
-    GCAT. Other surfaces, mirrors, obscurations and apertures of other shapes are refused by name.
+    Surfaces STANDARD, EVENASPH, ODDASPHE and COORDBRK; apertures FLAP, CLAP, SQAP with OBDC; the system's aperture
+    ENPD, FNUM, OBNA or FLOA; fields FTYP, XFLN, YFLN; wavelengths WAVM or WAVL with PWAV; units MM, CM, IN, METER;
+    catalogues GCAT. Other surfaces, mirrors, obscurations and apertures of other shapes are refused by name.
     """
     header, blocks, tail = _split(text)
     return _Reader(header, blocks, tail, fallback_name).prescription()
@@ -238,11 +239,13 @@ class _Reader:
         environment = self._header("ENVD")
         if environment and (_optional(environment, 0, 20.0), _optional(environment, 1, 1.0)) != (20.0, 1.0):
             self.warnings.append(
-                f"header: ENVD {environment}: indices are those at 20 degC and 1 atm; the file's temperature and pressure have no effect"
+                f"header: ENVD {environment}: indices are those at 20 degC and 1 atm; the file's temperature and "
+                "pressure have no effect"
             )
         if any(_nonzero(self._header(name)) for name in ("VDXN", "VDYN", "VCXN", "VCYN", "VANN")):
             self.warnings.append(
-                "header: the vignetting factors VDX, VDY, VCX, VCY have no effect here: rays are clipped by the surfaces' apertures"
+                "header: the vignetting factors VDX, VDY, VCX, VCY have no effect here: rays are clipped by the "
+                "surfaces' apertures"
             )
         for keyword, rest in self.tail:
             if keyword == "MNUM" and _optional(rest, 0, 1.0) > 1:
@@ -339,7 +342,9 @@ class _Reader:
         return None
 
     def _stated_stop(self, stop: _SurfaceBlock) -> float | None:
-        """The stop's semi-diameter where it is fixed or was found by aiming rays at the stop: else it is the beams' extent."""
+        """The stop's semi-diameter where it is fixed or was found by aiming rays at the stop: else it is the beams'
+        extent.
+        """
         stated = stop.last("DIAM") or ""
         aimed = int(_optional(self._header("RAIM") or "", 1)) != 0
         radius = _optional(stated, 0) * self.scale

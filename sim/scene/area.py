@@ -37,7 +37,9 @@ def _value(pattern, row, col, surround):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, inline="always")
 def _mean_whole(pattern, u, v, u_across, u_down, v_across, v_down, surround):  # type: ignore[no-untyped-def]
-    """Mean over a square at (u, v) no larger than a cell, whose sides run along (u_across, v_across), (u_down, v_down)."""
+    """Mean over a square at (u, v) no larger than a cell, whose sides run along (u_across, v_across),
+    (u_down, v_down).
+    """
     u_border, v_border = np.rint(u), np.rint(v)
     col, row = int(u_border), int(v_border)
     right = _share(u - u_border, u_across, u_down)
@@ -82,8 +84,8 @@ def _mean(pattern, u, v, u_across, u_down, v_across, v_down, lit, surround):  # 
 def project_means(pattern, back, row, col, step, divide, lit, surround, out):  # type: ignore[no-untyped-def]
     """Means of a pattern's cells over the squares at `row` x `col` (px, `step` wide), into `out`.
 
-    `back` (3, 3) takes (x = col, y = row, 1) to the pattern's (u, v, w). Every square is divided `divide` times each way.
-    `lit` (u0, u1, v0, v1) is the part of every cell that holds its value, None for all of it.
+    `back` (3, 3) takes (x = col, y = row, 1) to the pattern's (u, v, w). Every square is divided `divide` times each
+    way. `lit` (u0, u1, v0, v1) is the part of every cell that holds its value, None for all of it.
     """
     fine = step / divide
     count = divide * divide
@@ -114,8 +116,9 @@ def project_means(pattern, back, row, col, step, divide, lit, surround, out):  #
 
 @njit(cache=True, nogil=True)
 def mapped_means(pattern, u, v, divide, lit, surround, out):  # type: ignore[no-untyped-def]
-    """As `project_means`, for squares at given pattern points `u`, `v`, a frame of one square wider than needed all round;
-    (rows x divide + 2, cols x divide + 2) for `out` of (rows, cols)."""
+    """As `project_means`, for squares at given pattern points `u`, `v`, a frame of one square wider than needed all
+    round; (rows x divide + 2, cols x divide + 2) for `out` of (rows, cols).
+    """
     count = divide * divide
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -171,8 +174,9 @@ def aligned_means(table, u, v, wide, high):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def means_down(values, edges, begin, end, surround):  # type: ignore[no-untyped-def]
-    """Means down the rows between neighbouring `edges` (ascending) of what is values[j] from j + begin to j + end and `surround`
-    elsewhere, column by column: (edges - 1, columns)."""
+    """Means down the rows between neighbouring `edges` (ascending) of what is values[j] from j + begin to j + end and
+    `surround` elsewhere, column by column: (edges - 1, columns).
+    """
     count, width = values.shape
     out = np.empty((edges.size - 1, width))
     for i in range(edges.size - 1):

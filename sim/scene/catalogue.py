@@ -43,7 +43,9 @@ UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class View:
-    """How an ideal pinhole camera focused at `distance_mm` sees a plane there: m = f / (distance - f), image distance f (1 + m)."""
+    """How an ideal pinhole camera focused at `distance_mm` sees a plane there: m = f / (distance - f), image distance f
+    (1 + m).
+    """
 
     rows: int
     cols: int
@@ -54,7 +56,8 @@ class View:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.distance_mm) and self.distance_mm > self.focal_length_mm):
             raise ValueError(
-                f"distance {self.distance_mm} mm is not above the limit of the focal length, {self.focal_length_mm:g} mm, or not finite: put the scene farther away"
+                f"distance {self.distance_mm} mm is not above the limit of the focal length, {self.focal_length_mm:g} "
+                "mm, or not finite: put the scene farther away"
             )
 
     @classmethod
@@ -105,7 +108,9 @@ class View:
         return min(self.rows / rows, self.cols / cols)
 
     def corner_mm(self, rows: float, cols: float, cell_px: float) -> tuple[float, float, float]:
-        """Position of the upper left corner of such a pattern in the camera's frame (x to the right, y down, z away)."""
+        """Position of the upper left corner of such a pattern in the camera's frame (x to the right, y down, z
+        away).
+        """
         cell_mm = cell_px / self.px_per_mm
         return -0.5 * cols * cell_mm, -0.5 * rows * cell_mm, self.distance_mm
 
@@ -123,8 +128,9 @@ class Declared(Frozen):
 
     @classmethod
     def choose(cls, parameters: Mapping[str, object] | None) -> Self:
-        """The declaration with some parameters set. Raises ValueError, in one line, for an unknown one or a value outside its
-        bounds."""
+        """The declaration with some parameters set. Raises ValueError, in one line, for an unknown one or a value
+        outside its bounds.
+        """
         try:
             return cls.model_validate(dict(parameters or {}))
         except ValidationError as error:
@@ -369,7 +375,8 @@ class Cube(Declared):
         return replace(image, to_camera=view.centre_pattern(rows, cols, self.fill * view.cell_px_to_fill(rows, cols)))
 
 
-#: Texels to a square of a board's texture: a multiple of a marker's cells when markers take 3/4 of a square, 7 cells wide.
+#: Texels to a square of a board's texture: a multiple of a marker's cells when markers take 3/4 of a square, 7 cells
+#: wide.
 TEXELS_PER_SQUARE = 56
 
 

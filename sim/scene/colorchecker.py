@@ -47,8 +47,8 @@ def reflectances(chart: str = "ColorChecker24") -> dict[str, Spectrum]:
 
     ColorCheckerSG: not measured but recovered from colours, as no spectra of the SG's 140 patches are available. The
     curves have exactly the XYZ that X-Rite publishes (charts after November 2014, D50, 2 degrees), and the shape of
-    measured materials of such a colour (see `recovered`). They are metamers: on the 24 patches with known curves, this
-    recovery has an error of 0.04 rms of reflectance. Don't calibrate a spectral response with them.
+    measured materials of such a colour (see `recover_reflectances`). They are metamers: on the 24 patches with known
+    curves, this recovery has an error of 0.04 rms of reflectance. Don't calibrate a spectral response with them.
 
     Beyond their ends the end values hold. Raises ValueError for a chart that isn't known.
     """
@@ -93,7 +93,8 @@ def recover_reflectances(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
         left = float(np.max(np.abs(found.x @ to_xyz - wanted)))
         if left > 1e-5:
             raise ValueError(
-                f"XYZ {np.round(wanted, 4).tolist()} under D50 is {left:.2g} beyond any reflectance between 0 and 1: check the values, and that Y of white is 1"
+                f"XYZ {np.round(wanted, 4).tolist()} under D50 is {left:.2g} beyond any reflectance between 0 and 1: "
+                "check the values, and that Y of white is 1"
             )
         curves.append(np.clip(found.x, 0.0, 1.0))
     return np.asarray(observer.wavelengths), np.array(curves)

@@ -21,9 +21,10 @@ def displace_drawing(
 ) -> FloatArray:
     """A drawing's samples taken at other places, (n oversample, m oversample) as `drawn`.
 
-    `from_row_px`, `from_col_px`: (n + 2, m + 2) places in pixels of the drawing, the first of which has its centre at (0, 0), that the
-    light at its pixels comes from, with one more pixel all round; linear between them. Outside the drawing its border goes on. A cubic
-    B-spline goes through the samples (Unser, IEEE Signal Process. Mag. 16(6), 1999).
+    `from_row_px`, `from_col_px`: (n + 2, m + 2) places in pixels of the drawing, the first of which has its centre at
+    (0, 0), that the light at its pixels comes from, with one more pixel all round; linear between them. Outside the
+    drawing its border goes on. A cubic B-spline goes through the samples (Unser, IEEE Signal Process. Mag. 16(6),
+    1999).
     """
     out = np.empty(drawn.shape)
     _displace(spline_filter(drawn, mode="nearest"), from_row_px, from_col_px, oversample, out)
@@ -69,7 +70,9 @@ def _displace(coefficients, from_row_px, from_col_px, oversample, out):  # type:
 
 @njit(cache=True, inline="always")
 def _taps(place, count, weight, at):  # type: ignore[no-untyped-def]
-    """Weights of the four cubic B-splines about a place, and whose they are, the ends standing for what lies outside."""
+    """Weights of the four cubic B-splines about a place, and whose they are, the ends standing for what lies
+    outside.
+    """
     place = min(max(place, -1.0), float(count))
     first = int(np.floor(place))
     weight[0], weight[1], weight[2], weight[3] = spline_weights(place - first)

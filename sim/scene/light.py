@@ -46,7 +46,8 @@ def at_luminance(curve: Spectrum, wanted_cd_m2: float) -> Spectrum:
     has = luminance_cd_m2(curve)
     if not has > 0:
         raise ValueError(
-            f"a light of {has:g} cd/m^2 between {curve.wavelength_nm[0]:g} and {curve.wavelength_nm[-1]:g} nm can't be scaled to {wanted_cd_m2:g} cd/m^2: it needs visible light above 0; state its radiance instead"
+            f"a light of {has:g} cd/m^2 between {curve.wavelength_nm[0]:g} and {curve.wavelength_nm[-1]:g} nm can't be "
+            f"scaled to {wanted_cd_m2:g} cd/m^2: it needs visible light above 0; state its radiance instead"
         )
     return curve.scale(wanted_cd_m2 / has)
 
@@ -57,8 +58,9 @@ def illuminant_names() -> tuple[str, ...]:
 
 
 def illuminant(name: str, luminance_cd_m2: float) -> Spectrum:
-    """Radiance (W sr^-1 m^-2 nm^-1) of a perfect white diffuser under a named illuminant (D65, A, FL2, LED-B1, ...), at the given
-    luminance. Raises ValueError that lists the names for one that isn't known."""
+    """Radiance (W sr^-1 m^-2 nm^-1) of a perfect white diffuser under a named illuminant (D65, A, FL2, LED-B1, ...), at
+    the given luminance. Raises ValueError that lists the names for one that isn't known.
+    """
     known = colour_science().SDS_ILLUMINANTS
     matching = {key.lower(): key for key in known}
     if name.lower() not in matching:
@@ -76,8 +78,9 @@ def screen(
     falloff_exponent: float = 0.0,
     sub_pixels: SubPixels | None = None,
 ) -> Screen:
-    """A liquid-crystal screen with the measured primaries of colour-science's "Apple Studio Display", white of `white_cd_m2`, black
-    of white / `contrast_ratio` in white's colour."""
+    """A liquid-crystal screen with the measured primaries of colour-science's "Apple Studio Display", white of
+    `white_cd_m2`, black of white / `contrast_ratio` in white's colour.
+    """
     if not contrast_ratio > 1:
         raise ValueError(
             f"the screen's contrast ratio is {contrast_ratio}, not above the limit of 1: give white over black"

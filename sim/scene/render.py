@@ -38,7 +38,9 @@ EVERYWHERE: Window = (slice(None), slice(None))
 
 @dataclass(frozen=True)
 class Grid:
-    """Square samples, `oversample` by `oversample` to the pixel, over a frame of (rows, cols) and `margin_px` around it."""
+    """Square samples, `oversample` by `oversample` to the pixel, over a frame of (rows, cols) and `margin_px` around
+    it.
+    """
 
     rows: int
     cols: int
@@ -159,7 +161,8 @@ def cell_means(
     divide = max(1, int(np.ceil(_footprint(pattern.shape, warp, grid) / 0.999)))
     if divide > MOST_DIVISIONS:
         raise ValueError(
-            f"the pattern's cells are {1.0 / (divide * grid.oversample):.3g} px on the camera, below the limit of {1.0 / (MOST_DIVISIONS * grid.oversample):.3g} px: use larger cells or bring the target closer"
+            f"the pattern's cells are {1.0 / (divide * grid.oversample):.3g} px on the camera, below the limit of "
+            f"{1.0 / (MOST_DIVISIONS * grid.oversample):.3g} px: use larger cells or bring the target closer"
         )
     pattern = np.ascontiguousarray(pattern, float)
     row, col = grid.axes_px()
@@ -187,7 +190,9 @@ def cell_means(
 def _upright_means(
     pattern: FloatArray, warp: Warp, grid: Grid, surround: float, lit: tuple[float, float, float, float] | None
 ) -> FloatArray:
-    """`cell_means` where the pattern isn't rotated: exact means along columns, then along rows, of cells of any size."""
+    """`cell_means` where the pattern isn't rotated: exact means along columns, then along rows, of cells of any
+    size.
+    """
     from sim.scene.area import means_down
 
     h = np.asarray(warp.homography) / warp.homography[2][2]
@@ -326,7 +331,8 @@ def _zone_plate(scene: ZonePlate, grid: Grid) -> FloatArray:
 
     if scene.highest_cy_per_px > 0.5 * grid.oversample:
         raise ValueError(
-            f"the zone plate rises to {scene.highest_cy_per_px:g} cy/px, above the limit of {0.5 * grid.oversample:g} cy/px of {grid.oversample} samples a pixel: draw with more samples, or lower highest_cy_per_px"
+            f"the zone plate rises to {scene.highest_cy_per_px:g} cy/px, above the limit of {0.5 * grid.oversample:g} "
+            f"cy/px of {grid.oversample} samples a pixel: draw with more samples, or lower highest_cy_per_px"
         )
     k = scene.highest_cy_per_px / scene.radius_px
     step = 1.0 / grid.oversample
@@ -423,7 +429,9 @@ def _window(axis: FloatArray, corners: FloatArray) -> slice:
 def quadrilateral(
     row: FloatArray, col: FloatArray, side: float, corner_row: FloatArray, corner_col: FloatArray
 ) -> FloatArray:
-    """Share of each sample's square (`side` px wide, centred at the even axes `row` x `col`) inside a convex polygon, exactly."""
+    """Share of each sample's square (`side` px wide, centred at the even axes `row` x `col`) inside a convex polygon,
+    exactly.
+    """
     from sim.scene.area import polygon_share
 
     if not (row.size and col.size):

@@ -66,9 +66,10 @@ class ReflectanceChart:
 class EdgeRegion:
     """One straight edge, `region` = (row0, col0, row1, col1), end excluded.
 
-    `angle_deg` is the edge's angle from the vertical; positive turns its top to the right. The side with larger `col` (of an
-    edge near the vertical) is light: a point's signed distance is (col - c0) cos(angle) + (row - r0) sin(angle) - offset_px,
-    positive on the light side, with (r0, c0) the centre of the region. Add 180 to the angle to swap dark and light.
+    `angle_deg` is the edge's angle from the vertical; positive turns its top to the right. The side with larger `col`
+    (of an edge near the vertical) is light: a point's signed distance is (col - c0) cos(angle) + (row - r0)
+    sin(angle) - offset_px, positive on the light side, with (r0, c0) the centre of the region. Add 180 to the angle to
+    swap dark and light.
     """
 
     region: tuple[int, int, int, int]
@@ -121,22 +122,28 @@ class ScreenPattern:
 
 
 class Posed:
-    """A flat thing at a pose: a point X of its plane (x to the right along columns, y down along rows, z away from the camera, mm;
-    OpenCV's frame of a board) goes to `rotation` X + `translation_mm` in the camera's frame and is projected by `geometry`."""
+    """A flat thing at a pose: a point X of its plane (x to the right along columns, y down along rows, z away from the
+    camera, mm; OpenCV's frame of a board) goes to `rotation` X + `translation_mm` in the camera's frame and is
+    projected by `geometry`.
+    """
 
     rotation: Matrix
     translation_mm: tuple[float, float, float]
     geometry: Geometry
 
     def plane_warp(self, unit_mm: float) -> Warp:
-        """From the plane's coordinates in units of `unit_mm` to camera px: camera_matrix [r1 r2 t] unit_mm, then the distortion."""
+        """From the plane's coordinates in units of `unit_mm` to camera px: camera_matrix [r1 r2 t] unit_mm, then the
+        distortion.
+        """
         turn = np.asarray(self.rotation, float)
         pose = np.column_stack([turn[:, 0] * unit_mm, turn[:, 1] * unit_mm, np.asarray(self.translation_mm, float)])
         return Warp.of(np.asarray(self.geometry.camera_matrix, float) @ pose, self.geometry)
 
     def pose_for_rig(self, rig: StereoRig) -> tuple[Self, Self]:
-        """The same thing before both cameras of a rig, this pose being that in the left one's frame: what stands at x before the
-        left camera stands at rotation x + translation_mm before the right one. Geometries are the cameras'."""
+        """The same thing before both cameras of a rig, this pose being that in the left one's frame: what stands
+        at x before the left camera stands at rotation x + translation_mm before the right one. Geometries are the
+        cameras'.
+        """
         pair = rig.left.geometry, rig.right.geometry
         if pair[0] is None or pair[1] is None:
             raise ValueError(
@@ -154,8 +161,8 @@ class Posed:
 class PlanarTarget(Posed):
     """A flat printed target at a pose: a ChArUco board.
 
-    `texture` (rows, cols), 0..1, is the share of `light_radiance` (1) against `dark_radiance` (0). Its texel [i, j] covers
-    j..j+1 by i..i+1 texels of `texel_mm` in the plane of `Posed`. Around the texture there's `surround` (0..1).
+    `texture` (rows, cols), 0..1, is the share of `light_radiance` (1) against `dark_radiance` (0). Its texel [i, j]
+    covers j..j+1 by i..i+1 texels of `texel_mm` in the plane of `Posed`. Around the texture there's `surround` (0..1).
     """
 
     texture: NDArray[np.uint8] | FloatArray
@@ -175,8 +182,10 @@ class PlanarTarget(Posed):
 
 @dataclass(frozen=True)
 class PlaneEdge:
-    """One straight edge in a target's plane: through the point `through_mm` [x, y], `angle_deg` from the y axis (positive turns its
-    top to the right), light on the side of larger x. It rules the points that lie nearest to `centre_mm` [x, y]."""
+    """One straight edge in a target's plane: through the point `through_mm` [x, y], `angle_deg` from the y axis
+    (positive turns its top to the right), light on the side of larger x. It rules the points that lie nearest to
+    `centre_mm` [x, y].
+    """
 
     centre_mm: tuple[float, float]
     through_mm: tuple[float, float]
@@ -204,8 +213,10 @@ class PosedEdges(Posed):
         return self.plane_warp(1.0)
 
     def distances(self, row: FloatArray, col: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-        """On the grid of ascending `row` x `col` (px): the index of the edge that rules each point, and the signed distance of each
-        point from each edge in mm, positive on the light side; (rows, cols) and (edges, rows, cols)."""
+        """On the grid of ascending `row` x `col` (px): the index of the edge that rules each point, and the signed
+        distance of each point from each edge in mm, positive on the light side; (rows, cols) and
+        (edges, rows, cols).
+        """
         x, y = self.warp().grid_to_pattern(row, col)
         owner = np.argmin([np.hypot(x - e.centre_mm[0], y - e.centre_mm[1]) for e in self.edges], axis=0)
         away = []
@@ -323,7 +334,8 @@ class ScreenImage(Posed):
     def __post_init__(self) -> None:
         if self.codes.ndim != 3 or self.codes.shape[2] != 3 or not self.codes.size or self.codes.dtype != np.uint8:
             raise ValueError(
-                f"codes of shape {self.codes.shape} and type {self.codes.dtype} have to be (rows, cols, 3) uint8: convert the picture to 8-bit RGB"
+                f"codes of shape {self.codes.shape} and type {self.codes.dtype} have to be (rows, cols, 3) uint8: "
+                "convert the picture to 8-bit RGB"
             )
         _above_zero("the screen's pixel", self.pixel_mm, "mm")
 
@@ -364,26 +376,32 @@ class SpectralImage:
         step = np.diff(self.wavelength_nm)
         if len(self.wavelength_nm) < 2 or not np.all(np.isfinite(self.wavelength_nm)):
             raise ValueError(
-                f"a spectral image of {len(self.wavelength_nm)} wavelengths needs two or more, all finite: give the bands' centres in nm"
+                f"a spectral image of {len(self.wavelength_nm)} wavelengths needs two or more, all finite: give the "
+                "bands' centres in nm"
             )
         if not np.all(step > 0):
             at = int(np.argmax(step <= 0))
             raise ValueError(
-                f"wavelengths must ascend: {self.wavelength_nm[at + 1]:g} nm follows {self.wavelength_nm[at]:g} nm; sort the bands"
+                f"wavelengths must ascend: {self.wavelength_nm[at + 1]:g} nm follows {self.wavelength_nm[at]:g} nm; "
+                "sort the bands"
             )
         if self.radiance.ndim != 3 or not self.radiance.size or self.radiance.shape[2] != len(self.wavelength_nm):
             raise ValueError(
-                f"radiance of shape {self.radiance.shape} has to be (rows, cols, {len(self.wavelength_nm)} bands): move the bands to the last axis"
+                f"radiance of shape {self.radiance.shape} has to be (rows, cols, {len(self.wavelength_nm)} bands): "
+                "move the bands to the last axis"
             )
         if self.radiance.dtype not in (np.float32, np.float64):
             raise ValueError(
-                f"radiance is {self.radiance.dtype}, and has to be float32 or float64: scale codes to W sr^-1 m^-2 nm^-1"
+                f"radiance is {self.radiance.dtype}, and has to be float32 or float64: scale codes to W sr^-1 m^-2 "
+                "nm^-1"
             )
         # One pass for all three faults: a NaN makes the minimum a NaN.
         if not (np.min(self.radiance) >= 0 and np.max(self.radiance) < np.inf):
             i, j, k = (int(n) for n in np.argwhere(~((self.radiance >= 0) & (self.radiance < np.inf)))[0])
             raise ValueError(
-                f"radiance is {self.radiance[i, j, k]:g} W sr^-1 m^-2 nm^-1 at row {i}, column {j}, {self.wavelength_nm[k]:g} nm, below the limit of 0 or not finite: correct the cube, or set what noise left below 0 to 0"
+                f"radiance is {self.radiance[i, j, k]:g} W sr^-1 m^-2 nm^-1 at row {i}, column {j}, "
+                f"{self.wavelength_nm[k]:g} nm, below the limit of 0 or not finite: correct the cube, or set what "
+                "noise left below 0 to 0"
             )
 
     @classmethod
@@ -394,7 +412,8 @@ class SpectralImage:
         photons = np.asarray(photons)
         if photons.ndim != 3 or photons.shape[2] != len(wavelength_nm):
             raise ValueError(
-                f"photons of shape {photons.shape} have to be (rows, cols, {len(wavelength_nm)} bands): move the bands to the last axis"
+                f"photons of shape {photons.shape} have to be (rows, cols, {len(wavelength_nm)} bands): move the bands "
+                "to the last axis"
             )
         return cls(wavelength_nm, np.asarray(energy_from_photons(wavelength_nm, photons), float), to_camera)
 

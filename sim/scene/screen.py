@@ -69,7 +69,8 @@ class Screen(Frozen):
             lowest = min(curve.value)
             if lowest < 0:
                 raise ValueError(
-                    f"the screen's {what} has a radiance of {lowest:g} W sr^-1 m^-2 nm^-1, below the limit of 0: subtract the radiometer's dark reading"
+                    f"the screen's {what} has a radiance of {lowest:g} W sr^-1 m^-2 nm^-1, below the limit of 0: "
+                    "subtract the radiometer's dark reading"
                 )
         return self
 

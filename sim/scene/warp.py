@@ -82,7 +82,8 @@ class Warp:
     def mapper(
         self, rows: tuple[float, float], col: FloatArray
     ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-        """A function from ascending camera `row` (px, within `rows`) to pattern (u, v) on their grid with ascending `col`.
+        """A function from ascending camera `row` (px, within `rows`) to pattern (u, v) on their grid with ascending
+        `col`.
 
         The lens's distortion is smooth: it is inverted on nodes some 8 px apart and interpolated by cubic splines
         (1e-5 px).
@@ -99,7 +100,9 @@ class Warp:
 
 @dataclass(frozen=True)
 class _RowSpline:
-    """A cubic spline of two variables at given columns, as a spline down the rows: value = B(row) C, B the B-splines of `knots`."""
+    """A cubic spline of two variables at given columns, as a spline down the rows: value = B(row) C, B the B-splines of
+    `knots`.
+    """
 
     knots: FloatArray
     coefficients: FloatArray
@@ -141,7 +144,8 @@ def _brown(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple
 def _check_distortion(geometry: Geometry) -> None:
     if len(geometry.distortion) > 5 and any(geometry.distortion[5:]):
         raise ValueError(
-            f"distortion has {len(geometry.distortion)} coefficients, and the model takes k1 k2 p1 p2 k3: fit with those five"
+            f"distortion has {len(geometry.distortion)} coefficients, and the model takes k1 k2 p1 p2 k3: fit with "
+            "those five"
         )
 
 

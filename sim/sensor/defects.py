@@ -60,8 +60,10 @@ def size_nodes(spread: float, count: int = 24) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Defects:
-    """A share of the pixels, chosen by a seed, with sizes that are gamma distributed about their mean: a `relative_std` of 1 is an
-    exponential distribution, 0 are sizes that are all alike. The unit of `mean_size` is that of what the pixels do."""
+    """A share of the pixels, chosen by a seed, with sizes that are gamma distributed about their mean: a `relative_std`
+    of 1 is an exponential distribution, 0 are sizes that are all alike. The unit of `mean_size` is that of what the
+    pixels do.
+    """
 
     share: float
     mean_size: float
@@ -84,6 +86,8 @@ class Defects:
 
 @dataclass(frozen=True)
 class Jumps(Defects):
-    """Pixels that jump between two levels, a size apart: the higher one in `high_share` of the frames. Their mean is nil."""
+    """Pixels that jump between two levels, a size apart: the higher one in `high_share` of the frames. Their mean is
+    nil.
+    """
 
     high_share: float = 0.5

@@ -1,11 +1,11 @@
 """From electrons to codes: fixed patterns, shot noise, full well, read-out, conversion, quantisation.
 
-The order, for one exposure: mean electrons (light + dark current) -> x (1 + PRNU) on the light -> shot noise (Poisson) -> full
-well -> the read-out's response -> + DSNU, the columns' offsets, read noise and the rows' noise -> x conversion gain, + black
-level -> round, clip to [0, white_level_dn].
+The order, for one exposure: mean electrons (light + dark current) -> x (1 + PRNU) on the light -> shot noise
+(Poisson) -> full well -> the read-out's response -> + DSNU, the columns' offsets, read noise and the rows'
+noise -> x conversion gain, + black level -> round, clip to [0, white_level_dn].
 
-Shot noise is exact at every mean. The other noises are normal, in single precision: the least step of a variable of standard
-deviation 1 is 1e-7, its tail ends at 6e-8 a side.
+Shot noise is exact at every mean. The other noises are normal, in single precision: the least step of a variable of
+standard deviation 1 is 1e-7, its tail ends at 6e-8 a side.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ class ReadOut:
 
     response      mean or noisy electrons -> electrons, point by point
     shot_e2       mean electrons -> variance of their shot noise
-    added         (shape of the frame, generator) -> electrons that one frame's read-out adds, which broadcast to that shape, of mean `added_e`
+    added         (shape of the frame, generator) -> electrons that one frame's read-out adds, which broadcast to that
+    shape, of mean `added_e`
                   and variance `added_e2`
     codes         DN before rounding -> DN
     neighbours    mean electrons -> correlation of the shot noise with each of four neighbours
@@ -91,8 +92,9 @@ class FixedPattern:
 
 
 def dark_current_e_per_s(camera: CameraModel, temperature_c: float | None = None) -> float:
-    """Mean dark current at a sensor temperature: D 2^((T - T_reference) / T_doubling). Where the temperature or the doubling
-    isn't known, the stated current."""
+    """Mean dark current at a sensor temperature: D 2^((T - T_reference) / T_doubling). Where the temperature or the
+    doubling isn't known, the stated current.
+    """
     if temperature_c is None or camera.dark_current_doubling_c is None:
         return camera.dark_current_e_per_s
     doublings = (temperature_c - camera.dark_current_reference_c) / camera.dark_current_doubling_c
@@ -147,14 +149,14 @@ def clipped_moments(
 def coded_moments(
     mean: FloatArray, variance: FloatArray, highest: float, skewness: FloatArray | float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance of a variable (normal, but for a small `skewness`) after rounding to whole numbers and clipping to [0,
-    highest], which may be infinite.
+    """Mean and variance of a variable (normal, but for a small `skewness`) after rounding to whole numbers and clipping
+    to [0, highest], which may be infinite.
 
-    With a standard deviation of 0.9 and more (1 near a limit): mean and variance of the clipped variable, and what rounding adds. With f the
-    density and P the share between the limits a = 0 and b that is f(b) / 24 - f(a) / 24 to the mean and P / 12 + (M - a) f(a) / 12 +
-    (b - M) f(b) / 12 to the variance (sums of the distribution function at half codes as integrals, by Euler and Maclaurin): 1/12
-    far from the limits. Narrower: far from the limits by `_rounded`, near them the sum over the codes within 8.
-    Good to 1e-3 DN at a limit and 1e-6 DN far from any.
+    With a standard deviation of 0.9 and more (1 near a limit): mean and variance of the clipped variable, and what
+    rounding adds. With f the density and P the share between the limits a = 0 and b that is f(b) / 24 - f(a) / 24 to
+    the mean and P / 12 + (M - a) f(a) / 12 + (b - M) f(b) / 12 to the variance (sums of the distribution function at
+    half codes as integrals, by Euler and Maclaurin): 1/12 far from the limits. Narrower: far from the limits by
+    `_round_moments`, near them the sum over the codes within 8. Good to 1e-3 DN at a limit and 1e-6 DN far from any.
     """
     mean, variance = np.broadcast_arrays(np.asarray(mean, float), np.asarray(variance, float))
     out_mean, out_variance = clipped_moments(mean, variance, 0.0, highest, skewness)
@@ -198,9 +200,10 @@ def coded_moments(
 def _round_moments(mean: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of a normal variable of variance 0.1 and more after rounding to whole numbers.
 
-    With r(y) = (1 / pi) sum_k (-1)^k sin(2 pi k y) / k what rounding adds and d_k = exp(-2 pi^2 k^2 variance): E r = (1 / pi)
-    sum (-1)^k d_k sin(2 pi k mean) / k; variance + 2 variance E r' + E r^2 - (E r)^2 with E r' = 2 sum (-1)^k d_k cos(2 pi k mean)
-    and E r^2 = 1 / 12 + (1 / pi^2) sum (-1)^k d_k cos(2 pi k mean) / k^2. Three terms: d_4 is 2e-14.
+    With r(y) = (1 / pi) sum_k (-1)^k sin(2 pi k y) / k what rounding adds and d_k = exp(-2 pi^2 k^2 variance): E
+    r = (1 / pi) sum (-1)^k d_k sin(2 pi k mean) / k; variance + 2 variance E r' + E r^2 - (E r)^2 with E r' = 2 sum
+    (-1)^k d_k cos(2 pi k mean) and E r^2 = 1 / 12 + (1 / pi^2) sum (-1)^k d_k cos(2 pi k mean) / k^2. Three terms: d_4
+    is 2e-14.
     """
     shift, slope, square = np.zeros_like(mean), np.zeros_like(mean), np.full_like(mean, 1.0 / 12.0)
     for k in (1, 2, 3):
@@ -223,10 +226,11 @@ def dn_moments(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (DN, that of the rounded codes) and temporal variance (DN^2) of pixels with mean `electrons`.
 
-    Shot noise is Poisson; clipping (at full well, or by the converter where that comes first) and rounding are averaged over
-    the noise (`clipped_moments`, `coded_moments`): to first order in its skewness, and not over single electrons that are wider
-    than the read noise and a code. The variance goes through the response by its slope. `fixed_pattern`: the moments of those
-    pixels, in place of pixels that are all alike; then `dark_electrons` of `electrons` are dark current.
+    Shot noise is Poisson; clipping (at full well, or by the converter where that comes first) and rounding are averaged
+    over the noise (`clipped_moments`, `coded_moments`): to first order in its skewness, and not over single electrons
+    that are wider than the read noise and a code. The variance goes through the response by its slope. `fixed_pattern`:
+    the moments of those pixels, in place of pixels that are all alike; then `dark_electrons` of `electrons` are dark
+    current.
     """
     check_electrons(electrons)
     if fixed_pattern is not None:
@@ -276,14 +280,16 @@ def sample_from(
     gain_db: float = 0.0,
     read_out: ReadOut = LINEAR,
 ) -> NDArray[np.uint16]:
-    """One frame: codes (rows, cols) drawn around `expected_electrons` (the mean, of which `dark_electrons` are dark current).
+    """One frame: codes (rows, cols) drawn around `expected_electrons` (the mean, of which `dark_electrons` are dark
+    current).
 
-    `fixed_pattern` None stands for pixels that are all alike. Raises ValueError for electrons below 0 or not finite, and for
-    a white level beyond 16 bit.
+    `fixed_pattern` None stands for pixels that are all alike. Raises ValueError for electrons below 0 or not finite,
+    and for a white level beyond 16 bit.
     """
     if camera.white_level_dn > 65535:
         raise ValueError(
-            f"the white level {camera.white_level_dn:g} DN is above the limit of 65535 DN of a 16-bit frame: give the converter's highest code"
+            f"the white level {camera.white_level_dn:g} DN is above the limit of 65535 DN of a 16-bit frame: give the "
+            "converter's highest code"
         )
     electrons = np.asarray(expected_electrons, float)
     check_electrons(electrons)
@@ -322,7 +328,9 @@ def sample_from(
 def _added_electrons(
     shape: tuple[int, ...], camera: CameraModel, rng: np.random.Generator, read_out: ReadOut
 ) -> Float32Array | None:
-    """Electrons that one frame's read-out adds besides every pixel's own read noise: row noise, and noise of effects."""
+    """Electrons that one frame's read-out adds besides every pixel's own read noise: row noise, and noise of
+    effects.
+    """
     total: FloatArray | None = None
     if camera.row_noise_e > 0:
         total = rng.standard_normal((*shape[:-1], 1)) * camera.row_noise_e
@@ -392,5 +400,6 @@ def check_electrons(electrons: FloatArray) -> None:
     if not (lowest >= 0 and np.isfinite(highest)):  # a NaN fails either comparison
         bad = lowest if not lowest >= 0 else highest
         raise ValueError(
-            f"mean electrons of a pixel are {bad:g} e, below the limit of 0 e or not finite: check the radiance and the effects' parameters"
+            f"mean electrons of a pixel are {bad:g} e, below the limit of 0 e or not finite: check the radiance and "
+            "the effects' parameters"
         )

@@ -17,8 +17,10 @@ _STREAM = {"columns": 3, "rows": 4}
 
 @dataclass(frozen=True)
 class LineNoise:
-    """Electrons that all pixels of a row (or column) share: a normal variable in every frame, of which lines n apart have
-    `correlation`^n in common; fixed offsets drawn once by `seed`, of mean 0 over the lines; a step from even to odd lines."""
+    """Electrons that all pixels of a row (or column) share: a normal variable in every frame, of which lines n apart
+    have `correlation`^n in common; fixed offsets drawn once by `seed`, of mean 0 over the lines; a step from even to
+    odd lines.
+    """
 
     lines: Lines
     temporal_e: float = 0.0
@@ -52,8 +54,9 @@ class LineNoise:
         return self.temporal_e**2
 
     def spectrum_e2(self, frequency_cy_per_px: FloatArray, fixed: bool) -> FloatArray:
-        """Power spectrum across the lines of what they share anew in every frame or, `fixed`, in all, without the step from even to odd
-        lines; e^2, its mean over -0.5..0.5 cy/px is the variance."""
+        """Power spectrum across the lines of what they share anew in every frame or, `fixed`, in all, without the step
+        from even to odd lines; e^2, its mean over -0.5..0.5 cy/px is the variance.
+        """
         even = np.ones(np.shape(frequency_cy_per_px))
         if fixed:
             return self.fixed_e**2 * even
@@ -63,7 +66,9 @@ class LineNoise:
 
 
 def _correlate(white: FloatArray, correlation: float) -> FloatArray:
-    """White noise of variance 1 along its longer axis as a stationary autoregressive process of first order, of variance 1."""
+    """White noise of variance 1 along its longer axis as a stationary autoregressive process of first order, of
+    variance 1.
+    """
     if correlation == 0.0:
         return white
     from scipy.signal import lfilter  # here: the library takes a while to load

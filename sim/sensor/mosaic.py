@@ -53,7 +53,8 @@ def assemble(channels: Mapping[str, NDArray[Scalar]], cfa: Cfa) -> NDArray[Scala
     missing = [channel for channel in places if channel not in channels]
     if missing:
         raise ValueError(
-            f"a {cfa} mosaic has the channels {', '.join(places)}, and no image came for {', '.join(missing)}: give one each"
+            f"a {cfa} mosaic has the channels {', '.join(places)}, and no image came for {', '.join(missing)}: give "
+            "one each"
         )
     shapes = {np.shape(channels[channel]) for channel in places}
     if len(shapes) != 1:

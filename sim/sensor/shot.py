@@ -20,7 +20,8 @@ Float32Array = NDArray[np.float32]
 #: From this mean on the normal variable with its correction, below it tables.
 FROM_NORMAL = 10.0
 
-#: Entries of the distribution function's table at each whole mean (beyond 63 electrons lie 1e-30 of a mean of 9), and of its guide.
+#: Entries of the distribution function's table at each whole mean (beyond 63 electrons lie 1e-30 of a mean of 9), and
+#: of its guide.
 _COUNTS, _GUIDE = 64, 256
 
 
@@ -40,8 +41,9 @@ def draw_poisson(mean: Float32Array, rng: np.random.Generator) -> Float32Array:
 
 @cache
 def _tables() -> tuple[FloatArray, NDArray[np.int64]]:
-    """Distribution functions of Poisson variables of means 0..9, (10, counts), and for each 1/256 of a probability the first
-    count whose distribution function lies above it, (10, 256)."""
+    """Distribution functions of Poisson variables of means 0..9, (10, counts), and for each 1/256 of a probability the
+    first count whose distribution function lies above it, (10, 256).
+    """
     share = special.pdtr(np.arange(_COUNTS), np.arange(float(FROM_NORMAL))[:, None])
     share[:, -1] = 1.0
     guide = np.stack([np.searchsorted(row, np.arange(_GUIDE) / _GUIDE, side="right") for row in share])
@@ -106,7 +108,9 @@ def _correct_candidate(mu: float, s: float, k: int, u: float, rng: np.random.Gen
 
 @njit(cache=True)
 def _densities(mu: float, s: float, k: int) -> tuple[float, float, float, float]:
-    """Poisson probability of k as p exp(log_p), and that of the whole part of the normal variable as n exp(log_n) (procedure F)."""
+    """Poisson probability of k as p exp(log_p), and that of the whole part of the normal variable as n exp(log_n)
+    (procedure F).
+    """
     b1 = 1.0 / (24.0 * mu)
     b2 = 0.3 * b1 * b1
     c3 = b1 * b2 / 7.0

@@ -50,9 +50,11 @@ def lamp() -> Spectrum:
 
 
 class SyntheticLens:
-    """A lens whose point spread function is known in closed form: two Gaussians, the second one displaced along the radius (coma)
-    in proportion to the height h (0..1 at the corner), both displaced with the wavelength (lateral colour); wider along the
-    radius than across it (astigmatism). RI = 1 - 0.35 h^2, image radius = ideal radius x (1 + k h^2)."""
+    """A lens whose point spread function is known in closed form: two Gaussians, the second one displaced along the
+    radius (coma) in proportion to the height h (0..1 at the corner), both displaced with the wavelength
+    (lateral colour); wider along the radius than across it (astigmatism). RI = 1 - 0.35 h^2, image radius = ideal
+    radius x (1 + k h^2).
+    """
 
     f_mm, pitch_um, samples = 8.0, 0.5, 64
     wavelength_nm = np.arange(400.0, 721.0, 10.0)
@@ -83,7 +85,9 @@ class SyntheticLens:
         return (1.0 + self.k * h * h + extra) * (1.0 + 3.0 * self.k * h * h + extra)
 
     def table(self) -> LensTable:
-        """The lens as a table of 21 heights, or of 15 x 17 fields as a lens without symmetry has it; made once a session."""
+        """The lens as a table of 21 heights, or of 15 x 17 fields as a lens without symmetry has it; made once a
+        session.
+        """
         return _table(self.corner_um, self.k, self.colour, self.grid)
 
     def made(self) -> LensTable:

@@ -1,4 +1,6 @@
-"""Only `sim` applies an effect's physics: other code asks the three entries `sim.uniform`, `sim.point` and `sim.frame`."""
+"""Only `sim` applies an effect's physics: other code asks the three entries `sim.uniform`, `sim.point` and
+`sim.frame`.
+"""
 
 from __future__ import annotations
 
@@ -46,8 +48,9 @@ def test_no_code_outside_sim_applies_an_effect(path: Path) -> None:
 
 
 def test_an_effect_has_at_most_eight_methods_to_write() -> None:
-    """The stage methods, the two that a score asks, and what hardware bounds; none of the library's effects overrides anything else of the
-    base."""
+    """The stage methods, the two that a score asks, and what hardware bounds; none of the library's effects overrides
+    anything else of the base.
+    """
     writable = {*STAGES.values(), "prototypes", "log_prior", "limits"}
     assert len(writable) <= 8
     own = {name for name in vars(Effect) if not name.startswith("_") and callable(getattr(Effect, name))}

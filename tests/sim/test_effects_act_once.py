@@ -52,9 +52,10 @@ SPREADING = [
 def test_a_blur_acts_once_in_a_frame_as_in_an_edges_profile(
     mono_camera: CameraModel, lamp: Spectrum, one: Effect
 ) -> None:
-    """What an effect changes in a MONO frame across an edge is what it changes in the edge's profile, whether the frame is drawn
-    or taken from the profile, and whether the effect blurs the image, moves the charge or filters the codes. The drawing's own
-    error, and its other end, change by 2 % of what the effect does."""
+    """What an effect changes in a MONO frame across an edge is what it changes in the edge's profile, whether the frame
+    is drawn or taken from the profile, and whether the effect blurs the image, moves the charge or filters the codes.
+    The drawing's own error, and its other end, change by 2 % of what the effect does.
+    """
     camera = mono_camera.model_copy(
         update={"dark_current_e_per_s": 0.0, "lens": Lens(f_number=4.0, focal_length_mm=5000.0)}
     )
@@ -74,7 +75,9 @@ def test_a_blur_acts_once_in_a_frame_as_in_an_edges_profile(
 
 
 def test_crosstalk_acts_once_in_a_mosaic(colour_camera: CameraModel, lamp: Spectrum) -> None:
-    """A frame with crosstalk is the frame without it, its charge moved between neighbours once: nothing else happens."""
+    """A frame with crosstalk is the frame without it, its charge moved between neighbours once: nothing else
+    happens.
+    """
     kind = library.effects()["crosstalk"](share_percent=4.0)
     for scene in scenes(lamp)[1:]:
         without = sim_frame.expected_electrons(colour_camera, Exposure(scene, 0.02))

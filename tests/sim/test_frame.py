@@ -52,7 +52,9 @@ def test_an_edge_by_its_profile_is_the_edge_drawn_and_blurred(mono_camera: Camer
 
 
 def test_blur_conserves_light(mono_camera: CameraModel, lamp: Spectrum) -> None:
-    """A small lit square far from the borders: all electrons together are its area's, and where its centre was is theirs."""
+    """A small lit square far from the borders: all electrons together are its area's, and where its centre was is
+    theirs.
+    """
     camera = mono_camera.model_copy(
         update={"dark_current_e_per_s": 0.0, "lens": Lens(f_number=4.0, focal_length_mm=5000.0)}
     )
@@ -60,8 +62,8 @@ def test_blur_conserves_light(mono_camera: CameraModel, lamp: Spectrum) -> None:
     scene = ScreenPattern(np.ones((1, 1), np.uint8), square, lamp.scale(0.0), lamp)
     frame = sim_frame.expected_electrons(camera, Exposure(scene, 1.0), (Birefringent(d_um=2.0),), oversample=3)
     light = frame.sum() / electron_rate(camera, "Y", lamp)
-    # Diffraction's tails outside the frame (some 35 px away) hold about 2 N lambda / (pi^2 35 p) = 0.4 %; clipping of ringing
-    # at 0 adds less.
+    # Diffraction's tails outside the frame (some 35 px away) hold about 2 N lambda / (pi^2 35 p) = 0.4 %; clipping of
+    # ringing at 0 adds less.
     assert light == pytest.approx(6.5**2, rel=8e-3)
     row = frame.sum(1) @ np.arange(72) / frame.sum()
     assert row == pytest.approx(33.45, abs=0.05)
@@ -116,8 +118,8 @@ def test_samples_scatter_as_expected_and_variance_say(colour_camera: CameraModel
     frames = np.stack([_draw(colour_camera, exposure, electrons, rng) for _ in range(12)])
     n = frames.size
     z = (frames - mean) / np.sqrt(variance)
-    # chi^2 of n values has the standard deviation sqrt(2 n), skewness of shot noise adds little: 4.5 of them, and 0.2 % for
-    # rounding, which is uniform only where noise is wider than a code (here 1.2 DN).
+    # chi^2 of n values has the standard deviation sqrt(2 n), skewness of shot noise adds little: 4.5 of them, and 0.2 %
+    # for rounding, which is uniform only where noise is wider than a code (here 1.2 DN).
     assert np.mean(z**2) == pytest.approx(1.0, abs=4.5 * np.sqrt(2.2 / n) + 0.002)
     assert np.mean(z) == pytest.approx(0.0, abs=4.5 / np.sqrt(n))
 
@@ -219,7 +221,9 @@ def test_a_knife_edge_gives_each_pixel_to_the_nearest_region(colour_camera: Came
 
 
 def test_a_charuco_boards_corners_are_found_where_they_were_put() -> None:
-    """OpenCV's detector, an independent judge, on a board at a tilted pose through a distorting lens: within 0.1 px rms, without a bias."""
+    """OpenCV's detector, an independent judge, on a board at a tilted pose through a distorting lens: within 0.1 px
+    rms, without a bias.
+    """
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     # Six cells to a marker and one on each side: eight texels to the square.
     board = cv2.aruco.CharucoBoard((6, 4), 8.0, 6.0, dictionary)
@@ -233,7 +237,8 @@ def test_a_charuco_boards_corners_are_found_where_they_were_put() -> None:
     camera = CameraModel(
         rows=280, cols=380, pixel_pitch_um=3.0, fill_factor=0.9, cfa="MONO", bit_depth=8, black_level_dn=8.0,
         white_level_dn=255.0, conversion_gain_dn_per_e=0.1, full_well_e=1e5, read_noise_e=1.0, dark_current_e_per_s=0.0,
-        dsnu_e=0.0, prnu_percent=0.0, quantum_efficiency={"Y": qe}, lens=Lens(f_number=4.0, focal_length_mm=20.0), geometry=geometry,
+        dsnu_e=0.0, prnu_percent=0.0, quantum_efficiency={"Y": qe}, lens=Lens(f_number=4.0, focal_length_mm=20.0),
+        geometry=geometry,
     )  # fmt: skip
     light = Spectrum.of([400.0, 700.0], [1.0, 1.0])
     light = light.scale(1800.0 / electron_rate(camera, "Y", light))
@@ -282,7 +287,9 @@ def test_a_lens_is_diffraction_limited_unless_it_says_otherwise(
 
 
 def test_magnification_dims_a_whole_frame_as_in_iset(colour_camera: CameraModel, lamp: Spectrum) -> None:
-    """E = pi T L / (1 + 4 N^2 (1 + |m|)^2), for every kind of scene; the light that doesn't come through the lens stays."""
+    """E = pi T L / (1 + 4 N^2 (1 + |m|)^2), for every kind of scene; the light that doesn't come through the lens
+    stays.
+    """
     camera = colour_camera.model_copy(update={"dark_current_e_per_s": 0.0})
     ratio = irradiance_factor(4.0, 0.5) / irradiance_factor(4.0)
     for scene in scenes(lamp)[1:]:

@@ -1,4 +1,6 @@
-"""Displaced light: the lens's geometry acts on the scene before the blur; wavelengths that are displaced differently blur."""
+"""Displaced light: the lens's geometry acts on the scene before the blur; wavelengths that are displaced differently
+blur.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,8 @@ def _screen(scale: float) -> Scene:
     """11 x 15 cells of 4 px about the frame's middle, scaled about it."""
     pattern = np.random.default_rng(3).integers(0, 2, (11, 15)).astype(np.uint8)
     half_y, half_x = 22.0 * scale, 30.0 * scale
-    warp = Warp.from_corners(11, 15, [(24 - half_y, 32 - half_x), (24 - half_y, 32 + half_x), (24 + half_y, 32 + half_x), (24 + half_y, 32 - half_x)])  # fmt: skip
+    warp = Warp.from_corners(11, 15, [(24 - half_y, 32 - half_x), (24 - half_y, 32 + half_x),
+                                      (24 + half_y, 32 + half_x), (24 + half_y, 32 - half_x)])  # fmt: skip
     return ScreenPattern(pattern, warp, LIGHT.scale(0.01), LIGHT)
 
 
@@ -53,8 +56,9 @@ def _edge(scale: float) -> Scene:
 
 @pytest.mark.parametrize(("scene", "rms"), [(_screen, 3e-3), (_edge, 1e-6)])
 def test_magnifying_the_scene_leaves_the_blur_as_it_is(mono: CameraModel, scene, rms: float) -> None:  # type: ignore[no-untyped-def]
-    """A scene magnified by the lens is the larger scene: exactly for an edge's profile, and for a screen as nearly as one is drawn
-    with 3 samples a pixel. Were the blurred image magnified, the blur would be 5 % wider: 5e-3."""
+    """A scene magnified by the lens is the larger scene: exactly for an edge's profile, and for a screen as nearly as
+    one is drawn with 3 samples a pixel. Were the blurred image magnified, the blur would be 5 % wider: 5e-3.
+    """
     by_lens = expected_electrons(mono, Exposure(scene(1.0), 1.0), (Magnified(percent=5.0),))
     larger = expected_electrons(mono, Exposure(scene(1.05), 1.0))
     inside = slice(4, -4), slice(4, -4)
@@ -63,7 +67,9 @@ def test_magnifying_the_scene_leaves_the_blur_as_it_is(mono: CameraModel, scene,
 
 
 def test_two_lines_that_land_apart_are_a_double_image(mono: CameraModel) -> None:
-    """Two narrow lines of equal electrons, 2 a apart at a place: |H / H without| = |cos(2 pi a f)| where the lens passes both alike."""
+    """Two narrow lines of equal electrons, 2 a apart at a place: |H / H without| = |cos(2 pi a f)| where the lens
+    passes both alike.
+    """
     wavelength_nm = np.array([540.0, 560.0])
     one = LateralChromaticAberration(slope_um=20.0)
     place = (0.5 * mono.half_diagonal_um, 0.0)
@@ -76,8 +82,9 @@ def test_two_lines_that_land_apart_are_a_double_image(mono: CameraModel) -> None
 
 
 def test_lateral_colour_blurs_a_channel_along_the_radius_alone(colour_camera: CameraModel, lamp: Spectrum) -> None:
-    """At a place on the x axis contrast is lost along x, by 2 (pi f)^2 times the variance of the shift over the channel's light; none is
-    along y, and none in the middle."""
+    """At a place on the x axis contrast is lost along x, by 2 (pi f)^2 times the variance of the shift over the
+    channel's light; none is along y, and none in the middle.
+    """
     one = LateralChromaticAberration(slope_um=2.0)
     f = np.array([0.05])
     place = (colour_camera.half_diagonal_um, 0.0)

@@ -64,13 +64,15 @@ def test_edge_profile_is_the_integral_of_its_definition(
         )
         for x in d
     ]
-    # The table's period of 1024 px leaves tails of 1e-6; its cubic spline 2e-6; the integral from 0 to 1e-6 cy/px 2e-6 d.
+    # The table's period of 1024 px leaves tails of 1e-6; its cubic spline 2e-6; the integral from 0 to 1e-6 cy/px 2e-6
+    # d.
     np.testing.assert_allclose(edge_profile(colour_camera, "G", lamp, angle_deg, d, effects), wanted, atol=3e-5)
 
 
 def test_edge_profile_of_an_aperture_alone_is_a_ramp(colour_camera: CameraModel) -> None:
-    """At f/0.5 and 100 um the lens blurs by 0.003 px: what is left is the square. 64 cy/px end the integral: 1 / (2 pi^2 64)
-    = 0.0008 at the ramp's ends, and the lens rounds them by 0.0011."""
+    """At f/0.5 and 100 um the lens blurs by 0.003 px: what is left is the square. 64 cy/px end the integral:
+    1 / (2 pi^2 64) = 0.0008 at the ramp's ends, and the lens rounds them by 0.0011.
+    """
     camera = colour_camera.model_copy(
         update={"pixel_pitch_um": 100.0, "fill_factor": 1.0, "lens": Lens(f_number=0.5, focal_length_mm=8.0)}
     )
@@ -115,7 +117,8 @@ def test_a_coarse_kernel_convolves_pixel_aligned_cells(mono_camera: CameraModel,
     frame = sim_frame.expected_electrons(camera, Exposure(scene, 1.0), (Shift(x_um=1.5, y_um=0.0),), oversample=8)
     frame /= electron_rate(camera, "Y", lamp) * relative_illumination(camera, 35.0, 47.0)
     wanted = kernel(camera, "Y", lamp, 33, 1, (Shift(x_um=1.5, y_um=0.0),))
-    # The kernel's share outside its support (1 %) is put back by the sum; drawing on 8 x 8 samples leaves 2e-3 of white.
+    # The kernel's share outside its support (1 %) is put back by the sum; drawing on 8 x 8 samples leaves 2e-3 of
+    # white.
     np.testing.assert_allclose(
         frame[35 - 5 : 35 + 6, 47 - 5 : 47 + 6], wanted[11:22, 11:22] * frame[19:52, 31:64].sum(), atol=3e-3
     )
@@ -123,7 +126,9 @@ def test_a_coarse_kernel_convolves_pixel_aligned_cells(mono_camera: CameraModel,
 
 
 def test_wavelength_weights_are_shares_of_the_detected_light(colour_camera: CameraModel, lamp: Spectrum) -> None:
-    """Means of what is linear in the wavelength are those of the detected light, and an effect on its colour is in them."""
+    """Means of what is linear in the wavelength are those of the detected light, and an effect on its colour is in
+    them.
+    """
     grid = np.linspace(380.0, 780.0, 90)
     sights = [(channel, light) for channel in "RGB" for light in (lamp, None)]
     shares = wavelength_shares(colour_camera, sights, grid)
@@ -137,7 +142,9 @@ def test_wavelength_weights_are_shares_of_the_detected_light(colour_camera: Came
 
 @pytest.mark.parametrize("cfa", ["RGGB", "GBRG"])
 def test_charge_brings_the_transfer_of_neighbours_of_other_colours(colour_camera: CameraModel, cfa: Cfa) -> None:
-    """Against plane waves on the mosaic's pixels, each channel with its own signal and transfer, whose charge is moved in the frame."""
+    """Against plane waves on the mosaic's pixels, each channel with its own signal and transfer, whose charge is moved
+    in the frame.
+    """
     camera = colour_camera.model_copy(update={"cfa": cfa})
     effects = (Crosstalk(share_percent=3.0, row_excess=0.4, corner_share=0.3), InterPixelCapacitance(share_percent=1.0))
     signals = np.array([0.7, 2.0, 0.4])
@@ -161,8 +168,9 @@ def test_charge_brings_the_transfer_of_neighbours_of_other_colours(colour_camera
 
 
 def test_charge_between_colours_takes_more_contrast_of_the_fainter(colour_camera: CameraModel, lamp: Spectrum) -> None:
-    """Where all channels have one transfer, what neighbours bring grows with their signal over a pixel's own; of one colour's
-    pixels alone, the factor is the kernel's."""
+    """Where all channels have one transfer, what neighbours bring grows with their signal over a pixel's own; of one
+    colour's pixels alone, the factor is the kernel's.
+    """
     effects, f = (Crosstalk(share_percent=2.0),), np.array([0.0, 0.2])
     of_camera = {c: optical_transfer(colour_camera, c, lamp, f, 0 * f, effects) for c in "RGB"}
     plain = {c: optical_transfer(colour_camera, c, lamp, f, 0 * f) for c in "RGB"}

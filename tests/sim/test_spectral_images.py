@@ -28,7 +28,9 @@ def _cube(lamp: Spectrum, rows: int, cols: int) -> tuple[tuple[float, ...], np.n
 
 
 def test_a_cube_of_pixels_is_summed_band_by_band_with_the_kernel(mono_camera: CameraModel, lamp: Spectrum) -> None:
-    """The exact answer: every band's picture convolved with the band's own kernel. Five wavelengths stand for all bands."""
+    """The exact answer: every band's picture convolved with the band's own kernel. Five wavelengths stand for all
+    bands.
+    """
     from scipy.signal import fftconvolve
 
     camera = mono_camera.model_copy(update={"rows": 24, "cols": 32, "dark_current_e_per_s": 0.0})
@@ -38,8 +40,8 @@ def test_a_cube_of_pixels_is_summed_band_by_band_with_the_kernel(mono_camera: Ca
     exact = np.zeros((24, 32))
     for k, band in enumerate(image.bands()):
         spread = kernel(camera, "Y", band, 101, 1)
-        # An Airy pattern has 2 lambda N / (pi^2 r) of its light beyond r, about 1.13 of a square's half side: the kernel's sum
-        # was made 1 all the same.
+        # An Airy pattern has 2 lambda N / (pi^2 r) of its light beyond r, about 1.13 of a square's half side: the
+        # kernel's sum was made 1 all the same.
         beyond = 2e-3 * image.wavelength_nm[k] * 4.0 / (np.pi**2 * 1.13 * 50.5 * 3.0)
         exact += electron_rate(camera, "Y", band) * (1 - beyond) * fftconvolve(image.radiance[..., k], spread, "same")
     exact *= relative_illumination(camera, np.arange(24)[:, None], np.arange(32)[None, :])
@@ -63,7 +65,9 @@ def test_a_cube_on_pixels_is_the_limit_of_finer_drawing(colour_camera: CameraMod
 
 
 def test_an_even_cube_is_a_flat_field(colour_camera: CameraModel, lamp: Spectrum) -> None:
-    """A cube larger than the frame with the lamp in every sample, far from its rim, with a filter that moves with the angle."""
+    """A cube larger than the frame with the lamp in every sample, far from its rim, with a filter that moves with the
+    angle.
+    """
     camera = colour_camera.model_copy(update={"lens": Lens(f_number=4.0, focal_length_mm=0.6)})
     wavelength_nm = tuple(np.arange(380.0, 781.0, 5.0).tolist())
     cube = np.broadcast_to(lamp.at(wavelength_nm), (72, 96, len(wavelength_nm))).copy()

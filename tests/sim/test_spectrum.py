@@ -72,7 +72,8 @@ def test_quadrature_is_exact_for_a_narrow_line_on_a_sloping_curve() -> None:
     line = Spectrum.of([549.95, 550.0, 550.05], [0.0, 20.0, 0.0])
     slope = Spectrum.of([400.0, 700.0], [0.0, 3.0])
     nodes, weights = quadrature([line, slope])
-    # Integral of line x slope x wavelength: line of area 1 about 550; slope x wavelength is quadratic, variance 0.05^2 / 6.
+    # Integral of line x slope x wavelength: line of area 1 about 550; slope x wavelength is quadratic, variance
+    # 0.05^2 / 6.
     exact = 1.5 * 550.0 + 0.01 * 0.05**2 / 6
     assert np.sum(weights * line.at(nodes) * slope.at(nodes) * nodes) == pytest.approx(exact, rel=1e-12)
 

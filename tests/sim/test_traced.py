@@ -78,8 +78,10 @@ def _measured(table: LensTable) -> MeasuredPsf:
 def test_a_lens_that_is_the_same_everywhere_is_the_plain_chain(
     colour_camera: CameraModel, lamp: Spectrum, same_everywhere: LensTable, index: int, with_effects: bool
 ) -> None:
-    """Two ways to one frame: scattered as a table, and by Fourier transforms with the table's function as a measured one. They
-    differ by the sampling of both (carrying, edges of the window, wrap of the frame's ends): 4e-3 of the mean."""
+    """Two ways to one frame: scattered as a table, and by Fourier transforms with the table's function as a measured
+    one. They differ by the sampling of both (carrying, edges of the window, wrap of the frame's ends): 4e-3 of the
+    mean.
+    """
     effects = (library.effects()["optical_low_pass_filter"](displacement_x_um=2.0, displacement_y_um=1.0),)
     effects = effects if with_effects else ()
     camera = _traced(colour_camera, same_everywhere)
@@ -114,7 +116,8 @@ def test_distortion_moves_light_unless_the_scene_is_placed_in_the_image(
 ) -> None:
     """A bright spot at 45 px from the axis: barrel distortion of 4 % there draws it in by 1.8 px."""
     lens = synthetic_lens(corner_um=135.0, k=-0.04, colour=0.0)
-    camera = _traced(colour_camera.model_copy(update={"cfa": "MONO", "quantum_efficiency": {"Y": colour_camera.quantum_efficiency["G"]}}),
+    camera = _traced(colour_camera.model_copy(update={"cfa": "MONO",
+                                                      "quantum_efficiency": {"Y": colour_camera.quantum_efficiency["G"]}}),
                      lens.table())  # fmt: skip
     spot = np.zeros((9, 9), np.uint8)
     spot[4, 4] = 1

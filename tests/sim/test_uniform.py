@@ -94,7 +94,8 @@ def test_other_impossible_input_is_named(colour_camera: CameraModel, lamp: Spect
         predict_frame(colour_camera, Exposure(KnifeEdge((), lamp, lamp), 0.01))
 
 
-# --- the entries agree -------------------------------------------------------------------------------------------------
+# --- the entries agree
+# -------------------------------------------------------------------------------------------------
 
 
 def _every_pixel(camera: CameraModel) -> FieldPoints:
@@ -115,7 +116,8 @@ def _means_dn(camera: CameraModel, lamp: Spectrum, exposure: Exposure, acting: t
     return {c: float(dn) + offset_dn for c, dn in model.mean_dn(electrons).items()}
 
 
-#: What the uniform entry leaves out: a reflection's share of even light, which is a factor on its level, and columns' fixed offsets.
+#: What the uniform entry leaves out: a reflection's share of even light, which is a factor on its level, and columns'
+#: fixed offsets.
 NOT_UNIFORM = {"ghost", "column_noise"}
 UNIFORM_EFFECTS = [kind for kind in (*library.effects().values(), ReadOutRamp) if kind.name not in NOT_UNIFORM]
 
@@ -124,8 +126,9 @@ UNIFORM_EFFECTS = [kind for kind in (*library.effects().values(), ReadOutRamp) i
 def test_a_flat_frame_has_the_mean_of_the_uniform_entry(
     colour_camera: CameraModel, lamp: Spectrum, kind: type[Effect]
 ) -> None:
-    """Frame and uniform entry are two ways to one number. They differ by what is rounded and clipped in a frame, and by light that
-    only a frame moves from one end of it to the other: 0.05 % of the level, 0.02 DN."""
+    """Frame and uniform entry are two ways to one number. They differ by what is rounded and clipped in a frame, and by
+    light that only a frame moves from one end of it to the other: 0.05 % of the level, 0.02 DN.
+    """
     camera = colour_camera.model_copy(update={"dark_current_e_per_s": 0.0})
     exposure = Exposure(UniformField(lamp), 0.02, elapsed_s=300.0)
     for one in kind.prototypes(camera)[0]:

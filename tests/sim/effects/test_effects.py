@@ -47,9 +47,12 @@ def _camera() -> CameraModel:
         return Spectrum.of(WAVELENGTH, 0.5 * np.exp(-0.5 * ((WAVELENGTH - peak) / 40.0) ** 2))
 
     return CameraModel(
-        rows=24, cols=32, pixel_pitch_um=3.0, fill_factor=0.8, cfa="RGGB", bit_depth=12, black_level_dn=64.0, white_level_dn=4095.0,
-        conversion_gain_dn_per_e=0.4, full_well_e=10000.0, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=0.0, prnu_percent=0.0,
-        quantum_efficiency={"R": bell(600), "G": bell(535), "B": bell(460)}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
+        rows=24, cols=32, pixel_pitch_um=3.0, fill_factor=0.8, cfa="RGGB", bit_depth=12, black_level_dn=64.0,
+        white_level_dn=4095.0,
+        conversion_gain_dn_per_e=0.4, full_well_e=10000.0, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=0.0,
+        prnu_percent=0.0,
+        quantum_efficiency={"R": bell(600), "G": bell(535), "B": bell(460)},
+        lens=Lens(f_number=4.0, focal_length_mm=8.0),
     )  # fmt: skip
 
 
@@ -87,7 +90,8 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     rest = [one.source(600.0), one.collected_s(0.02), one.ambient_e("G", 1.0) / 1e3, one.offset_dn(600.0, 30.0),
             float(one.shot_e2(np.array(9e3))), even_share(CAMERA, acting), sum(h[0] for h in halos(CAMERA, acting)),
             1e3 * one.unsteadiness**2,
-            *one.shade_light(np.ones(5), place, place), *np.ravel(np.zeros(10) if moved is None else moved)]  # fmt: skip
+            *one.shade_light(np.ones(5), place, place),
+            *np.ravel(np.zeros(10) if moved is None else moved)]  # fmt: skip
     # what acts on dark pixels, on the frame after, and on the read-out, in electrons or DN
     dark = Exposure(Darkness(), 0.5, temperature_c=32.0)
     after = list(expected_sequence(CAMERA, [Exposure(UniformField(LIGHT), 0.004), dark], acting))
@@ -315,7 +319,9 @@ def test_axial_colour_is_each_wavelengths_own_defocus() -> None:
 
 
 def test_field_curvature_is_each_places_own_defocus() -> None:
-    """c r^2 + a x + b y in half diagonals: 0.6 along columns and -0.8 along rows with c = 10, a = 5, b = 2 um make 11.4 um."""
+    """c r^2 + a x + b y in half diagonals: 0.6 along columns and -0.8 along rows with c = 10, a = 5, b = 2 um make 11.4
+    um.
+    """
     half_um = 0.5 * CAMERA.pixel_pitch_um * float(np.hypot(CAMERA.rows, CAMERA.cols))
     one = effect("field_curvature")(curvature_um=10.0, tilt_x_um=5.0, tilt_y_um=2.0)
     f, none = np.linspace(0.0, 0.4, 9), np.zeros(9)
@@ -338,7 +344,9 @@ def test_coma_moves_detail_along_it_and_leaves_it_even_across() -> None:
 
 
 def test_axial_colour_swaps_the_channels_through_focus() -> None:
-    """Red focuses behind: with the sensor moved back red gains and blue loses, and only the sum of the paths says so."""
+    """Red focuses behind: with the sensor moved back red gains and blue loses, and only the sum of the paths says
+    so.
+    """
     f = np.full(1, 0.3)
     colour = effect("axial_chromatic_aberration")(slope_um=-15.0)
     moved = effect("defocus")(defocus_um=8.0)
@@ -351,7 +359,9 @@ def test_axial_colour_swaps_the_channels_through_focus() -> None:
 
 
 def test_aberrations_add_up_in_the_pupil() -> None:
-    """W040 with W020 = -W040 is the best focus of spherical aberration: better than either alone, as the sum of the paths is."""
+    """W040 with W020 = -W040 is the best focus of spherical aberration: better than either alone, as the sum of the
+    paths is.
+    """
     spherical = effect("spherical_aberration")(w040_um=0.5)
     # defocus has one sign alone; astigmatism of equal and opposite parts doesn't: -x^2 - y^2 in two steps
     back = effect("axial_chromatic_aberration")(slope_um=-0.5 * 8.0 * 16.0)
@@ -381,7 +391,9 @@ def test_a_cameras_own_pupil_takes_aberrations_in() -> None:
 
 
 def test_cover_glass_is_the_spherical_aberration_of_its_thickness() -> None:
-    """2 mm of n = 1.52 at f/4: W040 = t (n^2 - 1) / (128 n^3 N^4); left unfocused, t (1 - 1/n) of defocus comes on top."""
+    """2 mm of n = 1.52 at f/4: W040 = t (n^2 - 1) / (128 n^3 N^4); left unfocused, t (1 - 1/n) of defocus comes on
+    top.
+    """
     kind, f = effect("cover_glass"), np.linspace(0.0, 0.4, 9)
     w040 = 2000.0 * (1.52**2 - 1) / (128 * 1.52**3 * 4.0**4)
     wanted = _transfer(effect("spherical_aberration")(w040_um=w040), f, 0 * f, 550.0)
@@ -471,7 +483,9 @@ def test_a_uniform_field_stays_uniform_where_light_is_moved() -> None:
 
 
 def test_lateral_colour_moves_an_edge_as_it_moves_a_dot() -> None:
-    """A vertical edge 12 px right of the axis, seen in red: the edge's profile is moved by the law at the edge's middle."""
+    """A vertical edge 12 px right of the axis, seen in red: the edge's profile is moved by the law at the edge's
+    middle.
+    """
     one = effect("lateral_chromatic_aberration")(slope_um=3.0)
     edge = KnifeEdge((EdgeRegion((4, 24, 20, 31), 0.0),), LIGHT.scale(0.1), LIGHT)
     camera = CAMERA.model_copy(update={"cfa": "MONO", "quantum_efficiency": {"Y": LINE_650}})
@@ -484,12 +498,15 @@ def test_lateral_colour_moves_an_edge_as_it_moves_a_dot() -> None:
 
 
 def test_a_pinholes_scene_is_distorted_as_the_geometry_says() -> None:
-    """A board seen by an ideal pinhole, then distorted, is the board seen through the geometry: barrel of 4 % in the corner."""
+    """A board seen by an ideal pinhole, then distorted, is the board seen through the geometry: barrel of 4 % in the
+    corner.
+    """
     matrix = ((90.0, 0.0, 46.5), (0.0, 90.0, 34.5), (0.0, 0.0, 1.0))
     geometry = Geometry(camera_matrix=matrix, distortion=(-0.1, 0.01, 2e-3, -1e-3))
     camera = CAMERA.model_copy(update={"rows": 72, "cols": 96, "cfa": "MONO", "quantum_efficiency": {"Y": LINE_650}})
     texture = (np.indices((14, 18)).sum(axis=0) % 2).astype(np.uint8)
-    board = PlanarTarget(texture, 10.0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (-90.0, -70.0, 100.0), Geometry(camera_matrix=matrix), LIGHT.scale(0.1), LIGHT)  # fmt: skip
+    board = PlanarTarget(texture, 10.0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (-90.0, -70.0, 100.0),
+                         Geometry(camera_matrix=matrix), LIGHT.scale(0.1), LIGHT)  # fmt: skip
     lens = Lens(f_number=4.0, focal_length_mm=8.0)
     camera = camera.model_copy(update={"lens": lens})
     seen = expected_electrons(camera, Exposure(replace(board, geometry=geometry), 1.0))
@@ -507,7 +524,9 @@ def test_distortion_that_folds_the_image_is_refused() -> None:
 
 
 def test_distortion_bends_an_edge() -> None:
-    """A vertical edge 19.5 px right of the axis: at the frame's ends it lies further out than in the middle, by the law."""
+    """A vertical edge 19.5 px right of the axis: at the frame's ends it lies further out than in the middle, by the
+    law.
+    """
     one = effect("distortion")(corner_percent=5.0)
     camera = CAMERA.model_copy(update={"rows": 96, "cols": 96, "cfa": "MONO", "quantum_efficiency": {"Y": LINE_650}})
     edge = KnifeEdge((EdgeRegion((0, 60, 96, 75), 0.0),), LIGHT.scale(0.1), LIGHT)

@@ -26,8 +26,10 @@ from sim.uniform import Uniform, electron_rate
 
 WAVELENGTH = np.arange(380.0, 961.0)
 CAMERA = CameraModel(
-    rows=60, cols=80, pixel_pitch_um=2.0, fill_factor=1.0, cfa="RGGB", bit_depth=12, black_level_dn=64.0, white_level_dn=4095.0,
-    conversion_gain_dn_per_e=0.4, full_well_e=10000.0, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=0.0, prnu_percent=0.0,
+    rows=60, cols=80, pixel_pitch_um=2.0, fill_factor=1.0, cfa="RGGB", bit_depth=12, black_level_dn=64.0,
+    white_level_dn=4095.0,
+    conversion_gain_dn_per_e=0.4, full_well_e=10000.0, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=0.0,
+    prnu_percent=0.0,
     quantum_efficiency={c: Spectrum.of(WAVELENGTH, np.full(WAVELENGTH.shape, 0.5)) for c in "RGB"},
     lens=Lens(f_number=4.0, focal_length_mm=8.0),
 )  # fmt: skip
@@ -73,7 +75,9 @@ def test_a_warm_up_starts_as_a_drift_and_settles() -> None:
 
 
 def test_an_unsteady_source_scatters_and_keeps_its_mean() -> None:
-    """Of 4000 frames the mean is known to s / sqrt(4000), the standard deviation to s / sqrt(8000); the same frame is the same again."""
+    """Of 4000 frames the mean is known to s / sqrt(4000), the standard deviation to s / sqrt(8000); the same frame is
+    the same again.
+    """
     one = light_of(CAMERA, (SourceInstability(instability_percent=2.0),))
     drawn = np.array([one.unsteady(20.0 * k) for k in range(4000)])
     assert drawn.mean() == pytest.approx(1.0, abs=3.5 * 0.02 / np.sqrt(4000))
@@ -109,8 +113,9 @@ def test_the_room_s_colour_leaves_green_as_it_is() -> None:
 
 
 def test_a_screen_s_gamma_moves_the_edges_of_lit_cells() -> None:
-    """(1 + erf(x / s sqrt 2)) / 2 to the fifth: the mean of the largest of five normal numbers, 1.1630 s inside; with no power rims
-    stay as they are asked for, and a blur without a power is unlikely to be a gamma."""
+    """(1 + erf(x / s sqrt 2)) / 2 to the fifth: the mean of the largest of five normal numbers, 1.1630 s inside; with
+    no power rims stay as they are asked for, and a blur without a power is unlikely to be a gamma.
+    """
     x_um = (np.arange(400) - 199.5)[None, :] * 0.05 * CAMERA.pixel_pitch_um
     step = np.broadcast_to(x_um > 0, (4, 400)).astype(float)
     y_um = np.arange(4)[:, None] * 0.05 * CAMERA.pixel_pitch_um
@@ -136,7 +141,9 @@ def test_another_f_number_has_its_own_diffraction() -> None:
 
 @pytest.mark.parametrize("reach_nm", [700.0, 1000.0])
 def test_stray_light_lies_where_the_light_is_stated_whatever_the_cameras_reach(reach_nm: float) -> None:
-    """A line in 401 nm of stated range: 2 % of it spread over these, of which a curve of 1 sees those above 650 nm and no others."""
+    """A line in 401 nm of stated range: 2 % of it spread over these, of which a curve of 1 sees those above 650 nm and
+    no others.
+    """
     wavelength = np.arange(380.0, 781.0)
     line = Spectrum.of(wavelength, np.exp(-0.5 * ((wavelength - 500.0) / 5.0) ** 2))
     efficiency = Spectrum.of((650.0, reach_nm), (1.0, 1.0))

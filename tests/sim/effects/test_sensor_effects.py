@@ -1,4 +1,6 @@
-"""Effects on charge and read-out beyond the contract of all effects: their analytic limits, and frames that agree with their moments."""
+"""Effects on charge and read-out beyond the contract of all effects: their analytic limits, and frames that agree with
+their moments.
+"""
 
 from __future__ import annotations
 
@@ -39,8 +41,10 @@ from sim.uniform import Uniform
 
 LIGHT = Spectrum.of([500.0, 600.0], [2e-3, 2e-3])
 CAMERA = CameraModel(
-    rows=48, cols=64, pixel_pitch_um=3.45, fill_factor=1.0, cfa="MONO", bit_depth=12, black_level_dn=100.0, white_level_dn=4095.0,
-    conversion_gain_dn_per_e=0.5, full_well_e=7500.0, read_noise_e=2.0, dark_current_e_per_s=10.0, dsnu_e=0.0, prnu_percent=0.0,
+    rows=48, cols=64, pixel_pitch_um=3.45, fill_factor=1.0, cfa="MONO", bit_depth=12, black_level_dn=100.0,
+    white_level_dn=4095.0,
+    conversion_gain_dn_per_e=0.5, full_well_e=7500.0, read_noise_e=2.0, dark_current_e_per_s=10.0, dsnu_e=0.0,
+    prnu_percent=0.0,
     quantum_efficiency={"Y": Spectrum.of([400.0, 700.0], [0.5, 0.5])}, lens=Lens(f_number=4.0, focal_length_mm=50.0),
 )  # fmt: skip
 BRIGHT, DARK = Exposure(UniformField(LIGHT), 0.02), Exposure(Darkness(), 0.5, temperature_c=35.0)
@@ -257,7 +261,8 @@ def test_blooming_of_neighbours_adds_up_and_runs_off_the_frame() -> None:
 
 def test_greens_differ_by_their_ratio_and_keep_their_mean() -> None:
     curve = Spectrum.of([400.0, 700.0], [0.5, 0.5])
-    camera = CAMERA.model_copy(update={"cfa": "GRBG", "quantum_efficiency": dict.fromkeys("RGB", curve), "dark_current_e_per_s": 0.0})  # fmt: skip
+    camera = CAMERA.model_copy(update={"cfa": "GRBG", "quantum_efficiency": dict.fromkeys("RGB", curve),
+                                       "dark_current_e_per_s": 0.0})  # fmt: skip
     far = camera.model_copy(update={"lens": Lens(f_number=4.0, focal_length_mm=5000.0)})
     plain = expected_electrons(far, BRIGHT)
     frame = expected_electrons(far, BRIGHT, (GreenImbalance(imbalance_percent=3.0),))
@@ -266,7 +271,8 @@ def test_greens_differ_by_their_ratio_and_keep_their_mean() -> None:
     assert part["G2"].mean() / same["G2"].mean() == pytest.approx(0.985)
     assert frame.mean() == pytest.approx(plain.mean(), rel=1e-9)
     np.testing.assert_array_equal(part["R"], same["R"])
-    np.testing.assert_array_equal(predict_frame(CAMERA, BRIGHT, (GreenImbalance(imbalance_percent=3.0),)), predict_frame(CAMERA, BRIGHT))  # fmt: skip
+    np.testing.assert_array_equal(predict_frame(CAMERA, BRIGHT, (GreenImbalance(imbalance_percent=3.0),)),
+                                  predict_frame(CAMERA, BRIGHT))  # fmt: skip
 
 
 def _lit(one: LightFlicker, even: FloatArray, exposure_s: float, elapsed_s: float) -> FloatArray:

@@ -2,8 +2,9 @@
 
     python tests/sim/optics/reference_batoid.py > tests/sim/optics/data/batoid.csv
 
-The two lenses are those of `lenses/doublet.zmx` and `lenses/tilted.zmx`, written down here once more by hand, so that the reader
-is checked as well. Rays start in the plane of the stop, which is the first surface; lengths in mm, indices those at 587.5618 nm.
+The two lenses are those of `lenses/doublet.zmx` and `lenses/tilted.zmx`, written down here once more by hand, so that
+the reader is checked as well. Rays start in the plane of the stop, which is the first surface; lengths in mm, indices
+those at 587.5618 nm.
 """
 
 import csv

@@ -48,7 +48,9 @@ def test_null_lies_at_half_the_inverse_displacement() -> None:
 
 @pytest.mark.parametrize(("f_number", "error"), [(8.0, 0.003), (4.0, 0.012), (1.8, 0.06)])
 def test_plate_agrees_with_snells_law(f_number: float, error: float) -> None:
-    """The focus of a cone at angle u moves by t (1 - cos u / sqrt(n^2 - sin^2 u)); dW = (shift less the paraxial one) sin u du."""
+    """The focus of a cone at angle u moves by t (1 - cos u / sqrt(n^2 - sin^2 u)); dW = (shift less the paraxial one)
+    sin u du.
+    """
     t_um, n = 500.0, 1.52
     u = np.linspace(0.0, np.arcsin(0.5 / f_number), 20001)
     shift = t_um * (1.0 - np.cos(u) / np.sqrt(n**2 - np.sin(u) ** 2))
@@ -79,7 +81,8 @@ def test_interference_edges_move_to_the_blue_and_glass_stays() -> None:
     assert edge_transmittance(650.0, 650.0, 5.0, 0.5) == pytest.approx(0.5)
     field = edge_transmittance(640.0, 650.0, 5.0, np.array([0.0, 0.2, 0.4]), 1.8)
     assert np.all(np.diff(field) < 0)
-    np.testing.assert_array_equal(edge_transmittance(np.array([600.0, 700.0]), 650.0, 5.0, 0.0, 1.8), edge_transmittance(np.array([600.0, 700.0]), 650.0, 5.0))  # fmt: skip
+    np.testing.assert_array_equal(edge_transmittance(np.array([600.0, 700.0]), 650.0, 5.0, 0.0, 1.8),
+                                  edge_transmittance(np.array([600.0, 700.0]), 650.0, 5.0))  # fmt: skip
 
 
 def test_a_veil_takes_its_share_at_every_frequency_but_zero() -> None:

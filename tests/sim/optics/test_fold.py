@@ -18,16 +18,18 @@ def test_the_radial_table_is_the_sum_over_aliases(shape: tuple[int, int], cutoff
 
 
 def test_light_is_conserved_and_a_perfect_image_is_its_pixels() -> None:
-    """At zero frequency sinc of every other order is 0. A lens that passes everything over full pixels: sum over orders of
-    sinc^2 = 1 at every frequency; 40 orders leave 2 / (pi^2 40)."""
+    """At zero frequency sinc of every other order is 0. A lens that passes everything over full pixels: sum over orders
+    of sinc^2 = 1 at every frequency; 40 orders leave 2 / (pi^2 40).
+    """
     assert fold_diffraction((16, 16), 0.7, 1.9)[0, 0] == pytest.approx(1.0, abs=1e-12)
     full = fold_transfer(lambda fx, fy: np.ones(np.broadcast_shapes(fx.shape, fy.shape)), (8, 1), 1.0, 40.0)
     np.testing.assert_allclose(full[:, 0], 1.0, atol=2.0 / (np.pi**2 * 40) + 1e-3)
 
 
 def test_a_direct_kernel_has_the_folded_transform() -> None:
-    """The kernel of a lens that blurs nothing below 40 cy/px: the overlap of pixel and square, by area. What lies beyond is 2 / (pi^2 20)
-    a direction at most."""
+    """The kernel of a lens that blurs nothing below 40 cy/px: the overlap of pixel and square, by area. What lies
+    beyond is 2 / (pi^2 20) a direction at most.
+    """
     size = 16
     got = np.fft.irfft2(
         fold_transfer(lambda fx, fy: np.ones(np.broadcast_shapes(fx.shape, fy.shape)), (size, size), 1.0, 20.0)

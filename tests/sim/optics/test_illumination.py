@@ -57,7 +57,9 @@ def test_a_makers_curve_stands_in_for_the_cosine(colour_camera: CameraModel) -> 
 
 
 def test_a_flat_gives_its_own_fall_off_back(colour_camera: CameraModel) -> None:
-    """cos^4 about a point off the centre with 1 % of noise: found to 3 sigma of 28 coefficients over 6912 pixels, 0.2 %."""
+    """cos^4 about a point off the centre with 1 % of noise: found to 3 sigma of 28 coefficients over 6912 pixels, 0.2
+    %.
+    """
     axis = Geometry(camera_matrix=((100.0, 0.0, 55.0), (0.0, 100.0, 30.0), (0.0, 0.0, 1.0)))
     wide = colour_camera.model_copy(
         update={"lens": colour_camera.lens.model_copy(update={"focal_length_mm": 0.35}), "geometry": axis}
@@ -82,7 +84,8 @@ def test_a_flat_gives_its_own_fall_off_back(colour_camera: CameraModel) -> None:
 def test_a_measured_fall_off_shades_the_frame(colour_camera: CameraModel, lamp: Spectrum) -> None:
     half = MeasuredIllumination(values=((1.0, 0.5), (1.0, 0.5)))
     camera = colour_camera.model_copy(
-        update={"lens": colour_camera.lens.model_copy(update={"illumination": half}), "cfa": "MONO", "quantum_efficiency": {"Y": lamp.scale(0.1 / max(lamp.value))}, "dark_current_e_per_s": 0.0}
+        update={"lens": colour_camera.lens.model_copy(update={"illumination": half}), "cfa": "MONO",
+                "quantum_efficiency": {"Y": lamp.scale(0.1 / max(lamp.value))}, "dark_current_e_per_s": 0.0}
     )  # fmt: skip
     electrons = expected_electrons(camera, Exposure(UniformField(lamp), 0.01))
     assert electrons[5, 0] / electrons[5, -1] == pytest.approx(2.0)

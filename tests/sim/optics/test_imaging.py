@@ -65,7 +65,9 @@ MODELS = [DiffractionLimited(), PUPIL, measured(airy(0.55)), OTF, TracedLens(tab
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda m: m.kind)
 def test_every_model_is_a_transfer_function(model: Imaging) -> None:
-    """1 at zero frequency, the conjugate at -f (an image is real), no gain, nothing beyond the cutoff; of the broadcast shape."""
+    """1 at zero frequency, the conjugate at -f (an image is real), no gain, nothing beyond the cutoff; of the broadcast
+    shape.
+    """
     fx, fy = GRID[None, :], GRID[:, None]
     value = np.asarray(model.transfer(fx, fy, 520.0, N))
     assert value.shape == (41, 41)
@@ -106,7 +108,9 @@ def test_zernike_pupil_without_aberration_is_diffraction() -> None:
 
 
 def test_zernike_coefficients_are_seidels_by_another_name() -> None:
-    """Z11 = sqrt(5) (6 r^4 - 6 r^2 + 1), Z4 = sqrt(3) (2 r^2 - 1): c11 and c4 that leave W040 r^4 alone; 1 um = 2 waves at 500 nm."""
+    """Z11 = sqrt(5) (6 r^4 - 6 r^2 + 1), Z4 = sqrt(3) (2 r^2 - 1): c11 and c4 that leave W040 r^4 alone; 1 um = 2 waves
+    at 500 nm.
+    """
     c11 = 0.3 / (6 * np.sqrt(5))
     c4 = 6 * np.sqrt(5) * c11 / (2 * np.sqrt(3))
     noll = ZernikePupil(coefficients=(0, 0, 0, c4, 0, 0, 0, 0, 0, 0, c11), index="noll", unit="um")
@@ -123,7 +127,9 @@ def test_zernike_coefficients_are_seidels_by_another_name() -> None:
 
 
 def test_colours_have_their_focus_and_place() -> None:
-    """Axial: dz = 16 um at 450 nm is W020 = 16 / (8 N^2); lateral: the image of 650 nm lies 1.5 um to the right; between: half."""
+    """Axial: dz = 16 um at 450 nm is W020 = 16 / (8 N^2); lateral: the image of 650 nm lies 1.5 um to the right;
+    between: half.
+    """
     model = ZernikePupil(
         coefficients=(),
         index="noll",
@@ -162,7 +168,9 @@ def test_bad_pupils_are_refused(changes: dict[str, object], message: str) -> Non
 
 
 def test_a_perfect_lens_by_its_samples_is_the_perfect_lens() -> None:
-    """Beyond a window of half-width R lies the share 2 lambda N / (pi^2 R) of the light; its transfer was at the lowest frequencies."""
+    """Beyond a window of half-width R lies the share 2 lambda N / (pi^2 R) of the light; its transfer was at the lowest
+    frequencies.
+    """
     n = 257
     otf = measured(airy(0.55, n)).transfer(LINE, 0 * LINE, 550.0, N)
     beyond = 2 * 0.55 * N / (np.pi**2 * 0.5 * n * PITCH)

@@ -36,7 +36,9 @@ def hopkins(share: float, w020_waves: float) -> float:
 
 
 def by_brute_force(wavefront: Wavefront, share: float, angle: float) -> complex:
-    """The overlap of two discs row by row, each row by Gauss's rule: coordinates that don't know of the overlap's other rim."""
+    """The overlap of two discs row by row, each row by Gauss's rule: coordinates that don't know of the overlap's other
+    rim.
+    """
     node, weight = np.polynomial.legendre.leggauss(120)
     dx, dy = share * np.cos(angle), share * np.sin(angle)
     # across the frequency v = v_max sin(t), along it from rim to rim
@@ -162,7 +164,8 @@ def test_zernike_polynomials_are_orthonormal() -> None:
 
 def test_index_schemes_are_the_published_ones() -> None:
     """Noll (1976), table I; ANSI Z80.28, table 1."""
-    noll = [(0, 0), (1, 1), (1, -1), (2, 0), (2, -2), (2, 2), (3, -1), (3, 1), (3, -3), (3, 3), (4, 0), (4, 2), (4, -2), (4, 4), (4, -4)]  # fmt: skip
+    noll = [(0, 0), (1, 1), (1, -1), (2, 0), (2, -2), (2, 2), (3, -1), (3, 1), (3, -3), (3, 3), (4, 0), (4, 2), (4, -2),
+            (4, 4), (4, -4)]  # fmt: skip
     assert [noll_order(j) for j in range(1, 16)] == noll
     osa = [(n, m) for n in range(6) for m in range(-n, n + 1, 2)]
     assert [osa_order(j) for j in range(len(osa))] == osa
@@ -184,11 +187,14 @@ def test_wavefronts_add_and_know_their_symmetry() -> None:
     np.testing.assert_allclose(both(x, y), 0.2 * r2**2 + 0.1 * r2 + 0.3 * r2 * y, rtol=1e-12)
     assert [w.is_isotropic for w in (seidel(), seidel(spherical_um=1.0, defocus_um=2.0), zernike(6, 0))] == [True] * 3
     assert not any(w.is_isotropic for w in (both, zernike(2, 2), zernike(4, -4), Wavefront.of({(1, 1): 0.1})))
-    assert all(seidel(astigmatism_um=a, astigmatism_deg=d).is_isotropic == (a == 0.0) for a, d in product((0.0, 0.1), (0.0, 20.0)))  # fmt: skip
+    assert all(seidel(astigmatism_um=a, astigmatism_deg=d).is_isotropic == (a == 0.0) for a,
+               d in product((0.0, 0.1), (0.0, 20.0)))  # fmt: skip
 
 
 def test_one_table_serves_all_sizes_and_wavelengths_of_a_shape() -> None:
-    """The table's expansion against the overlap integrated anew: sizes in every octave of it and beyond, wavelengths at random."""
+    """The table's expansion against the overlap integrated anew: sizes in every octave of it and beyond, wavelengths at
+    random.
+    """
     rng = np.random.default_rng(4)
     share = np.linspace(0.05, 0.95, 19)
     for waves in (0.03, 0.125, 0.2, 0.4, 0.9, 1.7):

@@ -65,8 +65,10 @@ def _weights(lens: Any) -> FloatArray:
     "place", ["middle", "aside", "corner", "all of a small field", "without symmetry", "other grids"]
 )
 def test_superposition_is_the_exact_sum_over_sources(synthetic_lens: Any, place: str) -> None:
-    """3e-3 rms of the image's contrast (its own standard deviation, ten times less than its mean), for lenses that change all over
-    500 px and, harsher than any real one, over 60 px. Sources: four Gauss points to each sample's square."""
+    """3e-3 rms of the image's contrast (its own standard deviation, ten times less than its mean), for lenses that
+    change all over 500 px and, harsher than any real one, over 60 px. Sources: four Gauss points to each sample's
+    square.
+    """
     lens = synthetic_lens(corner_um=250.0 if place.startswith("all") else 2500.0, grid=place == "without symmetry")
     axis = {"aside": (-100.0, -30.0), "corner": (-400.0, -500.0), "without symmetry": (-300.0, -400.0)}.get(
         place, (9.5, 9.5)

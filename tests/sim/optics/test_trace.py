@@ -52,7 +52,8 @@ def doublet() -> Prescription:
     return read_zmx(HERE / "lenses/doublet.zmx")
 
 
-# --- analytic limits ---------------------------------------------------------------------------------------------------
+# --- analytic limits
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_one_refracting_surface() -> None:
@@ -130,7 +131,8 @@ def test_the_derivatives_of_rays_are_those_of_differences() -> None:
             assert centre[place] == pytest.approx((ahead[value] - behind[value]) / (2 * h), abs=1e-7)
 
 
-# --- an independent tracer ---------------------------------------------------------------------------------------------
+# --- an independent tracer
+# ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["doublet", "tilted"])
@@ -153,7 +155,8 @@ def test_rays_agree_with_batoid(name: str) -> None:
             assert ray[place] == pytest.approx(v[key], abs=1e-10)  # both in double precision
 
 
-# --- images ------------------------------------------------------------------------------------------------------------
+# --- images
+# ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_perfect_image_is_airys() -> None:
@@ -185,7 +188,9 @@ def test_a_perfect_lens_has_the_diffraction_mtf() -> None:
 
 
 def test_what_leaves_the_lens_arrives() -> None:
-    """The light in ever larger windows comes to 1: Airy's tail outside a square of half side a is 2 / (pi^2 a NA / wavelength) x 0.9."""
+    """The light in ever larger windows comes to 1: Airy's tail outside a square of half side a is
+    2 / (pi^2 a NA / wavelength) x 0.9.
+    """
     system = OpticalSystem(ellipsoid(pupil_mm=4.0))
     missing = []
     for samples in (32, 64, 128):
@@ -227,7 +232,8 @@ def test_far_rays_left_out_keep_the_light_in_the_window() -> None:
     half_diagonal = 0.5e-3 * 16 * 0.8 * math.sqrt(2)
     assert np.max(np.hypot(rays.x_mm, rays.y_mm - centre[1])) > 4.2 * half_diagonal
     whole, near = (point_spread(rays, centre, 16, 0.8, reach) for reach in (math.inf, 4 * half_diagonal))
-    # What far rays send into the window is diffracted at the rim: thousandths of the light, which move its fine fringes.
+    # What far rays send into the window is diffracted at the rim: thousandths of the light, which move its fine
+    # fringes.
     assert near.sum() == pytest.approx(whole.sum(), abs=5e-3)
     assert np.sqrt(np.mean((near - whole) ** 2)) < 0.25 * np.sqrt(np.mean(whole**2))
 
@@ -252,7 +258,8 @@ def test_rays_between_traced_wavelengths_are_interpolated() -> None:
     assert between.energy == pytest.approx(own.energy, rel=1e-9)
 
 
-# --- tables ------------------------------------------------------------------------------------------------------------
+# --- tables
+# ------------------------------------------------------------------------------------------------------------
 
 SMALL = TableSettings(wavelength_nm=(450.0, 550.0, 650.0), fields=4, samples=24)
 
@@ -277,7 +284,9 @@ def test_a_table_holds_what_single_rays_say() -> None:
 
 
 def test_vignetting_by_an_aperture_that_is_not_the_stop() -> None:
-    """Two equal circles, the second seen shifted by d tan(theta): the share that overlaps, by their lens-shaped area."""
+    """Two equal circles, the second seen shifted by d tan(theta): the share that overlaps, by their lens-shaped
+    area.
+    """
     radius, gap, theta = 1.0, 3.0, math.radians(20.0)
     circle = Aperture(shape="circle", half_width_mm=radius, half_height_mm=radius)
     f = 1000.0  # so weak that rays stay parallel to 1e-3
@@ -416,7 +425,8 @@ def test_a_damaged_cache_is_computed_again(tmp_path: Path) -> None:
     assert other.content_hash != table.content_hash and other != table
 
 
-# --- known lenses ------------------------------------------------------------------------------------------------------
+# --- known lenses
+# ------------------------------------------------------------------------------------------------------
 
 
 @needs_lenses

@@ -79,11 +79,11 @@ def test_radiometry_of_24_patches() -> None:
 def test_electrons_of_24_patches_behind_a_diffracting_lens() -> None:
     """Means of the middle 24 x 24 px of every patch of 58.52 px, within 0.2 %.
 
-    What their chart is: 6 x 4 patches of 16 x 16 samples without a frame, in darkness, padded by an eighth of its size on each side
-    (12 and 8 samples) and blurred by FFT, so that light wraps around a field of 120 x 80 samples: 438.9 x 292.6 px of 2 um. The
-    field here is that, rounded to 439 x 293 px, without a margin, so that it wraps alike. An Airy pattern's tails are long:
-    four edges at 29 px take 4 x 0.2 % of the light out of the white patch and bring it to others, and a field twice as wide
-    gives the black patch 0.8 % less. What's left, 0.11 % at most
+    What their chart is: 6 x 4 patches of 16 x 16 samples without a frame, in darkness, padded by an eighth of its size
+    on each side (12 and 8 samples) and blurred by FFT, so that light wraps around a field of 120 x 80 samples:
+    438.9 x 292.6 px of 2 um. The field here is that, rounded to 439 x 293 px, without a margin, so that it wraps alike.
+    An Airy pattern's tails are long: four edges at 29 px take 4 x 0.2 % of the light out of the white patch and bring
+    it to others, and a field twice as wide gives the black patch 0.8 % less. What's left, 0.11 % at most
     (0.03 % rms), is their scene's sampling at 3.66 px and the field's rounding.
     """
     spectra, patches = table("macbeth_spectra.csv"), table("macbeth_diffraction_patches.csv")
@@ -143,8 +143,8 @@ def test_noise(row: np.void) -> None:
         )
         if not on & {"prnu", "all"}:
             assert variance[0, 0] + spatial == pytest.approx(row["pred_var_e2"], rel=1e-6)
-    # ISETCam measured 128 x 128 x 8 values, clipped at 0 V and 1 V: so does this. Four standard errors of the two: temporal noise
-    # averages over all values, a pattern over the pixels; a variance's is sqrt((m4 - v^2) / n).
+    # ISETCam measured 128 x 128 x 8 values, clipped at 0 V and 1 V: so does this. Four standard errors of the two:
+    # temporal noise averages over all values, a pattern over the pixels; a variance's is sqrt((m4 - v^2) / n).
     digital = model.model_copy(update={"conversion_gain_dn_per_e": 6.0, "black_level_dn": 0.0, "white_level_dn": 6e4})
     rng = np.random.default_rng(1)
     pattern = FixedPattern.draw(digital, rng)
@@ -171,7 +171,9 @@ def test_analytic_contrast_with_and_without_a_birefringent_filter() -> None:
 
 
 def test_birefringent_kernel() -> None:
-    """Four spots at +-1.1 um, a quarter of the light each, which theirs shares out linearly among the nearest samples, of 0.2508 um."""
+    """Four spots at +-1.1 um, a quarter of the light each, which theirs shares out linearly among the nearest samples,
+    of 0.2508 um.
+    """
     kernel = loadmat(REFERENCE / "birefringent_kernel.mat")["k"]
     kernel = np.where(np.isfinite(kernel), kernel, 0.0)  # their interpolation has no value at the rim
     positions, shares = birefringent_spots(2.2, 2.2)

@@ -151,7 +151,8 @@ def test_a_cube_of_the_frames_shape_lies_sample_on_pixel(camera: CameraModel) ->
     assert drawn.layers[0].coverage.sum() / 4 == pytest.approx(30 * 45, rel=1e-12)
 
 
-# --- stereo ------------------------------------------------------------------------------------------------------------
+# --- stereo
+# ------------------------------------------------------------------------------------------------------------
 
 
 def rotation_of(turn: tuple[float, float, float]) -> tuple[tuple[float, float, float], ...]:
@@ -160,8 +161,9 @@ def rotation_of(turn: tuple[float, float, float]) -> tuple[tuple[float, float, f
 
 
 def test_both_cameras_of_a_rig_see_one_plane_where_it_stands(mono_camera: CameraModel) -> None:
-    """Corners found in both frames triangulate to the board's corners at its pose: a board of 8 x 6 squares of 10 mm, 200 mm away,
-    before two cameras of 560 px and 60 mm apart that look 0.28 rad inwards, both lenses distorting."""
+    """Corners found in both frames triangulate to the board's corners at its pose: a board of 8 x 6 squares of 10 mm,
+    200 mm away, before two cameras of 560 px and 60 mm apart that look 0.28 rad inwards, both lenses distorting.
+    """
     lens = Lens(f_number=4.0, focal_length_mm=1.68)
     geometries = [
         Geometry(
@@ -209,8 +211,8 @@ def test_both_cameras_of_a_rig_see_one_plane_where_it_stands(mono_camera: Camera
     # Inner corner i of the board is (i % 7 + 1, i // 7 + 1) squares from its own.
     squares = np.array([(i % 7 + 1, i // 7 + 1, 0) for i in shared]) * 10.0
     wanted = squares @ np.array(pose).T + [-36.0, -30.0, 200.0]
-    # cornerSubPix is good to 0.06 px on 8-bit greys of corners this small (a marker's begins 5 px away): 200 / 560 x 0.06 =
-    # 0.0214 mm across, and 200^2 / (560 x 58.6) x sqrt(2) x 0.06 = 0.103 mm along the axis.
+    # cornerSubPix is good to 0.06 px on 8-bit greys of corners this small (a marker's begins 5 px away):
+    # 200 / 560 x 0.06 = 0.0214 mm across, and 200^2 / (560 x 58.6) x sqrt(2) x 0.06 = 0.103 mm along the axis.
     away = points - wanted
     spread = np.array([0.0214, 0.0214, 0.103])
     assert np.all(np.sqrt(np.mean(away**2, axis=0)) < spread)

@@ -46,7 +46,9 @@ def test_a_facing_edge_is_a_straight_one(colour_camera: CameraModel, lamp: Spect
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_bent_edge_is_what_drawing_by_area_gives(colour_camera: CameraModel, lamp: Spectrum, turned: bool) -> None:
-    """The frame of the exact profiles, against the drawing blurred as any picture is: 0.5 % of white at 4 samples a pixel."""
+    """The frame of the exact profiles, against the drawing blurred as any picture is: 0.5 % of white at 4 samples a
+    pixel.
+    """
     scene = edges(colour_camera, lamp, -0.2, 0.0, 1e-3, -1e-3)
     if turned:
         c, s = float(np.cos(0.5)), float(np.sin(0.5))
@@ -77,7 +79,9 @@ def test_an_edge_is_blurred_as_its_place_is(colour_camera: CameraModel, lamp: Sp
 
 
 def test_light_that_is_moved_moves_the_edge(colour_camera: CameraModel, lamp: Spectrum) -> None:
-    """20 % at the corner, and in proportion to the cube of the distance from the axis elsewhere: a row's sum falls by contrast x shift."""
+    """20 % at the corner, and in proportion to the cube of the distance from the axis elsewhere: a row's sum falls by
+    contrast x shift.
+    """
     place = PlaneEdge((30.0, 0.0), (30.3, 0.0), 0.0)
     scene = replace(edges(colour_camera, lamp), edges=(place,))
     level = [

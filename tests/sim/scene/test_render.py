@@ -89,8 +89,9 @@ GEOMETRY = Geometry(camera_matrix=((60.0, 0.0, 20.0), (0.0, 60.0, 15.0), (0.0, 0
 
 @pytest.mark.parametrize(("size", "geometry"), [(10, None), (10, GEOMETRY), (64, None)])
 def test_cells_are_means_over_squares(size: int, geometry: Geometry | None) -> None:
-    """Against 32 x 32 points a sample, which leave 1/32 x 1/sqrt(12) of a cell's step along a border: 0.01. At 64 cells over
-    30 px the squares are divided."""
+    """Against 32 x 32 points a sample, which leave 1/32 x 1/sqrt(12) of a cell's step along a border: 0.01. At 64 cells
+    over 30 px the squares are divided.
+    """
     pattern = np.random.default_rng(3).integers(0, 2, (size, size)).astype(np.uint8)
     warp = Warp.from_corners(size, size, [(2.3, 4.1), (5.2, 36.4), (28.1, 33.0), (25.4, 1.9)], geometry)
     grid = Grid(30, 40, 2, 2)
@@ -176,7 +177,8 @@ def test_the_colorchecker_has_24_patches_from_dark_skin_to_black() -> None:
         colorchecker.reflectances("IT8")
 
 
-# --- drawn scenes ------------------------------------------------------------------------------------------------------
+# --- drawn scenes
+# ------------------------------------------------------------------------------------------------------
 
 DARK = LIGHT.scale(0.0)
 
@@ -204,8 +206,9 @@ STEPS = Ramp((14.5, 14.5), 25.0, DARK, LIGHT, angle_deg=33.0, steps=6)
 
 @pytest.mark.parametrize("scene", [edge(5.0), edge(45.0), edge(271.0, 2.2), STAR, HOLES, STEPS])
 def test_area_drawn_coarse_is_the_mean_of_area_drawn_fine(scene: Scene) -> None:
-    """Exact areas add up: no sample depends on where or how finely others are drawn, so nothing can alias that the square's
-    own mean doesn't let pass."""
+    """Exact areas add up: no sample depends on where or how finely others are drawn, so nothing can alias that the
+    square's own mean doesn't let pass.
+    """
     coarse = covered(scene, Grid(30, 30, 2, 1))
     np.testing.assert_allclose(blocks(covered(scene, Grid(30, 30, 8, 1)), 4), coarse, rtol=0, atol=1e-12)
 
@@ -243,8 +246,10 @@ def test_of_several_edges_the_nearest_region_rules() -> None:
 
 
 def test_a_drawn_edge_blurs_to_the_edges_exact_profile(mono_camera: CameraModel, lamp: Spectrum) -> None:
-    """Drawn at 6 x 6 samples a pixel and seen through the same transfer. What is left is what squares of 1/6 px alias: with
-    a line's spectrum of 1 / (2 pi f) a cycle and lens and pixel passing < 0.05 near 5 cy/px, below 1e-3 of the step."""
+    """Drawn at 6 x 6 samples a pixel and seen through the same transfer. What is left is what squares of 1/6 px alias:
+    with a line's spectrum of 1 / (2 pi f) a cycle and lens and pixel passing < 0.05 near 5 cy/px, below 1e-3 of the
+    step.
+    """
     camera = mono_camera.model_copy(update={"lens": mono_camera.lens.model_copy(update={"transmittance": 1.0})})
     dark = lamp.scale(0.2)
     for angle_deg in (0.0, 5.0, 45.0, 90.0, 187.0, 270.0):
@@ -284,13 +289,15 @@ def test_a_zone_plates_squares_are_means_of_its_formula() -> None:
     inside = np.hypot(row[:, None] - 64, col[None, :] - 64) < 47
     # Midpoints of 1/48 px: the second derivative of the cosine is below (2 pi 0.6)^2, / 24 x (1/48)^2 x 2 axes / 2.
     np.testing.assert_allclose(drawn[inside], wanted[inside], rtol=0, atol=3e-4)
-    # In the taper, which is taken at the square's centre: slope pi / (2 x 12 px), half a sample each way, half the contrast.
+    # In the taper, which is taken at the square's centre: slope pi / (2 x 12 px), half a sample each way, half the
+    # contrast.
     np.testing.assert_allclose(drawn, wanted, rtol=0, atol=0.5 * np.pi / 24 / 3 * 0.5)
 
 
 def test_a_zone_plates_mean_is_its_integral() -> None:
-    """Without a taper the disc's integral of cos(pi k r^2) is sin(pi k R^2) / k; a taper over almost nothing leaves it so,
-    to what the rim's squares, taken whole or not, hold: noise of sqrt(2 pi R) squares of 1/9 px^2."""
+    """Without a taper the disc's integral of cos(pi k r^2) is sin(pi k R^2) / k; a taper over almost nothing leaves it
+    so, to what the rim's squares, taken whole or not, hold: noise of sqrt(2 pi R) squares of 1/9 px^2.
+    """
     for radius in (40.2, 41.0, 60.0):
         drawn = covered(plate(radius, 0.6, 1e-6), Grid(129, 129, 3, 0)) - 0.5
         k = 0.6 / radius
@@ -301,8 +308,9 @@ def test_a_zone_plates_mean_is_its_integral() -> None:
 
 
 def test_a_zone_plate_holds_nothing_above_its_highest_frequency() -> None:
-    """The rim's taper of T = 12 px is a raised cosine: beyond its first null, 1/T away, its spectrum is 31 dB down, 8e-4 of the
-    energy of the ring, which has 0.36 of the plate's area."""
+    """The rim's taper of T = 12 px is a raised cosine: beyond its first null, 1/T away, its spectrum is 31 dB down,
+    8e-4 of the energy of the ring, which has 0.36 of the plate's area.
+    """
     drawn = covered(plate(), Grid(129, 129, 3, 0)) - 0.5
     power = np.abs(np.fft.fft2(drawn)) ** 2
     f = np.fft.fftfreq(drawn.shape[0], 1 / 3)
@@ -377,7 +385,8 @@ def test_an_even_field_is_all_ground() -> None:
     assert drawing.layers == ()
 
 
-# --- cubes and screens -------------------------------------------------------------------------------------------------
+# --- cubes and screens
+# -------------------------------------------------------------------------------------------------
 
 
 def test_a_cube_keeps_its_radiance_and_its_light() -> None:
@@ -398,7 +407,8 @@ def test_a_cube_keeps_its_radiance_and_its_light() -> None:
         warp = Warp.of([(3.1 * c, -2.2 * s, 20.0), (3.1 * s, 2.2 * c, 9.0), (0, 0, 1)])
         drawn = draw(SpectralImage(bands, cube, warp), Grid(50, 80, 2, 3))
         for k, layer in enumerate(drawn.layers):
-            # A square that holds a turned corner is a product of shares: a few hundredths, of either sign, of few squares.
+            # A square that holds a turned corner is a product of shares: a few hundredths, of either sign, of few
+            # squares.
             tolerance = 1e-12 if turn == 0 else 2e-4
             assert layer.coverage.sum() / 4 == pytest.approx(cube[:, :, k].sum() * 3.1 * 2.2, rel=tolerance)
 
@@ -427,7 +437,8 @@ def test_a_screens_light_is_its_drives_whatever_its_sub_pixels(sub_pixels: SubPi
     drawing = draw(shown, Grid(60, 80, 3, 4))
     assert drawing.ground[0] is not None
     assert not any(drawing.ground[0].value)
-    # A screen's pixel is 4 px wide on the camera; stripes of 0.4 px under a turned grid leave a product's error at corners.
+    # A screen's pixel is 4 px wide on the camera; stripes of 0.4 px under a turned grid leave a product's error at
+    # corners.
     tolerance = 1e-12 if turn == 0 else 3e-3
     assert drawing.layers[0].coverage.sum() / 9 == pytest.approx(8 * 12 * 16, rel=tolerance)
     for k, layer in enumerate(drawing.layers[1:]):
@@ -480,7 +491,9 @@ def test_a_screen_falls_off_with_the_angle_of_view() -> None:
 
 
 def test_black_and_white_codes_are_a_screens_pattern(mono_camera: CameraModel) -> None:
-    """The screen's model and the pattern of cells that the recordings' screens show are one thing at codes 0 and 255."""
+    """The screen's model and the pattern of cells that the recordings' screens show are one thing at codes 0 and
+    255.
+    """
     pattern = np.random.default_rng(4).integers(0, 2, (8, 12), dtype=np.uint8)
     codes = np.repeat(255 * pattern[:, :, None], 3, axis=2)
     image = ScreenImage(screen(gamma=(1.0, 2.2, 3.0)), codes, 1.0, **POSE)

@@ -68,7 +68,8 @@ def test_frames_have_the_moments(colour_camera: CameraModel, level_e: float) -> 
     mean, variance = (float(m[0, 0]) for m in dn_moments(electrons, camera, 3.0))
     frame = sample_from(electrons, camera, np.random.default_rng(7), gain_db=3.0).astype(float)
     n = frame.size
-    # Rounding is uniform noise only where the noise is wide against a code (here 1.9 DN at least, clipped at black): 1 %.
+    # Rounding is uniform noise only where the noise is wide against a code (here 1.9 DN at least, clipped at black): 1
+    # %.
     assert frame.mean() == pytest.approx(mean, abs=4.5 * np.sqrt(variance / n) + 0.01)
     kurtosis = 3.0 if level_e < 10_000 else 12.0
     assert frame.var() == pytest.approx(variance, rel=4.5 * np.sqrt((kurtosis - 1) / n) + 0.02, abs=1e-3)

@@ -1,7 +1,8 @@
 """Frames against their moments: every noise source alone and all together, 200 frames each.
 
-Pixels are independent but for the rows' noise, so over `n` pixels the mean's chi-squared is n within 4.5 sqrt(2 n), and the mean of
-sample variance over wanted variance is 1 within 4.5 times its own scatter over the pixels divided by sqrt(n).
+Pixels are independent but for the rows' noise, so over `n` pixels the mean's chi-squared is n within 4.5 sqrt(2 n), and
+the mean of sample variance over wanted variance is 1 within 4.5 times its own scatter over the pixels divided by
+sqrt(n).
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from sim.spectrum import FloatArray, Spectrum
 FRAMES = 200
 SHAPE = 48, 64
 QUIET = CameraModel(
-    rows=SHAPE[0], cols=SHAPE[1], pixel_pitch_um=3.45, fill_factor=1.0, cfa="MONO", bit_depth=12, black_level_dn=100.0, white_level_dn=4095.0,
-    conversion_gain_dn_per_e=1.0, full_well_e=10_000.0, read_noise_e=0.0, dark_current_e_per_s=0.0, dsnu_e=0.0, prnu_percent=0.0,
+    rows=SHAPE[0], cols=SHAPE[1], pixel_pitch_um=3.45, fill_factor=1.0, cfa="MONO", bit_depth=12, black_level_dn=100.0,
+    white_level_dn=4095.0,
+    conversion_gain_dn_per_e=1.0, full_well_e=10_000.0, read_noise_e=0.0, dark_current_e_per_s=0.0, dsnu_e=0.0,
+    prnu_percent=0.0,
     quantum_efficiency={"Y": Spectrum.of([400.0, 700.0], [0.5, 0.5])}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
 )  # fmt: skip
 
@@ -41,7 +44,8 @@ CASES: dict[str, tuple[dict[str, float], float, float]] = {
     "DSNU": ({"dsnu_e": 6.0, "read_noise_e": 2.0}, 0.0, 0.0),
     "column offsets": ({"column_noise_e": 5.0, "read_noise_e": 2.0}, 0.0, 0.0),
     "everything": (
-        {"read_noise_e": 2.4, "row_noise_e": 1.0, "column_noise_e": 0.7, "dsnu_e": 1.5, "prnu_percent": 0.8, "conversion_gain_dn_per_e": 0.4},
+        {"read_noise_e": 2.4, "row_noise_e": 1.0, "column_noise_e": 0.7, "dsnu_e": 1.5, "prnu_percent": 0.8,
+         "conversion_gain_dn_per_e": 0.4},
         2500.0,
         3.0,
     ),
@@ -102,7 +106,9 @@ def test_frames_agree_with_expected_and_variance(name: str) -> None:
     ("source", "size"), [("dsnu_e", 5.0), ("column_noise_e", 4.0), ("prnu_percent", 1.5), ("row_noise_e", 0.0)]
 )
 def test_fixed_patterns_have_their_spatial_variance(source: str, size: float) -> None:
-    """Variance over the pixels of the mean of 200 frames: the pattern's and what the temporal noise leaves, 1/200 of it."""
+    """Variance over the pixels of the mean of 200 frames: the pattern's and what the temporal noise leaves, 1/200 of
+    it.
+    """
     camera = QUIET.model_copy(
         update={"read_noise_e": 2.0, "conversion_gain_dn_per_e": 0.4, "rows": 96, "cols": 400, source: size}
     )
