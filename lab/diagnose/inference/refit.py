@@ -92,8 +92,7 @@ class Fit:
     `log_posterior` is the log-likelihood and log prior there, less `parameter_log_odds` for every parameter.
     `jacobian` (n, p) is that of the prediction by the coordinates that were fitted.
     `promised_gain`: the log posterior that one more Newton step of all coordinates would gain.
-    `tolerated`: the share of the laws' form tolerances by which the seen numbers are likeliest. `conditional_std`: as `std`, of each
-    parameter with the others as they stand.
+    `tolerated`: the share of the laws' form tolerances by which the seen numbers are likeliest.
     """
 
     effects: tuple[Effect, ...]
@@ -104,7 +103,6 @@ class Fit:
     converged: bool = True  # False: a rough fit
     promised_gain: float = 0.0
     tolerated: float = 1.0
-    conditional_std: tuple[dict[str, float | None], ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -333,16 +331,12 @@ def _fit(
     at_best = _prediction_jacobian(model, best, coords, u, typical, high)
     whitened = model.seen_gaussian(best).whiten(at_best[seen])
     std = _standard_deviations(whitened, coords, u, prior_std, len(best))
-    alone = [
-        _standard_deviations(whitened[:, [k]], [c], u[[k]], prior_std[[k]], len(best)) for k, c in enumerate(coords)
-    ]
-    conditional = tuple({n: s for one in alone for n, s in one[i].items()} for i in range(len(best)))
     log_prior += sum(_usual_log_odds(e, s) for e, s in zip(best, std, strict=True))
     promised = _promised_gain(
         tolerated.gaussian, model.seen_value, at_best[seen], (u - prior_centre) / prior_std, prior_std
     )
     log_posterior = value + log_prior - policy.parameter_log_odds * len(coords)
-    return Fit(best, tuple(std), value, log_posterior, at_best, not rough, promised, tolerated.share, conditional)
+    return Fit(best, tuple(std), value, log_posterior, at_best, not rough, promised, tolerated.share)
 
 
 def is_of_usual_size(effects: Effects, camera: CameraModel) -> bool:
