@@ -16,7 +16,7 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.formats.recording_set import RecordingSet
 from lab.measure.level_lines import CLIPPED_LIMIT, robust_response
-from lab.measure.stated_light import light_of
+from lab.measure.stated_light import light_of, most_frequent_gain_db
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
@@ -143,10 +143,9 @@ def exchanged_frames(recordings: RecordingSet, side: Side) -> ExchangedFrames | 
     other's setting. Levels nearer than `APART` tolerances can't be told apart. At most a quarter of a lamp's captures may be wrong.
     """
     flats = recordings.captures(FlatCapture, side)
-    gains = [flat.gain_db or 0.0 for flat in flats]
-    if not gains:
+    if not flats:
         return None
-    gain_db = max(sorted(set(gains)), key=gains.count)
+    gain_db = most_frequent_gain_db(flats)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
     darks = [dark for dark in recordings.captures(DarkCapture, side) if (dark.gain_db or 0.0) == gain_db]
     if len(darks) < 2:

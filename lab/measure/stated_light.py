@@ -43,6 +43,12 @@ def stated_light(flat: FlatCapture) -> StatedLight:
     return StatedLight(flat.exposure_s, "s", flat.wavelength_nm)
 
 
+def most_frequent_gain_db(flats: Sequence[FlatCapture]) -> float:
+    """Return the amplification, dB, of most of the flats, the lowest of several that are equally frequent; 0 without flats."""
+    gains = [flat.gain_db or 0.0 for flat in flats]
+    return max(sorted(set(gains)), key=gains.count, default=0.0)
+
+
 # --- photon numbers ------------------------------------------------------------------------------------------------
 # Photons on a pixel by the irradiance that a reference photodiode measured, for flats whose manifest states no
 # number of photons.

@@ -22,6 +22,7 @@ from lab.diagnose.measurements.repeatability import (
 )
 from lab.formats.results import NoiseFit
 from lab.measure.rounding import variance_before_rounding
+from lab.measure.stated_light import most_frequent_gain_db
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
@@ -95,7 +96,8 @@ def noise_guess(study: Study) -> NoiseGuess:
 def _as_fitted(study: Study, first: NoiseGuess, fitted: NoiseFit, gain_at_0_db: float) -> NoiseGuess:
     """Return the noise fit's figures in the place of first estimates. The fit states its gain for 0 dB, and its read noise without
     rounding: that of the dark frames stays."""
-    gain = gain_at_0_db * 10.0 ** (_flats_gain_db(study) / 20.0)
+    flats = study.recordings.captures(FlatCapture, study.side)
+    gain = gain_at_0_db * 10.0 ** (most_frequent_gain_db(flats) / 20.0)
     black = first.black if fitted.black_level_dn is None else fitted.black_level_dn
     return replace(
         first,
@@ -166,12 +168,6 @@ def _from_darks(study: Study, stated: NoiseGuess) -> NoiseGuess:
         stated, black=black, dark_dn_per_s=dark, dark_c=dark_c, read_dn=read, jitter_dn=max(jitter, BLACK_FLOOR_DN), jitter_freedom=freedom,
         black_std=black_std, dark_std=dark_std,
     )  # fmt: skip
-
-
-def _flats_gain_db(study: Study) -> float:
-    """Return the most frequent amplification of flats, dB, at which the noise is fitted; the fit states its gain for 0 dB."""
-    gains = [flat.gain_db or 0.0 for flat in study.recordings.captures(FlatCapture, study.side)]
-    return max(sorted(set(gains)), key=gains.count, default=0.0)
 
 
 def _transfer_points(study: Study, black: float) -> tuple[list[float], list[float], float]:

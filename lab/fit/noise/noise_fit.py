@@ -37,7 +37,7 @@ from lab.formats.results import ChannelNoise, Emva1288, NoiseFit, PhotonTransfer
 from lab.measure.dark_pixels import DarkPixels, read_noise_distribution, stack_of
 from lab.measure.levels import MeasuredLevel, defective_pixels, rounded_c
 from lab.measure.mishaps import alike_planes, copied_frames, exchanged_frames
-from lab.measure.stated_light import StatedLight, light_of, why_not
+from lab.measure.stated_light import StatedLight, light_of, most_frequent_gain_db, why_not
 from sim.camera import Side
 from sim.spectrum import Spectrum
 
@@ -267,8 +267,7 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     if exchanged is not None:
         recordings = exchanged.corrected
     flats = recordings.captures(FlatCapture, side)
-    gains = [flat.gain_db or 0.0 for flat in flats]
-    gain_db = max(sorted(set(gains)), key=gains.count)
+    gain_db = most_frequent_gain_db(flats)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
     darks = [dark for dark in recordings.captures(DarkCapture, side) if (dark.gain_db or 0.0) == gain_db]
     dark_levels, pixels = _dark_levels(recordings, darks, camera)
