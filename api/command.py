@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
+from lab.cli.sources import open_store, store_to_read
 from lab.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,19 +32,6 @@ RESCUE_FIRST_S = 4.0
 #: Switch interval (s) of Python's threads: short, as a session's steps and the service's answers alternate often.
 SWITCH_S = 0.001
 _ANY = ("0.0.0.0", "::", "")  # addresses that listen everywhere and name no computer
-
-
-def _store(folder: Path | None) -> Store:
-    from lab.capture.settings import Settings
-    from lab.capture.store import Store
-
-    return Store.open(Settings() if folder is None else Settings(data=folder))
-
-
-def _store_to_read(folder: Path | None) -> Store:
-    from lab.cli.sources import store_to_read
-
-    return store_to_read(folder)
 
 
 def _first_key(store: Store) -> None:
@@ -104,7 +92,7 @@ def serve(
     from lab.capture.recovery import Recovery
     from lab.capture.safe_at_start import made_safe_at_start
 
-    store = _store(data)
+    store = open_store(data)
     wanted = is_loopback(host) if create_first_key is None else create_first_key
     makes_key = wanted and not stored_keys(store)
     if not makes_key:
@@ -150,18 +138,18 @@ def create(
     data: Folder = None,
 ) -> None:
     """Make a key and print it. It can't be printed again."""
-    typer.echo(create_key(_store(data), name, scope))
+    typer.echo(create_key(open_store(data), name, scope))
 
 
 @key.command("list")
 def list_keys(data: Folder = None) -> None:
     """Names and scopes of all keys."""
-    for stored in stored_keys(_store_to_read(data)):
+    for stored in stored_keys(store_to_read(data)):
         typer.echo(f"{stored.name}  {stored.scope}")
 
 
 @key.command("remove")
 def remove(name: str, data: Folder = None) -> None:
     """Remove a key and the logins of the operator's page that were made with it."""
-    _store_to_read(data).remove_key(name)
+    store_to_read(data).remove_key(name)
     typer.echo(f"removed: {name}")
