@@ -146,7 +146,7 @@ class LiveCase(Frozen):
 
 
 class FoundParameter(Frozen):
-    """A parameter of a concealed effect that was named: true and estimated value, with standard deviation."""
+    """A parameter of a concealed effect that was named: true and estimated value, with standard deviation or 95 % interval."""
 
     effect: str
     parameter: str
@@ -154,6 +154,7 @@ class FoundParameter(Frozen):
     truth: float
     value: float
     std: float | None
+    interval: tuple[float, float] | None = None
 
 
 class LiveRun(Frozen):
@@ -288,6 +289,7 @@ def judged(case: LiveCase, found: DiagnosisResult) -> LiveRun:
                             truth=float(values[parameter]),
                             value=value.value,
                             std=value.std,
+                            interval=value.interval,
                         )
                     )
     held = found.held_out

@@ -77,6 +77,8 @@ def table(runs: Mapping[str, LiveRun]) -> str:
 
 def _words(parameter: FoundParameter) -> str:
     doubt = "" if parameter.std is None else f" ± {parameter.std:.2g}"
+    if parameter.interval is not None:
+        doubt = f" ({parameter.interval[0]:.3g} to {parameter.interval[1]:.3g})"
     return f"{parameter.parameter} {parameter.value:.3g}{doubt} {parameter.unit}, {parameter.truth:g}"
 
 
@@ -110,10 +112,10 @@ def drawing(runs: Mapping[str, LiveRun]) -> str:
         if parameter is None:
             parts.append(f'<text x="{LABEL_PX + 6}" y="{y + 4:.0f}" fill="{colour}">no value</text>')
             continue
-        ratio = parameter.value / parameter.truth
-        half = 0.0 if parameter.std is None else 2.0 * parameter.std / abs(parameter.truth)
-        parts.append(
-            f'<path d="M{x_of(ratio - half):.1f} {y:.1f}H{x_of(ratio + half):.1f}" stroke="{colour}" stroke-width="2"/>'
-        )
+        ratio, half = parameter.value / parameter.truth, 2.0 * (parameter.std or 0.0) / abs(parameter.truth)
+        ends = ratio - half, ratio + half
+        if parameter.interval is not None:
+            ends = parameter.interval[0] / parameter.truth, parameter.interval[1] / parameter.truth
+        parts.append(f'<path d="M{x_of(ends[0]):.1f} {y:.1f}H{x_of(ends[1]):.1f}" stroke="{colour}" stroke-width="2"/>')
         parts.append(f'<circle cx="{x_of(ratio):.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"/>')
     return "\n".join([*parts, "</svg>\n"])

@@ -23,7 +23,7 @@ from lab.challenge.live import (
     run_case,
     typical_spec,
 )
-from lab.challenge.live_page import drawing, summary, table, write_page
+from lab.challenge.live_page import HIGH, LABEL_PX, LOW, PLOT_PX, drawing, summary, table, write_page
 from lab.challenge.truth import store
 from lab.formats.results import DiagnosisResult, NamedEffect, ParameterValue, Rival
 from mocks.conceal import NOT_SHOWN, parse
@@ -137,6 +137,19 @@ def test_results_that_are_there_are_not_run_again(tmp_path: Path) -> None:
     assert "Run at commit unknown." in text
     others = {name: kept.model_copy(update={"commit": "1234567"}) for name in ("coma", "ghost")}
     assert "Run at commit 1234567, except:\n- unknown: defocus" in summary(runs | others)
+
+
+def test_a_size_with_an_interval_is_drawn_and_told_with_it() -> None:
+    """A size without a standard deviation isn't an exact one: 21 in 20 to 27 um beside 22 um is a line from 20/22 to 27/22."""
+    case = every_case()["defocus"]
+    found = result("explained", ("defocus", ("left",), {"defocus_um": 21.0}, ()))
+    (effect,) = found.effects
+    size = effect.parameters["defocus_um"].model_copy(update={"std": None, "interval": (20.0, 27.0)})
+    told = effect.model_copy(update={"parameters": {"defocus_um": size}})
+    runs = {"defocus": judged(case, found.model_copy(update={"effects": (told,)}))}
+    assert "defocus_um 21 (20 to 27) um, 22" in table(runs)
+    start, end = LABEL_PX + PLOT_PX * (20.0 / 22.0 - LOW) / (HIGH - LOW), LABEL_PX + PLOT_PX * (27.0 / 22.0 - LOW) / (HIGH - LOW)  # fmt: skip
+    assert f"M{start:.1f} " in drawing(runs) and f"H{end:.1f}" in drawing(runs)
 
 
 def test_a_bench_that_refuses_is_a_failed_case(tmp_path: Path) -> None:
