@@ -1,4 +1,6 @@
-"""Summaries of captures that fit, validation and diagnosis share: each kind of capture is measured by one code.
+"""Summaries of captures that fits and diagnosis share; it knows neither.
 
-Frames are read once by whoever asks first (`RecordingSet.frame`); a summary holds values, their uncertainty, and the captures it is of.
+So far those of darks and flats: statistics of the levels (`levels`), lines through them (`level_lines`), the light that flats state
+(`stated_light`), single pixels in the dark (`dark_pixels`), and captures that aren't what they are said to be (`mishaps`). Edges, screens,
+boards and spectra are still measured in `lab.fit` and in `lab.diagnose.measurements`.
 """
