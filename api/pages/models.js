@@ -3,7 +3,6 @@
 import { $, api, ask, element, may, show, time, told } from "./page.js";
 import { takesFiles } from "./send.js";
 
-
 export function modelsAre() {
   $("model-drop").hidden = !may("calibrate");
 }

@@ -341,7 +341,8 @@ def preview_capture(
     width: Annotated[int, Query(ge=16, le=4096, description="px, at most")] = 480,
     stretch: Annotated[bool, Query(description="white is the frame's own brightest, not the data sheet's")] = False,
 ) -> Response:
-    """A small picture, .png or .webp (a tenth of its bytes): black subtracted, one value per colour and mosaic cell, gamma-encoded, without white balance."""
+    """A small picture, .png or .webp (a tenth of its bytes): black subtracted, one value per colour and mosaic cell, gamma-encoded, without white
+    balance."""
     info = _known_capture(service, session_id, capture_id)
     tag = f'"{session_id}-{capture_id}-{width}-{int(stretch)}-{picture}"'
     headers = FOR_EVER | {"ETag": tag}
