@@ -20,7 +20,7 @@ from drivers.camera.base import Camera as CameraDriver
 from drivers.camera.base import Frame, StreamingCamera, capture_together
 from drivers.camera.stream import MOST_LOST, FrameStream
 from drivers.display.base import Display
-from drivers.errors import Garbled, InstrumentError, NoAnswer, Refused
+from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
 from drivers.monochromator.base import Monochromator
 from drivers.photodiode.base import IrradianceMeasurement, Photodiode
 from drivers.spectroradiometer.base import Spectroradiometer
@@ -174,10 +174,23 @@ class ShutterDevice(Device):
 
 
 def shut(monochromator: Monochromator) -> None:
-    """Stop a monochromator and ask for its shutter. Raises InstrumentError where it says that it is open still."""
+    """Stop a monochromator and ask for its shutter. Raises InstrumentError where it says that it is open still.
+
+    A stop by another thread, which closes the shutter as well, ends the question: it is asked again within `STOP_S`.
+    """
     monochromator.stop()
-    if monochromator.shutter_is_open():
+    if _ask_shutter(monochromator):
         raise InstrumentError("monochromator: its shutter is open though it was told to close; block the light by hand")
+
+
+def _ask_shutter(monochromator: Monochromator) -> bool:
+    until = time.monotonic() + STOP_S
+    while True:
+        try:
+            return monochromator.shutter_is_open()
+        except Interrupted:
+            if time.monotonic() >= until:
+                raise
 
 
 @dataclass(frozen=True)

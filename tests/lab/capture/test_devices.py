@@ -6,11 +6,12 @@ import time
 import numpy as np
 import pytest
 
-from drivers.errors import InstrumentError, NoAnswer
+from drivers.errors import InstrumentError, Interrupted, NoAnswer
 from lab.capture import blocking_calls
 from lab.capture.blocking_calls import Status, in_thread
-from lab.capture.devices import level_of
+from lab.capture.devices import level_of, shut
 from lab.formats.recording_set import DataSheet
+from tests.lab.fake_bench import Bench, FakeMonochromator
 
 
 def test_a_level_is_that_of_the_brightest_channel() -> None:
@@ -112,3 +113,29 @@ def test_the_level_is_the_percentile_of_the_codes() -> None:
     for _ in range(20):
         frame = rng.poisson(rng.uniform(1.0, 3000.0), (30, 44)).astype(np.uint16)
         assert level_of(frame, sheet) == pytest.approx(np.percentile(frame, 99.5) / sheet.saturation_dn)
+
+
+@pytest.mark.parametrize(("stops", "is_told"), [(0, True), (1, True), (6, True), (1, False)])
+def test_a_shutter_is_asked_again_where_another_stop_ends_the_question(
+    stops: int, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A halt closes the shutter and ends the run at once, from two threads: each stop ends what the other waits for."""
+    bench, asked = Bench(), 0
+    bench.opened = True
+
+    def shutter_is_open(self: FakeMonochromator) -> bool:
+        nonlocal asked
+        asked += 1
+        if asked <= stops:
+            raise Interrupted("stopped while waiting for 'shutter?'")
+        return self.bench.opened
+
+    monkeypatch.setattr(FakeMonochromator, "shutter_is_open", shutter_is_open)
+    if is_told:
+        shut(FakeMonochromator(bench))
+        assert asked == stops + 1
+    else:  # no time is left
+        monkeypatch.setattr("lab.capture.devices.STOP_S", 0.0)
+        with pytest.raises(Interrupted):
+            shut(FakeMonochromator(bench))
+    assert not bench.opened
