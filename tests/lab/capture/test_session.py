@@ -256,8 +256,8 @@ def test_an_abort_ends_the_packing_which_goes_on_later(store: Store, monkeypatch
     session = begin(store, Bench(), DARKS)
     info = session.run()
     assert (info.state, info.error) == ("interrupted", "halted") and info.steps_done == info.steps
-    # Those that had begun, and not all of the 40 frames; how many depends on when the packing thread gets the processor.
-    assert len(packed) < 40
+    # Those that a thread had begun, two at a time, and no other of the 40 frames.
+    assert len(packed) < 10
     monkeypatch.setattr(nexus, "_chunk", chunk)
     assert CaptureSession(store, session.id, connect=Bench().drivers).run().state == "finished"
     assert_whole(store, session.id)
