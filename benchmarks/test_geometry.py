@@ -14,12 +14,12 @@ import pytest
 
 from benchmarks.table import Row, show
 from lab.capture_kinds.charuco import CharucoCapture
-from lab.fit.geometry.board_detection import find_board, luminance
-from lab.fit.geometry.calibration import calibrate, calibrate_robustly
-from lab.fit.geometry.pinhole import difference, grid, grid_points, intrinsics_of, points_at
-from lab.fit.geometry.recordings import fit_geometry, geometry_result
+from lab.fit.geometry import fit_geometry, geometry_result
 from lab.fit.stereo import fit_stereo
 from lab.formats.importers import read_checkerboard_pairs
+from lab.measure.board_calibration import calibrate, calibrate_robustly
+from lab.measure.board_detection import find_board, luminance
+from lab.measure.pinhole import difference, grid, grid_points, intrinsics_of, points_at
 from tests.lab.fit import conftest as drawn
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 

@@ -23,8 +23,8 @@ import psutil
 import pytest
 
 from benchmarks.table import Row, show
-from lab.fit.geometry.recordings import fit_geometry
-from lab.fit.mtf.recordings import fit_mtf
+from lab.fit.geometry import fit_geometry
+from lab.fit.mtf import fit_mtf
 from lab.fit.noise.noise_fit import fit_noise
 from lab.fit.psf.recordings import fit_psf_field
 from lab.fit.spectral.recordings import fit_spectral

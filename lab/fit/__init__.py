@@ -91,8 +91,8 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
     """Run the fits of `steps` of one side. Geometry runs in a thread of its own. `told` is called with each step that
     was done.
     """
-    from lab.fit.geometry.recordings import fit_geometry
-    from lab.fit.mtf.recordings import fit_mtf
+    from lab.fit.geometry import fit_geometry
+    from lab.fit.mtf import fit_mtf
     from lab.fit.noise.noise_fit import fit_noise
     from lab.fit.psf.recordings import fit_psf_field
     from lab.fit.spectral.recordings import fit_spectral

@@ -4,7 +4,7 @@ Every number that a fit states with a standard deviation is compared, found by i
 of a curve or a kernel share one row: that of the point with the largest difference, corrected for the number of points
 (Sidak). Dark currents are compared at the sensor temperature of A (`lab.fit.noise.dark_current`). The geometry of
 cameras is also compared by its effect: both calibrations project the same points, after the rigid motion that they
-imply between each other is removed (`lab.fit.geometry.pinhole`). Parameters that differ much may project alike, and the
+imply between each other is removed (`lab.measure.pinhole`). Parameters that differ much may project alike, and the
 reverse.
 
 Rules by which changes fail a check (`calibench compare --fail-on`) name a figure and a tolerance: `FIGURE`, or
@@ -28,18 +28,6 @@ from scipy import special
 from scipy.spatial.transform import Rotation
 
 from lab.errors import InputError
-from lab.fit.geometry.pinhole import (
-    COUNT,
-    NAMES,
-    difference,
-    grid,
-    grid_points,
-    implied_motion,
-    intrinsics_of_fit,
-    project,
-    seen_points,
-    unproject,
-)
 from lab.fit.noise.dark_current import SensorTemperature
 from lab.formats.results import (
     CameraFit,
@@ -58,6 +46,18 @@ from lab.formats.results import (
     StereoFit,
 )
 from lab.formats.results.figure_names import plain_name, unit_of
+from lab.measure.pinhole import (
+    COUNT,
+    NAMES,
+    difference,
+    grid,
+    grid_points,
+    implied_motion,
+    intrinsics_of_fit,
+    project,
+    seen_points,
+    unproject,
+)
 from sim.camera import Side
 from sim.parameters import Frozen
 

@@ -2,7 +2,7 @@
 saw.
 
 One least-squares problem over everything that both cameras saw: rotation and translation of the rig, the intrinsics of
-both cameras, the warp of the boards and the pose of the board in every capture (`lab.fit.geometry.bundle_adjustment`).
+both cameras, the warp of the boards and the pose of the board in every capture (`lab.measure.bundle_adjustment`).
 A solve for the rig alone, with the intrinsics held at the values of the single cameras, would transfer their errors to
 the rig and leave them out of its uncertainty.
 
@@ -24,8 +24,12 @@ from scipy.spatial.transform import Rotation
 
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import BoardView, board_points
-from lab.fit.geometry.bundle_adjustment import (
+from lab.fit.geometry import corner_errors
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
+from lab.measure.board_calibration import list_reasons
+from lab.measure.board_detection import BoardView, board_points
+from lab.measure.bundle_adjustment import (
     RIG,
     BundleAdjustment,
     Observation,
@@ -35,8 +39,7 @@ from lab.fit.geometry.bundle_adjustment import (
     board_pose,
     rms_px,
 )
-from lab.fit.geometry.calibration import list_reasons
-from lab.fit.geometry.pinhole import (
+from lab.measure.pinhole import (
     NAMES,
     cross_matrices,
     distortion_of,
@@ -48,9 +51,6 @@ from lab.fit.geometry.pinhole import (
     project_with_jacobian,
     unproject,
 )
-from lab.fit.geometry.recordings import corner_errors
-from lab.formats.recording_set import RecordingSet
-from lab.formats.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 

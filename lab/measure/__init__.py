@@ -1,6 +1,12 @@
 """Summaries of captures that fits and diagnosis share; it knows neither.
 
-So far those of darks and flats: statistics of the levels (`levels`), lines through them (`level_lines`), the light that flats state
-(`stated_light`), single pixels in the dark (`dark_pixels`), and captures that aren't what they are said to be (`mishaps`). Edges, screens,
-boards and spectra are still measured in `lab.fit` and in `lab.diagnose.measurements`.
+- darks and flats: statistics of the levels (`levels`), lines through them (`level_lines`), the light that flats state
+  (`stated_light`), single pixels in the dark (`dark_pixels`);
+- slanted edges: the edges of a frame and the MTF of one (`edges`), by `edge_finding`, `edge_spread` and `edge_mtf`;
+- boards: corners (`board_detection`), the camera model (`pinhole`), one solve for intrinsics, poses and warp
+  (`bundle_adjustment`), and its outliers, choice of model and halves (`board_calibration`);
+- screens: captures of one pose, and where the pattern lies in the frame (`screen_registration`);
+- captures that aren't what they are said to be (`mishaps`).
+
+Spectra and charts are still measured in `lab.fit.spectral` and `lab.diagnose.measurements`.
 """

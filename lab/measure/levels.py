@@ -175,6 +175,9 @@ def pattern_sums(
 
 
 SHADING_DEGREE = 6
+#: Share of saturation that the levels of a figure at saturation have to reach: a parabola through less says nothing of
+#: what it does beyond twice their range.
+LEAST_REACH = 0.5
 F = TypeVar("F", bound=np.floating[Any])
 
 

@@ -15,9 +15,9 @@ import numpy as np
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
-from lab.fit.mtf.recordings import measure_edge
-from lab.fit.mtf.transfer_function import EdgeMtf
 from lab.formats.recording_set import RecordingSet
+from lab.measure.edge_mtf import EdgeMtf
+from lab.measure.edges import measure_edge
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.frame import Exposure, dark_electrons, expected_electrons, is_steady, read_out

@@ -19,8 +19,6 @@ from lab.diagnose.measurements.chart import Patch as PatchLevel
 from lab.diagnose.measurements.chart import patch_covariance, patch_levels
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.mtf.recordings import measure_edge
-from lab.fit.mtf.transfer_function import EdgeMtf
 from lab.fit.psf.screen_kernel import expected_kernel
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
@@ -34,6 +32,8 @@ from lab.formats.results import (
     Skipped,
     ValidationResult,
 )
+from lab.measure.edge_mtf import EdgeMtf
+from lab.measure.edges import measure_edge
 from lab.one_blas_thread import one_blas_thread
 from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side

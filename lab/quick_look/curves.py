@@ -15,8 +15,8 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import InputError, NotDetermined
-from lab.fit.mtf.recordings import measure_edge
 from lab.formats.recording_set import RecordingSet
+from lab.measure.edges import measure_edge
 from sim.camera import Side
 from sim.parameters import Frozen
 from sim.sensor.mosaic import planes

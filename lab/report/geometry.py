@@ -11,10 +11,10 @@ from scipy.spatial import ConvexHull, QhullError
 
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import InputError, NotDetermined
-from lab.fit.geometry.board_detection import luminance
 from lab.fit.stereo import rectification_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
+from lab.measure.board_detection import luminance
 from lab.report.charts import CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.figures import measured
 from lab.report.pictures import photograph_data_uri

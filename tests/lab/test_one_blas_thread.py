@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from lab.fit.mtf import transfer_function
+from lab.measure import edge_mtf
 from lab.one_blas_thread import one_blas_thread
-from tests.lab.fit.mtf.drawn_edges import edge
+from tests.lab.measure.drawn_edges import edge
 
 
 def blas_threads() -> set[int]:
@@ -87,9 +87,9 @@ def test_the_last_to_leave_gives_them_back():
 
 def test_an_edge_is_measured_with_one(monkeypatch: pytest.MonkeyPatch):
     seen: list[set[int]] = []
-    measured = transfer_function.measure_mtf
+    measured = edge_mtf.measure_mtf
     monkeypatch.setattr(
-        transfer_function, "measure_mtf", lambda *arguments: (seen.append(blas_threads()), measured(*arguments))[1]
+        edge_mtf, "measure_mtf", lambda *arguments: (seen.append(blas_threads()), measured(*arguments))[1]
     )
-    transfer_function.edge_mtf(np.asarray(edge(64, 5.0, 0.5)))
+    edge_mtf.edge_mtf(np.asarray(edge(64, 5.0, 0.5)))
     assert seen == [{1}]

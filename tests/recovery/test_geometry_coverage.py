@@ -8,12 +8,12 @@ import pytest
 from scipy.optimize import least_squares
 
 from lab.fit.compare import compare
-from lab.fit.geometry.board_detection import CornerFits
-from lab.fit.geometry.calibration import calibrate_robustly, cross_validation
-from lab.fit.geometry.pinhole import difference, grid, grid_points, intrinsics_of, points_at
-from lab.fit.geometry.recordings import channel_geometry, geometry_result
+from lab.fit.geometry import channel_geometry, geometry_result
 from lab.fit.stereo import StereoPair, depth_std, solve_rig
 from lab.formats.results import CameraFit, FitResult
+from lab.measure.board_calibration import calibrate_robustly, cross_validation
+from lab.measure.board_detection import CornerFits
+from lab.measure.pinhole import difference, grid, grid_points, intrinsics_of, points_at
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 DRAWS, VARIANCE_DRAWS = 400, 800

@@ -14,7 +14,7 @@ from lab.diagnose.measurements.boards import FEWEST_CORNERS, REFERENCE_NM, views
 from lab.diagnose.measurements.lateral_colour import COLOUR_FLOOR_PX, colour_shift_px, outward_shifts_px
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import BoardView, channel_corners
+from lab.measure.board_detection import BoardView, channel_corners
 from sim.spectrum import FloatArray
 
 Array = NDArray[np.floating[Any]]

@@ -19,11 +19,11 @@ from scipy import linalg
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import BoardView, find_boards
-from lab.fit.geometry.bundle_adjustment import BundleAdjustment, Solution
-from lab.fit.geometry.calibration import MODELS, Calibration, calibrate_robustly, free_intrinsics, observations_of
-from lab.fit.geometry.pinhole import NAMES, intrinsics_of
 from lab.formats.results import Skipped
+from lab.measure.board_calibration import MODELS, Calibration, calibrate_robustly, free_intrinsics, observations_of
+from lab.measure.board_detection import BoardView, find_boards
+from lab.measure.bundle_adjustment import BundleAdjustment, Solution
+from lab.measure.pinhole import NAMES, intrinsics_of
 from sim.camera import Side
 from sim.point import displaced_um
 from sim.spectrum import FloatArray

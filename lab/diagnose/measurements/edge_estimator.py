@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import CubicSpline
 
-from lab.fit.mtf.transfer_function import ROUGHNESS_SHARE, EdgeGeometry
+from lab.measure.edge_mtf import ROUGHNESS_SHARE, EdgeGeometry
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]

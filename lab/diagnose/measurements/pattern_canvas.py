@@ -14,8 +14,7 @@ from scipy.interpolate import CubicSpline, RectBivariateSpline
 from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.psf.screen_kernel import draw_by_area
-from lab.fit.psf.screen_registration import ScreenWarp
+from lab.measure.screen_registration import ScreenWarp, draw_by_area
 from sim.camera import CameraModel
 from sim.frame import screen_light
 from sim.optics.diffraction import aperture_otf

@@ -1,6 +1,6 @@
 """The fit of a random (Bernoulli) pattern on a screen: its image as a linear combination of parts of the drawn pattern.
 
-The pattern is drawn where the checkerboard captures place it (`lab.fit.psf.screen_registration`), and blurred by the baseline's OTF.
+The pattern is drawn where the checkerboard captures place it (`lab.measure.screen_registration`), and blurred by the baseline's OTF.
 The drawn pattern P is split into bands P_b of frequency and orientation. The recorded image, black subtracted and divided by white
 less black, is fitted by least squares over the pixels of each channel:
 
@@ -43,7 +43,7 @@ from lab.diagnose.measurements.pattern_canvas import (
 from lab.diagnose.measurements.reads import SHOWN, acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.psf.screen_registration import ScreenWarp, register
+from lab.measure.screen_registration import ScreenWarp, register
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.frame import with_reflections

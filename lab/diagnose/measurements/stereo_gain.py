@@ -22,7 +22,7 @@ from lab.diagnose.measurements.dark_squares import screen_block
 from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_variance
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import BoardView
+from lab.measure.board_detection import BoardView
 from lab.predict.camera_model import camera_model
 from sim.camera import Side
 from sim.effects.veiling_glare import VeilingGlare

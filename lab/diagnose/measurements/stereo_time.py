@@ -12,10 +12,10 @@ from lab.diagnose.measurements.boards import views_of
 from lab.diagnose.measurements.stereo_gain import SIDES, needs_both_sides
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import BoardView
-from lab.fit.geometry.bundle_adjustment import board_pose
-from lab.fit.geometry.calibration import Calibration, calibrate_robustly
-from lab.fit.geometry.pinhole import project
+from lab.measure.board_calibration import Calibration, calibrate_robustly
+from lab.measure.board_detection import BoardView
+from lab.measure.bundle_adjustment import board_pose
+from lab.measure.pinhole import project
 from sim.frame import right_delay_s
 from sim.spectrum import FloatArray
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.diagnose.measurements.boards import BOARDS
 from lab.diagnose.metadata.misstatement import Misstatement
-from lab.fit.geometry.board_detection import as_grey, luminance
 from lab.formats.recording_set import RecordingSet
+from lab.measure.board_detection import as_grey, luminance
 from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]

@@ -9,8 +9,8 @@ import numpy as np
 from lab.diagnose.measurements.pattern_contrast import BERNOULLI
 from lab.diagnose.metadata.misstatement import Misstatement
 from lab.errors import NotDetermined
-from lab.fit.psf.screen_registration import ScreenPictures, register, screen_pictures
 from lab.formats.recording_set import RecordingSet
+from lab.measure.screen_registration import ScreenPictures, register, screen_pictures
 from sim.camera import Side
 
 TOLERANCE = 0.05  # relative: the stated size is nominal, and cells of a tilted screen differ over the frame

@@ -17,8 +17,8 @@ from scipy import special
 
 from lab.diagnose.measurements.boards import BOARDS
 from lab.diagnose.policy import DecisionPolicy
-from lab.fit.geometry.board_detection import MIN_CORNERS
 from lab.formats.results import GeometryFit, Unexplained, ViewResiduals
+from lab.measure.board_detection import MIN_CORNERS
 from sim.camera import Side
 from sim.spectrum import FloatArray
 

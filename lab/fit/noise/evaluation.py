@@ -23,7 +23,7 @@ from lab.measure.level_lines import (
     robust_response,
     saturation_of,
 )
-from lab.measure.levels import MeasuredLevel, RecordedLevels, Remarks
+from lab.measure.levels import LEAST_REACH, MeasuredLevel, RecordedLevels, Remarks
 from lab.measure.rounding import QUANTISATION_DN2
 
 # --- level consistency ---------------------------------------------------------------------------------------------
@@ -227,9 +227,6 @@ def lamp_drift(recorded: RecordedLevels, dark: DarkSignal, saturation: Saturatio
 
 
 MIN_LEVELS = 3
-#: Share of saturation that the levels of a figure at saturation have to reach: a parabola through less says nothing of what it does beyond twice
-#: their range.
-LEAST_REACH = 0.5
 
 
 @dataclass(frozen=True)

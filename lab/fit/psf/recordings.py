@@ -15,9 +15,9 @@ from scipy import special
 
 from lab.errors import NotDetermined
 from lab.fit.psf.screen_kernel import ScreenKernel, measure_field
-from lab.fit.psf.screen_registration import screen_pictures
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import PsfKernel, PsfSymmetry
+from lab.measure.screen_registration import screen_pictures
 from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]

@@ -20,7 +20,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from lab.errors import NotDetermined
 from lab.fit.psf.kernel import KernelEstimate, NormalEquations, on_simplex, solve_kernel
-from lab.fit.psf.screen_registration import ScreenPictures, ScreenWarp, register
+from lab.measure.screen_registration import ScreenPictures, ScreenWarp, draw_by_area, register
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases
@@ -206,21 +206,6 @@ class DrawnPattern:
         step = np.linalg.lstsq((columns * inlier) @ columns.T, (columns * inlier) @ residual, rcond=1e-10)[0]
         step = step.reshape(2, -1)
         return self.warp.displace(np.column_stack([-step @ mean, step]))
-
-
-def draw_by_area(target: Array, cell_x: Array, cell_y: Array) -> Array:
-    """Average `target` (cells) over squares the size of a sample about the points `cell_x`, `cell_y`; dark outside.
-
-    The squares are aligned with the cells: the error is of second order in their rotation. A square may hold any
-    number of cells.
-    """
-    from sim.scene.area import aligned_means  # here: the compiler's library takes a while to load
-
-    table = np.pad(target.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-    wide, high = (
-        float(sum(np.abs(part).mean() for part in np.gradient(cell[::16, ::16]))) / 16.0 for cell in (cell_x, cell_y)
-    )
-    return np.asarray(aligned_means(table, cell_x, cell_y, wide, high))
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def read_slanted_edge(path: Path, options: ImportOptions) -> RecordingSet:
     Raises InputError with all that isn't stated, in one line, or where no edge is found in the picture.
     """
     from lab.errors import NotDetermined
-    from lab.fit.mtf.recordings import find_edges
+    from lab.measure.edges import find_edges
 
     frame, camera, notes = _picture(path, options, lambda image: _one_channel(image, options), ())
     try:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lab.capture_kinds.charuco import CharucoCapture
-from lab.fit.geometry.recordings import fit_geometry
+from lab.fit.geometry import fit_geometry
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import GeometryFit
 

@@ -12,8 +12,7 @@ import pytest
 
 from lab.cli import main
 from lab.fit.compare import compare, numbers_of
-from lab.fit.geometry.calibration import calibrate_robustly
-from lab.fit.geometry.recordings import geometry_result
+from lab.fit.geometry import geometry_result
 from lab.formats.results import (
     CameraFit,
     ComparisonResult,
@@ -26,6 +25,7 @@ from lab.formats.results import (
     SpectralFit,
     StereoFit,
 )
+from lab.measure.board_calibration import calibrate_robustly
 from tests.lab.fit.projected import SHAPE, poses, seen
 
 

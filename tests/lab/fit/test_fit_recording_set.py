@@ -16,9 +16,9 @@ from lab.formats.results import FitResult, GeometryFit, NoiseFit, StereoFit
 STEPS = {
     "noise": "lab.fit.noise.noise_fit.fit_noise",
     "spectral": "lab.fit.spectral.recordings.fit_spectral",
-    "mtf": "lab.fit.mtf.recordings.fit_mtf",
+    "mtf": "lab.fit.mtf.fit_mtf",
     "psf": "lab.fit.psf.recordings.fit_psf_field",
-    "geometry": "lab.fit.geometry.recordings.fit_geometry",
+    "geometry": "lab.fit.geometry.fit_geometry",
     "stereo": "lab.fit.stereo.fit_stereo",
 }
 

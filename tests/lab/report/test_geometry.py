@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.fit.geometry.calibration import calibrate_robustly
-from lab.fit.geometry.recordings import geometry_result
+from lab.fit.geometry import geometry_result
 from lab.fit.stereo import StereoPair, fit_pairs
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import ChannelGeometry, GeometryFit
+from lab.measure.board_calibration import calibrate_robustly
 from lab.report.geometry import (
     charts_by_side,
     coverage,

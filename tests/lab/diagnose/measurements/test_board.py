@@ -16,8 +16,8 @@ from lab.diagnose.measurements.stereo_time import time_block
 from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
-from lab.fit.geometry.pinhole import distortion_of, matrix_of
 from lab.formats.recording_set import RecordingSet
+from lab.measure.pinhole import distortion_of, matrix_of
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed

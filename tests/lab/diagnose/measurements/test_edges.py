@@ -14,8 +14,8 @@ from lab.diagnose.measurements.edge_estimator import REAL_AT, profile_interpolat
 from lab.diagnose.measurements.slanted_edge import ASIDE, _Edges, edge_block
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.mtf.recordings import check_phases
 from lab.formats.recording_set import Manifest, RecordingSet
+from lab.measure.edges import check_phases
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed

@@ -13,10 +13,10 @@ import pytest
 from lab.diagnose import diagnose, examine
 from lab.diagnose.outcome.board_departure import board_departure
 from lab.diagnose.policy import DecisionPolicy
-from lab.fit.geometry.calibration import calibrate_robustly
-from lab.fit.geometry.recordings import fit_geometry, geometry_result
+from lab.fit.geometry import fit_geometry, geometry_result
 from lab.formats.importers import read_checkerboard_pairs
 from lab.formats.results import CameraFit, FitResult, GeometryFit, Unexplained
+from lab.measure.board_calibration import calibrate_robustly
 from tests.lab.diagnose.on_blocks import former
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 

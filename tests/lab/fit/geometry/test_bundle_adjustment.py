@@ -14,8 +14,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lab.fit.geometry.board_detection import find_boards
-from lab.fit.geometry.bundle_adjustment import (
+from lab.fit.geometry import geometry_result
+from lab.fit.stereo import StereoPair, rig_observations, solve_rig
+from lab.formats.importers import read_checkerboard_pairs
+from lab.measure.board_calibration import MODELS, calibrate, calibrate_robustly, free_intrinsics, with_model_error
+from lab.measure.board_detection import find_boards
+from lab.measure.bundle_adjustment import (
     BundleAdjustment,
     Observation,
     RigParameters,
@@ -23,11 +27,7 @@ from lab.fit.geometry.bundle_adjustment import (
     first_intrinsics,
     first_state,
 )
-from lab.fit.geometry.calibration import MODELS, calibrate, calibrate_robustly, free_intrinsics, with_model_error
-from lab.fit.geometry.pinhole import intrinsics_of
-from lab.fit.geometry.recordings import geometry_result
-from lab.fit.stereo import StereoPair, rig_observations, solve_rig
-from lab.formats.importers import read_checkerboard_pairs
+from lab.measure.pinhole import intrinsics_of
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 AT = poses(10)

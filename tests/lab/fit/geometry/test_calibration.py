@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.geometry.calibration import calibrate_robustly, cross_validation
+from lab.measure.board_calibration import calibrate_robustly, cross_validation
 from tests.lab.fit.projected import SHAPE, Truth, poses, seen
 
 

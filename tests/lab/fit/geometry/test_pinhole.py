@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.fit.geometry.calibration import calibrate_robustly
-from lab.fit.geometry.pinhole import (
+from lab.measure.board_calibration import calibrate_robustly
+from lab.measure.pinhole import (
     cross_matrices,
     difference,
     distortion_of,

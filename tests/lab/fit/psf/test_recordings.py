@@ -19,8 +19,8 @@ from lab.errors import NotDetermined
 from lab.fit.psf import recordings
 from lab.fit.psf.recordings import PsfFit, fit_psf_field, radial_symmetry
 from lab.fit.psf.screen_kernel import ScreenField, ScreenKernel, measure_field
-from lab.fit.psf.screen_registration import ScreenPictures, register, screen_pictures, target_corners
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
+from lab.measure.screen_registration import ScreenPictures, register, screen_pictures, target_corners
 from tests.lab.fit.psf.drawn_targets import (
     gaussian,
 )

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lab.errors import InputError
-from lab.fit.geometry.recordings import fit_geometry
+from lab.fit.geometry import fit_geometry
 from lab.fit.stereo import fit_stereo
 from lab.formats import recording_set as recording
 from lab.formats.importers import ImportOptions, read_foreign

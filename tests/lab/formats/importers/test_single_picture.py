@@ -9,7 +9,7 @@ import pytest
 from scipy.special import erf
 
 from lab.errors import InputError
-from lab.fit.mtf.recordings import fit_mtf
+from lab.fit.mtf import fit_mtf
 from lab.formats import recording_set as recording
 from lab.formats.importers import ImportOptions, read_colour_chart, read_slanted_edge
 from lab.formats.importers.single_picture import located_chart

@@ -18,7 +18,7 @@ from scipy import sparse
 from scipy.interpolate import CubicSpline
 
 from lab.errors import NotDetermined
-from lab.fit.mtf.edge_finding import (
+from lab.measure.edge_finding import (
     EdgeCurve,
     Plane,
     Samples,
@@ -33,7 +33,7 @@ from lab.fit.mtf.edge_finding import (
     usable_reach_px,
     widest_gap_px,
 )
-from lab.fit.mtf.edge_spread import (
+from lab.measure.edge_spread import (
     KNOT_SPACING_PX,
     LOG_LIKELIHOOD_RANGE,
     LineSpreadPriors,

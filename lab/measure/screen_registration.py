@@ -24,8 +24,8 @@ from scipy import ndimage, spatial
 
 from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import fit_corners
 from lab.formats.recording_set import RecordingSet
+from lab.measure.board_detection import fit_corners
 from sim.camera import Side
 from sim.sensor.mosaic import planes
 
@@ -353,3 +353,18 @@ def _fit_warp(points: Array, cells: Array) -> ScreenWarp:
         kept = left < 5.0 * rms / np.sqrt(2.0) + 1e-6
     std = rms / float(np.sqrt(2.0 * max(int(kept.sum()) - terms, 1)))
     return ScreenWarp(homography, displacement, warp.centre, warp.scale, rms, std)
+
+
+def draw_by_area(target: Array, cell_x: Array, cell_y: Array) -> Array:
+    """Average `target` (cells) over squares the size of a sample about the points `cell_x`, `cell_y`; dark outside.
+
+    The squares are aligned with the cells: the error is of second order in their rotation. A square may hold any
+    number of cells.
+    """
+    from sim.scene.area import aligned_means  # here: the compiler's library takes a while to load
+
+    table = np.pad(target.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    wide, high = (
+        float(sum(np.abs(part).mean() for part in np.gradient(cell[::16, ::16]))) / 16.0 for cell in (cell_x, cell_y)
+    )
+    return np.asarray(aligned_means(table, cell_x, cell_y, wide, high))

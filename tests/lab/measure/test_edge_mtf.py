@@ -12,10 +12,10 @@ from scipy.special import erf, ndtr
 
 from lab.errors import NotDetermined
 from lab.fit.mtf import edge_mtf
-from lab.fit.mtf.edge_finding import Plane, half_way_px
-from lab.fit.mtf.edge_spread import SortedSamples, Spline
-from lab.fit.mtf.transfer_function import planes_mtf
-from tests.lab.fit.mtf.drawn_edges import edge, gaussian_mtf, gaussian_mtf50, noisy, squares
+from lab.measure.edge_finding import Plane, half_way_px
+from lab.measure.edge_mtf import planes_mtf
+from lab.measure.edge_spread import SortedSamples, Spline
+from tests.lab.measure.drawn_edges import edge, gaussian_mtf, gaussian_mtf50, noisy, squares
 
 KNOTS_PX = np.array([-40.0, -9.0, -4.0, -2.5, *np.arange(-8, 9) * 0.25, 2.5, 4.0, 9.0, 40.0])
 SPLINE = Spline(KNOTS_PX)

@@ -39,8 +39,8 @@ from scipy import linalg, optimize
 from scipy.spatial.transform import Rotation
 
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import BoardView
-from lab.fit.geometry.pinhole import (
+from lab.measure.board_detection import BoardView
+from lab.measure.pinhole import (
     COUNT,
     NAMES,
     cross_matrices,
@@ -723,7 +723,7 @@ def first_intrinsics(views: Sequence[BoardView], shape: tuple[int, int]) -> Arra
     """Return a pinhole without distortion to begin with: the focal length of Zhang, or the width of the frame where the
     views determine none.
 
-    `shape`: (rows, cols) of the frames. Returns a vector (12,), see `lab.fit.geometry.pinhole`.
+    `shape`: (rows, cols) of the frames. Returns a vector (12,), see `lab.measure.pinhole`.
     """
     boards = [view.board_mm.astype(np.float32) for view in views]
     points = [view.image_px.astype(np.float32) for view in views]

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import MIN_CORNERS, BoardView
-from lab.fit.geometry.bundle_adjustment import (
+from lab.formats.results import CrossValidation, DistortionModel, Skipped
+from lab.measure.board_detection import MIN_CORNERS, BoardView
+from lab.measure.bundle_adjustment import (
     BundleAdjustment,
     CorrelatedErrors,
     Observation,
@@ -28,8 +29,7 @@ from lab.fit.geometry.bundle_adjustment import (
     rms_px,
     with_boards,
 )
-from lab.fit.geometry.pinhole import COUNT, NAMES, Difference, difference, points_at, projection_std
-from lab.formats.results import CrossValidation, DistortionModel, Skipped
+from lab.measure.pinhole import COUNT, NAMES, Difference, difference, points_at, projection_std
 from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]
@@ -158,7 +158,7 @@ class Calibration:
 
     @property
     def intrinsics(self) -> Array:
-        """Return the intrinsics (12,); see `lab.fit.geometry.pinhole`."""
+        """Return the intrinsics (12,); see `lab.measure.pinhole`."""
         return np.asarray(self.solution.state.intrinsics[0])
 
     @property

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.mtf import edge_mtf
-from lab.fit.mtf.recordings import find_edges, fit_mtf
-from tests.lab.fit.mtf.drawn_edges import edge, gaussian_mtf50, squares
+from lab.fit.mtf import edge_mtf, fit_mtf
+from lab.measure.edges import find_edges
+from tests.lab.measure.drawn_edges import edge, gaussian_mtf50, squares
 
-DATA = Path(__file__).resolve().parents[5] / "shared" / "data" / "sfrmat5_edges"
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data" / "sfrmat5_edges"
 
 
 @pytest.mark.parametrize("cfa", ["MONO", "RGGB"])

@@ -1,4 +1,15 @@
-"""The geometry of a camera from its board captures, as it stands in the results.
+"""Intrinsics of a camera from views of a board, with their uncertainty: the step on a recording set, and its result.
+
+- `lab.measure.board_detection`: corners of a ChArUco board or a checkerboard in the raw mosaic, to hundredths of a
+  pixel;
+- `lab.measure.pinhole`: the camera model of OpenCV and its Jacobian, the uncertainty of the projection over the frame,
+  and the difference of two calibrations;
+- `lab.measure.bundle_adjustment`: one least-squares solve for intrinsics, poses and the warp of the boards, whose
+  Jacobian and residuals give the full covariance. Errors that neighbouring corners share are an error of the model,
+  and part of it;
+- `lab.measure.board_calibration`: outlying corners and views are left out, with the reason. The distortion model is
+  chosen by views that its fit has not seen: a richer model is refused where it predicts them worse. Two halves of the
+  views are calibrated separately; what they differ by beyond their uncertainties widens the covariance.
 
 Lateral colour: the camera of each colour of a mosaic follows from where its corners lie beside those of the luminance
 (`channel_geometry`).
@@ -14,28 +25,6 @@ from numpy.typing import NDArray
 
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import MIN_CORNERS, BoardView, CornerFits, channel_corners, find_boards
-from lab.fit.geometry.bundle_adjustment import Solution, warp_prior_mm
-from lab.fit.geometry.calibration import (
-    DIFFERENCE_SIGMA,
-    MIN_VIEWS,
-    OUTLYING_CORNER_STD,
-    Calibration,
-    calibrate_robustly,
-    cross_validation,
-    first_view_of_boards,
-    list_reasons,
-    widen_covariance,
-)
-from lab.fit.geometry.pinhole import (
-    COUNT,
-    distortion_of,
-    grid,
-    grid_points,
-    matrix_of,
-    project_with_jacobian,
-    unproject,
-)
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
     BoardWarp,
@@ -46,6 +35,28 @@ from lab.formats.results import (
     ProjectionUncertainty,
     Skipped,
     ViewResiduals,
+)
+from lab.measure.board_calibration import (
+    DIFFERENCE_SIGMA,
+    MIN_VIEWS,
+    OUTLYING_CORNER_STD,
+    Calibration,
+    calibrate_robustly,
+    cross_validation,
+    first_view_of_boards,
+    list_reasons,
+    widen_covariance,
+)
+from lab.measure.board_detection import MIN_CORNERS, BoardView, CornerFits, channel_corners, find_boards
+from lab.measure.bundle_adjustment import Solution, warp_prior_mm
+from lab.measure.pinhole import (
+    COUNT,
+    distortion_of,
+    grid,
+    grid_points,
+    matrix_of,
+    project_with_jacobian,
+    unproject,
 )
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side

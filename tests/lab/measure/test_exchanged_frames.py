@@ -14,7 +14,7 @@ from lab.formats.recording_set import RecordingSet
 from lab.measure.mishaps import exchanged_frames
 from tests.lab.fit.noise.synthetic_sensor import Sensor, recording_set, scores
 
-CMOS = Path(__file__).parents[5] / "shared" / "data" / "emva1288_cmos_crop"
+CMOS = Path(__file__).parents[4] / "shared" / "data" / "emva1288_cmos_crop"
 SENSOR = Sensor(shape=(64, 96), bend=0.02)
 DARKS = [(0.001, 3), (1.0, 3), (2.0, 3)]
 LADDER = [(round(float(light), 3), 2) for light in np.linspace(0.05, 1.1, 12)]  # the last saturates in no channel

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lab.errors import NotDetermined
-from lab.fit.mtf.edge_spread import SortedSamples, Spline
+from lab.measure.edge_spread import SortedSamples, Spline
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases
 from sim.sensor.mosaic import step as period
