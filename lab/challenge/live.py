@@ -53,6 +53,7 @@ SIZES: dict[str, str] = {
     "decentre": "left:shift_x_um=3",
     "defocus": "left:defocus_um=22",
     "distortion": "left:corner_percent=1.5",
+    "empirical_law": "left:strength=1",
     "exposure_offset": "left:offset_us=25",
     "field_curvature": "left:curvature_um=25",
     "ghost": "left:share_percent=2",
@@ -118,6 +119,7 @@ WARM_UP_C = {"dark_current_temperature": 6.0}
 #: change recordings alike. The model discrepancy's typical instance is an isotropic loss of contrast.
 NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
     "cover_glass": frozenset({"spherical_aberration"}),
+    "empirical_law": frozenset(),
     "model_discrepancy": frozenset({"isotropic_contrast_loss"}),
     "other_f_number": frozenset(),
 }

@@ -73,6 +73,24 @@ class DecisionPolicy(Frozen):
             "as `slice_false_alarm_rate`",
         ),
     ] = 0.005
+    discovery_rate: Annotated[
+        float,
+        Rule(
+            "significance",
+            "1",
+            "false discoveries among the laws that are told though no effect has them, by Benjamini and Yekutieli",
+            "chosen: a camera is looked at along five indices, and one healthy camera in a hundred may show one",
+        ),
+    ] = 0.005
+    least_discovery_share: Annotated[
+        float,
+        Rule(
+            "significance",
+            "1",
+            "share of chi2 along its index that a law no effect has must take off to be told",
+            "chosen: below, most of what is seen along that index is something else",
+        ),
+    ] = 0.1
     held_out_veto_sigma: Annotated[
         float,
         Rule(

@@ -6,14 +6,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lab.diagnose.discovery import discover, law_of, told
 from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.measurements.blocks import measurement_model, study_of
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.outcome.board_departure import board_departure
@@ -30,6 +31,7 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
+    DiscoveredLaw,
     ExaminedPlace,
     FitResult,
     HeldOut,
@@ -88,6 +90,7 @@ class SideFindings:
     improved: CameraFile | None = None
     proposals: tuple[CaptureProposal, ...] = ()
     settling: str | None = None
+    discovered: tuple[DiscoveredLaw, ...] = ()
     places: tuple[ExaminedPlace, ...] = ()
     measurements: tuple[MeasurementFit, ...] = ()
     visibility: tuple[Visibility, ...] = ()
@@ -116,7 +119,8 @@ def diagnose_side(
     if fit is not None and recordings.camera(side).cfa != stated.cfa:  # its planes were mixed
         fit = fit.model_copy(update={"cameras": {s: c for s, c in fit.cameras.items() if s != side}})
     report("summarising the recordings")
-    model, skipped = measurement_model(recordings, side, fit, baseline)
+    study = study_of(recordings, side, fit, baseline)
+    model, skipped = measurement_model(recordings, side, fit, baseline, study)
     skipped = (*skipped, *unchecked(recordings, side))
     if model is None:
         return SideFindings(side, skipped, unexplained=wrong)
@@ -128,10 +132,13 @@ def diagnose_side(
         least = image_threshold(draws, policy.false_alarm_rate)
     report("scoring the effects")
     verdict = decide(model, rng, policy, report, least_threshold=least)
+    report("looking for laws that no effect has")
+    discovered = discover(study, (*model.always, *verdict.effects), policy)
     report("looking for the next capture")
     improved, corrections = improved_model(
         recordings, side, fit, baseline, model, verdict.effects, verdict.discrepancies
     )
+    improved = replace(improved, effects=(*improved.effects, *(law_of(one, study) for one in discovered)))
     fitted = fit.cameras.get(side) if fit is not None else None
     shape = (model.camera.rows, model.camera.cols)
     departure = board_departure(side, fitted.geometry if fitted is not None else None, shape, policy)
@@ -168,6 +175,7 @@ def diagnose_side(
         improved=improved,
         proposals=proposals(recordings, side, verdict, policy),
         settling=settling_sentence(recordings, side, left),
+        discovered=told(side, study, discovered),
         places=tuple(places(side, verdict, policy)),
         measurements=tuple(measurement_fits(side, verdict)),
         visibility=tuple(detectability(side, verdict, policy)),

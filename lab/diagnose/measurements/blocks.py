@@ -35,16 +35,30 @@ NO_GAIN = (
 _NEAR_FULL = 0.985
 
 
-def measurement_model(
+def study_of(
     recordings: RecordingSet, side: Side, fit: FitResult | None = None, baseline: CameraFile | None = None
+) -> Study:
+    """The study of one side, with the baseline camera that `measurement_model` describes."""
+    camera_fit = fit.cameras.get(side) if fit is not None else None
+    camera = baseline.camera if baseline else camera_model(recordings, side, camera_fit, maker_curves=True)
+    misstated = frozenset(name for level in misstated_levels(camera_fit) for name in level.captures)
+    noise = camera_fit.noise if camera_fit else None
+    return Study(recordings, side, camera, _saturation_dn(camera_fit), misstated, noise)
+
+
+def measurement_model(
+    recordings: RecordingSet,
+    side: Side,
+    fit: FitResult | None = None,
+    baseline: CameraFile | None = None,
+    study: Study | None = None,
 ) -> tuple[MeasurementModel | None, tuple[Skipped, ...]]:
     """The measurement model of one side (None where no measurement is determined), and what was skipped or assumed.
 
     The baseline camera is made of the data sheet and of the side's `fit`. `baseline` stands in place of both: a camera file,
-    whose effects are then part of the baseline.
+    whose effects are then part of the baseline. `study`: that of `study_of`, where it is there already.
     """
     camera_fit = fit.cameras.get(side) if fit is not None else None
-    camera = baseline.camera if baseline else camera_model(recordings, side, camera_fit, maker_curves=True)
     skipped = [
         Skipped(
             step=f"diagnose {a.quantity}",
@@ -53,10 +67,7 @@ def measurement_model(
         )
         for a in assumptions(recordings.camera(side), camera_fit)
     ]
-    misstated = frozenset(name for level in misstated_levels(camera_fit) for name in level.captures)
-    study = Study(
-        recordings, side, camera, _saturation_dn(camera_fit), misstated, camera_fit.noise if camera_fit else None
-    )
+    study = study or study_of(recordings, side, fit, baseline)
     skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for reason in study.copies.told]
     if not study.noise.gain_is_known:
         skipped.append(Skipped(step="diagnose conversion_gain_dn_per_e", reason=NO_GAIN, side=side))

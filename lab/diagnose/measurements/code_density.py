@@ -48,12 +48,13 @@ AROUND = 9  # side of the box in a plane of the mosaic whose mean is the light a
 STEP_OF_LEVELS = 0.2
 PARTS = 4  # of the range of codes, each with a chi2 of its own
 FINE = 8  # samples a code at which the converter's law is evaluated where it isn't straight
+JUMP = 0.5  # codes on which a sample lands, above which the law jumps within it
 STRAIGHT = 1e-9  # codes: second difference of a law between codes, of rounding alone
 MARGIN = 64  # codes beyond those that are counted
 
 
 @dataclass(frozen=True)
-class _Codes:
+class CodeCounts:
     """The histogram over the codes that can be tested; arrays are (codes,)."""
 
     first: int  # the lowest code
@@ -68,7 +69,7 @@ class _Codes:
 def code_block(study: Study) -> Block:
     """Code-density test of all uniform light: steps (DN) by the code, combs of a few codes' period, and the variance of the counts about a
     smooth curve."""
-    counts = _counted(study)
+    counts = study.once(counted)
     joined = int(np.bitwise_or.reduce(np.flatnonzero(sum(c.count for c in counts.values()))))
     apart = joined & -joined  # the largest power of two that divides every code
     if apart >= SHIFTED_FROM:
@@ -78,10 +79,10 @@ def code_block(study: Study) -> Block:
         )
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
-    sets: list[tuple[_Codes, sparse.csr_array, list[_Part]]] = []
+    sets: list[tuple[CodeCounts, sparse.csr_array, list[_Part]]] = []
     values, covariances, scales = [], [], []
     for held_out in (False, True):
-        codes = _prepared(study, counts[held_out])
+        codes = prepared(study, counts[held_out])
         if codes is None:
             continue
         (steps, boundaries), parts = _steps(study, codes), _parts(codes)
@@ -93,7 +94,7 @@ def code_block(study: Study) -> Block:
             np.array([p.excess(residual) - p.number / p.chi2_std for p in parts]),
         ]
         # unequal codes show in proportion to the number of pixels counted: seen and held-out frames have different ones
-        scales += [np.ones(len(steps) + len(combs)), np.array([p.of_widths for p in parts])]
+        scales += [np.ones(len(steps) + len(combs)), np.array([p.ofwidths for p in parts])]
         linear = np.vstack([steps, combs])
         floor = np.concatenate([np.full(len(steps), STEP_FLOOR * _spacing(study)), np.full(len(combs), COMB_FLOOR)])
         covariances += [
@@ -122,7 +123,7 @@ def code_block(study: Study) -> Block:
     def predict(effects: Effects) -> Prediction:
         found = []
         for codes, linear, parts in sets:
-            change = codes.expected * (_widths(codes, effects, study) - 1.0)
+            change = codes.expected * (widths(codes, effects, study) - 1.0)
             moved = codes.rough @ change
             found += [linear @ change, np.array([p.excess(moved) for p in parts])]
         return Prediction(np.concatenate(found), {})
@@ -183,7 +184,7 @@ def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
         yield low, int(n), np.diff(ndtr(edges))
 
 
-def _counted(study: Study) -> dict[bool, _Counts]:
+def counted(study: Study) -> dict[bool, _Counts]:
     """Counts of all flat and narrowband frames without gain in dB: seen (False) and held out (True)."""
     size = int(study.camera.white_level_dn) + 1
     counts = {out: _Counts(np.zeros(size), np.zeros(size), [], []) for out in (False, True)}
@@ -197,7 +198,7 @@ def _counted(study: Study) -> dict[bool, _Counts]:
     return counts
 
 
-def _prepared(study: Study, counts: _Counts) -> _Codes | None:
+def prepared(study: Study, counts: _Counts) -> CodeCounts | None:
     """The histogram over the usable codes, None where they are too few."""
     level = np.arange(len(counts.count), dtype=float)
     noise = np.sqrt(np.maximum(study.noise.gain * (level - study.noise.black), 0.0) + study.noise.read_dn**2)
@@ -227,7 +228,7 @@ def _prepared(study: Study, counts: _Counts) -> _Codes | None:
     used = inside & (smooth >= LEAST_COUNT)
     if used.sum() < LEAST_CODES:
         return None
-    return _Codes(first, count, expected, smooth, rough, noise, used)
+    return CodeCounts(first, count, expected, smooth, rough, noise, used)
 
 
 @cache
@@ -238,7 +239,7 @@ def _smoothing(half: int) -> FloatArray:
     return np.asarray(np.linalg.pinv(np.vander(x, DEGREE + 1, increasing=True))[0])
 
 
-def _covariance(linear: FloatArray, codes: _Codes, counts: _Counts) -> FloatArray:
+def _covariance(linear: FloatArray, codes: CodeCounts, counts: _Counts) -> FloatArray:
     """Covariance of `linear` (m, codes) @ counts. Each pixel has one code: the counts of a group's pixels are multinomial."""
     found = (linear * np.maximum(codes.expected, 1.0)) @ linear.T
     means = []
@@ -250,7 +251,7 @@ def _covariance(linear: FloatArray, codes: _Codes, counts: _Counts) -> FloatArra
     return np.asarray(found - np.transpose(means) @ np.array(means))
 
 
-def _combs(codes: _Codes) -> tuple[FloatArray, list[tuple[float, str]]]:
+def _combs(codes: CodeCounts) -> tuple[FloatArray, list[tuple[float, str]]]:
     """Weights (combs, codes) of the counts that give the combs' amplitudes relative to the mean count, and (mean code, words) of each.
 
     For every frequency of `COMBS`: the cosine and, below 1/2 cycle a code, the sine part of the residuals' Fourier sum.
@@ -274,7 +275,7 @@ def _spacing(study: Study) -> int:
     return max(round(2.0**study.camera.bit_depth / PLACES), LEAST_SPACING)
 
 
-def _steps(study: Study, codes: _Codes) -> tuple[FloatArray, list[int]]:
+def _steps(study: Study, codes: CodeCounts) -> tuple[FloatArray, list[int]]:
     """Weights of the counts that give how many codes' worth is missing about each of `PLACES` parts of the converter's range, and these
     codes.
 
@@ -314,14 +315,14 @@ class _Part:
     number: int  # of codes used
     variance: FloatArray  # of the residuals; infinite at codes that aren't used
     chi2_std: float  # standard deviation of the residuals' chi2
-    of_widths: float  # excess where the codes' widths have a relative variance of 1, independent of each other
+    ofwidths: float  # excess where the codes' widths have a relative variance of 1, independent of each other
 
     def excess(self, residual: FloatArray) -> float:
         """chi2 of the residuals (codes,) over its standard deviation."""
         return float(np.sum(np.square(residual[self.at]) / self.variance)) / self.chi2_std
 
 
-def _parts(codes: _Codes) -> list[_Part]:
+def _parts(codes: CodeCounts) -> list[_Part]:
     """The parts with codes enough. Var(chi2) = 2 n sum_k r_k^2 with the residuals' autocorrelation r of the smoothing filter."""
     square = codes.rough.power(2)
     variance = np.asarray(square @ np.maximum(codes.smooth, 1.0))
@@ -337,12 +338,12 @@ def _parts(codes: _Codes) -> list[_Part]:
         shared = np.correlate(row, row, mode="full") / float(row @ row)
         number = int(kept.sum())
         chi2_std = float(np.sqrt(2.0 * number * np.sum(shared**2)))
-        of_widths = float(np.sum(unequal[at][kept] / variance[at][kept])) / chi2_std
-        found.append(_Part(at, number, np.where(kept, variance[at], np.inf), chi2_std, of_widths))
+        ofwidths = float(np.sum(unequal[at][kept] / variance[at][kept])) / chi2_std
+        found.append(_Part(at, number, np.where(kept, variance[at], np.inf), chi2_std, ofwidths))
     return found
 
 
-def _widths(codes: _Codes, effects: Effects, study: Study) -> FloatArray:
+def widths(codes: CodeCounts, effects: Effects, study: Study) -> FloatArray:
     """Width (codes,) of each code: the interval of the converter's input that gives it, 1 for an ideal converter.
 
     The input is cut at the edges of the ideal converter's codes. Where the converter's law is straight over several of these intervals, what
@@ -356,11 +357,16 @@ def _widths(codes: _Codes, effects: Effects, study: Study) -> FloatArray:
     bent[:-1] |= bend
     bent[1:] |= bend
     found = np.zeros(size)
-    x = (edge[:-1][bent][:, None] + (np.arange(FINE) + 0.5) / FINE).ravel()
-    # a sample stands for an interval of 1 / FINE of a code, which may be shared by two codes
-    top = law(x + codes.first) - codes.first + 0.5 / FINE
-    code = np.rint(top).astype(int)
-    above = np.clip((top - code + 0.5) * FINE, 0.0, 1.0)
+    # a sample is an interval of 1 / FINE of a code, which the law stretches and two codes may share
+    samples = edge[:-1][bent][:, None] + np.arange(FINE + 1) / FINE
+    lands_on = law(samples.ravel() + codes.first).reshape(samples.shape) - codes.first
+    low, high = (end(lands_on[:, :-1], lands_on[:, 1:]).ravel() for end in (np.minimum, np.maximum))
+    jumps = high - low > JUMP  # there the law isn't continuous: where its middle lands, as wide as without it
+    middle = law((samples[:, :-1].ravel() + 0.5 / FINE)[jumps] + codes.first) - codes.first
+    low[jumps], high[jumps] = middle - 0.5 / FINE, middle + 0.5 / FINE
+    code = np.rint(high).astype(int)
+    stretch = high - low
+    above = np.where(stretch > 0.0, np.clip((high - code + 0.5) / np.maximum(stretch, 1e-12), 0.0, 1.0), 1.0)
     for at, share in ((code, above), (code - 1, 1.0 - above)):
         inside = (at >= 0) & (at < size)
         found += np.bincount(at[inside], share[inside], minlength=size) / FINE

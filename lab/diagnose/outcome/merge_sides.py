@@ -18,6 +18,7 @@ from lab.effect_titles import effect_title
 from lab.formats.results import (
     DiagnosisResult,
     DiagnosisVerdict,
+    DiscoveredLaw,
     HeldOut,
     Member,
     Mismatch,
@@ -45,13 +46,14 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
     effects = tuple(_named(found, policy))
     unexplained = tuple(u for f in found for u in f.unexplained)
     vetoed = tuple(v for f in found for v in f.vetoed)
+    discovered = tuple(d for f in found for d in f.discovered)
     verdict: DiagnosisVerdict = "unexplained"
     if not any(f.is_judged for f in found):
         verdict = "nothing_judged"
-    elif not effects and not unexplained and not mismatches:
+    elif not effects and not unexplained and not mismatches and not discovered:
         verdict = "no_mismatch"
     elif effects:
-        is_whole = not unexplained and not any(e.members and e.law == "inexact" for e in effects)
+        is_whole = not unexplained and not discovered and not any(e.members and e.law == "inexact" for e in effects)
         verdict = "explained" if is_whole else "partly_explained"
     models = tuple(f.models for f in found if f.models is not None)
     held_out = _held_out(found)
@@ -63,6 +65,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
         effects=effects,
         unexplained=unexplained,
         vetoed=vetoed,
+        discovered=discovered,
         models=models,
         held_out=held_out,
         next_capture=LEAST_CAPTURES
@@ -79,7 +82,9 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
         skipped=tuple(  # parts of one measurement give the same reason
             dict.fromkeys(s for f in found for s in f.skipped)
         ),
-        summary=tuple(_summary(verdict, mismatches, effects, unexplained, vetoed, models, held_out, policy)),
+        summary=tuple(
+            _summary(verdict, mismatches, effects, unexplained, discovered, vetoed, models, held_out, policy)
+        ),
         policy=policy.told(),
     )
 
@@ -263,6 +268,7 @@ def _summary(
     mismatches: Sequence[Mismatch],
     effects: Sequence[NamedEffect],
     unexplained: Sequence[Unexplained],
+    discovered: Sequence[DiscoveredLaw],
     vetoed: Sequence[VetoedName],
     models: Sequence[SideModels],
     held_out: HeldOut | None,
@@ -286,6 +292,7 @@ def _summary(
         f"Not explained: {measurement_title(u.measurement)} of the {u.side} camera, {u.where}: {u.shape}."
         for u in unexplained
     ]
+    lines += [d.statement for d in discovered]
     lines += dict.fromkeys(u.check for u in unexplained if u.check)
     lines += [v.statement for v in vetoed]
     lines += set_sentences(models, effects, unexplained, policy)

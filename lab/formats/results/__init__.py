@@ -8,6 +8,7 @@ from lab.formats.results.comparison import Change, ComparisonResult, ProjectionC
 from lab.formats.results.diagnosis import (
     DiagnosisResult,
     DiagnosisVerdict,
+    DiscoveredLaw,
     EffectSet,
     ExaminedPlace,
     HeldOut,
@@ -75,6 +76,7 @@ __all__ = [
     "DepthUncertainty",
     "DiagnosisResult",
     "DiagnosisVerdict",
+    "DiscoveredLaw",
     "DistortionModel",
     "EffectSet",
     "Emva1288",

@@ -106,6 +106,28 @@ class Unexplained(Frozen):
     check: str = ""  # stated values, of the camera or of captures, that the recordings contradict, as sentences
 
 
+class DiscoveredLaw(Frozen):
+    """A table by code, row or column that recordings hold and no effect of the library has; it stands in the improved
+    model as `empirical_law`.
+
+    `stage`, `along`, `period`, `first` and `table` are those of that effect. chi2 is of the `n` numbers along the index
+    in held-out captures (in the captures themselves where none are held out), without and with the law. `suspects`:
+    what physics may do it; none of them is a name.
+    """
+
+    side: Side
+    stage: str
+    along: str
+    period: int
+    first: int
+    table: tuple[float, ...]
+    chi2_before: float
+    chi2_after: float
+    n: int
+    suspects: str
+    statement: str
+
+
 class VetoedName(Frozen):
     """An effect that the captures used for the choice suggest, and that held-out captures contradict: it isn't named.
 
@@ -290,6 +312,7 @@ class DiagnosisResult(Frozen):
     effects: tuple[NamedEffect, ...] = ()
     unexplained: tuple[Unexplained, ...] = ()
     vetoed: tuple[VetoedName, ...] = ()
+    discovered: tuple[DiscoveredLaw, ...] = ()  # the most significant first, for each side
     models: tuple[SideModels, ...] = ()
     held_out: HeldOut | None = None
     next_capture: str | None = None

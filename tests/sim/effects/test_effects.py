@@ -138,7 +138,9 @@ def test_declares_what_the_diagnosis_reads(kind: type[Effect]) -> None:
     assert 0.0 < kind.form_tolerance < 0.5
     assert kind.invariances <= {"f_number", "exposure", "wavelength", "field", "level", "orientation", "time"}
     # a known part of a camera, the diagnosis' own term for what has no name, and a misstated f-number
-    assert kind.is_candidate == (kind.name not in {"cover_glass", "model_discrepancy", "other_f_number"})
+    assert kind.is_candidate == (
+        kind.name not in {"cover_glass", "empirical_law", "model_discrepancy", "other_f_number"}
+    )
     assert kind.quantities()
     assert kind.shapes <= set(kind.quantities())
 

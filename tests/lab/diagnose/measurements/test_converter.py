@@ -13,7 +13,7 @@ from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.chart import chart_block
-from lab.diagnose.measurements.code_density import _widths, code_block
+from lab.diagnose.measurements.code_density import code_block, widths
 from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.measurements.noise import variance_block
@@ -175,7 +175,7 @@ def test_patches_of_a_chart_lie_off_by_what_the_converter_does_at_their_level() 
     np.testing.assert_allclose(block.predict((ripple,)).mean - before, wanted, atol=2e-3)
 
 
-def test_widths_of_codes_are_what_fine_samples_of_the_input_give() -> None:
+def testwidths_of_codes_are_what_fine_samples_of_the_input_give() -> None:
     """A step between two codes, a step of many, a saw tooth of three bits and a ripple with a step, against 512 samples a code: an
     interval that straddles a step is sampled 8 times, so that a width is off by 1 / 8 of a code at most, and by less than 1e-3 elsewhere."""
     study = _study(7)
@@ -192,6 +192,6 @@ def test_widths_of_codes_are_what_fine_samples_of_the_input_give() -> None:
     for acting in laws:
         landed = np.rint(Uniform(study.camera, acting).codes(x)).astype(int) - first
         wanted = np.bincount(landed[(landed >= 0) & (landed < size)], minlength=size) / 512
-        off = np.abs(_widths(codes, acting, study) - wanted)  # type: ignore[arg-type]
+        off = np.abs(widths(codes, acting, study) - wanted)  # type: ignore[arg-type]
         assert off.max() < 0.126
         assert np.sum(off > 5e-3) <= 8

@@ -1,0 +1,414 @@
+"""Discover laws that no effect of the library has: tables by code, row or column that predict what they weren't taken from.
+
+A profile holds what the baseline and the named effects leave along one index: the counts of codes in uniform light
+about a smooth curve, the means of rows and columns of flats over a running polynomial, and those of darks. Tables that
+repeat after 2 to 32 indices are fitted to the seen captures by weighted least squares (F test). Of all that were tried,
+those are told whose false-discovery rate is below `DecisionPolicy.discovery_rate` by Benjamini and Yekutieli (Ann.
+Statist. 29, 1165, 2001), and which predict both halves of the index from the other one and the captures held out. Where
+the counts of single codes repeat beyond any period, the table is one by code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import savgol_coeffs
+from scipy.stats import f as f_distribution
+
+from lab.diagnose.measurements.block import Effects
+from lab.diagnose.measurements.code_density import WIDEST, CodeCounts, counted, prepared, widths
+from lab.diagnose.measurements.dark_readout import dark_readout
+from lab.diagnose.measurements.even_flats import flats
+from lab.diagnose.measurements.study import Study
+from lab.diagnose.policy import DecisionPolicy
+from lab.errors import NotDetermined
+from lab.formats.results import DiscoveredLaw
+from sim.camera import Side
+from sim.effects.empirical_law import Along, EmpiricalLaw, Stage
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+PERIODS = (*range(2, 17), 20, 24, 32, 64)
+LEAST_REPEATS = 6  # of a period over the index
+#: Lines on either side of the running polynomial, in lines of a plane of the mosaic, and its degree.
+REACH, DEGREE = 24, 2
+ROBUST = 1.4826  # median absolute departure -> standard deviation of a normal distribution
+LEAST_WIDTH = 0.02  # of a code: a missing code's
+#: Share of what the chosen table takes off chi2 that a shorter one takes off, too, from which on that one is told first.
+SHORTER_SHARE = 0.9
+
+#: What a table may come from, by stage and index: suspects, not names.
+SUSPECTS: dict[tuple[Stage, Along], str] = {
+    ("codes", "code"): (
+        "converter bits of wrong weight do that, interleaved converters, or codes rescaled from another bit depth"
+    ),
+    ("charge", "row"): "phase-detection rows do that, shared read-out of neighbouring rows, or light that pulses",
+    ("charge", "column"): "column amplifiers of unequal gain do that, or phase-detection columns",
+    (
+        "signal",
+        "row",
+        True,
+    ): "shared read-out of neighbouring rows does that, or pick-up at a fraction of the line rate",
+    ("signal", "column"): "interleaved column converters with offsets of their own do that",
+}
+MOST_TOLD = 16  # entries of a table
+LINES: tuple[Along, ...] = ("row", "column")
+#: What the table is of, by stage.
+QUANTITIES: dict[Stage, str] = {"codes": "code widths", "charge": "sensitivities", "signal": "dark offsets"}
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What is left along an index in some captures.
+
+    index     (n,) index of each number
+    residual  (n,) departure, filtered
+    variance  (n,) of the residuals
+    spread    (N, k) departures by every index, before the filter -> (n, k) after it
+    """
+
+    index: np.ndarray
+    residual: FloatArray
+    variance: FloatArray
+    spread: Callable[[FloatArray], FloatArray]
+    count: int  # N
+
+    def classes(self, period: int) -> FloatArray:
+        """Return the columns (n, period) of a table with that period."""
+        return self.spread(np.eye(period)[np.arange(self.count) % period])
+
+    def chi2(self, departure: FloatArray) -> float:
+        """Return chi2 of the residuals less a departure by every index (N,)."""
+        left = self.residual - self.spread(departure[:, None])[:, 0]
+        return float(np.sum(np.square(left) / self.variance))
+
+
+@dataclass(frozen=True)
+class Look:
+    """The profiles of one quantity: of the captures that the search may use, and of those held out."""
+
+    stage: Stage
+    along: Along
+    seen: Profile
+    held_out: Profile | None
+
+
+@dataclass(frozen=True)
+class Found:
+    """A table that predicts: departures from no change by class (period,) or by index (N,)."""
+
+    look: Look
+    period: int
+    departure: FloatArray
+    log_probability: float
+    chi2: tuple[float, float, int]  # of the held-out captures (of the seen ones without any), before, after, and n
+    shorter: tuple[Found, ...] = ()  # tables of fewer numbers that it rests on, the shortest first
+
+
+def discover(study: Study, effects: Effects, policy: DecisionPolicy) -> tuple[Found, ...]:
+    """Find tables that hold in what they weren't taken from, the most significant first; see the module."""
+    looks = [look for make in (_codes, _light_lines, _dark_lines) for look in make(study, effects)]
+    tried = [(look, *_fitted(look.seen, period)) for look in looks for period in _periods(look.seen)]
+    if not tried:
+        return ()
+    # Benjamini and Yekutieli: the largest k with p_(k) <= k q / (m (1 + 1/2 + ... + 1/m))
+    order = np.sort([log_p for *_, log_p in tried])
+    many = len(tried) * float(np.sum(1.0 / np.arange(1, len(tried) + 1)))
+    below = np.flatnonzero(order <= np.log(np.arange(1, len(tried) + 1) * policy.discovery_rate / many))
+    limit = float(order[below[-1]]) if len(below) else -np.inf
+    found = []
+    for look in looks:
+        own = [(p, table, log_p) for one, p, table, log_p in tried if one is look and log_p <= limit]
+        if not own:
+            continue
+        # of the tables that hold, the one of the least description length: n ln chi2 + k ln n
+        period, table, log_p = min(own, key=lambda t: _description_length(look.seen, t[0], t[1]))
+        if not _predicts_other_half(look.seen, period):
+            continue
+        judged = _judged(look, period, table, log_p)
+        gain = judged.chi2[0] - judged.chi2[1]
+        if gain < policy.least_discovery_share * judged.chi2[0]:
+            continue
+        shorter = (_judged(look, *one) for one in sorted(own, key=lambda t: t[0]) if one[0] < period)
+        base = next((s for s in shorter if s.chi2[0] - s.chi2[1] >= SHORTER_SHARE * gain), None)
+        judged = replace(judged, shorter=() if base is None else (base,))
+        found.append(_by_code(judged) if look.stage == "codes" else judged)
+    return tuple(sorted(found, key=lambda one: one.log_probability))
+
+
+def told(side: Side, study: Study, found: Sequence[Found]) -> tuple[DiscoveredLaw, ...]:
+    """Put discovered laws into results: the law as it stands in a camera file, its chi2, and sentences."""
+    return tuple(
+        DiscoveredLaw(
+            side=side,
+            stage=one.look.stage,
+            along=one.look.along,
+            period=one.period,
+            first=(law := law_of(one, study)).first,
+            table=law.table,
+            chi2_before=one.chi2[0],
+            chi2_after=one.chi2[1],
+            n=one.chi2[2],
+            suspects=SUSPECTS[one.look.stage, one.look.along],
+            statement=_statement(side, one),
+        )
+        for one in found
+    )
+
+
+def law_of(found: Found, study: Study) -> EmpiricalLaw:
+    """Return the law as an effect that acts on its stage, in its units."""
+    look = found.look
+    if look.stage == "signal":
+        table = found.departure / study.noise.gain
+    else:
+        table = np.maximum(1.0 + found.departure, LEAST_WIDTH)
+        table = table / table.mean()
+    return EmpiricalLaw(
+        stage=look.stage,
+        along=look.along,
+        period=found.period,
+        table=tuple(table.tolist()),
+        strength=1.0,
+    )
+
+
+# --- the search ------------------------------------------------------------------------------------------------------
+
+
+def _periods(profile: Profile) -> list[int]:
+    span = int(np.ptp(profile.index)) + 1
+    return [p for p in PERIODS if p * LEAST_REPEATS <= span]
+
+
+def _fitted(profile: Profile, period: int) -> tuple[int, FloatArray, float]:
+    """Fit a table: its period, its departures (period,) of mean 0, and ln of the probability of its gain by chance.
+
+    Weighted least squares of least norm, as the filter takes out what all classes share. F test of the gain: the
+    scatter that the table leaves stands for the noise, so that a variance that is too small gains nothing.
+    """
+    weight = 1.0 / np.sqrt(profile.variance)
+    columns = profile.classes(period) * weight[:, None]
+    value = profile.residual * weight
+    table, _, rank, _ = np.linalg.lstsq(columns, value, rcond=1e-6)
+    table = table - table.mean()
+    before = float(value @ value)
+    after = float(np.sum(np.square(value - columns @ table)))
+    freedom = len(value) - int(rank)
+    if rank == 0 or freedom < 1 or after >= before:
+        return period, table, 0.0
+    ratio = (before - after) / rank / (after / freedom)
+    return period, table, float(f_distribution.logsf(ratio, rank, freedom))
+
+
+def _description_length(profile: Profile, period: int, table: FloatArray) -> float:
+    n = len(profile.residual)
+    left = profile.chi2(np.resize(table, profile.count))
+    return float(n * np.log(left) + (period - 1) * np.log(n))
+
+
+def _predicts_other_half(profile: Profile, period: int) -> bool:
+    """Whether a table from each half of the index lowers chi2 of the other half: a few outlying lines don't."""
+    middle = float(np.median(profile.index))
+    for first in (profile.index < middle, profile.index >= middle):
+        _, table, _ = _fitted(_part(profile, first), period)
+        other = _part(profile, ~first)
+        if other.chi2(np.resize(table, profile.count)) >= other.chi2(np.zeros(profile.count)):
+            return False
+    return True
+
+
+def _part(profile: Profile, used: np.ndarray) -> Profile:
+    """Return the profile of a part (n,) of its numbers."""
+
+    def spread(departure: FloatArray) -> FloatArray:
+        return profile.spread(departure)[used]
+
+    return Profile(profile.index[used], profile.residual[used], profile.variance[used], spread, profile.count)
+
+
+def _judged(look: Look, period: int, table: FloatArray, log_p: float) -> Found:
+    """Return the table with chi2 of the captures held out; of the seen ones where none are."""
+    judge = look.held_out or look.seen
+    before, after = judge.chi2(np.zeros(judge.count)), judge.chi2(np.resize(table, judge.count))
+    return Found(look, period, table, log_p, (before, after, len(judge.residual)))
+
+
+def _by_code(found: Found) -> Found:
+    """Return a table by every code where the captures held out show that widths differ beyond the period, else the same.
+
+    What the periodic table leaves of a code's width is weighed by the variance that its counts' noise doesn't explain
+    (empirical Bayes), and drawn only where it differs from its neighbours'.
+    """
+    look = found.look
+    if look.held_out is None:
+        return found
+    periodic = np.resize(found.departure, look.seen.count)
+    left = look.seen.residual - look.seen.spread(periodic[:, None])[:, 0]
+    scale = _own_change(look.seen)
+    noise = look.seen.variance / np.square(scale)
+    excess = max(float(np.mean(np.square(left / scale) - noise)), 0.0)
+    departure = np.zeros(look.seen.count)
+    departure[look.seen.index] = left / scale * excess / (excess + noise)
+    every = periodic + departure
+    after = look.held_out.chi2(every)
+    if after >= found.chi2[1] - 2.0 * np.sqrt(2.0 * found.chi2[2]):
+        return found
+    chi2 = found.chi2[0], after, found.chi2[2]
+    return Found(look, 0, every, found.log_probability, chi2, (*found.shorter, found))
+
+
+def _own_change(profile: Profile) -> FloatArray:
+    """Return how much each residual changes with the departure at its own index, (n,): the diagonal of `spread`."""
+    step, found = 2 * 2 * WIDEST + 1, np.zeros(len(profile.index))  # farther apart than the filter reaches
+    for begin in range(step):
+        ones = np.zeros((profile.count, 1))
+        ones[begin::step] = 1.0
+        at = profile.index % step == begin
+        found[at] = profile.spread(ones)[at, 0]
+    return found
+
+
+# --- the profiles ----------------------------------------------------------------------------------------------------
+
+
+def _codes(study: Study, effects: Effects) -> list[Look]:
+    """Counts of codes in uniform light, seen and held out, less those that the effects' converter gives."""
+    try:
+        counts = study.once(counted)
+    except NotDetermined:
+        return []
+    found = {}
+    for held_out in (False, True):
+        codes = prepared(study, counts[held_out]) if counts[held_out].captures else None
+        if codes is not None:
+            found[held_out] = _code_profile(codes, effects, study)
+    return [Look("codes", "code", found[False], found.get(True))] if False in found else []
+
+
+def _code_profile(codes: CodeCounts, effects: Effects, study: Study) -> Profile:
+    used, rough = np.flatnonzero(codes.used), codes.rough
+    known = rough @ (codes.expected * (widths(codes, effects, study) - 1.0)) if effects else 0.0
+    every = len(codes.count) + codes.first
+
+    def spread(departure: FloatArray) -> FloatArray:
+        return np.asarray((rough @ (codes.smooth[:, None] * departure[codes.first : every]))[used])
+
+    variance = rough.power(2) @ np.maximum(codes.smooth, 1.0)
+    return Profile(
+        used + codes.first,
+        (rough @ codes.count - known)[used],
+        variance[used],
+        spread,
+        int(study.camera.white_level_dn) + 1,
+    )
+
+
+def _light_lines(study: Study, effects: Effects) -> list[Look]:
+    """Means of rows and columns of the flats over the mean of their plane, less the dark offsets."""
+    try:
+        levels, images = study.once(flats)
+    except NotDetermined:
+        return []
+    if False not in images:
+        return []
+    dark = study.once(dark_readout)
+    looks = []
+    for along in LINES:
+        made: dict[bool, Profile | None] = {}
+        for held_out, (image, _) in images.items():
+            part = [u for u in levels if u.held_out == held_out]
+            signal = max(float(np.mean([np.mean(list(u.mean.values())) for u in part])), 1e-9)
+            offsets = 0.0 if dark is None else np.asarray(dark.offsets_dn, float) / signal
+            made[held_out] = _lines(study, np.asarray(image, float) - offsets, along)
+        seen = made[False]
+        if seen is not None:
+            looks.append(Look("charge", along, seen, made.get(True)))
+    return looks
+
+
+def _dark_lines(study: Study, effects: Effects) -> list[Look]:
+    """Means of rows and columns of the darks, DN, less the offsets that the effects add."""
+    dark = study.once(dark_readout)
+    if dark is None:
+        return []
+    added = Uniform(study.camera, effects)
+    known = study.noise.gain * added.added_e if added.adds_signal else 0.0
+    image = np.asarray(dark.offsets_dn, float) - known
+    profiles = {along: _lines(study, image, along) for along in LINES}
+    return [Look("signal", along, profile, None) for along, profile in profiles.items() if profile is not None]
+
+
+def _lines(study: Study, image: FloatArray, along: Along) -> Profile | None:
+    """Return the profile of an image (rows, cols) along its rows or columns, each plane of the mosaic by itself.
+
+    The filter takes a running polynomial out. The variance is the square of the residuals' robust spread.
+    """
+    axis, period = (0, mosaic.step(study.camera.cfa)) if along == "row" else (1, mosaic.step(study.camera.cfa))
+    count = image.shape[axis]
+    rows: list[np.ndarray] = []
+    values: list[FloatArray] = []
+    filters: list[FloatArray] = []
+    for channel_phases in mosaic.phases(study.camera.cfa).values():
+        for phase in channel_phases:
+            plane = image[phase[0] :: period, phase[1] :: period]
+            mean = plane.mean(axis=1 - axis)
+            taken = _polynomial_filter(len(mean))
+            if taken is None:
+                return None
+            rows.append(np.arange(phase[axis], count, period)[: len(mean)])
+            filters.append(taken)
+            values.append(taken @ mean)
+    residual = np.concatenate(values)
+    spread_of = ROBUST * float(np.median(np.abs(residual - np.median(residual))))
+    if spread_of == 0.0:
+        return None
+
+    def spread(departure: FloatArray) -> FloatArray:
+        return np.concatenate([taken @ departure[at] for taken, at in zip(filters, rows, strict=True)])
+
+    return Profile(np.concatenate(rows), residual, np.full(len(residual), spread_of**2), spread, count)
+
+
+def _polynomial_filter(count: int) -> FloatArray | None:
+    """Return the matrix (count, count) that takes a running polynomial out of lines; None for too few of them."""
+    reach = min(REACH, (count - 1) // 4)
+    if 2 * reach + 1 <= 2 * DEGREE + 1:
+        return None
+    matrix = np.eye(count)
+    for i in range(count):
+        low = min(max(i - reach, 0), count - 2 * reach - 1)
+        matrix[i, low : low + 2 * reach + 1] -= savgol_coeffs(2 * reach + 1, DEGREE, pos=i - low, use="dot")
+    return matrix
+
+
+# --- in words --------------------------------------------------------------------------------------------------------
+
+
+def _statement(side: Side, found: Found) -> str:
+    """Say which entries differ, what that may be, and by how much held-out captures are predicted better.
+
+    The shortest table is told, and what longer ones take off chi2 besides.
+    """
+    look, steps = found.look, (*found.shorter, found)
+    line = "code" if look.along == "code" else look.along
+    base, n = steps[0], found.chi2[2]
+    shown = ", ".join(_entry(look, value) for value in base.departure[:MOST_TOLD])
+    more = ", ..." if base.period > MOST_TOLD else ""
+    suspects = SUSPECTS[look.stage, look.along]
+    where = " of held-out captures" if look.held_out is not None else ""
+    falls = ", ".join(
+        f"to {one.chi2[1] / n:.3g} with {f'{one.period} numbers' if one.period else 'one by code'}" for one in steps
+    )
+    return (
+        f"No listed effect, but the {QUANTITIES[look.stage]} of the {side} camera repeat every {base.period} {line}s; "
+        f"by {line} mod {base.period}: {shown}{more}. {suspects[0].upper()}{suspects[1:]}. "
+        f"By such a table chi2 over n{where} falls from {found.chi2[0] / n:.3g} {falls}."
+    )
+
+
+def _entry(look: Look, value: float) -> str:
+    return f"{value:+.2g} DN" if look.stage == "signal" else f"{100.0 * value:+.2g} %"
