@@ -29,7 +29,7 @@ def _changed(seed: int, change: Callable[[Frame, str, float], Frame], cfa: str =
     """A healthy camera's recordings whose frames were changed: `change` takes frame, kind and black level, DN."""
     camera = ConcealedCamera(seed, (), cfa=cfa, rows=96, cols=128)
     session = record(camera, LIT_AND_DARK)
-    kinds = {capture["file"]: capture["kind"] for capture in session.manifest["captures"]}
+    kinds = {capture["frame"]: capture["kind"] for capture in session.manifest["captures"]}
     rng = np.random.default_rng(seed)
     for path, frame in session.frames.items():
         value = change(frame.astype(float), kinds[path], camera.black_level_dn)
