@@ -28,11 +28,12 @@ from lab.formats.results import (
     Skipped,
     ValidationResult,
 )
+from lab.formats.results.in_words import measured
 from lab.report import answers, charts, geometry, words
 from lab.report import diagnosis as diagnosis_page
 from lab.report.chart_data import ChartData, plotly_base64
 from lab.report.emva import data_sheets
-from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
+from lab.report.figures import by_side, geometry_figures, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
 from lab.report.provenance import Provenance, installed_versions, provenance_of
 from lab.report.stills import still

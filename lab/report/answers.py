@@ -11,9 +11,10 @@ import numpy as np
 from lab.diagnose.measurements.library import measurement_title
 from lab.effect_titles import at_beginning, effect_title
 from lab.formats.results import Check, DiagnosisResult, FitResult, NamedEffect, ResidualCurve, ValidationResult
+from lab.formats.results.in_words import measured
 from lab.report import charts, words
 from lab.report.diagnosis import worst_of_each
-from lab.report.figures import KeyFigure, camera_figures, measured
+from lab.report.figures import KeyFigure, camera_figures
 from sim.camera import Side
 from sim.effects.library import effects as library
 

@@ -13,7 +13,7 @@ import numpy as np
 from lab.diagnose.measurements.library import measurement_title
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Check, DiagnosisResult, NoiseFit, PatchComparison, ResidualCurve, SpectralFit
-from lab.report.figures import measured
+from lab.formats.results.in_words import measured
 from sim.camera import Side
 
 Figure = dict[str, Any]

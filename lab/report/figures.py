@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
 from lab.formats.results.figure_names import plain_name, unit_of
+from lab.formats.results.in_words import measured
 from sim.camera import Side
 
 #: Fields of `NoiseFit` in the order of the table; the maker's value has the same field name.
@@ -30,13 +31,6 @@ _NOISE = (
 NOISE = {field: (plain_name(field), unit_of(field)) for field in _NOISE}
 #: Names of the distortion's coefficients, in OpenCV's order.
 DISTORTION = tuple(plain_name("distortion", place) for place in ("k1", "k2", "p1", "p2", "k3"))
-#: Units whose printed form differs from their form in names.
-SHOWN_UNITS = {"um": "µm", "us": "µs", "deg": "°", "C": "°C", "percent": "%"}
-
-
-def shown_unit(unit: str) -> str:
-    """A unit as it is printed; empty for a ratio."""
-    return "" if unit == "1" else SHOWN_UNITS.get(unit, unit)
 
 
 @dataclass(frozen=True)
@@ -54,27 +48,6 @@ class KeyFigure:
     def text(self) -> str:
         """Value and standard deviation with unit and note: `0.383 ± 0.008 at 610 nm`."""
         return f"{measured(self.value, self.std, self.unit)} {self.note}".rstrip()
-
-
-def measured(
-    value: float, std: float | None = None, unit: str = "", interval: tuple[float, float] | None = None
-) -> str:
-    """`value ± std unit`, the standard deviation to two digits and the value to the same place; without one, the value to four digits, or
-    `value (low to high) unit` with an interval."""
-    if interval is not None:
-        return f"{value:.3g} ({interval[0]:.3g} to {interval[1]:.3g}) {shown_unit(unit)}".rstrip()
-    if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
-        number = f"{value:.4g}"
-    else:
-        place = 1 - math.floor(math.log10(std))
-        if abs(value) < 1e6 and place <= 9:
-            digits = max(place, 0)
-            number = f"{value:.{digits}f} ± {std:.{digits}f}"
-        else:
-            power = math.floor(math.log10(max(abs(value), std)))
-            digits = max(place + power, 0)
-            number = f"({value / 10**power:.{digits}f} ± {std / 10**power:.{digits}f})e{power:+03d}"
-    return f"{number} {shown_unit(unit)}".rstrip()
 
 
 def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:

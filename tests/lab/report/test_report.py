@@ -27,7 +27,7 @@ from lab.formats.results import (
 )
 from lab.report import charts, provenance_of, render_report, write_report
 from lab.report.chart_data import figure_json, plotly_base64
-from lab.report.figures import by_side, measured, rotation_vector_mrad
+from lab.report.figures import by_side, rotation_vector_mrad
 from lab.report.pictures import (
     difference_picture,
     frame_picture,
@@ -286,24 +286,6 @@ def test_provenance_has_a_digest_of_every_frame(small_set: Callable[..., Recordi
 
 
 # --- figures and pictures -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("value", "std", "text"),
-    [
-        (0.28034, 0.00041, "0.28034 ± 0.00041 DN"),
-        (9120.4, 21.3, "9120 ± 21 DN"),
-        (9120.4, 213.0, "9120 ± 213 DN"),
-        (-2.5, 0.5, "-2.50 ± 0.50 DN"),
-        (1.5e7, 2.0e5, "(1.500 ± 0.020)e+07 DN"),
-        (3.2e-11, 4e-13, "(3.200 ± 0.040)e-11 DN"),
-        (0.123456, None, "0.1235 DN"),
-        (5.0, 0.0, "5 DN"),
-        (5.0, float("nan"), "5 DN"),
-    ],
-)
-def test_values_are_rounded_to_their_uncertainty(value: float, std: float | None, text: str) -> None:
-    assert measured(value, std, "DN") == text
 
 
 def test_what_one_side_lacks_keeps_its_place(made_up: MadeUp) -> None:
