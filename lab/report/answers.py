@@ -11,7 +11,8 @@ import numpy as np
 from lab.diagnose.measurements.library import measurement_title
 from lab.effect_titles import at_beginning, effect_title
 from lab.formats.results import Check, DiagnosisResult, FitResult, NamedEffect, ResidualCurve, ValidationResult
-from lab.formats.results.in_words import measured
+from lab.formats.results.in_words import measured, plain_number
+from lab.predict.both_models import BothModels
 from lab.report import charts, words
 from lab.report.diagnosis import worst_of_each
 from lab.report.figures import KeyFigure, camera_figures
@@ -102,19 +103,30 @@ def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
         yield f"False-alarm rate: {100 * diagnosis.false_alarm_rate:.2g} % of healthy cameras are reported with a mismatch."
 
 
-def meaning(diagnosis: DiagnosisResult | None, validation: ValidationResult | None) -> Iterator[str]:
-    """Sentences: what the effects do to light and signal, and by how much the baseline's predictions are off."""
+def meaning(
+    diagnosis: DiagnosisResult | None, validation: ValidationResult | None, both: BothModels | None = None
+) -> Iterator[str]:
+    """Yield sentences: what the effects do to light and signal, and by how much the baseline's predictions are off."""
     for effect in diagnosis.effects[:NAMED] if diagnosis is not None else ():
         yield effect.statement.split(" Seen in ")[0]
-    named = diagnosis is not None and bool(diagnosis.effects)
-    for side, worst in _worst(validation.checks if validation is not None else ()).items():
+    checks = both.baseline if both is not None else validation.checks if validation is not None else ()
+    model = "baseline" if both is not None else words.FITTED
+    mended = _worst(both.improved) if both is not None else {}
+    for side, worst in _worst(checks).items():
         off = [check for check in worst if not check.passed]
-        said = ", ".join(f"{words.CHECK_NAMES[check.name]} by {check.rms_relative_percent:.2g} % rms" for check in off)
+        said = ", ".join(f"{_name(check)} by {plain_number(check.rms_relative_percent, 2)} % rms" for check in off)
         if off:
-            yield f"{'Without these effects, the' if named else 'The'} {side} camera's prediction misses: {said}."
+            now = {check.name: check for check in mended.get(side, ())}
+            after = ", ".join(
+                f"{plain_number(now[check.name].rms_relative_percent, 2)} %" for check in off if check.name in now
+            )
+            yield f"The {model} of the {side} camera misses {said}{f'; the improved model: {after}' if after else ''}."
         elif worst:
-            names = ", ".join(words.CHECK_NAMES[check.name] for check in worst)
-            yield f"The {side} camera is predicted within its uncertainty: {names}."
+            yield f"The {model} of the {side} camera predicts within its uncertainty: {', '.join(map(_name, worst))}."
+
+
+def _name(check: Check) -> str:
+    return words.CHECK_NAMES[check.name]
 
 
 def _worst(checks: Iterable[Check]) -> dict[Side, list[Check]]:
@@ -216,13 +228,14 @@ def answers(
     diagnosis: DiagnosisResult | None,
     left_out: int = 0,
     warnings: int = 0,
+    both: BothModels | None = None,
 ) -> list[tuple[str, list[str]]]:
     """The four questions, each with its answers in sentences. `left_out`: number of skipped steps; `warnings`: number of warnings about the
     recordings."""
     return [
         ("What was found", list(found(fit, diagnosis))),
         ("How sure", list(certainty(diagnosis))),
-        ("What it means", list(meaning(diagnosis, validation))),
+        ("What it means", list(meaning(diagnosis, validation, both))),
         ("What to do", list(to_do(diagnosis, left_out, warnings))),
     ]
 
@@ -233,6 +246,7 @@ def context(
     diagnosis: DiagnosisResult | None,
     left_out: int,
     warnings: int,
+    both: BothModels | None = None,
 ) -> dict[str, Any]:
     """Variables of `answers.html`."""
     badge, mood, headline = words.headline(diagnosis)
@@ -240,7 +254,7 @@ def context(
         "badge": badge,
         "mood": mood,
         "headline": headline,
-        "answers": answers(fit, validation, diagnosis, left_out, warnings),
+        "answers": answers(fit, validation, diagnosis, left_out, warnings, both),
         "proofs": proofs(fit, diagnosis),
         "strip": strip(fit),
     }
