@@ -10,7 +10,15 @@ import numpy as np
 
 from lab.diagnose.measurements.library import measurement_title
 from lab.effect_titles import at_beginning, effect_title
-from lab.formats.results import Check, DiagnosisResult, FitResult, NamedEffect, ResidualCurve, ValidationResult
+from lab.formats.results import (
+    Check,
+    DiagnosisResult,
+    FitResult,
+    NamedEffect,
+    ParameterValue,
+    ResidualCurve,
+    ValidationResult,
+)
 from lab.formats.results.in_words import measured, plain_number
 from lab.predict.both_models import BothModels
 from lab.report import charts, words
@@ -18,10 +26,12 @@ from lab.report.diagnosis import worst_of_each
 from lab.report.figures import KeyFigure, camera_figures
 from sim.camera import Side
 from sim.effects.library import effects as library
+from sim.parameters import Quantity
 
 #: Parameters within so many standard deviations of 0 aren't on the first screen.
 TOLD_SIGMA = 2.0
 PROOFS = 2  # charts
+ODDS = 4  # sets of effects a side
 #: Most effects that the first screen describes; the others follow in the diagnosis.
 NAMED = 4
 #: Prefixes of the names of the key figures on the first screen.
@@ -42,6 +52,36 @@ def _short(value: float) -> str:
     return f"{value:.0f}" if value >= 9.95 else f"{value:.2g}"
 
 
+def _from_zero(value: ParameterValue, quantity: Quantity | None) -> str:
+    """Return how many standard deviations lie between a size and none, in brackets; empty where it has no such distance."""
+    if quantity is None or quantity.absent is None or not value.std or value.interval is not None:
+        return ""
+    return f" ({plain_number(abs(value.value - quantity.absent) / value.std, 2)} σ from {quantity.absent:g})"
+
+
+def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, float]]]]:
+    """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, the rivals, and all the rest."""
+    found = []
+    for one in diagnosis.models if diagnosis is not None else ():
+        shown = one.sets[:ODDS]
+        rows = [
+            (
+                f"{' + '.join(effect_title(name) for name in item.effects)}, none further"
+                if item.effects
+                else "no effect: the baseline",
+                item.probability,
+            )
+            for item in shown
+        ]
+        rows.append(("all other sets of listed effects together", max(1.0 - sum(p for _, p in rows), 0.0)))
+        for effect in diagnosis.effects if diagnosis is not None else ():
+            if one.side in effect.sides:
+                title = effect_title(effect.name)
+                rows += [(f"rival of {title}: {effect_title(r.name)}", r.probability) for r in effect.rivals]
+        found.append((one.side, rows))
+    return found
+
+
 def effect_line(effect: NamedEffect) -> str:
     """An effect, its cameras, and its parameters that differ from zero, in the library's words."""
     law = library().get(effect.nearest_law)
@@ -49,7 +89,7 @@ def effect_line(effect: NamedEffect) -> str:
     fields = law.choices() if law else {}
     sizes = [
         f"{described[name].meaning if name in described else words.parameter_name(name, value)} "
-        f"{measured(value.value, value.std, value.unit, value.interval)}{'' if value.sign_known else ', sign unknown'}"
+        f"{measured(value.value, value.std, value.unit, value.interval)}{_from_zero(value, described.get(name))}{'' if value.sign_known else ', sign unknown'}"
         for name, value in effect.parameters.items()
         if value.std is None or abs(value.value) >= TOLD_SIGMA * value.std
     ]
@@ -176,7 +216,9 @@ def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
     worst = worst_of_each(curves, len(curves))
     chosen: list[ResidualCurve] = []
     for effect in diagnosis.effects[:PROOFS]:
-        mine = [c for name in effect.shown_in for c in worst if c.measurement == name and c not in chosen]
+        # a transfer function is what a reader knows; the contrast of patterns says the same
+        shown_in = sorted(effect.shown_in, key=lambda name: name != "slanted_edge")
+        mine = [c for name in shown_in for c in worst if c.measurement == name and c not in chosen]
         chosen += mine[:1]
     return [*chosen, *(c for c in worst if c not in chosen)][:PROOFS]
 
@@ -192,14 +234,36 @@ def proof_words(curve: ResidualCurve) -> tuple[str, str]:
     return f"{title[0].upper()}{title[1:]}, {curve.side}, {curve.channel}", caption
 
 
-def proofs(fit: FitResult, diagnosis: DiagnosisResult | None) -> list[Proof]:
-    """Charts for the first screen.
+def _as_sensitivity(curve: ResidualCurve, fit: FitResult, both: BothModels | None) -> ResidualCurve:
+    """Return a curve of signals in narrowband light as the quantum efficiency, which the exposures don't enter; others as they are."""
+    models = both.sensitivity.get(curve.side, {}) if both is not None else {}
+    spectral = fit.cameras[curve.side].spectral if curve.side in fit.cameras else None
+    if curve.measurement != "narrowband" or spectral is None or curve.channel not in models:
+        return curve
+    drawn, at = models[curve.channel], spectral.wavelength_nm
+    return curve.model_copy(
+        update={
+            "label": "all wavelengths",
+            "quantity": "quantum efficiency, e/photon",
+            "held_out": False,
+            "x": at,
+            "measured": spectral.quantum_efficiency[curve.channel],
+            "measured_std": spectral.quantum_efficiency_std[curve.channel],
+            "before": tuple(np.interp(at, drawn.wavelength_nm, drawn.baseline).tolist()),
+            "after": tuple(np.interp(at, drawn.wavelength_nm, drawn.improved).tolist()),
+        }
+    )
+
+
+def proofs(fit: FitResult, diagnosis: DiagnosisResult | None, both: BothModels | None = None) -> list[Proof]:
+    """Draw charts for the first screen.
 
     The two measurements that show the named effects (`proof_curves`), with both models; of a healthy or an undiagnosed camera, its
     photon transfer.
     """
     shown = []
-    for curve in proof_curves(diagnosis) if diagnosis is not None else ():
+    for signals in proof_curves(diagnosis) if diagnosis is not None else ():
+        curve = _as_sensitivity(signals, fit, both)
         title, caption = proof_words(curve)
         shown.append(Proof(title=title, caption=caption, figure=charts.residual_curve(curve)))
     for side, camera in fit.cameras.items():
@@ -213,7 +277,10 @@ def proofs(fit: FitResult, diagnosis: DiagnosisResult | None) -> list[Proof]:
 def strip(fit: FitResult) -> list[tuple[str, list[KeyFigure]]]:
     """The key figures of the first screen: by side, then those of the stereo pair."""
     rows = [
-        (str(side), [figure for figure in camera_figures(camera) if figure.name.startswith(STRIP)])
+        (
+            str(side),
+            [figure for figure in camera_figures(camera) if figure.name.startswith(STRIP) and figure.is_determined],
+        )
         for side, camera in fit.cameras.items()
     ]
     if fit.stereo is not None:
@@ -255,6 +322,7 @@ def context(
         "mood": mood,
         "headline": headline,
         "answers": answers(fit, validation, diagnosis, left_out, warnings, both),
-        "proofs": proofs(fit, diagnosis),
+        "odds": odds(diagnosis),
+        "proofs": proofs(fit, diagnosis, both),
         "strip": strip(fit),
     }

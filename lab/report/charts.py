@@ -13,7 +13,7 @@ import numpy as np
 from lab.diagnose.measurements.library import measurement_title
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Check, DiagnosisResult, NoiseFit, PatchComparison, ResidualCurve, SpectralFit
-from lab.formats.results.in_words import measured
+from lab.formats.results.in_words import measured, plain_number
 from lab.predict.both_models import SensitivityCurve
 from sim.camera import Side
 
@@ -23,8 +23,10 @@ Trace = dict[str, Any]
 CHANNEL = {"R": "#d1495b", "G": "#2a9d57", "B": "#3d7be0", "Y": "#8a63d2", "G1": "#2a9d57", "G2": "#7fb800"}
 BEFORE, AFTER = "#e08a1e", "#1f9aa5"
 BASELINE = "baseline"
+#: Range of a residual's axis, standard deviations; what lies beyond is marked at its edge.
+RESIDUAL_SIGMA = 5.0
 #: Share of the abscissa that a strip takes at least to have a label.
-LABELLED_SHARE = 0.12
+LABELLED_SHARE = 0.1
 FADED = 0.22  # opacity of an uncertainty band
 
 
@@ -495,14 +497,42 @@ def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
 
 
 def _range(curve: ResidualCurve) -> list[float]:
-    """Range of the ordinate: it shows all of the measurement and of the improved model. The baseline is cut off where it would compress
-    these."""
-    seen = np.concatenate([curve.measured, curve.after])
-    low, high = float(seen.min()), float(seen.max())
-    span = max(high - low, 1e-12 * max(abs(high), 1.0))
-    before = np.clip(curve.before, low - span, high + span)
-    low, high = min(low, float(before.min())), max(high, float(before.max()))
-    return [low - 0.06 * (high - low), high + 0.06 * (high - low)]
+    """Return the range of the ordinate: it holds the measurement with its bars, and both models."""
+    seen, std = np.asarray(curve.measured), np.nan_to_num(np.asarray(curve.measured_std))
+    shown = np.concatenate([seen - std, seen + std, curve.before, curve.after])
+    low, high = float(shown.min()), float(shown.max())
+    margin = 0.06 * (high - low) or 0.5 * abs(high) or 1.0
+    return [low - margin, high + margin]
+
+
+def _residual_traces(name: str, x: Sequence[float], residual: np.ndarray[Any, Any], colour: str) -> list[Trace]:
+    """Return residuals as dots within the axis, and as triangles at its edge where they lie beyond."""
+    places = np.asarray(x)
+    dots = {"type": "scatter", "mode": "markers", "name": name, "showlegend": False, "yaxis": "y2"}
+    traces: list[Trace] = []
+    for symbol, chosen, at in (
+        ("circle", np.abs(residual) <= RESIDUAL_SIGMA, residual),
+        ("triangle-up", residual > RESIDUAL_SIGMA, np.full_like(residual, RESIDUAL_SIGMA)),
+        ("triangle-down", residual < -RESIDUAL_SIGMA, np.full_like(residual, -RESIDUAL_SIGMA)),
+    ):
+        if chosen.any():
+            look = {"color": colour, "size": 4 if symbol == "circle" else 8, "symbol": symbol}
+            said = {"text": [f"{value:.3g} σ" for value in residual[chosen]], "hoverinfo": "x+text"}
+            traces.append(dots | said | {"x": places[chosen].tolist(), "y": at[chosen].tolist(), "marker": look})
+    return traces
+
+
+def beyond_axis(name: str, residual: np.ndarray[Any, Any]) -> str:
+    """Return how many residuals lie beyond the axis, and the farthest; empty where none does."""
+    beyond = np.abs(residual) > RESIDUAL_SIGMA
+    if not beyond.any():
+        return ""
+    farthest = float(residual[np.argmax(np.abs(residual))])
+    sign = "\N{MINUS SIGN}" if farthest < 0 else "+"
+    return (
+        f"{name}: {int(beyond.sum())} of {residual.size} beyond ±{RESIDUAL_SIGMA:g} σ, to "
+        f"{sign}{plain_number(abs(farthest), 2)} σ"
+    )
 
 
 def _named_ticks(curve: ResidualCurve) -> dict[str, Any]:
@@ -512,10 +542,24 @@ def _named_ticks(curve: ResidualCurve) -> dict[str, Any]:
     return {"tickvals": list(curve.x), "ticktext": list(curve.names), "tickangle": -45, "tickfont": {"size": 9}}
 
 
+def _beside_residuals(said: str, colour: str, place: int) -> dict[str, Any]:
+    """Return a line of text above the residuals."""
+    at = {
+        "xref": "paper",
+        "yref": "paper",
+        "x": 0.0,
+        "y": 0.305 + 0.055 * place,
+        "xanchor": "left",
+        "yanchor": "bottom",
+    }
+    return at | {"text": said, "showarrow": False, "font": {"size": 10, "color": colour}}
+
+
 def residual_curve(curve: ResidualCurve) -> Figure:
     """One measurement with both models' predictions, and below it the residuals in standard deviations."""
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     seen = np.asarray(curve.measured)
+    notes: list[dict[str, Any]] = []
     data: list[Trace] = [
         {
             "type": "scatter",
@@ -541,27 +585,27 @@ def residual_curve(curve: ResidualCurve) -> Figure:
                 "line": {"color": colour, "width": 2, "dash": dash},
             }
         )
-        data.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "showlegend": False,
-                "name": name,
-                "x": list(curve.x),
-                "y": ((seen - np.asarray(values)) / std).tolist(),
-                "marker": {"color": colour, "size": 4},
-                "yaxis": "y2",
-            }
-        )
+        residual = (seen - np.asarray(values)) / std
+        data += _residual_traces(name, curve.x, residual, colour)
+        if said := beyond_axis(name, residual):
+            notes.append(_beside_residuals(said, colour, len(notes)))
     return {
         "data": data,
         "layout": layout(
             330,
             xaxis=axis(curve.axis, anchor="y2", **_named_ticks(curve)),
             yaxis=axis(
-                "<br>".join(textwrap.wrap(curve.quantity or "measured", 20)), domain=[0.42, 1.0], range=_range(curve)
+                "<br>".join(textwrap.wrap(curve.quantity or "measured", 20)), domain=[0.44, 1.0], range=_range(curve)
             ),
-            yaxis2=axis("residual, σ", domain=[0.0, 0.32], zeroline=True),
+            yaxis2=axis(
+                "residual, σ",
+                domain=[0.0, 0.3],
+                zeroline=True,
+                range=[-1.15 * RESIDUAL_SIGMA, 1.15 * RESIDUAL_SIGMA],
+                tickvals=[-RESIDUAL_SIGMA, 0.0, RESIDUAL_SIGMA],
+                ticktext=["−5", "0", "+5"],
+            ),
+            annotations=notes,
             shapes=[
                 {
                     "type": "rect",

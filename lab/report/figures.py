@@ -43,11 +43,18 @@ class KeyFigure:
     std: float | None = None
     stated: float | None = None
     note: str = ""
+    may_be_zero: bool = False  # zero is as good a value as others: a part of a displacement or of a turn
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the uncertainty is below the value."""
+        return self.may_be_zero or self.std is None or self.std < abs(self.value)
 
     @property
     def text(self) -> str:
-        """Value and standard deviation with unit and note: `0.383 ± 0.008 at 610 nm`."""
-        return f"{measured(self.value, self.std, self.unit)} {self.note}".rstrip()
+        """The value and its standard deviation with unit and note: `0.383 ± 0.008 at 610 nm`."""
+        told = f"{measured(self.value, self.std, self.unit)} {self.note}".rstrip()
+        return told if self.is_determined else f"not determined ({told})"
 
 
 def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:
@@ -120,10 +127,12 @@ def stereo_figures(stereo: StereoFit) -> Iterator[KeyFigure]:
     yield KeyFigure("stereo baseline", "mm", stereo.baseline_mm, stereo.baseline_mm_std)
     for name, value, number in zip("xyz", stereo.translation_mm, range(3), strict=True):
         std = stereo.translation_mm_std
-        yield KeyFigure(f"stereo translation {name}", "mm", value, std[number] if std else None)
+        yield KeyFigure(f"stereo translation {name}", "mm", value, std[number] if std else None, may_be_zero=True)
     for name, value, number in zip("xyz", rotation_vector_mrad(stereo.rotation), range(3), strict=True):
         turns = stereo.rotation_std_rad
-        yield KeyFigure(f"stereo rotation about {name}", "mrad", value, 1e3 * turns[number] if turns else None)
+        yield KeyFigure(
+            f"stereo rotation about {name}", "mrad", value, 1e3 * turns[number] if turns else None, may_be_zero=True
+        )
     yield KeyFigure("stereo reprojection error, rms", "px", stereo.rms_px)
 
 
