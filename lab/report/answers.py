@@ -54,9 +54,9 @@ def _short(value: float) -> str:
 
 def _from_zero(value: ParameterValue, quantity: Quantity | None) -> str:
     """Return how many standard deviations lie between a size and none, in brackets; empty where it has no such distance."""
-    if quantity is None or quantity.absent is None or not value.std or value.interval is not None:
+    if quantity is None or quantity.absent != 0.0 or not value.std or value.interval is not None:
         return ""
-    return f" ({plain_number(abs(value.value - quantity.absent) / value.std, 2)} σ from {quantity.absent:g})"
+    return f" ({plain_number(abs(value.value) / value.std, 2)} σ from 0)"
 
 
 def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, float]]]]:
@@ -265,6 +265,7 @@ def proofs(fit: FitResult, diagnosis: DiagnosisResult | None, both: BothModels |
     for signals in proof_curves(diagnosis) if diagnosis is not None else ():
         curve = _as_sensitivity(signals, fit, both)
         title, caption = proof_words(curve)
+        title = title if curve is signals else f"Spectral sensitivity, {curve.side}, {curve.channel}"
         shown.append(Proof(title=title, caption=caption, figure=charts.residual_curve(curve)))
     for side, camera in fit.cameras.items():
         figure = charts.photon_transfer(camera.noise) if camera.noise is not None else None
