@@ -46,6 +46,7 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
         "ticklen": 4,
         "tickcolor": "@muted",
         "automargin": True,
+        "exponentformat": "none",  # 0.0005, not "500µ"
     } | more
 
 
