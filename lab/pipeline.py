@@ -54,7 +54,7 @@ TYPICAL_S: dict[Step, float] = {
     "validate": 7.0,
     "diagnose": 58.0,
     "resolve": 70.0,
-    "report": 3.0,
+    "report": 21.0,
 }
 
 
@@ -95,6 +95,7 @@ class PipelineRequest:
     reuse : take the kept results of a finished session in place of computing the goal's inputs again. Without it a diagnosis is given
         only the fits that it rests on, and these aren't kept
     fit, validation, diagnosis : results to rest on in place of new ones
+    improved : the cameras with the effects that `diagnosis` names, by side, for the report; where none are given, those that are kept with it
     models : camera files that replace the fitted cameras, by side, in validation and diagnosis
     resolve : after the diagnosis, take the captures that tell the remaining rivals apart
     pictures : draw the residual pictures of the diagnosis
@@ -113,6 +114,7 @@ class PipelineRequest:
     fit: FitResult | None = None
     validation: ValidationResult | None = None
     diagnosis: DiagnosisResult | None = None
+    improved: Mapping[Side, CameraFile] = field(default_factory=dict)
     models: Mapping[Side, CameraFile] = field(default_factory=dict)
     resolve: bool = False
     pictures: bool = True
@@ -495,16 +497,36 @@ class _Pipeline:
         self._say("resolve", "done", 1.0, remark=ties.verdict(examined.proposals))
 
     def _report_step(self) -> None:
+        from lab.calibration.limits import standing_limits
         from lab.formats.results import ReportFile
+        from lab.predict.both_models import predict_both
         from lab.report import provenance_of, write_report
 
         runs = self.store.runs(self._session) if self.store is not None and self._session is not None else []
         file = self.request.report_file or self._session_files()
         provenance = provenance_of(self.recordings, runs[-1].instruments if runs else None)
-        self._report = write_report(file, self.recordings, self.fitted, self._validation, self._diagnosis, provenance)
+        both = predict_both(
+            self.recordings,
+            self.fitted,
+            self._improved(),
+            self._diagnosis,
+            self.request.models,
+            progress=lambda what, share: self._say("report", what, share),
+        )
+        limits = standing_limits(self.store.root) if self.store is not None else None
+        results = (self.fitted, self._validation, self._diagnosis)
+        self._report = write_report(file, self.recordings, *results, provenance, both, limits)
         within = self.store is not None and self._report.is_relative_to(self.store.root)
         path = self._report.relative_to(self.store.root) if self.store is not None and within else self._report
         self._keep(self.request.goal, ReportFile(path=str(path), results=dict(self._results)))
+
+    def _improved(self) -> Mapping[Side, CameraFile]:
+        """The cameras with the effects that the diagnosis names: those it made, that were given with it, or that are kept with it."""
+        if self._examined is not None or self.request.diagnosis is not None or self.store is None:
+            return self._examined.improved if self._examined is not None else self.request.improved
+        from lab.calibration import camera_models
+
+        return camera_models.camera_files(self.store, camera_models.record(self.store, self._results["diagnose"]))
 
     def _session_files(self) -> Path:
         """Write the results and the improved cameras into the session's folder; where its report belongs."""

@@ -69,7 +69,7 @@ def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder
     """One calibration: its state, and its figures against the limits. Exit code 4 if a figure is bad or missing."""
     from lab.calibration.life import calibration, figures
     from lab.calibration.limits import judged
-    from lab.report.figures import shown_unit
+    from lab.formats.results.in_words import shown_unit
 
     check_writable(json)
     store = store_to_read(data)
@@ -137,7 +137,7 @@ def history(
     from lab.calibration.life import figure_names
     from lab.calibration.life import history as looked_up
     from lab.formats.results.figure_names import plain_name, unit_of
-    from lab.report.figures import shown_unit
+    from lab.formats.results.in_words import shown_unit
 
     check_writable(json)
     store = store_to_read(data)

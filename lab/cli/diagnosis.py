@@ -134,6 +134,12 @@ def report(
     diagnosis: Annotated[
         Path | None, typer.Option("--diagnosis", metavar="FILE", help="a diagnosis' JSON, in place of diagnosing again")
     ] = None,
+    cameras: Annotated[
+        Path | None,
+        typer.Option(
+            "--cameras", metavar="DIR", help="the improved cameras of --diagnosis, as `diagnose --save` writes them"
+        ),
+    ] = None,
     stored: Annotated[
         bool,
         typer.Option("--stored", help="take the newest stored results of a finished session, in place of new ones"),
@@ -146,28 +152,29 @@ def report(
     check_writable(out_file)
     store = existing_store(data)
     given = {"fit": fit_file, "validate": validation, "diagnose": diagnosis}
+    recordings = recordings_of(source, data)
+    if cameras is not None and diagnosis is None:
+        raise InputError("--cameras: are those of a diagnosis that is given; give it with --diagnosis")
     request = PipelineRequest(
         "report",
-        recordings=recordings_of(source, data),
+        recordings=recordings,
         source=source,
         keep=False,
         reuse=stored,
         fit=read_given(FitResult, fit_file),
         validation=read_given(ValidationResult, validation),
         diagnosis=read_given(DiagnosisResult, diagnosis),
+        improved=read_models(recordings, cameras),
         report_file=out_file,
     )
-    assert request.recordings is not None
     for option, one in (
         ("--fit", request.fit),
         ("--validation", request.validation),
         ("--diagnosis", request.diagnosis),
     ):
-        if one is not None and Path(one.source).name != Path(request.recordings.source).name:
+        if one is not None and Path(one.source).name != Path(recordings.source).name:
             err.print(
-                escape(
-                    f"calibench: {option}: computed from {one.source}, shown on the page of {request.recordings.source}"
-                )
+                escape(f"calibench: {option}: computed from {one.source}, shown on the page of {recordings.source}")
             )
     kept = [kind for kind, file in given.items() if file is None and store is not None and store.results(source, kind)]
     if kept and not stored:

@@ -11,6 +11,8 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from lab.calibration.figures import figures_of
+from lab.calibration.limits import CalibrationLimits, judged
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.measurements.library import measurement_title
@@ -28,11 +30,13 @@ from lab.formats.results import (
     Skipped,
     ValidationResult,
 )
+from lab.formats.results.in_words import measured
+from lab.predict.both_models import BothModels
 from lab.report import answers, charts, geometry, words
 from lab.report import diagnosis as diagnosis_page
 from lab.report.chart_data import ChartData, plotly_base64
 from lab.report.emva import data_sheets
-from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
+from lab.report.figures import by_side, geometry_figures, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
 from lab.report.provenance import Provenance, installed_versions, provenance_of
 from lab.report.stills import still
@@ -43,34 +47,49 @@ KERNELS_A_SIDE = 12
 
 
 @dataclass(frozen=True)
+class _Prediction:
+    """One model's kernel and its difference from the measured one, as pictures."""
+
+    model: str
+    picture: str
+    difference: str
+    psnr: str
+
+
+@dataclass(frozen=True)
 class _Kernel:
-    """One measured kernel beside its prediction, as pictures."""
+    """One measured kernel beside its predictions, as pictures. `limit`: of the differences' colours, of the peak."""
 
     label: str
     channel: str
     measured: str
-    predicted: str
-    difference: str
+    predictions: tuple[_Prediction, ...]
     limit: str
-    psnr_peak: str
-    psnr_unit: str
 
     @classmethod
-    def of(cls, pair: KernelPair) -> _Kernel:
-        measured_, predicted_ = np.asarray(pair.measured, float), np.asarray(pair.predicted, float)
-        margin = trimmed_margin([measured_, predicted_])
-        peak = float(predicted_.max())
+    def of(cls, pairs: dict[str, KernelPair]) -> _Kernel:
+        """Draw one kernel; `pairs`: by the name of the model that predicts it."""
+        first = next(iter(pairs.values()))
+        seen = np.asarray(first.measured, float)
+        predicted = {model: np.asarray(pair.predicted, float) for model, pair in pairs.items()}
+        margin = trimmed_margin([seen, *predicted.values()])
+        peak = max(float(one.max()) for one in predicted.values())
         # at least 5 % of the peak, so that noise doesn't look like a difference
-        limit = max(float(np.abs(measured_ - predicted_).max()), 0.05 * peak)
+        limit = max(*(float(np.abs(seen - one).max()) for one in predicted.values()), 0.05 * peak)
         return cls(
-            label=pair.label,
-            channel=pair.channel,
-            measured=kernel_picture(measured_, peak, margin),
-            predicted=kernel_picture(predicted_, peak, margin),
-            difference=difference_picture(measured_ - predicted_, limit, margin),
+            label=first.label,
+            channel=first.channel,
+            measured=kernel_picture(seen, peak, margin),
+            predictions=tuple(
+                _Prediction(
+                    model=model,
+                    picture=kernel_picture(one, peak, margin),
+                    difference=difference_picture(seen - one, limit, margin),
+                    psnr=f"{pairs[model].psnr_peak_db:.1f} dB",
+                )
+                for model, one in predicted.items()
+            ),
             limit=f"{100 * limit / peak:.2g} %",
-            psnr_peak=f"{pair.psnr_peak_db:.1f}",
-            psnr_unit=f"{pair.psnr_unit_db:.1f}",
         )
 
 
@@ -83,15 +102,15 @@ def _without_repeats(recordings: RecordingSet, checks: list[Check]) -> list[Chec
     return list(first.values())
 
 
-def _chart_item(recordings: RecordingSet, check: Check) -> dict[str, Any]:
+def _chart_item(recordings: RecordingSet, check: Check, improved: Check | None) -> dict[str, Any]:
     captures = [capture for capture in recordings.captures(ChartCapture, check.side) if capture.id == check.capture]
     photo = frame_picture(recordings.frame(captures[0]), recordings.camera(check.side)) if captures else None
+    best = improved or check
     return {
         "capture": check.capture,
-        "sentence": words.check_sentence(check),
         "photo": photo,
-        "patches": [(name, *pair) for name, pair in patch_colours(check.patches).items()],
-        "figure": charts.patch_comparison(check.patches),
+        "patches": [(name, *pair) for name, pair in patch_colours(best.patches).items()],
+        "figure": charts.patch_comparison(check.patches, improved.patches if improved else None),
     }
 
 
@@ -140,9 +159,9 @@ def page_environment() -> jinja2.Environment:
         "parameter_name": words.parameter_name,
         "parameter_value": parameter_value,
         "stated": stated,
+        "stated_as": lambda value, std, unit: "–" if value is None else measured(value, std, unit),
         "still": still,
         "mood": diagnosis_page.mood,
-        "check_name": lambda name: words.CHECK_NAMES.get(name, name),
     }
     return environment
 
@@ -153,10 +172,15 @@ def render_report(
     validation: ValidationResult | None,
     diagnosis: DiagnosisResult | None,
     provenance: Provenance,
+    both: BothModels | None = None,
+    limits: CalibrationLimits | None = None,
 ) -> str:
-    """The report as HTML text; see `write_report`."""
+    """Return the report as HTML text; see `write_report`."""
     sides = tuple(fit.cameras)
-    checks = validation.checks if validation is not None else ()
+    fitted_checks = validation.checks if validation is not None else ()
+    checks = both.baseline if both is not None else fitted_checks
+    by_improved = {(one.name, one.side, one.capture): one for one in both.improved} if both is not None else {}
+    model = "baseline" if both is not None else words.FITTED
     curves = diagnosis.curves if diagnosis is not None else ()
     rows = by_side(fit, recordings.manifest.cameras)
     skipped: dict[tuple[str, str, str], Skipped] = {}
@@ -167,6 +191,9 @@ def render_report(
     def of(side: Side, name: str) -> list[Check]:
         return [check for check in checks if check.side == side and check.name == name]
 
+    def after(check: Check) -> Check | None:
+        return by_improved.get((check.name, check.side, check.capture))
+
     noises = {side: camera.noise for side, camera in fit.cameras.items()}
     context: dict[str, Any] = {
         "title": recordings.manifest.name or Path(recordings.source).name,
@@ -175,7 +202,7 @@ def render_report(
         "made": provenance.made.strftime("%Y-%m-%d %H:%M UTC"),
         "captures": len(recordings.captures()),
         "sides": sides,
-        **answers.context(fit, validation, diagnosis, len(skipped), len(recordings.warnings)),
+        **answers.context(fit, validation, diagnosis, len(skipped), len(recordings.warnings), both),
         "diagnosis": diagnosis,
         "threshold_text": _threshold_text(diagnosis),
         "mismatch_map": charts.mismatch_map(diagnosis) if diagnosis is not None else None,
@@ -194,7 +221,9 @@ def render_report(
         "sheets": list(data_sheets(recordings, fit)),
         "linearity": {side: charts.linearity(noise) if noise else None for side, noise in noises.items()},
         "qe": {
-            side: charts.quantum_efficiency(camera.spectral, recordings, side)
+            side: charts.quantum_efficiency(
+                camera.spectral, recordings, side, both.sensitivity.get(side) if both else None
+            )
             if camera.spectral and camera.spectral.quantum_efficiency
             else None
             for side, camera in fit.cameras.items()
@@ -204,19 +233,36 @@ def render_report(
                 charts.explained_overlays([curve for curve in curves if curve.side == side]), 2
             )
             for side in sides
-        },
+        }
+        if both is None
+        else {},
         "mtf": {
-            side: charts.transfer_overlays(charts.validated_overlays(_without_repeats(recordings, of(side, "mtf"))))
+            side: charts.transfer_overlays(
+                charts.validated_overlays([(one, after(one)) for one in _without_repeats(recordings, of(side, "mtf"))]),
+                model=model,
+            )
             for side in sides
         },
         "kernels": {
-            side: [_Kernel.of(pair) for check in of(side, "psf") for pair in check.kernels][:KERNELS_A_SIDE]
+            side: [
+                _Kernel.of({model: pair} | ({"improved model": other} if other else {}))
+                for check in of(side, "psf")
+                for mended in (after(check),)
+                for pair, other in zip(
+                    check.kernels, mended.kernels if mended else (None,) * len(check.kernels), strict=True
+                )
+            ][:KERNELS_A_SIDE]
             for side in sides
         },
         "charts": {
-            side: [_chart_item(recordings, check) for check in of(side, "colorchecker") if check.patches][:1]
+            side: [_chart_item(recordings, check, after(check)) for check in of(side, "colorchecker") if check.patches][
+                :1
+            ]
             for side in sides
         },
+        "compared": words.compared(both.baseline if both else (), tuple(by_improved.values()), fitted_checks),
+        "models": words.models(both is not None, bool(by_improved)),
+        "judgements": judged(figures_of(fit), limits) if limits is not None else (),
         "stereo": list(stereo_figures(fit.stereo)) if fit.stereo else [],
         "pairs": fit.stereo.pairs if fit.stereo else 0,
         "pair": geometry.stereo_context(recordings, fit.stereo),
@@ -228,7 +274,6 @@ def render_report(
             else None
             for side, camera in fit.cameras.items()
         },
-        "checks": checks,
         "skipped": list(skipped.values()),
         "warnings": recordings.warnings,
         "provenance": provenance,
@@ -247,14 +292,17 @@ def write_report(
     validation: ValidationResult | None,
     diagnosis: DiagnosisResult | None,
     provenance: Provenance | None = None,
+    both: BothModels | None = None,
+    limits: CalibrationLimits | None = None,
 ) -> Path:
     """Write the report as the file `out`, one self-contained page: completely, or not at all.
 
     `validation` and `diagnosis` may be None: the page says that they were not done. `provenance`: by default, what the
-    recordings themselves tell. Raises InputError where the file can't be written.
+    recordings themselves tell. `both`: predictions by the baseline and the improved model, where both are known. `limits`:
+    that the figures are judged by, where the laboratory states some. Raises InputError where the file can't be written.
     """
     file = Path(out)
-    page = render_report(recordings, fit, validation, diagnosis, provenance or provenance_of(recordings))
+    page = render_report(recordings, fit, validation, diagnosis, provenance or provenance_of(recordings), both, limits)
     return write_page(file, page)
 
 

@@ -10,16 +10,28 @@ import numpy as np
 
 from lab.diagnose.measurements.library import measurement_title
 from lab.effect_titles import at_beginning, effect_title
-from lab.formats.results import Check, DiagnosisResult, FitResult, NamedEffect, ResidualCurve, ValidationResult
+from lab.formats.results import (
+    Check,
+    DiagnosisResult,
+    FitResult,
+    NamedEffect,
+    ParameterValue,
+    ResidualCurve,
+    ValidationResult,
+)
+from lab.formats.results.in_words import measured, plain_number
+from lab.predict.both_models import BothModels
 from lab.report import charts, words
 from lab.report.diagnosis import worst_of_each
-from lab.report.figures import KeyFigure, camera_figures, measured
+from lab.report.figures import KeyFigure, camera_figures
 from sim.camera import Side
 from sim.effects.library import effects as library
+from sim.parameters import Quantity
 
 #: Parameters within so many standard deviations of 0 aren't on the first screen.
 TOLD_SIGMA = 2.0
 PROOFS = 2  # charts
+ODDS = 4  # sets of effects a side
 #: Most effects that the first screen describes; the others follow in the diagnosis.
 NAMED = 4
 #: Prefixes of the names of the key figures on the first screen.
@@ -40,6 +52,36 @@ def _short(value: float) -> str:
     return f"{value:.0f}" if value >= 9.95 else f"{value:.2g}"
 
 
+def _from_zero(value: ParameterValue, quantity: Quantity | None) -> str:
+    """Return how many standard deviations lie between a size and none, in brackets; empty where it has no such distance."""
+    if quantity is None or quantity.absent != 0.0 or not value.std or value.interval is not None:
+        return ""
+    return f" ({plain_number(abs(value.value) / value.std, 2)} σ from 0)"
+
+
+def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, float]]]]:
+    """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, the rivals, and all the rest."""
+    found = []
+    for one in diagnosis.models if diagnosis is not None else ():
+        shown = one.sets[:ODDS]
+        rows = [
+            (
+                f"{' + '.join(effect_title(name) for name in item.effects)}, none further"
+                if item.effects
+                else "no effect: the baseline",
+                item.probability,
+            )
+            for item in shown
+        ]
+        rows.append(("all other sets of listed effects together", max(1.0 - sum(p for _, p in rows), 0.0)))
+        for effect in diagnosis.effects if diagnosis is not None else ():
+            if one.side in effect.sides:
+                title = effect_title(effect.name)
+                rows += [(f"rival of {title}: {effect_title(r.name)}", r.probability) for r in effect.rivals]
+        found.append((one.side, rows))
+    return found
+
+
 def effect_line(effect: NamedEffect) -> str:
     """An effect, its cameras, and its parameters that differ from zero, in the library's words."""
     law = library().get(effect.nearest_law)
@@ -47,7 +89,7 @@ def effect_line(effect: NamedEffect) -> str:
     fields = law.choices() if law else {}
     sizes = [
         f"{described[name].meaning if name in described else words.parameter_name(name, value)} "
-        f"{measured(value.value, value.std, value.unit, value.interval)}{'' if value.sign_known else ', sign unknown'}"
+        f"{measured(value.value, value.std, value.unit, value.interval)}{_from_zero(value, described.get(name))}{'' if value.sign_known else ', sign unknown'}"
         for name, value in effect.parameters.items()
         if value.std is None or abs(value.value) >= TOLD_SIGMA * value.std
     ]
@@ -101,19 +143,30 @@ def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
         yield f"False-alarm rate: {100 * diagnosis.false_alarm_rate:.2g} % of healthy cameras are reported with a mismatch."
 
 
-def meaning(diagnosis: DiagnosisResult | None, validation: ValidationResult | None) -> Iterator[str]:
-    """Sentences: what the effects do to light and signal, and by how much the baseline's predictions are off."""
+def meaning(
+    diagnosis: DiagnosisResult | None, validation: ValidationResult | None, both: BothModels | None = None
+) -> Iterator[str]:
+    """Yield sentences: what the effects do to light and signal, and by how much the baseline's predictions are off."""
     for effect in diagnosis.effects[:NAMED] if diagnosis is not None else ():
         yield effect.statement.split(" Seen in ")[0]
-    named = diagnosis is not None and bool(diagnosis.effects)
-    for side, worst in _worst(validation.checks if validation is not None else ()).items():
+    checks = both.baseline if both is not None else validation.checks if validation is not None else ()
+    model = "baseline" if both is not None else words.FITTED
+    mended = _worst(both.improved) if both is not None else {}
+    for side, worst in _worst(checks).items():
         off = [check for check in worst if not check.passed]
-        said = ", ".join(f"{words.CHECK_NAMES[check.name]} by {check.rms_relative_percent:.2g} % rms" for check in off)
+        said = ", ".join(f"{_name(check)} by {plain_number(check.rms_relative_percent, 2)} % rms" for check in off)
         if off:
-            yield f"{'Without these effects, the' if named else 'The'} {side} camera's prediction misses: {said}."
+            now = {check.name: check for check in mended.get(side, ())}
+            after = ", ".join(
+                f"{plain_number(now[check.name].rms_relative_percent, 2)} %" for check in off if check.name in now
+            )
+            yield f"The {model} of the {side} camera misses {said}{f'; the improved model: {after}' if after else ''}."
         elif worst:
-            names = ", ".join(words.CHECK_NAMES[check.name] for check in worst)
-            yield f"The {side} camera is predicted within its uncertainty: {names}."
+            yield f"The {model} of the {side} camera predicts within its uncertainty: {', '.join(map(_name, worst))}."
+
+
+def _name(check: Check) -> str:
+    return words.CHECK_NAMES[check.name]
 
 
 def _worst(checks: Iterable[Check]) -> dict[Side, list[Check]]:
@@ -163,7 +216,9 @@ def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
     worst = worst_of_each(curves, len(curves))
     chosen: list[ResidualCurve] = []
     for effect in diagnosis.effects[:PROOFS]:
-        mine = [c for name in effect.shown_in for c in worst if c.measurement == name and c not in chosen]
+        # a transfer function is what a reader knows; the contrast of patterns says the same
+        shown_in = sorted(effect.shown_in, key=lambda name: name != "slanted_edge")
+        mine = [c for name in shown_in for c in worst if c.measurement == name and c not in chosen]
         chosen += mine[:1]
     return [*chosen, *(c for c in worst if c not in chosen)][:PROOFS]
 
@@ -179,15 +234,38 @@ def proof_words(curve: ResidualCurve) -> tuple[str, str]:
     return f"{title[0].upper()}{title[1:]}, {curve.side}, {curve.channel}", caption
 
 
-def proofs(fit: FitResult, diagnosis: DiagnosisResult | None) -> list[Proof]:
-    """Charts for the first screen.
+def _as_sensitivity(curve: ResidualCurve, fit: FitResult, both: BothModels | None) -> ResidualCurve:
+    """Return a curve of signals in narrowband light as the quantum efficiency, which the exposures don't enter; others as they are."""
+    models = both.sensitivity.get(curve.side, {}) if both is not None else {}
+    spectral = fit.cameras[curve.side].spectral if curve.side in fit.cameras else None
+    if curve.measurement != "narrowband" or spectral is None or curve.channel not in models:
+        return curve
+    drawn, at = models[curve.channel], spectral.wavelength_nm
+    return curve.model_copy(
+        update={
+            "label": "all wavelengths",
+            "quantity": "quantum efficiency, e/photon",
+            "held_out": False,
+            "x": at,
+            "measured": spectral.quantum_efficiency[curve.channel],
+            "measured_std": spectral.quantum_efficiency_std[curve.channel],
+            "before": tuple(np.interp(at, drawn.wavelength_nm, drawn.baseline).tolist()),
+            "after": tuple(np.interp(at, drawn.wavelength_nm, drawn.improved).tolist()),
+        }
+    )
+
+
+def proofs(fit: FitResult, diagnosis: DiagnosisResult | None, both: BothModels | None = None) -> list[Proof]:
+    """Draw charts for the first screen.
 
     The two measurements that show the named effects (`proof_curves`), with both models; of a healthy or an undiagnosed camera, its
     photon transfer.
     """
     shown = []
-    for curve in proof_curves(diagnosis) if diagnosis is not None else ():
+    for signals in proof_curves(diagnosis) if diagnosis is not None else ():
+        curve = _as_sensitivity(signals, fit, both)
         title, caption = proof_words(curve)
+        title = title if curve is signals else f"Spectral sensitivity, {curve.side}, {curve.channel}"
         shown.append(Proof(title=title, caption=caption, figure=charts.residual_curve(curve)))
     for side, camera in fit.cameras.items():
         figure = charts.photon_transfer(camera.noise) if camera.noise is not None else None
@@ -200,7 +278,10 @@ def proofs(fit: FitResult, diagnosis: DiagnosisResult | None) -> list[Proof]:
 def strip(fit: FitResult) -> list[tuple[str, list[KeyFigure]]]:
     """The key figures of the first screen: by side, then those of the stereo pair."""
     rows = [
-        (str(side), [figure for figure in camera_figures(camera) if figure.name.startswith(STRIP)])
+        (
+            str(side),
+            [figure for figure in camera_figures(camera) if figure.name.startswith(STRIP) and figure.is_determined],
+        )
         for side, camera in fit.cameras.items()
     ]
     if fit.stereo is not None:
@@ -215,13 +296,14 @@ def answers(
     diagnosis: DiagnosisResult | None,
     left_out: int = 0,
     warnings: int = 0,
+    both: BothModels | None = None,
 ) -> list[tuple[str, list[str]]]:
     """The four questions, each with its answers in sentences. `left_out`: number of skipped steps; `warnings`: number of warnings about the
     recordings."""
     return [
         ("What was found", list(found(fit, diagnosis))),
         ("How sure", list(certainty(diagnosis))),
-        ("What it means", list(meaning(diagnosis, validation))),
+        ("What it means", list(meaning(diagnosis, validation, both))),
         ("What to do", list(to_do(diagnosis, left_out, warnings))),
     ]
 
@@ -232,6 +314,7 @@ def context(
     diagnosis: DiagnosisResult | None,
     left_out: int,
     warnings: int,
+    both: BothModels | None = None,
 ) -> dict[str, Any]:
     """Variables of `answers.html`."""
     badge, mood, headline = words.headline(diagnosis)
@@ -239,7 +322,8 @@ def context(
         "badge": badge,
         "mood": mood,
         "headline": headline,
-        "answers": answers(fit, validation, diagnosis, left_out, warnings),
-        "proofs": proofs(fit, diagnosis),
+        "answers": answers(fit, validation, diagnosis, left_out, warnings, both),
+        "odds": odds(diagnosis),
+        "proofs": proofs(fit, diagnosis, both),
         "strip": strip(fit),
     }

@@ -38,6 +38,13 @@
   const redraw = () => window.Plotly && boxes.filter(shown).forEach(box => { Plotly.purge(box); draw(box); });
   addEventListener("beforeprint", () => { document.documentElement.classList.add("printed"); redraw(); });
   addEventListener("afterprint", () => { document.documentElement.classList.remove("printed"); redraw(); });
+  // What scrolls sideways can be scrolled by keyboard, too.
+  const reach = () => document.querySelectorAll("table, .scroll").forEach(one => {
+    if (one.scrollWidth > one.clientWidth) one.tabIndex = 0; else one.removeAttribute("tabindex");
+  });
+  document.addEventListener("toggle", reach, true);
+  addEventListener("resize", reach);
+  reach();
   // A link to a section opens it.
   const reveal = () => {
     const target = location.hash.length > 1 && document.getElementById(decodeURIComponent(location.hash.slice(1)));

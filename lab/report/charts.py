@@ -13,7 +13,8 @@ import numpy as np
 from lab.diagnose.measurements.library import measurement_title
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Check, DiagnosisResult, NoiseFit, PatchComparison, ResidualCurve, SpectralFit
-from lab.report.figures import measured
+from lab.formats.results.in_words import measured, plain_number
+from lab.predict.both_models import SensitivityCurve
 from sim.camera import Side
 
 Figure = dict[str, Any]
@@ -21,6 +22,11 @@ Trace = dict[str, Any]
 #: Distinguishable with all common kinds of colour vision, and legible on white and on near-black.
 CHANNEL = {"R": "#d1495b", "G": "#2a9d57", "B": "#3d7be0", "Y": "#8a63d2", "G1": "#2a9d57", "G2": "#7fb800"}
 BEFORE, AFTER = "#e08a1e", "#1f9aa5"
+BASELINE = "baseline"
+#: Range of a residual's axis, standard deviations; what lies beyond is marked at its edge.
+RESIDUAL_SIGMA = 5.0
+#: Share of the abscissa that a strip takes at least to have a label.
+LABELLED_SHARE = 0.1
 FADED = 0.22  # opacity of an uncertainty band
 
 
@@ -40,6 +46,7 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
         "ticklen": 4,
         "tickcolor": "@muted",
         "automargin": True,
+        "exponentformat": "none",  # 0.0005, not "500µ"
     } | more
 
 
@@ -179,6 +186,10 @@ def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[
         shapes.append(look | at | {"yref": "paper", "y0": bottom, "y1": bottom + 0.05})
         shapes.append(look | at | {"yref": "paper", "y0": 0.0, "y1": bottom, "fillcolor": _faded(colour, 0.07)})
         size = "new" if one.difference_percent is None else f"{one.difference_percent:+.1f} %"
+        if one.to_nm - one.from_nm + 2 * half < LABELLED_SHARE * (
+            spectral.wavelength_nm[-1] - spectral.wavelength_nm[0]
+        ):
+            continue  # no room for its label
         notes.append(
             {
                 "x": 0.5 * (one.from_nm + one.to_nm),
@@ -194,9 +205,18 @@ def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[
     return shapes, notes
 
 
-def quantum_efficiency(spectral: SpectralFit, recordings: RecordingSet, side: Side) -> Figure:
-    """Quantum efficiency with its band (standard deviation times the fit's coverage factor); the maker's curve, scaled by the fitted factor
-    where there is one; and the wavelength bands in which the two differ."""
+def quantum_efficiency(
+    spectral: SpectralFit,
+    recordings: RecordingSet,
+    side: Side,
+    models: Mapping[str, SensitivityCurve] | None = None,
+) -> Figure:
+    """Return the quantum efficiency with its band (standard deviation times the fit's coverage factor) and the wavelength bands in
+    which it differs from the maker's.
+
+    `models`: curves of the baseline and the improved model by channel, drawn beside it. Without them, the maker's curve stands there,
+    scaled by the fitted factor where there is one.
+    """
     data: list[Trace] = []
     scale = spectral.maker_scale or 1.0
     for channel, values in spectral.quantum_efficiency.items():
@@ -208,30 +228,43 @@ def quantum_efficiency(spectral: SpectralFit, recordings: RecordingSet, side: Si
         data.append(
             {
                 "type": "scatter",
-                "mode": "lines+markers",
-                "name": channel,
+                "mode": "markers" if models else "lines+markers",
+                "name": f"{channel} measured" if models else channel,
                 "x": list(spectral.wavelength_nm),
                 "y": list(values),
                 "line": {"color": colour, "width": 2},
-                "marker": {"size": 4},
+                "marker": {"color": colour, "size": 4},
             }
         )
-    for channel, path in (recordings.camera(side).quantum_efficiency or {}).items():
-        curve = recordings.spectrum(path)
+    for number, (channel, curve) in enumerate((models or {}).items()):
+        colour = CHANNEL.get(channel, "#888888")
+        pairs = [(BASELINE, curve.baseline, "dash", 1.3), ("improved model", curve.improved, "solid", 1.8)]
+        for name, drawn, dash, width in pairs if curve.improved != curve.baseline else pairs[:1]:
+            line = {"color": colour, "width": width, "dash": dash}
+            if number == 0:
+                data.append(_legend(name, mode="lines", line=line | {"color": "@fg"}))
+            data.append(
+                {"type": "scatter", "mode": "lines", "x": list(curve.wavelength_nm), "y": list(drawn), "line": line}
+                | {"showlegend": False, "name": f"{channel}, {name}"}
+            )
+    for channel, path in ({} if models else recordings.camera(side).quantum_efficiency or {}).items():
+        stated = recordings.spectrum(path)
         data.append(
             {
                 "type": "scatter",
                 "mode": "lines",
                 "name": f"{channel}, maker" + (f" x {scale:.3f}" if spectral.maker_scale else ""),
-                "x": list(curve.wavelength_nm),
-                "y": [scale * value for value in curve.value],
+                "x": list(stated.wavelength_nm),
+                "y": [scale * value for value in stated.value],
                 "line": {"color": CHANNEL.get(channel, "#888888"), "width": 1.2, "dash": "dot"},
             }
         )
     span = [min(spectral.wavelength_nm) - 10, max(spectral.wavelength_nm) + 10]
     shapes, notes = _departures(spectral)
     # Room above the curves for the strips, where there are any.
-    top = 1.05 * max(max(values) for values in spectral.quantum_efficiency.values()) / (0.8 if shapes else 1.0)
+    highest = max(max(values) for values in spectral.quantum_efficiency.values())
+    highest = max([highest, *(max(*one.baseline, *one.improved) for one in (models or {}).values())])
+    top = 1.05 * highest / (0.8 if shapes else 1.0)
     return {
         "data": data,
         "layout": layout(
@@ -273,16 +306,23 @@ class Overlay:
     explained: Sequence[float] | None = None
 
 
-def validated_overlays(checks: Sequence[Check]) -> dict[str, list[Overlay]]:
-    """Panel title -> curves, one panel for each check."""
-    return {
-        check.curves[0].label.replace(f"-{check.side}", ""): [
-            Overlay(curve.channel, curve.x, curve.measured, curve.measured_std, curve.predicted)
-            for curve in check.curves
-        ]
-        for check in checks
-        if check.curves
-    }
+def validated_overlays(checks: Sequence[tuple[Check, Check | None]]) -> dict[str, list[Overlay]]:
+    """Return panel title -> curves, one panel for each check by a first model and, where there is one, by the improved model."""
+    panels: dict[str, list[Overlay]] = {}
+    for check, improved in checks:
+        mended = {curve.channel: curve.predicted for curve in improved.curves} if improved is not None else {}
+        for curve in check.curves:
+            panels.setdefault(check.curves[0].label.replace(f"-{check.side}", ""), []).append(
+                Overlay(
+                    curve.channel,
+                    curve.x,
+                    curve.measured,
+                    curve.measured_std,
+                    curve.predicted,
+                    mended.get(curve.channel),
+                )
+            )
+    return panels
 
 
 def explained_overlays(curves: Sequence[ResidualCurve], measurement: str = "slanted_edge") -> dict[str, list[Overlay]]:
@@ -306,7 +346,9 @@ def _legend(name: str, **look: Any) -> Trace:
     return {"type": "scatter", "name": name, "x": [None], "y": [None], "hoverinfo": "skip"} | look
 
 
-def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3) -> Figure | None:
+def transfer_overlays(
+    panels: Mapping[str, Sequence[Overlay]], columns: int = 3, model: str = "baseline"
+) -> Figure | None:
     """Measured MTF (points), the baseline's prediction (dashed), and the improved model's (solid) where effects were named."""
     if not panels:
         return None
@@ -327,7 +369,7 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
     everything = [overlay for overlays in panels.values() for overlay in overlays]
     for channel in dict.fromkeys(overlay.channel for overlay in everything):
         data.append(_legend(f"{channel} measured", mode="markers", marker={"color": CHANNEL.get(channel, "#888888")}))
-    data.append(_legend("baseline", mode="lines", line={"color": "@fg", "width": 1.3, "dash": "dash"}))
+    data.append(_legend(model, mode="lines", line={"color": "@fg", "width": 1.3, "dash": "dash"}))
     if any(overlay.explained is not None for overlay in everything):
         data.append(_legend("improved model", mode="lines", line={"color": "@fg", "width": 1.8}))
 
@@ -358,57 +400,49 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
     }
 
 
-def patch_comparison(patches: Sequence[PatchComparison]) -> Figure:
-    """Measured against predicted patches, and below it their difference in per cent with bars of one standard deviation."""
-    data: list[Trace] = []
-    top = max(max(patch.measured_dn, patch.predicted_dn) for patch in patches)
-    for channel in dict.fromkeys(patch.channel for patch in patches):
+def patch_comparison(patches: Sequence[PatchComparison], improved: Sequence[PatchComparison] | None = None) -> Figure:
+    """Return measured and predicted patches on the same axes, a panel for each channel, in per cent of its brightest measured patch.
+
+    Bars: one standard deviation of measurement and prediction together. `improved`: the same patches by the improved model.
+    """
+    channels = list(dict.fromkeys(patch.channel for patch in patches))
+    first = BASELINE if improved is not None else "predicted"
+    height, data, axes = 90 + 150 * len(channels), list[Trace](), dict[str, Any]()
+    pitch = 1.0 / len(channels)
+    for number, channel in enumerate(channels):
         mine = [patch for patch in patches if patch.channel == channel]
-        colour = CHANNEL.get(channel, "#888888")
-        common = {"type": "scatter", "mode": "markers", "name": channel, "marker": {"color": colour, "size": 6}}
+        mended = [patch for patch in improved or () if patch.channel == channel]
+        unit = 100.0 / max(*(patch.measured_dn for patch in mine), 1e-9)
+        names = [patch.patch for patch in mine]
+        suffix = "" if number == 0 else str(number + 1)
+        on = {"type": "scatter", "yaxis": f"y{suffix}", "showlegend": number == 0}
+        std = [unit * float(np.hypot(one.measured_dn_std, one.predicted_dn_std)) for one in mended or mine]
+        for name, values, colour, dash, width in (
+            (first, [one.predicted_dn for one in mine], BEFORE, "dash", 1.6),
+            ("improved model", [one.predicted_dn for one in mended], AFTER, "solid", 1.8),
+        ):
+            if values:
+                line = {"color": colour, "width": width, "dash": dash}
+                data.append(
+                    on | {"mode": "lines", "name": name, "x": names, "y": [unit * v for v in values], "line": line}
+                )
         data.append(
-            common
+            on
             | {
-                "x": [patch.predicted_dn for patch in mine],
-                "y": [patch.measured_dn for patch in mine],
-                "error_x": _bars([patch.predicted_dn_std for patch in mine], colour),
-                "error_y": _bars([patch.measured_dn_std for patch in mine], colour),
-                "text": [patch.patch for patch in mine],
+                "mode": "markers",
+                "name": "measured",
+                "x": names,
+                "y": [unit * patch.measured_dn for patch in mine],
+                "error_y": _bars(std, "@fg"),
+                "marker": {"color": CHANNEL.get(channel, "#888888"), "size": 6},
             }
         )
-        data.append(
-            common
-            | {
-                "x": [patch.patch for patch in mine],
-                "y": [100 * (patch.measured_dn / patch.predicted_dn - 1) for patch in mine],
-                "error_y": _bars(
-                    [100 * float(np.hypot(p.measured_dn_std, p.predicted_dn_std)) / p.predicted_dn for p in mine],
-                    colour,
-                ),
-                "xaxis": "x2",
-                "yaxis": "y2",
-                "showlegend": False,
-            }
-        )
-    data.append(
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "name": "equal",
-            "x": [0, top],
-            "y": [0, top],
-            "line": {"color": "@muted", "width": 1, "dash": "dot"},
-        }
-    )
+        top = 1.0 - number * pitch
+        axes[f"yaxis{suffix}"] = axis(f"{channel}, %", rangemode="tozero", domain=[top - 0.84 * pitch, top])
+    last = "y" if len(channels) == 1 else f"y{len(channels)}"
     return {
         "data": data,
-        "layout": layout(
-            560,
-            xaxis=axis("predicted, DN above black", rangemode="tozero", anchor="y"),
-            yaxis=axis("measured, DN above black", rangemode="tozero", domain=[0.56, 1.0]),
-            xaxis2=axis("", anchor="y2", tickangle=-45, tickfont={"size": 10}),
-            yaxis2=axis("measured − predicted, %", domain=[0.0, 0.4], zeroline=True),
-        ),
+        "layout": layout(height, xaxis=axis("", anchor=last, tickangle=-45, tickfont={"size": 10}), **axes),
     }
 
 
@@ -464,14 +498,42 @@ def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
 
 
 def _range(curve: ResidualCurve) -> list[float]:
-    """Range of the ordinate: it shows all of the measurement and of the improved model. The baseline is cut off where it would compress
-    these."""
-    seen = np.concatenate([curve.measured, curve.after])
-    low, high = float(seen.min()), float(seen.max())
-    span = max(high - low, 1e-12 * max(abs(high), 1.0))
-    before = np.clip(curve.before, low - span, high + span)
-    low, high = min(low, float(before.min())), max(high, float(before.max()))
-    return [low - 0.06 * (high - low), high + 0.06 * (high - low)]
+    """Return the range of the ordinate: it holds the measurement with its bars, and both models."""
+    seen, std = np.asarray(curve.measured), np.nan_to_num(np.asarray(curve.measured_std))
+    shown = np.concatenate([seen - std, seen + std, curve.before, curve.after])
+    low, high = float(shown.min()), float(shown.max())
+    margin = 0.06 * (high - low) or 0.5 * abs(high) or 1.0
+    return [low - margin, high + margin]
+
+
+def _residual_traces(name: str, x: Sequence[float], residual: np.ndarray[Any, Any], colour: str) -> list[Trace]:
+    """Return residuals as dots within the axis, and as triangles at its edge where they lie beyond."""
+    places = np.asarray(x)
+    dots = {"type": "scatter", "mode": "markers", "name": name, "showlegend": False, "yaxis": "y2"}
+    traces: list[Trace] = []
+    for symbol, chosen, at in (
+        ("circle", np.abs(residual) <= RESIDUAL_SIGMA, residual),
+        ("triangle-up", residual > RESIDUAL_SIGMA, np.full_like(residual, RESIDUAL_SIGMA)),
+        ("triangle-down", residual < -RESIDUAL_SIGMA, np.full_like(residual, -RESIDUAL_SIGMA)),
+    ):
+        if chosen.any():
+            look = {"color": colour, "size": 4 if symbol == "circle" else 8, "symbol": symbol}
+            said = {"text": [f"{value:.3g} σ" for value in residual[chosen]], "hoverinfo": "x+text"}
+            traces.append(dots | said | {"x": places[chosen].tolist(), "y": at[chosen].tolist(), "marker": look})
+    return traces
+
+
+def beyond_axis(name: str, residual: np.ndarray[Any, Any]) -> str:
+    """Return how many residuals lie beyond the axis, and the farthest; empty where none does."""
+    beyond = np.abs(residual) > RESIDUAL_SIGMA
+    if not beyond.any():
+        return ""
+    farthest = float(residual[np.argmax(np.abs(residual))])
+    sign = "\N{MINUS SIGN}" if farthest < 0 else "+"
+    return (
+        f"{name}: {int(beyond.sum())} of {residual.size} beyond ±{RESIDUAL_SIGMA:g} σ, to "
+        f"{sign}{plain_number(abs(farthest), 2)} σ"
+    )
 
 
 def _named_ticks(curve: ResidualCurve) -> dict[str, Any]:
@@ -481,10 +543,24 @@ def _named_ticks(curve: ResidualCurve) -> dict[str, Any]:
     return {"tickvals": list(curve.x), "ticktext": list(curve.names), "tickangle": -45, "tickfont": {"size": 9}}
 
 
+def _beside_residuals(said: str, colour: str, place: int) -> dict[str, Any]:
+    """Return a line of text above the residuals."""
+    at = {
+        "xref": "paper",
+        "yref": "paper",
+        "x": 0.0,
+        "y": 0.305 + 0.055 * place,
+        "xanchor": "left",
+        "yanchor": "bottom",
+    }
+    return at | {"text": said, "showarrow": False, "font": {"size": 10, "color": colour}}
+
+
 def residual_curve(curve: ResidualCurve) -> Figure:
     """One measurement with both models' predictions, and below it the residuals in standard deviations."""
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     seen = np.asarray(curve.measured)
+    notes: list[dict[str, Any]] = []
     data: list[Trace] = [
         {
             "type": "scatter",
@@ -510,27 +586,27 @@ def residual_curve(curve: ResidualCurve) -> Figure:
                 "line": {"color": colour, "width": 2, "dash": dash},
             }
         )
-        data.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "showlegend": False,
-                "name": name,
-                "x": list(curve.x),
-                "y": ((seen - np.asarray(values)) / std).tolist(),
-                "marker": {"color": colour, "size": 4},
-                "yaxis": "y2",
-            }
-        )
+        residual = (seen - np.asarray(values)) / std
+        data += _residual_traces(name, curve.x, residual, colour)
+        if said := beyond_axis(name, residual):
+            notes.append(_beside_residuals(said, colour, len(notes)))
     return {
         "data": data,
         "layout": layout(
             330,
             xaxis=axis(curve.axis, anchor="y2", **_named_ticks(curve)),
             yaxis=axis(
-                "<br>".join(textwrap.wrap(curve.quantity or "measured", 20)), domain=[0.42, 1.0], range=_range(curve)
+                "<br>".join(textwrap.wrap(curve.quantity or "measured", 20)), domain=[0.44, 1.0], range=_range(curve)
             ),
-            yaxis2=axis("residual, σ", domain=[0.0, 0.32], zeroline=True),
+            yaxis2=axis(
+                "residual, σ",
+                domain=[0.0, 0.3],
+                zeroline=True,
+                range=[-1.15 * RESIDUAL_SIGMA, 1.15 * RESIDUAL_SIGMA],
+                tickvals=[-RESIDUAL_SIGMA, 0.0, RESIDUAL_SIGMA],
+                ticktext=["−5", "0", "+5"],
+            ),
+            annotations=notes,
             shapes=[
                 {
                     "type": "rect",

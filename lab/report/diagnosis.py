@@ -13,11 +13,12 @@ from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.outcome.detectability import detectable
 from lab.diagnose.outcome.in_dn import told_as
 from lab.formats.results import DiagnosisResult, ExaminedPlace, ResidualCurve, ResidualPicture, Visibility
+from lab.formats.results.in_words import plain_number, shown_unit
 from lab.report.charts import Figure, axis, layout
-from lab.report.figures import SHOWN_UNITS
 from lab.report.pictures import difference_picture
 from sim.camera import Side
 from sim.effects.library import effects as library
+from sim.parameters import Quantity
 
 #: Range of a residual image's colours, standard deviations.
 PICTURE_LIMIT = 6.0
@@ -182,16 +183,24 @@ def _visibility(items: Sequence[Visibility]) -> dict[str, dict[Side, _Detectable
     """Effect -> side -> cells of the table, in the order of the names."""
     table: dict[str, dict[Side, _Detectable]] = {}
     for item in sorted(items, key=lambda item: item.effect):
-        units = dict(
-            told_as(name, quantity, gain_is_known=known)
-            for name, quantity in library()[item.effect].quantities().items()
+        declared = library()[item.effect].quantities()
+        told = {
+            told_as(name, quantity, gain_is_known=known): quantity
+            for name, quantity in declared.items()
             for known in (True, False)
-        )
-        sizes = [
-            f"{name.removesuffix('_' + ('percent' if units[name] == '%' else units[name].lower())).replace('_', ' ')} {value:.2g} "
-            f"{SHOWN_UNITS.get(units[name], '' if units[name] == '1' else units[name])}".strip()
-            for name, value in item.smallest.items()
-        ]
+        }
+        units = {name: (unit, quantity) for (name, unit), quantity in told.items()}
+        sizes = [_smallest_size(name, value, *units[name]) for name, value in item.smallest.items()]
         text = ", ".join(sizes) or "not a matter of size"
         table.setdefault(item.effect, {})[item.side] = _Detectable(text, item.nearest, item.cosine, item.told_apart)
     return table
+
+
+def _smallest_size(name: str, value: float, unit: str, quantity: Quantity) -> str:
+    """Return the least detectable size of a parameter, or that none within its bounds is detectable."""
+    said = name.removesuffix("_" + ("percent" if unit == "%" else unit.lower())).replace("_", " ")
+    size = f"{plain_number(value, 2)} {shown_unit(unit)}".strip()
+    away = [abs(bound - (quantity.absent or 0.0)) for bound in (quantity.lower, quantity.upper) if bound is not None]
+    if away and value > max(away):
+        return f"{said}: not detectable below {size}, which is beyond its bounds"
+    return f"{said} {size}"

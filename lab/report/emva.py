@@ -11,10 +11,11 @@ from lab.errors import NotDetermined
 from lab.fit.noise.pixel_maps import pixel_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelNoise, Emva1288, FitResult, NoiseFit, PixelDefects
+from lab.formats.results.in_words import measured
 from lab.report.emva_plot import EmvaPlot
 from lab.report.emva_spatial import spatial_plots
 from lab.report.emva_temporal import joint_fit_plots, temporal_plots
-from lab.report.figures import NOISE, measured
+from lab.report.figures import NOISE
 from lab.report.maps import MAPS
 from lab.report.pictures import map_picture, photograph_data_uri
 from sim.camera import Side

@@ -12,11 +12,11 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Emva1288, Emva1288Points
+from lab.formats.results.in_words import measured
 from lab.measure.dark_pixels import stack_of
 from lab.measure.stated_light import light_of
 from lab.report.charts import AFTER, BEFORE, Trace, axis, layout
 from lab.report.emva_plot import EmvaPlot, curve, floats, markers
-from lab.report.figures import measured
 from sim.camera import Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from lab.formats.results import Emva1288, Emva1288Points, NoiseFit
+from lab.formats.results.in_words import measured
 from lab.report.charts import AFTER, BEFORE, CHANNEL, axis, layout
 from lab.report.emva_plot import EmvaPlot, curve, floats, markers
-from lab.report.figures import measured
 from sim.spectrum import FloatArray
 
 BOLTZMANN_EV_PER_K, ZERO_C_K = 8.617333262e-5, 273.15

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
 from lab.formats.results.figure_names import plain_name, unit_of
+from lab.formats.results.in_words import measured
 from sim.camera import Side
 
 #: Fields of `NoiseFit` in the order of the table; the maker's value has the same field name.
@@ -30,13 +31,6 @@ _NOISE = (
 NOISE = {field: (plain_name(field), unit_of(field)) for field in _NOISE}
 #: Names of the distortion's coefficients, in OpenCV's order.
 DISTORTION = tuple(plain_name("distortion", place) for place in ("k1", "k2", "p1", "p2", "k3"))
-#: Units whose printed form differs from their form in names.
-SHOWN_UNITS = {"um": "µm", "us": "µs", "deg": "°", "C": "°C", "percent": "%"}
-
-
-def shown_unit(unit: str) -> str:
-    """A unit as it is printed; empty for a ratio."""
-    return "" if unit == "1" else SHOWN_UNITS.get(unit, unit)
 
 
 @dataclass(frozen=True)
@@ -49,32 +43,18 @@ class KeyFigure:
     std: float | None = None
     stated: float | None = None
     note: str = ""
+    may_be_zero: bool = False  # zero is as good a value as others: a part of a displacement or of a turn
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the uncertainty is below the value."""
+        return self.may_be_zero or self.std is None or self.std < abs(self.value)
 
     @property
     def text(self) -> str:
-        """Value and standard deviation with unit and note: `0.383 ± 0.008 at 610 nm`."""
-        return f"{measured(self.value, self.std, self.unit)} {self.note}".rstrip()
-
-
-def measured(
-    value: float, std: float | None = None, unit: str = "", interval: tuple[float, float] | None = None
-) -> str:
-    """`value ± std unit`, the standard deviation to two digits and the value to the same place; without one, the value to four digits, or
-    `value (low to high) unit` with an interval."""
-    if interval is not None:
-        return f"{value:.3g} ({interval[0]:.3g} to {interval[1]:.3g}) {shown_unit(unit)}".rstrip()
-    if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
-        number = f"{value:.4g}"
-    else:
-        place = 1 - math.floor(math.log10(std))
-        if abs(value) < 1e6 and place <= 9:
-            digits = max(place, 0)
-            number = f"{value:.{digits}f} ± {std:.{digits}f}"
-        else:
-            power = math.floor(math.log10(max(abs(value), std)))
-            digits = max(place + power, 0)
-            number = f"({value / 10**power:.{digits}f} ± {std / 10**power:.{digits}f})e{power:+03d}"
-    return f"{number} {shown_unit(unit)}".rstrip()
+        """The value and its standard deviation with unit and note: `0.383 ± 0.008 at 610 nm`."""
+        told = f"{measured(self.value, self.std, self.unit)} {self.note}".rstrip()
+        return told if self.is_determined else f"not determined ({told})"
 
 
 def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:
@@ -147,10 +127,12 @@ def stereo_figures(stereo: StereoFit) -> Iterator[KeyFigure]:
     yield KeyFigure("stereo baseline", "mm", stereo.baseline_mm, stereo.baseline_mm_std)
     for name, value, number in zip("xyz", stereo.translation_mm, range(3), strict=True):
         std = stereo.translation_mm_std
-        yield KeyFigure(f"stereo translation {name}", "mm", value, std[number] if std else None)
+        yield KeyFigure(f"stereo translation {name}", "mm", value, std[number] if std else None, may_be_zero=True)
     for name, value, number in zip("xyz", rotation_vector_mrad(stereo.rotation), range(3), strict=True):
         turns = stereo.rotation_std_rad
-        yield KeyFigure(f"stereo rotation about {name}", "mrad", value, 1e3 * turns[number] if turns else None)
+        yield KeyFigure(
+            f"stereo rotation about {name}", "mrad", value, 1e3 * turns[number] if turns else None, may_be_zero=True
+        )
     yield KeyFigure("stereo reprojection error, rms", "px", stereo.rms_px)
 
 

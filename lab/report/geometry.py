@@ -14,9 +14,9 @@ from lab.errors import InputError, NotDetermined
 from lab.fit.stereo import rectification_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
+from lab.formats.results.in_words import measured
 from lab.measure.board_detection import luminance
 from lab.report.charts import CHANNEL, Figure, Trace, axis, band, layout
-from lab.report.figures import measured
 from lab.report.pictures import photograph_data_uri
 from sim.camera import Side
 from sim.spectrum import FloatArray

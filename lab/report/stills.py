@@ -115,6 +115,10 @@ def _dots(points: Iterable[tuple[float, float]], marker: dict[str, Any]) -> str:
         )
         path = "".join(f"M{x:.1f} {y:.1f}{ring}" for x, y in points)
         return f'<path d="{path}" style="{_style(stroke=marker["color"], stroke_width=1, fill="none")}"/>'
+    if str(marker.get("symbol")).startswith("triangle"):
+        rise = size if marker["symbol"] == "triangle-up" else -size
+        path = "".join(f"M{x:.1f} {y - rise / 2:.1f}l{size / 2:g} {rise:g}h{-size:g}z" for x, y in points)
+        return f'<path d="{path}" style="{_style(fill=marker["color"])}"/>'
     path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
     return f'<path d="{path}" style="{_style(stroke=marker["color"], stroke_width=size, stroke_linecap="round")}"/>'
 
@@ -151,10 +155,12 @@ def _abscissa(axis: dict[str, Any], x_of: _Scale, bottom: float, height: float) 
 
 def _ordinate(axis: dict[str, Any], y_of: _Scale) -> Iterator[str]:
     left, right = LEFT, WIDTH - RIGHT
-    for tick in y_of.ticks(max(2, round((y_of.start - y_of.end) / 40))):
+    ticks = axis.get("tickvals") or y_of.ticks(max(2, round((y_of.start - y_of.end) / 40)))
+    names = axis.get("ticktext") or [_number(tick) for tick in ticks]
+    for tick, name in zip(ticks, names, strict=True):
         y = y_of(tick)
         yield f'<path d="M{left} {y:.1f}H{right}" style="{_style(stroke="@grid")}"/>'
-        yield _text(left - 7, y + 4, _number(tick), anchor="end")
+        yield _text(left - 7, y + 4, name, anchor="end")
     lines = axis["title"]["text"].split("<br>")
     middle = 0.5 * (y_of.start + y_of.end)
     for number, line in enumerate(lines):
@@ -192,5 +198,10 @@ def still(figure: Figure, number: int) -> Markup:
         )
         parts += [part for trace in mine for part in _trace(trace, x_of, y_of)]
         parts.append("</g>")
-    opening = f'<svg class="still" viewBox="0 0 {WIDTH:g} {height:g}" style="{_style(fill="@fg")}" role="img">'
+    for note in layout.get("annotations", ()):
+        x, y = LEFT + note["x"] * (x_of.end - LEFT), bottom - note["y"] * (bottom - top)
+        colour = f' style="{_style(fill=note["font"]["color"])}"'
+        parts.append(_text(x, y - 3, note["text"], size=note["font"]["size"], more=colour))
+    named = escape(str(layout["yaxis"]["title"]["text"]).replace("<br>", " "), quote=True)
+    opening = f'<svg class="still" aria-label="{named}" viewBox="0 0 {WIDTH:g} {height:g}" style="{_style(fill="@fg")}" role="img">'
     return Markup(opening + "".join(parts) + "</svg>")  # its texts are escaped

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 from lab.formats.results import Check, DiagnosisResult, ParameterValue
+from lab.formats.results.in_words import plain_number
+from sim.camera import Side
 
 #: Verdict -> (what stands on the badge, its mood, the headline).
 VERDICTS = {
@@ -23,28 +28,73 @@ VERDICTS = {
 
 
 def headline(diagnosis: DiagnosisResult | None) -> tuple[str, str, str]:
-    """(badge, mood, sentence) of a diagnosis, or of none."""
+    """Return (badge, mood, sentence) of a diagnosis, or of none."""
     if diagnosis is None:
         return "not diagnosed", "open", "The recordings were calibrated; they were not diagnosed."
     return VERDICTS[diagnosis.verdict]
 
 
 def parameter_name(name: str, value: ParameterValue) -> str:
-    """A parameter's name as words, without the unit at its end: `displacement_x_um` is `displacement x`."""
+    """Return a parameter's name as words, without the unit at its end: `displacement_x_um` is `displacement x`."""
     unit = "percent" if value.unit == "%" else value.unit
     return name.removesuffix(f"_{unit}").replace("_", " ")
 
 
-def _within(check: Check) -> str:
-    return "within its uncertainty" if check.passed else "beyond its uncertainty"
-
-
 CHECK_NAMES = {"colorchecker": "ColorChecker", "mtf": "MTF", "psf": "PSF"}
+#: The name of the model that a validation predicts with where no camera file stands in for it.
+FITTED = "fitted camera"
 
 
-def check_sentence(check: Check) -> str:
-    """One comparison of the baseline's prediction with the measurement."""
+@dataclass(frozen=True)
+class ComparedCheck:
+    """One kind of check on one side: what each model that was asked makes of it, in words, and whether it passes."""
+
+    name: str
+    side: Side
+    captures: int
+    results: dict[str, tuple[str, bool]]
+
+
+def models(has_both: bool, has_improved: bool) -> str:
+    """Return what predicts on the pages of the checks, and why the predictions may differ."""
+    if not has_both:
+        return (
+            f"Predicted by the {FITTED}: the data sheet's camera with the noise and the sensitivities that were measured. No "
+            "improved camera is known here."
+        )
+    improved = "The improved model is the baseline with the named effects. " if has_improved else ""
     return (
-        f"{CHECK_NAMES[check.name]} ({check.side}, {check.capture}): {check.rms_relative_percent:.2g} % rms from the "
-        f"baseline's prediction, {_within(check)}."
+        "The baseline is the data sheet's camera with the maker's sensitivities, freed within their uncertainty, and the fitted "
+        f"noise: the model that the diagnosis tests. {improved}The {FITTED} has the sensitivities that were measured in place of "
+        "the maker's. It can predict a chart well where the baseline departs from it: what was measured is in its curves, "
+        "without a cause."
+    )
+
+
+def compared(baseline: Sequence[Check], improved: Sequence[Check], fitted: Sequence[Check]) -> list[ComparedCheck]:
+    """Return the checks by kind and side, with the results of each model that predicted them."""
+    given = {"baseline": baseline, "improved model": improved, FITTED: fitted}
+    grouped: dict[tuple[str, Side], dict[str, list[Check]]] = {}
+    for model, checks in given.items():
+        for check in checks:
+            grouped.setdefault((check.name, check.side), {}).setdefault(model, []).append(check)
+    return [
+        ComparedCheck(
+            name=CHECK_NAMES[name],
+            side=side,
+            captures=max(len(checks) for checks in found.values()),
+            results={model: _told(checks) for model, checks in found.items()},
+        )
+        for (name, side), found in sorted(grouped.items(), key=lambda item: (item[0][1], item[0][0]))
+    ]
+
+
+def _told(checks: Sequence[Check]) -> tuple[str, bool]:
+    """Return the largest deviation and chi2 per number of checks, and whether all pass."""
+    rms = max(check.rms_relative_percent for check in checks)
+    per_number = max(check.chi2 / max(check.n, 1) for check in checks)
+    passed = sum(check.passed for check in checks)
+    return (
+        f"{plain_number(rms, 2)} % rms, χ²/n {plain_number(per_number, 2)}, {passed} of {len(checks)} pass",
+        passed == len(checks),
     )

@@ -32,6 +32,8 @@ PLACES: tuple[tuple[Applied, str, str], ...] = (
     ("noise", "level", "charge.variance_e2"),
     ("response", "level", "signal.response"),
 )
+#: Where a correction of the sensitivities stands, in words.
+IN_CURVES = "in the sensitivity curves"
 #: Share of the largest signal below which the discrepancy's relative size isn't known.
 LEAST_CONTRAST = 0.05
 #: Limits of the factors: a Gaussian process doesn't know that a quantity is positive.
@@ -92,7 +94,7 @@ def improved_model(
             for channel, (wavelength_nm, by) in each.items():
                 if channel in curves:
                     curves[channel] = _multiplied(curves[channel], wavelength_nm, by)
-            said = f"{name}: in the sensitivity curves, by wavelength and channel"
+            said = f"{name}: {IN_CURVES}, by wavelength and channel"
         else:
             acting.append(_correction(kind, block, x, factor, camera))
             is_shared = one.grouping == "shared"

@@ -29,6 +29,7 @@ from lab.formats.results import (
     Unexplained,
     VetoedName,
 )
+from lab.formats.results.in_words import measured
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.families import Family
@@ -131,7 +132,10 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
         shown = sorted({measurement_title(measurement) for measurement in shown_in})
         values = ", ".join(
             (
-                *(f"{_plain_name(f, p.unit)} {_number(p)}" for f, p in parameters.items()),
+                *(
+                    f"{_plain_name(f, p.unit)} {measured(p.value, p.std, p.unit, p.interval)}"
+                    for f, p in parameters.items()
+                ),
                 *(f"{f} {value}".replace("_", " ") for f, value in choices.items()),
             )
         )
@@ -209,17 +213,6 @@ def _family_statement(
 def _plain_name(field: str, unit: str) -> str:
     """Return a parameter's name in words, without its unit."""
     return field.removesuffix("_" + unit.lower()).replace("_", " ")
-
-
-def _number(parameter: ParameterValue) -> str:
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-    if parameter.interval is not None:
-        low, high = parameter.interval
-        return f"{parameter.value:.3g} ({low:.3g} to {high:.3g}){unit}"
-    if parameter.std is None:
-        return f"{parameter.value:.4g}{unit}"
-    digits = max(0, min(6, 1 - int(np.floor(np.log10(max(parameter.std, 1e-6))))))
-    return f"{parameter.value:.{digits}f} ± {parameter.std:.{digits}f}{unit}"
 
 
 def _interval(field: str, candidates: Sequence[Candidate]) -> tuple[float, float] | None:

@@ -13,21 +13,29 @@ import cv2
 import numpy as np
 import pytest
 
+from lab.calibration.limits import CalibrationLimits
 from lab.errors import InputError
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import (
     CameraFit,
+    DiagnosisResult,
+    EffectSet,
     FitResult,
     MakerDeparture,
     PatchComparison,
     PolicyRule,
+    ResidualCurve,
     Resolution,
+    SideModels,
     SpectralFit,
     Unexplained,
+    ValidationResult,
 )
+from lab.predict.both_models import BothModels, SensitivityCurve
 from lab.report import charts, provenance_of, render_report, write_report
+from lab.report.answers import odds
 from lab.report.chart_data import figure_json, plotly_base64
-from lab.report.figures import by_side, measured, rotation_vector_mrad
+from lab.report.figures import KeyFigure, by_side, rotation_vector_mrad
 from lab.report.pictures import (
     difference_picture,
     frame_picture,
@@ -288,24 +296,6 @@ def test_provenance_has_a_digest_of_every_frame(small_set: Callable[..., Recordi
 # --- figures and pictures -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("value", "std", "text"),
-    [
-        (0.28034, 0.00041, "0.28034 ± 0.00041 DN"),
-        (9120.4, 21.3, "9120 ± 21 DN"),
-        (9120.4, 213.0, "9120 ± 213 DN"),
-        (-2.5, 0.5, "-2.50 ± 0.50 DN"),
-        (1.5e7, 2.0e5, "(1.500 ± 0.020)e+07 DN"),
-        (3.2e-11, 4e-13, "(3.200 ± 0.040)e-11 DN"),
-        (0.123456, None, "0.1235 DN"),
-        (5.0, 0.0, "5 DN"),
-        (5.0, float("nan"), "5 DN"),
-    ],
-)
-def test_values_are_rounded_to_their_uncertainty(value: float, std: float | None, text: str) -> None:
-    assert measured(value, std, "DN") == text
-
-
 def test_what_one_side_lacks_keeps_its_place(made_up: MadeUp) -> None:
     fit = made_up()[0]
     noise = fit.cameras["left"].noise.model_copy(update={"full_well_e": None})
@@ -400,3 +390,91 @@ def test_departures_from_the_makers_curves_are_drawn_where_they_are(small_set: C
     assert drawn["yaxis"]["range"][1] > 0.5 / 0.85  # room for the strips
     plain = charts.quantum_efficiency(fit.model_copy(update={"maker_departures": ()}), recordings, "left")["layout"]
     assert plain["shapes"] == [] and plain["annotations"] == []
+
+
+def residual_panel(curve: ResidualCurve) -> list[dict[str, Any]]:
+    return [trace for trace in charts.residual_curve(curve)["data"] if trace.get("yaxis") == "y2"]
+
+
+def a_curve(before: tuple[float, ...]) -> ResidualCurve:
+    count = len(before)
+    return ResidualCurve(
+        side="left", measurement="slanted_edge", label="5 deg", channel="G", axis="spatial frequency, cy/px",
+        x=tuple(0.1 * k for k in range(count)), measured=(1.0,) * count, measured_std=(0.1,) * count, before=before,
+        after=(1.0,) * count, held_out=False,
+    )  # fmt: skip
+
+
+def test_residuals_beyond_five_sigma_are_triangles_at_the_edge_with_their_count() -> None:
+    drawn = charts.residual_curve(a_curve((1.4, 9.0, -2.0, 1.0)))  # residuals -4, -80, +30, 0 sigma
+    panel = residual_panel(a_curve((1.4, 9.0, -2.0, 1.0)))
+    found = {trace["marker"]["symbol"]: (trace["x"], trace["y"]) for trace in panel if trace["name"] == "baseline"}
+    assert found["triangle-down"] == ([0.1], [-5.0]) and found["triangle-up"] == ([0.2], [5.0])
+    assert found["circle"][1] == pytest.approx([-4.0, 0.0])
+    low, high = drawn["layout"]["yaxis2"]["range"]
+    assert all(low < y < high for trace in panel for y in trace["y"])
+    (note,) = drawn["layout"]["annotations"]
+    assert note["text"] == "baseline: 2 of 4 beyond ±5 σ, to −80 σ"
+    low, high = drawn["layout"]["yaxis"]["range"]
+    assert low < -2.0 and high > 9.0  # the baseline is drawn whole
+    assert charts.residual_curve(a_curve((1.1, 0.9)))["layout"]["annotations"] == []
+
+
+def test_a_figure_whose_uncertainty_exceeds_it_is_not_determined() -> None:
+    assert KeyFigure("radial distortion k3", "1", -2.0, 17.0).text == "not determined (-2 ± 17)"
+    assert KeyFigure("DSNU", "e", 1.3, 0.05).text == "1.300 ± 0.050 e"
+    assert KeyFigure("stereo translation y", "mm", 0.01, 0.02, may_be_zero=True).text == "0.010 ± 0.020 mm"
+
+
+def both_models(validation: ValidationResult, diagnosis: DiagnosisResult, fit: FitResult) -> BothModels:
+    """The baseline's checks, and the improved model's that all pass."""
+    mended = tuple(
+        check.model_copy(update={"passed": True, "chi2": 1.0 * check.n, "rms_relative_percent": 0.41})
+        for check in validation.checks
+    )
+    spectral = fit.cameras["left"].spectral
+    assert spectral is not None
+    curve = SensitivityCurve(spectral.wavelength_nm, (0.9,) * 33, (0.2,) * 33)
+    return BothModels(validation.checks, mended, {"left": dict.fromkeys("RGB", curve)})
+
+
+def test_both_models_stand_beside_what_was_measured(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> None:
+    recordings, (fit, validation, diagnosis) = small_set(), made_up()
+    both = both_models(validation, diagnosis, fit)
+    page = Page(render_report(recordings, fit, validation, diagnosis, provenance_of(recordings), both))
+    assert (
+        "The baseline of the left camera misses MTF by 9.1 % rms, PSF by 12 % rms; the improved model: 0.41 %"
+        in page.text
+    )
+    assert "ColorChecker baseline 1.2 % rms" in page.text and "fitted camera 1.2 % rms" in page.text
+    assert "It can predict a chart well where the baseline departs from it" in page.text
+    names = [{trace.get("name") for trace in figure["data"]} for figure in page.figures]
+    assert sum({"baseline", "improved model", "measured"} <= one for one in names) >= 2  # the charts of both sides
+    assert sum({"baseline", "improved model", "R measured"} <= one for one in names) >= 2 + 1  # MTF, sensitivity
+    alone = Page(render_report(recordings, fit, validation, diagnosis, provenance_of(recordings)))
+    assert "Predicted by the fitted camera" in alone.text and "improved camera is known here" in alone.text
+
+
+def test_figures_are_judged_by_the_limits_that_are_stated(
+    small_set: Callable[..., RecordingSet], made_up: MadeUp
+) -> None:
+    recordings, results = small_set(), made_up()
+    limits = CalibrationLimits.model_validate(
+        {"limit": [{"figure": "noise read_noise_e", "good": [0, 3]}, {"figure": "noise dsnu_e", "good": [0, 1]}]}
+    )
+    text = Page(render_report(recordings, *results, provenance_of(recordings), None, limits)).text
+    assert "left 2.600 ± 0.031 e 0 .. 3 pass" in text and "left 1.300 ± 0.050 e 0 .. 1 fail" in text
+
+
+def test_the_odds_hold_all_models_and_add_up(made_up: MadeUp) -> None:
+    diagnosis = made_up()[2]
+    sets = (
+        EffectSet(effects=("optical_low_pass_filter",), probability=0.9),
+        EffectSet(effects=(), probability=0.04),
+    )
+    models = SideModels(side="left", share=0.95, sets=sets, inclusion=())
+    ((side, rows),) = odds(diagnosis.model_copy(update={"models": (models,)}))
+    assert side == "left"
+    assert rows[0] == ("optical low-pass filter, none further", 0.9) and rows[1] == ("no effect: the baseline", 0.04)
+    assert sum(probability for label, probability in rows if not label.startswith("rival")) == pytest.approx(1.0)
+    assert rows[-1] == ("rival of optical low-pass filter: defocus", 0.006)
