@@ -47,11 +47,7 @@ SUSPECTS: dict[tuple[Stage, Along], str] = {
     ),
     ("charge", "row"): "phase-detection rows do that, shared read-out of neighbouring rows, or light that pulses",
     ("charge", "column"): "column amplifiers of unequal gain do that, or phase-detection columns",
-    (
-        "signal",
-        "row",
-        True,
-    ): "shared read-out of neighbouring rows does that, or pick-up at a fraction of the line rate",
+    ("signal", "row"): "shared read-out of neighbouring rows does that, or pick-up at a fraction of the line rate",
     ("signal", "column"): "interleaved column converters with offsets of their own do that",
 }
 MOST_TOLD = 16  # entries of a table
@@ -103,6 +99,7 @@ class Found:
     look: Look
     period: int
     departure: FloatArray
+    std: FloatArray  # of each departure
     log_probability: float
     chi2: tuple[float, float, int]  # of the held-out captures (of the seen ones without any), before, after, and n
     shorter: tuple[Found, ...] = ()  # tables of fewer numbers that it rests on, the shortest first
@@ -111,29 +108,27 @@ class Found:
 def discover(study: Study, effects: Effects, policy: DecisionPolicy) -> tuple[Found, ...]:
     """Find tables that hold in what they weren't taken from, the most significant first; see the module."""
     looks = [look for make in (_codes, _light_lines, _dark_lines) for look in make(study, effects)]
-    tried = [(look, *_fitted(look.seen, period)) for look in looks for period in _periods(look.seen)]
-    if not tried:
-        return ()
+    tables = [[_fitted(look.seen, period) for period in _periods(look.seen)] for look in looks]
     # Benjamini and Yekutieli: the largest k with p_(k) <= k q / (m (1 + 1/2 + ... + 1/m))
-    order = np.sort([log_p for *_, log_p in tried])
-    many = len(tried) * float(np.sum(1.0 / np.arange(1, len(tried) + 1)))
-    below = np.flatnonzero(order <= np.log(np.arange(1, len(tried) + 1) * policy.discovery_rate / many))
+    order = np.sort([table.log_probability for own in tables for table in own])
+    rank = np.arange(1, len(order) + 1)
+    below = np.flatnonzero(order <= np.log(rank * policy.discovery_rate / (len(order) * np.sum(1.0 / rank))))
     limit = float(order[below[-1]]) if len(below) else -np.inf
     found = []
-    for look in looks:
-        own = [(p, table, log_p) for one, p, table, log_p in tried if one is look and log_p <= limit]
-        if not own:
+    for look, own in zip(looks, tables, strict=True):
+        kept = [table for table in own if table.log_probability <= limit]
+        if not kept:
             continue
         # of the tables that hold, the one of the least description length: n ln chi2 + k ln n
-        period, table, log_p = min(own, key=lambda t: _description_length(look.seen, t[0], t[1]))
-        if not _predicts_other_half(look.seen, period):
+        best = min(kept, key=lambda table: _description_length(look.seen, table))
+        if not _predicts_other_half(look.seen, best.period):
             continue
-        judged = _judged(look, period, table, log_p)
+        judged = _judged(look, best)
         gain = judged.chi2[0] - judged.chi2[1]
         if gain < policy.least_discovery_share * judged.chi2[0]:
             continue
-        shorter = (_judged(look, *one) for one in sorted(own, key=lambda t: t[0]) if one[0] < period)
-        base = next((s for s in shorter if s.chi2[0] - s.chi2[1] >= SHORTER_SHARE * gain), None)
+        shorter = (_judged(look, table) for table in kept if table.period < best.period)
+        base = next((one for one in shorter if one.chi2[0] - one.chi2[1] >= SHORTER_SHARE * gain), None)
         judged = replace(judged, shorter=() if base is None else (base,))
         found.append(_by_code(judged) if look.stage == "codes" else judged)
     return tuple(sorted(found, key=lambda one: one.log_probability))
@@ -141,22 +136,27 @@ def discover(study: Study, effects: Effects, policy: DecisionPolicy) -> tuple[Fo
 
 def told(side: Side, study: Study, found: Sequence[Found]) -> tuple[DiscoveredLaw, ...]:
     """Put discovered laws into results: the law as it stands in a camera file, its chi2, and sentences."""
-    return tuple(
-        DiscoveredLaw(
-            side=side,
-            stage=one.look.stage,
-            along=one.look.along,
-            period=one.period,
-            first=(law := law_of(one, study)).first,
-            table=law.table,
-            chi2_before=one.chi2[0],
-            chi2_after=one.chi2[1],
-            n=one.chi2[2],
-            suspects=SUSPECTS[one.look.stage, one.look.along],
-            statement=_statement(side, one),
+    laws = []
+    for one in found:
+        shortest = (*one.shorter, one)[0]
+        laws.append(
+            DiscoveredLaw(
+                side=side,
+                stage=one.look.stage,
+                along=one.look.along,
+                period=one.period,
+                table=law_of(one, study).table,
+                shown_period=shortest.period,
+                shown_departure=tuple(shortest.departure.tolist()),
+                shown_std=tuple(shortest.std.tolist()),
+                chi2_before=one.chi2[0],
+                chi2_after=one.chi2[1],
+                n=one.chi2[2],
+                suspects=SUSPECTS[one.look.stage, one.look.along],
+                statement=_statement(side, one),
+            )
         )
-        for one in found
-    )
+    return tuple(laws)
 
 
 def law_of(found: Found, study: Study) -> EmpiricalLaw:
@@ -184,8 +184,20 @@ def _periods(profile: Profile) -> list[int]:
     return [p for p in PERIODS if p * LEAST_REPEATS <= span]
 
 
-def _fitted(profile: Profile, period: int) -> tuple[int, FloatArray, float]:
-    """Fit a table: its period, its departures (period,) of mean 0, and ln of the probability of its gain by chance.
+@dataclass(frozen=True)
+class Table:
+    """A table by class: departures (period,) of mean 0, their standard deviations, and ln of the probability that
+    chance gains as much.
+    """
+
+    period: int
+    departure: FloatArray
+    std: FloatArray
+    log_probability: float
+
+
+def _fitted(profile: Profile, period: int) -> Table:
+    """Fit a table with a period.
 
     Weighted least squares of least norm, as the filter takes out what all classes share. F test of the gain: the
     scatter that the table leaves stands for the noise, so that a variance that is too small gains nothing.
@@ -197,24 +209,27 @@ def _fitted(profile: Profile, period: int) -> tuple[int, FloatArray, float]:
     table = table - table.mean()
     before = float(value @ value)
     after = float(np.sum(np.square(value - columns @ table)))
-    freedom = len(value) - int(rank)
-    if rank == 0 or freedom < 1 or after >= before:
-        return period, table, 0.0
+    freedom = max(len(value) - int(rank), 1)
+    covariance = np.linalg.pinv(columns.T @ columns, rcond=1e-12, hermitian=True) * after / freedom
+    without_mean = np.eye(period) - 1.0 / period
+    std = np.sqrt(np.maximum(np.diag(without_mean @ covariance @ without_mean), 0.0))
+    if rank == 0 or len(value) <= rank or after >= before:
+        return Table(period, table, std, 0.0)
     ratio = (before - after) / rank / (after / freedom)
-    return period, table, float(f_distribution.logsf(ratio, rank, freedom))
+    return Table(period, table, std, float(f_distribution.logsf(ratio, rank, freedom)))
 
 
-def _description_length(profile: Profile, period: int, table: FloatArray) -> float:
+def _description_length(profile: Profile, table: Table) -> float:
     n = len(profile.residual)
-    left = profile.chi2(np.resize(table, profile.count))
-    return float(n * np.log(left) + (period - 1) * np.log(n))
+    left = profile.chi2(np.resize(table.departure, profile.count))
+    return float(n * np.log(left) + (table.period - 1) * np.log(n))
 
 
 def _predicts_other_half(profile: Profile, period: int) -> bool:
     """Whether a table from each half of the index lowers chi2 of the other half: a few outlying lines don't."""
     middle = float(np.median(profile.index))
     for first in (profile.index < middle, profile.index >= middle):
-        _, table, _ = _fitted(_part(profile, first), period)
+        table = _fitted(_part(profile, first), period).departure
         other = _part(profile, ~first)
         if other.chi2(np.resize(table, profile.count)) >= other.chi2(np.zeros(profile.count)):
             return False
@@ -230,11 +245,12 @@ def _part(profile: Profile, used: np.ndarray) -> Profile:
     return Profile(profile.index[used], profile.residual[used], profile.variance[used], spread, profile.count)
 
 
-def _judged(look: Look, period: int, table: FloatArray, log_p: float) -> Found:
+def _judged(look: Look, table: Table) -> Found:
     """Return the table with chi2 of the captures held out; of the seen ones where none are."""
     judge = look.held_out or look.seen
-    before, after = judge.chi2(np.zeros(judge.count)), judge.chi2(np.resize(table, judge.count))
-    return Found(look, period, table, log_p, (before, after, len(judge.residual)))
+    before, after = judge.chi2(np.zeros(judge.count)), judge.chi2(np.resize(table.departure, judge.count))
+    chi2 = before, after, len(judge.residual)
+    return Found(look, table.period, table.departure, table.std, table.log_probability, chi2)
 
 
 def _by_code(found: Found) -> Found:
@@ -254,11 +270,13 @@ def _by_code(found: Found) -> Found:
     departure = np.zeros(look.seen.count)
     departure[look.seen.index] = left / scale * excess / (excess + noise)
     every = periodic + departure
+    std = np.full(look.seen.count, np.sqrt(excess))
+    std[look.seen.index] = np.sqrt(excess * noise / (excess + noise))
     after = look.held_out.chi2(every)
     if after >= found.chi2[1] - 2.0 * np.sqrt(2.0 * found.chi2[2]):
         return found
     chi2 = found.chi2[0], after, found.chi2[2]
-    return Found(look, 0, every, found.log_probability, chi2, (*found.shorter, found))
+    return Found(look, 0, every, std, found.log_probability, chi2, (*found.shorter, found))
 
 
 def _own_change(profile: Profile) -> FloatArray:
@@ -397,7 +415,7 @@ def _statement(side: Side, found: Found) -> str:
     line = "code" if look.along == "code" else look.along
     base, n = steps[0], found.chi2[2]
     shown = ", ".join(_entry(look, value) for value in base.departure[:MOST_TOLD])
-    more = ", ..." if base.period > MOST_TOLD else ""
+    more = (", ..." if base.period > MOST_TOLD else "") + f" (each ± {_entry(look, float(np.median(base.std)), '')})"
     suspects = SUSPECTS[look.stage, look.along]
     where = " of held-out captures" if look.held_out is not None else ""
     falls = ", ".join(
@@ -410,5 +428,5 @@ def _statement(side: Side, found: Found) -> str:
     )
 
 
-def _entry(look: Look, value: float) -> str:
-    return f"{value:+.2g} DN" if look.stage == "signal" else f"{100.0 * value:+.2g} %"
+def _entry(look: Look, value: float, sign: str = "+") -> str:
+    return f"{value:{sign}.2g} DN" if look.stage == "signal" else f"{100.0 * value:{sign}.2g} %"

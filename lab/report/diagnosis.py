@@ -12,7 +12,14 @@ from scipy import special
 from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.outcome.detectability import detectable
 from lab.diagnose.outcome.in_dn import told_as
-from lab.formats.results import DiagnosisResult, ExaminedPlace, ResidualCurve, ResidualPicture, Visibility
+from lab.formats.results import (
+    DiagnosisResult,
+    DiscoveredLaw,
+    ExaminedPlace,
+    ResidualCurve,
+    ResidualPicture,
+    Visibility,
+)
 from lab.formats.results.in_words import plain_number, shown_unit
 from lab.report.charts import Figure, axis, layout
 from lab.report.pictures import difference_picture
@@ -36,10 +43,35 @@ def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[st
     threshold = diagnosis.threshold
     return {
         "place_map": place_maps(diagnosis, sides),
+        "discovered": [(law, _law_chart(law)) for law in diagnosis.discovered],
         "residual_pictures": [_ResidualImages.of(picture) for picture in diagnosis.pictures],
         "picture_limit": f"{PICTURE_LIMIT:g}",
         "visibility": _visibility(diagnosis.visibility),
         "detectable": f"{detectable(threshold):.0f}" if threshold is not None else "",
+    }
+
+
+def _law_chart(law: DiscoveredLaw) -> Figure:
+    """Draw the shortest table of a discovered law, with two standard deviations."""
+    factor, unit = (1.0, "DN") if law.stage == "signal" else (100.0, "%")
+    quantity = {"codes": "width of a code less 1", "charge": "sensitivity less 1", "signal": "offset"}[law.stage]
+    return {
+        "data": [
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "x": list(range(law.shown_period)),
+                "y": [factor * value for value in law.shown_departure],
+                "error_y": {"type": "data", "array": [2.0 * factor * std for std in law.shown_std], "color": "@fg"},
+                "marker": {"color": "@fg", "size": 7},
+                "showlegend": False,
+            }
+        ],
+        "layout": layout(
+            200,
+            xaxis=axis(f"{law.along} mod {law.shown_period}", dtick=max(1, law.shown_period // 16)),
+            yaxis=axis(f"{quantity}, {unit}"),
+        ),
     }
 
 

@@ -110,7 +110,9 @@ class DiscoveredLaw(Frozen):
     """A table by code, row or column that recordings hold and no effect of the library has; it stands in the improved
     model as `empirical_law`.
 
-    `stage`, `along`, `period`, `first` and `table` are those of that effect. chi2 is of the `n` numbers along the index
+    `stage`, `along`, `period` and `table` are those of that effect. `shown_departure` is the shortest table that does
+    nearly as well, by index mod `shown_period`: departures from no change, relative or in DN (stage `signal`), with
+    their standard deviations. chi2 is of the `n` numbers along the index
     in held-out captures (in the captures themselves where none are held out), without and with the law. `suspects`:
     what physics may do it; none of them is a name.
     """
@@ -119,8 +121,10 @@ class DiscoveredLaw(Frozen):
     stage: str
     along: str
     period: int
-    first: int
     table: tuple[float, ...]
+    shown_period: int
+    shown_departure: tuple[float, ...]
+    shown_std: tuple[float, ...]
     chi2_before: float
     chi2_after: float
     n: int

@@ -88,6 +88,8 @@ def test_dim_rows_are_found_with_period_and_size() -> None:
     expected = np.where(np.arange(8) == 3, -0.02, 0.0)
     tolerance = 4.0 * 0.02 / np.sqrt(12 * 128)
     assert one.departure == pytest.approx(expected - expected.mean(), abs=tolerance)
+    assert np.abs(one.departure - expected + expected.mean()).max() < 4.0 * one.std.max()
+    assert one.std.max() < tolerance
 
 
 def test_offsets_of_columns_are_told_from_gains() -> None:
