@@ -176,15 +176,17 @@ class ShutterDevice(Device):
 def shut(monochromator: Monochromator) -> None:
     """Stop a monochromator and ask for its shutter. Raises InstrumentError where it says that it is open still.
 
-    It is connected first, as one that isn't ignores a stop. A stop by another thread, which closes the shutter as well,
+    One that isn't connected yet ignores a stop: it is connected then, and told to close. A stop by another thread, which closes the shutter as well,
     ends the question: it is asked again within `STOP_S`.
     """
     until = time.monotonic() + STOP_S
     while True:
         try:
-            monochromator.connect()
             monochromator.stop()
-            opened = monochromator.shutter_is_open()
+            monochromator.connect()
+            if opened := monochromator.shutter_is_open():
+                monochromator.close_shutter()
+                opened = monochromator.shutter_is_open()
         except Interrupted:
             if time.monotonic() >= until:
                 raise
