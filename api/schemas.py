@@ -75,10 +75,7 @@ class Asked(Schema):
     def _of_their_kinds(cls, data: Any) -> Any:
         for name, field in cls.model_fields.items() if isinstance(data, dict) else ():
             if name in data:
-                try:
-                    check_kind(data[name], field.annotation)
-                except ValueError as error:
-                    raise ValueError(f"{name}: {error}") from None
+                check_kind(name, data[name], field.annotation)
         return data
 
 

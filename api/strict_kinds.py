@@ -18,23 +18,23 @@ def _kinds(annotation: Any) -> set[Any]:
     return {kind for argument in arguments for kind in _kinds(argument)}
 
 
-def check_kind(value: Any, annotation: Any) -> None:
-    """Raise ValueError where a value of a request would only be taken for what the annotation says after a conversion."""
-    _check(value, _kinds(annotation) - {type(None), Ellipsis})
+def check_kind(where: str, value: Any, annotation: Any) -> None:
+    """Raise ValueError where the value at `where` would only be taken for what the annotation says after a conversion."""
+    _check(where, value, _kinds(annotation) - {type(None), Ellipsis})
 
 
-def _check(value: Any, wanted: set[Any]) -> None:
+def _check(where: str, value: Any, wanted: set[Any]) -> None:
     shown = json.dumps(value) if isinstance(value, bool) else repr(value)[:60]
     numbers = bool(wanted & {int, float})
     if isinstance(value, list | tuple):
-        for one in value:
-            _check(one, wanted)
+        for number, one in enumerate(value):
+            _check(f"{where}.{number}", one, wanted)
     elif isinstance(value, dict):
-        for one in value.values():
-            _check(one, wanted)
+        for name, one in value.items():
+            _check(f"{where}.{name}", one, wanted)
     elif isinstance(value, bool) and numbers and bool not in wanted:
-        raise ValueError(f"{shown} isn't a number; write one")
+        raise ValueError(f"{where}: {shown} isn't a number; write one")
     elif isinstance(value, str) and numbers and wanted <= {int, float}:
-        raise ValueError(f"{shown} isn't a number; write it without quotes")
+        raise ValueError(f"{where}: {shown} isn't a number; write it without quotes")
     elif isinstance(value, str | int | float) and not isinstance(value, bool) and wanted == {bool}:
-        raise ValueError(f"{shown} isn't true or false; write one of them, without quotes")
+        raise ValueError(f"{where}: {shown} isn't true or false; write one of them, without quotes")

@@ -67,7 +67,7 @@ def test_what_is_wrong_with_an_archive_is_said_without_the_readers_words(tmp_pat
         (
             "/sessions",
             {"station": "fakes", "parameters": {"dark": {"frames": True}}},
-            "parameters: true isn't a number",
+            "parameters.dark.frames: true isn't a number",
         ),
         ("/sessions", {"station": "fakes", "quick": 1}, "quick: 1 isn't true or false"),
         ("/sessions", {"station": "fakes", "quick": "yes"}, "quick: 'yes' isn't true or false"),
