@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fastapi import APIRouter, FastAPI, HTTPException, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import HTMLResponse, PlainTextResponse
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
@@ -23,6 +23,7 @@ from api.checks import DeviceChecks
 from api.errors import DefectMiddleware, Problem, answers, problem
 from api.idempotency import PARAMETER, Idempotency
 from api.keys import LOOPBACK, stored_keys
+from api.known_queries import check_query
 from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.pictures import Pictures
@@ -264,9 +265,10 @@ def create_app(
 
     app.add_exception_handler(TooManyFailures, too_many)
     app.include_router(open_to_all)
-    app.include_router(stations_router, prefix=PREFIX)
+    strict = [Depends(check_query)]
+    app.include_router(stations_router, prefix=PREFIX, dependencies=strict)
     for part in (knowledge, sessions, queue, recordings, jobs, findings, calibrations, camera_models, challenges):
-        app.include_router(part.router, prefix=PREFIX)
+        app.include_router(part.router, prefix=PREFIX, dependencies=strict)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
 

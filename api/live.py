@@ -14,10 +14,10 @@ from functools import partial
 import anyio
 
 from api.errors import Conflict
-from api.safety import KnownSafety, StationSafety
+from api.safety import KnownSafety, StationSafety, key_of
 from lab.capture.blocking_calls import in_thread
-from lab.capture.instruments import SafeState
 from lab.capture.plan import CapturePlan, full_plan
+from lab.capture.records import now
 from lab.capture.recovery import make_station_safe
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.station import Drivers, Station, drivers_of
@@ -53,6 +53,7 @@ class LiveSession:
         self._lock = threading.Lock()
         self._followers: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
         self._thread: threading.Thread | None = None
+        self._known_before: StationSafety | None = None
 
     @property
     def latest(self) -> Progress | None:
@@ -67,6 +68,7 @@ class LiveSession:
     def begin(self, capture: CaptureSession) -> None:
         """Start the run's thread. How the run ends is written to the registry."""
         self.capture = capture
+        self._known_before = self._safety.find(self.station)
         self._safety.note(self.station, None)
         self._thread = threading.Thread(target=self._work, args=(capture,), name=f"session {capture.id}", daemon=True)
         self._thread.start()
@@ -87,6 +89,8 @@ class LiveSession:
         finally:
             if capture.safe is not None:
                 self._safety.note(self.station, StationSafety.of(capture.safe))
+            elif self._known_before is not None:  # it took no instruments up
+                self._safety.note(self.station, self._known_before)
             self._changed(ended=True)
 
     def tell(self, progress: Progress) -> None:
@@ -161,12 +165,16 @@ class LiveSessions:
         self._lock = threading.Lock()
         self._closed = False
         self._held: list[frozenset[str]] = []  # addresses that sessions are kept off
+        self._asking = threading.Lock()
+        self._asked: dict[str, Future[None]] = {}  # what was asked last at each shutter
 
-    def hold(self, station: Station) -> Callable[[], None]:
-        """Keep sessions off a station's instruments until what is returned is called. Raises Conflict where one runs on them, or they
-        are held already."""
+    def hold(self, station: Station, but: str = "") -> Callable[[], None]:
+        """Keep sessions off a station's instruments until what is returned is called.
+
+        Raises Conflict where one other than `but` runs on them, or they are held already.
+        """
         with self._lock:
-            self._check_free(station)
+            self._check_free(station, but)
             self._held.append(station.addresses)
         return lambda: self._held.remove(station.addresses)
 
@@ -220,9 +228,9 @@ class LiveSessions:
             self._check_free(station)
             # After that: the run before, which is over, has said whether it ended badly.
             if in_turn:
-                now = self._store.session(session_id)
-                if now.state != "queued" or now.error is not None:
-                    raise Conflict(f"session {session_id} is {now.state} now: {now.error}")
+                info = self._store.session(session_id)
+                if info.state != "queued" or info.error is not None:
+                    raise Conflict(f"session {session_id} is {info.state} now: {info.error}")
             live = LiveSession(station, self._changed, self.safety)
             capture = CaptureSession(
                 self._store, session_id, station=station, on_progress=live.tell, connect=self._connect
@@ -282,49 +290,57 @@ class LiveSessions:
         capture.abort(reason)
 
     def halt(self, station: Station | None, reason: str) -> dict[str, Future[None]]:
-        """End every run now, or those on the instruments of a station: shutters first, without waiting for anything. The sessions' ids, and what is done
-        when the shutter has answered, or can't."""
+        """End every run now, or those on the instruments of a station: shutters first, without waiting for anything.
+
+        Returns by session what is done when the shutter has answered, or can't.
+        """
         wanted = None if station is None else station.addresses
         ended = {}
         for id, live in list(self._live.items()):
             if not live.ended and (wanted is None or wanted & live.station.addresses) and live.capture is not None:
-                ended[id] = in_thread(partial(self._shut, live, live.capture, reason))
+                ended[id] = in_thread(partial(self._shut, id, live.station, live.capture, reason))
                 in_thread(partial(live.capture.abort, reason))
         return ended
 
-    def _shut(self, live: LiveSession, capture: CaptureSession, reason: str) -> None:
+    def _shut(self, session_id: str, station: Station, capture: CaptureSession, reason: str) -> None:
         try:
-            if capture.shut(reason):
-                self._note(live, self.safety.note_shut)
-            elif capture.safe is not None and not live.ended:  # it is packed: its instruments are let go
-                self.safety.note_asked(live.station)
-                self.safety.note(live.station, StationSafety.of(self._made_safe(live.station)))
+            shutter = capture.shut(reason)
         except Exception as error:
-            self._note(live, partial(self.safety.note_trouble, words=str(error)))
+            found = StationSafety(state="not confirmed", shutter="unknown", at=now(), words=str(error))
+        else:
+            if shutter is None:  # it connects or is packed: a connection of our own asks
+                self.make_safe(station, session_id).result()
+                return
+            found = StationSafety(state="halting", shutter=shutter, at=now())
+        if capture.safe is None:  # else what the run says of itself at its end is newer than `found`
+            self.safety.note(station, found)
+        else:
+            self.safety.note(station, StationSafety.of(capture.safe))
 
-    def _note(self, live: LiveSession, note: Callable[[Station], None]) -> None:
-        """Note what is known while the run ends; what it says of itself at its end counts more."""
-        if not live.ended and (live.capture is None or live.capture.safe is None):
-            note(live.station)
+    def make_safe(self, station: Station, session_id: str = "") -> Future[None]:
+        """Make a station safe whose instruments no run of this service holds, by connections of our own.
 
-    def make_safe(self, station: Station) -> Future[None]:
-        """Make a station safe on which no run of this service is: what comes of it is noted."""
-        self.safety.note_asked(station)
-        return in_thread(partial(self._make_safe, station))
+        `session_id`: the run that may be under way, and holds none. What comes of it is noted; whoever asks while it is
+        under way shares it, as a second connection would be refused.
+        """
+        with self._asking:
+            under_way = self._asked.get(key_of(station))
+            if under_way is None or under_way.done():
+                self.safety.note_asked(station)
+                under_way = self._asked[key_of(station)] = in_thread(partial(self._make_safe, station, session_id))
+            return under_way
 
-    def _make_safe(self, station: Station) -> None:
+    def _make_safe(self, station: Station, session_id: str) -> None:
         try:
-            let_go = self.hold(station)
+            let_go = self.hold(station, session_id)
         except Conflict as error:
             self.safety.note_trouble(station, str(error))
             return
         try:
-            self.safety.note(station, StationSafety.of(self._made_safe(station)))
+            found = make_station_safe(station, self._connect, partial(self.safety.note_shut, station))
+            self.safety.note(station, StationSafety.of(found))
         finally:
             let_go()
-
-    def _made_safe(self, station: Station) -> SafeState:
-        return make_station_safe(station, self._connect, partial(self.safety.note_shut, station))
 
     def close(self, patience_s: float = PATIENCE_S) -> None:
         """End every run: shutters are closed, and the sessions can be resumed."""
@@ -347,14 +363,14 @@ class LiveSessions:
             raise Conflict(f"session {session_id} isn't under way here, it is {elsewhere}")
         return live.capture, live
 
-    def _check_free(self, station: Station) -> None:
+    def _check_free(self, station: Station, but: str = "") -> None:
         self._live = {id: session for id, session in self._live.items() if not session.ended}
         if self._closed:
             raise Conflict("the service is being stopped; start the session when it is up again")
-        if (busy := self.busy(station)) is not None:
+        if (busy := self.busy(station)) not in (None, but):
             raise Conflict(f"session {busy} runs on these instruments; wait for it or abort it")
         if any(held & station.addresses for held in self._held):
-            raise Conflict("one of these instruments is being checked; wait for the end of that")
+            raise Conflict("one of these instruments is being checked or made safe; wait for the end of that")
 
     def busy(self, station: Station) -> str | None:
         """Id of a session that uses an instrument of this station now, in this process or another."""

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
 from api.keys import Permission
 from api.safety import StationSafety
+from api.strict_kinds import check_kind
 from lab.calibration.camera_models import Kind as CameraModelKind
 from lab.calibration.camera_models import ModelOfCamera
 from lab.calibration.limits import CalibrationLimits
@@ -66,6 +67,18 @@ class Schema(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+class Asked(Schema):
+    """Base of what a request's body asks: no value of another kind is converted."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_their_kinds(cls, data: Any) -> Any:
+        for name, field in cls.model_fields.items() if isinstance(data, dict) else ():
+            if name in data:
+                check_kind(name, data[name], field.annotation)
+        return data
+
+
 class Health(Schema):
     """Says that the service is up. It needs no key, so it says nothing else."""
 
@@ -80,7 +93,7 @@ class Me(Schema):
     scope: Permission
 
 
-class Login(Schema):
+class Login(Asked):
     """A key, to be exchanged for a cookie."""
 
     key: str = Field(min_length=1, max_length=200)
@@ -102,7 +115,7 @@ class StationState(Schema):
     problem: str | None = None
 
 
-class PlanAsked(Schema):
+class PlanAsked(Asked):
     """Which sequences to take, and how."""
 
     model_config = ConfigDict(
@@ -158,14 +171,14 @@ class SessionStart(CaptureStart):
         return self
 
 
-class QueuePlace(Schema):
+class QueuePlace(Asked):
     """Where in the queue a session waits, and until when at least. A session that is held is released by it."""
 
     place: int | None = Field(default=None, ge=1, le=100_000, description="1: first; null: where it is, or last")
     not_before: AwareDatetime | None = Field(default=None, description="the earliest time, with its zone")
 
 
-class Halt(Schema):
+class Halt(Asked):
     """What to halt."""
 
     station: str | None = Field(default=None, max_length=100, description="null: every station")
@@ -185,7 +198,7 @@ class Halted(Schema):
     stations: tuple[HaltedStation, ...] = ()
 
 
-class Certify(Schema):
+class Certify(Asked):
     """Certifies a calibration."""
 
     model_config = ConfigDict(
@@ -232,7 +245,7 @@ class FigureName(Schema):
     unit: str = "1"
 
 
-class SessionResume(Schema):
+class SessionResume(Asked):
     """On which station a session continues."""
 
     station: str | None = Field(
@@ -309,7 +322,7 @@ class StoredCapture(Schema):
     frame: str = Field(description="path of its raw frame, .npy, uint16 (rows, cols)")
 
 
-class JobStart(Schema):
+class JobStart(Asked):
     """What to compute. `pipeline`: everything, from what is left to capture to the report."""
 
     model_config = ConfigDict(json_schema_extra={"example": {"kind": "diagnose"}})
@@ -440,7 +453,7 @@ class Recordings(Schema):
 # --- challenges -------------------------------------------------------------------------------------------------------
 
 
-class ChallengeStart(Schema):
+class ChallengeStart(Asked):
     """A challenge to be made: recording sets of cameras that conceal something, their truths sealed until it is scored."""
 
     model_config = ConfigDict(
@@ -455,7 +468,7 @@ class ChallengeStart(Schema):
     name: str = Field(default="", max_length=120)
 
 
-class ChallengeJobStart(Schema):
+class ChallengeJobStart(Asked):
     """What to do with a challenge: `make` what is missing of it, or `score` it."""
 
     kind: Literal["make", "score"]
@@ -503,7 +516,7 @@ class ConnectedDevice(Schema):
     driver: str = Field(description="`family.name` of what drives it; empty where none is known, as of a serial port")
 
 
-class DeviceCheck(Schema):
+class DeviceCheck(Asked):
     """How a device is checked."""
 
     transcript: bool = Field(default=False, description="keep what goes over its wire meanwhile")

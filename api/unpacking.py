@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import io
+import re
 import shutil
 import stat
 import tarfile
@@ -27,6 +28,8 @@ CHUNK = 1 << 20
 _LISTED_BYTES = 400
 #: Bytes of the disk that uploads leave free: captures come first.
 RESERVE_BYTES = 1 << 30
+#: Most bytes that a byte of an archive may stand for, beyond what unpacks within a second anyway: frames, even dark ones, pack less.
+MOST_RATIO, FREE_BYTES = 100, 64 << 20
 _GZIP = b"\x1f\x8b"
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 
@@ -189,7 +192,7 @@ def _opened(archive: Path, limit_bytes: int, limit_files: int) -> Iterator[_Arch
                 yield _Zip(zipped)
             return
         # Headers, and what fills the last block of each file.
-        most = limit_bytes + 4 * 512 * (limit_files + 20)
+        most = min(limit_bytes, most_bytes(archive)) + 4 * 512 * (limit_files + 20)
         with contextlib.ExitStack() as stack:
             content: IO[bytes] = file
             if begin[:2] == _GZIP:
@@ -203,12 +206,36 @@ def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> N
     try:
         with _opened(archive, limit_bytes, limit_files) as opened:
             members = _checked(opened, folder.parent, limit_bytes, limit_files)
+            check_ratio(archive, sum(member.size_bytes for member, _ in members))
             _write(opened, members, folder, limit_bytes)
     except _BROKEN as error:
-        said = " ".join(str(error).replace(str(folder), "").split())[:120]
+        said = _said(error, folder)
         raise InputError(
             f"archive: can't be unpacked ({said}); send a .zip, .tar or .tar.gz with each file once, without a password"
         ) from error
+
+
+def most_bytes(archive: Path) -> int:
+    """Bytes that an archive of this size may hold."""
+    return MOST_RATIO * archive.stat().st_size + FREE_BYTES
+
+
+def check_ratio(archive: Path, stated_bytes: int) -> None:
+    """Raise TooMuch where an archive states to hold far more than recordings can be packed into it."""
+    if stated_bytes > (most := most_bytes(archive)):
+        raise TooMuch(
+            f"archive: {stated_bytes} bytes unpacked from {archive.stat().st_size} packed ones, {most} at most; "
+            "pack the recordings without compression"
+        )
+
+
+def _said(error: Exception, folder: Path) -> str:
+    """What is wrong with an archive, in one line without the words of Python's readers."""
+    if isinstance(error, FileExistsError | NotADirectoryError | IsADirectoryError):
+        name = Path(str(error.filename)).relative_to(folder) if error.filename else ""
+        return f"{name} is there twice, or as a file and as a folder"[-120:]
+    text = re.sub(r"<ZipInfo filename='(.*?)'.*?>", r"'\1'", str(error))
+    return " ".join(text.replace(str(folder), "").split())[:120]
 
 
 def _checked(opened: _Archive, room: Path, limit_bytes: int, limit_files: int) -> list[tuple[_Member, PurePosixPath]]:

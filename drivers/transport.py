@@ -56,6 +56,7 @@ class Transport:
         self._port: serial.SerialBase | None = None
         self._received = bytearray()
         self._interrupted = threading.Event()
+        self._heeds = True  # interruptions
 
     @property
     def name(self) -> str:
@@ -100,6 +101,15 @@ class Transport:
     def resume(self) -> None:
         """Revoke `interrupt`."""
         self._interrupted.clear()
+
+    @contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """Let no `interrupt` end a wait within: for a short exchange that is worse broken off than waited for."""
+        self._heeds = False
+        try:
+            yield
+        finally:
+            self._heeds = True
 
     def pause(self, seconds: float, asked: str = "") -> None:
         """Let time pass before the next question. Raises `Interrupted`."""
@@ -160,7 +170,7 @@ class Transport:
         if begun:
             end = time.monotonic() + BETWEEN_S
         while True:
-            if self._interrupted.is_set():
+            if self._heeds and self._interrupted.is_set():
                 raise self._stopped(asked)
             left = end - time.monotonic()
             if self._receive(max(0.0, min(_SLICE_S, left))):
@@ -218,6 +228,7 @@ class WireInstrument(Instrument):
         self._stopping = threading.Lock()  # a stop ends what others wait for, but no stop
         self._live = False
         self._met = False
+        self._out_of_step = False  # a stop ended a wait: what was waited for may still come
 
     @abstractmethod
     def _establish(self) -> None:
@@ -226,6 +237,13 @@ class WireInstrument(Instrument):
     @abstractmethod
     def _make_safe(self) -> None:
         """Bring the instrument into its safe state, within a conversation."""
+
+    def _gets_in_step(self) -> bool:
+        """Make sure that no answer is outstanding, on the same connection, after a stop ended a wait.
+
+        Returns False where the instrument has no way to tell: the connection is opened anew, which takes longer.
+        """
+        return False
 
     def _let_go(self) -> None:
         """Leave it as it was found, within a conversation: other programs may talk to it next."""
@@ -260,16 +278,32 @@ class WireInstrument(Instrument):
         """Hold the connection; after any failure but a refusal, the next conversation opens it anew, so that a late
         answer is never taken for the answer to a later question."""
         with self._lock:
+            if self._out_of_step:
+                self._resynchronise()
             if not self._live:
                 self._meet()
             try:
                 yield self._transport
             except Refused:
                 raise
+            except Interrupted:
+                self._out_of_step = True
+                raise
             except InstrumentError:
                 self._live = False
                 self._transport.close()
                 raise
+
+    def _resynchronise(self) -> None:
+        """Go on with the connection if the instrument gets in step; close it if not."""
+        try:
+            with self._transport.undisturbed():
+                self._live = self._live and self._gets_in_step()
+        except InstrumentError:
+            self._live = False
+        self._out_of_step = False
+        if not self._live:
+            self._transport.close()
 
     def _meet(self) -> None:
         """Open the connection and identify the instrument; twice if it was known before, as a late answer may still

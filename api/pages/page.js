@@ -99,18 +99,43 @@ export const clock = (text) => `${time(text).slice(11)} UTC`;
 // A halt's answer has to come within this time (ms), or somebody goes to the bench.
 const HALT_MS = 2000;
 
+// The halts that are told, by their places: which station (null: all), and when each had answered last before.
+const halts = new Map();
+let latest = [];
+
+// Says in `place` what the stations' instruments have answered: NOT CONFIRMED for as long as one hasn't, and no longer.
+function sayHalt(place, stations, fallback) {
+  const open = stations.filter((one) => one.safety.shutter === "unknown");
+  const shut = stations.filter((one) => one.safety.shutter === "closed");
+  const words = open.map((one) => `NOT CONFIRMED: go to the bench of ${one.name} (${one.safety.words || "its shutter is being asked"})`);
+  if (shut.length) words.push(`shutter closed ${clock(shut[0].safety.at)}${stations.length > 1 ? `: ${shut.map((one) => one.name).join(", ")}` : ""}`);
+  place.classList.toggle("unsafe", open.length > 0);
+  const text = words.join("; ") || fallback;
+  if (place.textContent !== text) place.textContent = text;
+}
+
+export const forgetHalt = (place) => {
+  halts.delete(place);
+  place.textContent = "";
+};
+
+// Tells every halt anew by what the stations' cards show. A station that hasn't answered since the halt says nothing of it.
+export function tellHalts(stations) {
+  latest = stations;
+  for (const [place, { station, before }] of halts) {
+    const answered = stations.filter((one) => one.safety && (!station || one.name === station) && one.safety.at !== before.get(one.name));
+    if (answered.length) sayHalt(place, answered, "");
+  }
+}
+
 // Halts a station, or all where none is named, and says beside the button in `place` what came of it.
 export async function halt(place, station = null) {
   place.className = "halted";
   place.textContent = "halting …";
+  halts.set(place, { station, before: new Map(latest.map((one) => [one.name, one.safety?.at])) });
   try {
     const found = await ask("/halt", { method: "POST", body: JSON.stringify({ station }) }, HALT_MS);
-    const open = found.stations.filter((one) => one.safety.shutter === "unknown");
-    place.classList.toggle("unsafe", open.length > 0);
-    const shut = found.stations.filter((one) => one.safety.shutter === "closed");
-    const words = open.map((one) => `NOT CONFIRMED: go to the bench of ${one.name} (${one.safety.words})`);
-    if (shut.length) words.push(`shutter closed ${clock(shut[0].safety.at)}${found.stations.length > 1 ? `: ${shut.map((one) => one.name).join(", ")}` : ""}`);
-    place.textContent = words.join("; ") || "halted; no station here has a shutter";
+    sayHalt(place, found.stations, "halted; no station here has a shutter");
   } catch (error) {
     place.classList.add("unsafe");
     place.textContent = `NOT CONFIRMED: go to the bench (${error.message})`;

@@ -1,6 +1,6 @@
 // Stations at a glance: a card each, with what runs there, its shutter, light and temperature, and a halt.
 
-import { $, LIVE, api, ask, clock, duration, element, halt, may, mayHalt, post, told } from "./page.js";
+import { $, LIVE, api, ask, clock, duration, element, forgetHalt, halt, may, mayHalt, post, tellHalts, told } from "./page.js";
 
 // A browser keeps six connections to a service open; the streams leave some of them for requests.
 const STREAMS = 3;
@@ -124,7 +124,7 @@ async function showRun(parts, session, safety) {
   parts.buttons.Pause.disabled = session.state !== "running";
   parts.buttons.Resume.disabled = !["paused", "pausing"].includes(session.state);
   if (begun) {
-    parts.halted.textContent = "";
+    forgetHalt(parts.halted);
     parts.remarks.replaceChildren();
     parts.step.textContent = "";
     parts.bar.value = 0;
@@ -137,6 +137,7 @@ async function showRun(parts, session, safety) {
 
 // A card for each station, and one for each session that runs somewhere else.
 export async function showStations(stations, sessions) {
+  tellHalts(stations);
   const running = sessions.filter((s) => LIVE.includes(s.state));
   const wanted = new Map();
   for (const one of stations.filter((s) => !s.problem)) {
@@ -147,6 +148,7 @@ export async function showStations(stations, sessions) {
   for (const [id, parts] of cards) {
     if (!wanted.has(id)) {
       parts.whole.remove();
+      forgetHalt(parts.halted);
       cards.delete(id);
     }
   }

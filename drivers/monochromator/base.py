@@ -82,8 +82,11 @@ class Monochromator(Instrument):
     """A monochromator behind a light source. `stop` and `close` leave the shutter closed."""
 
     def shut_at_once(self) -> bool:
-        """Ask for a closed shutter before anything else is said, without an answer: the first thing after a crash. `connect` and `stop` follow,
-        which make sure. False where the instrument needs to be spoken to first, and nothing was asked. Raises `InstrumentError`."""
+        """Close the shutter before anything else is said: the first thing after a crash, and in a halt.
+
+        Returns whether the instrument answered that it is closed; False where it needs to be spoken to first. `connect` and
+        `stop` follow in any case. Raises `InstrumentError` where it isn't reached.
+        """
         return False
 
     @abstractmethod

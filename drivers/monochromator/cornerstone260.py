@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 
-from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.errors import Garbled, InstrumentError, NoAnswer, Refused
 from drivers.instrument import Identity, Recorder
 from drivers.monochromator.base import (
     Monochromator,
@@ -42,6 +42,10 @@ _NOT_UNDERSTOOD = 1
 _LOOK_S = 0.1
 #: Lines that a slow instrument still sends after the statements of the first contact, echoes and status bytes, and the most of them.
 _LATE, _LATE_LINES = {"", "ABORT", *_DONE}, 6
+#: Most lines, echoes and status bytes among them, before an answer that tells where the instrument stands.
+_STALE_LINES = 24
+#: How often the shutter is asked before the first contact: a late answer to an earlier program is at most one of the answers.
+_ASKED = 2
 #: Longest time (s) that the status byte of HANDSHAKE itself is waited for.
 _HANDSHAKE_S = 1.0
 #: Reciprocal linear dispersion with 1200 l/mm: 1e6 nm / (1200 per mm x 260 mm) x cos(9.6 deg).
@@ -83,6 +87,7 @@ class Cornerstone260(WireInstrument, Monochromator):
         self._tells_idle = False
         self._found_handshake: bool | None = None
         self._found_units = ""
+        self._info = ""  # the reply to INFO?, which is nothing else's
 
     # --- the abstraction --------------------------------------------------------------------------------------------
 
@@ -98,9 +103,18 @@ class Cornerstone260(WireInstrument, Monochromator):
 
     def shut_at_once(self) -> bool:
         with self._lock:
+            self._live = False
             self._transport.open()
-            self._transport.write(b"\r\nABORT\r\nSHUTTER C\r\n")
-        return True
+            self._transport.write(b"\r\nABORT\r\nSHUTTER C\r\n" + _ASKED * b"SHUTTER?\r\n")
+            try:
+                closed = 0
+                for _ in range(_STALE_LINES):
+                    closed += self._line("SHUTTER?") == "C"
+                    if closed == _ASKED:
+                        return True
+            except (NoAnswer, Garbled):
+                return False
+        return False
 
     def move_nm(self, wavelength_nm: float) -> None:
         wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
@@ -164,7 +178,8 @@ class Cornerstone260(WireInstrument, Monochromator):
         line.write(b"\r\n")
         line.write(b"ABORT\r\n")
         line.drain(quiet_s=0.3)  # an instrument that moves is slow to echo
-        model, _, serial_number = self._first_answer().partition(" SN ")
+        self._info = self._first_answer()
+        model, _, serial_number = self._info.partition(" SN ")
         self._identity = Identity("Newport", model.strip() or "Cornerstone 260", serial_number.strip())
         self._say("HANDSHAKE 1")
         with suppress(NoAnswer):  # its own status byte: waited for, as a busy computer hands it over late
@@ -218,18 +233,20 @@ class Cornerstone260(WireInstrument, Monochromator):
     def _make_safe(self) -> None:
         self._do("SHUTTER C")
 
+    def _gets_in_step(self) -> bool:
+        """End the motion and ask INFO?: answers come in the order of the statements, so what comes before its reply is stale."""
+        self._transport.write(b"\r\nABORT\r\nINFO?\r\n")
+        for _ in range(_STALE_LINES):
+            if self._line("INFO?") == self._info:
+                return self._line("INFO?") in _DONE
+        return False
+
     def _do(self, statement: str) -> None:
         """A command: its echo, its status byte, and the end of its motion."""
-        try:
-            self._say(statement)
-            status = self._line(statement, self.move_timeout_s)
-            if self._tells_idle and status in _DONE:
-                self._await_idle(statement)
-        except Interrupted:
-            self._transport.resume()
-            self._transport.write(b"ABORT\r\n")
-            self._transport.drain(quiet_s=0.2)
-            raise
+        self._say(statement)
+        status = self._line(statement, self.move_timeout_s)
+        if self._tells_idle and status in _DONE:
+            self._await_idle(statement)
         if status in _FAILED:
             code = self._error_number()
             if code != _ALREADY_THERE:

@@ -176,21 +176,24 @@ class ShutterDevice(Device):
 def shut(monochromator: Monochromator) -> None:
     """Stop a monochromator and ask for its shutter. Raises InstrumentError where it says that it is open still.
 
-    A stop by another thread, which closes the shutter as well, ends the question: it is asked again within `STOP_S`.
+    One that isn't connected yet ignores a stop: it is connected then, and told to close. A stop by another thread, which closes the shutter as well,
+    ends the question: it is asked again within `STOP_S`.
     """
-    monochromator.stop()
-    if _ask_shutter(monochromator):
-        raise InstrumentError("monochromator: its shutter is open though it was told to close; block the light by hand")
-
-
-def _ask_shutter(monochromator: Monochromator) -> bool:
     until = time.monotonic() + STOP_S
     while True:
         try:
-            return monochromator.shutter_is_open()
+            monochromator.stop()
+            monochromator.connect()
+            if opened := monochromator.shutter_is_open():
+                monochromator.close_shutter()
+                opened = monochromator.shutter_is_open()
         except Interrupted:
             if time.monotonic() >= until:
                 raise
+        else:
+            break
+    if opened:
+        raise InstrumentError("monochromator: its shutter is open though it was told to close; block the light by hand")
 
 
 @dataclass(frozen=True)

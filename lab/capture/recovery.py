@@ -11,6 +11,8 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 
+from drivers.instrument import Instrument
+from drivers.monochromator.base import Monochromator
 from lab.capture.blocking_calls import STOP_S, in_thread
 from lab.capture.file_lock import Lock
 from lab.capture.instruments import SafeState, Shutter, made_safe
@@ -31,14 +33,21 @@ def make_station_safe(
     """Connect to every instrument of a station and stop it, all at once: shutter closed, screen dark, motion stopped. A person at a prompt isn't asked.
 
     An instrument that isn't reached, or doesn't stop within `STOP_S`, has its complaint. `on_shut` is called as soon as
-    the shutter is closed. Raises nothing.
+    the shutter has answered that it is closed: where it can be asked at once, long before the instrument's identity
+    and state are known. Raises nothing.
     """
     try:
         drivers = connect(station.machines)
     except (InputError, DeviceError) as error:
         shutter: Shutter = "none" if station.monochromator is None else "unknown"
         return SafeState(shutter=shutter, complaints=(str(error),), at=now())
-    found, until = made_safe(drivers, lambda driver: driver.connect(), on_shut), time.monotonic() + STOP_S
+
+    def reached(driver: Instrument) -> None:
+        if isinstance(driver, Monochromator) and driver.shut_at_once():
+            on_shut()
+        driver.connect()
+
+    found, until = made_safe(drivers, reached, on_shut), time.monotonic() + STOP_S
     closing = [in_thread(driver.close) for driver in drivers.all.values()]
     for done in closing:
         try:

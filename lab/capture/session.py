@@ -28,7 +28,7 @@ from bluesky.utils import DuringTask, FailedStatus, Msg, RunEngineInterrupted, T
 
 from drivers.errors import InstrumentError
 from drivers.instrument import Identity
-from lab.capture.blocking_calls import in_thread
+from lab.capture.blocking_calls import STOP_S, in_thread
 from lab.capture.instruments import BenchState, Instruments, SafeState
 from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import JournalEntry, RunRecord, SessionInfo, now
@@ -148,6 +148,7 @@ class CaptureSession:
         self._engine: RunEngine | None = None
         self._instruments: Instruments | None = None
         self._control = threading.Condition()
+        self._held = threading.Lock()  # while instruments are taken up, shut or let go
         self._ended_by: str | None = None
         self._resume_asked = False
         self._began_s = time.monotonic()
@@ -207,16 +208,22 @@ class CaptureSession:
             self._resume_asked = True
             self._control.notify_all()
 
-    def shut(self, reason: str) -> bool:
-        """Close the shutter now, without waiting for the step under way, and open it no more in this run. Whether there is one that the run holds.
-        Raises InstrumentError where the monochromator doesn't say that it is closed. `abort` then ends the run, for the same `reason`."""
+    def shut(self, reason: str) -> Literal["closed", "none"] | None:
+        """Close the shutter now, without waiting for the step under way, and open it no more in this run.
+
+        `abort` then ends the run, for the same `reason`. Returns `closed` by the monochromator's own answer, `none` where
+        the station has no monochromator, and None where the run holds no instruments, and takes none up from now on.
+        Raises InstrumentError where the monochromator doesn't say that its shutter is closed.
+        """
         with self._control:
             self._ended_by = self._ended_by or reason
-            instruments = self._instruments
-        if instruments is None or instruments.shutter is None:
-            return False
-        instruments.shutter.bar()
-        return True
+        with self._held:
+            if self._instruments is None:
+                return None
+            if self._instruments.shutter is None:
+                return "none"
+            self._instruments.shutter.bar()
+            return "closed"
 
     def abort(self, reason: str = "aborted") -> None:
         """End the run now. The current step is dropped, finished ones stay, and `run` continues from there: also while the session is packed."""
@@ -299,9 +306,11 @@ class CaptureSession:
             cells=self.store.recording_set(self.id).target,
         )
         failure: BaseException | None = None
+        with self._held:
+            if self._ended_by is not None:
+                return
+            self._instruments = instruments
         try:
-            with self._control:
-                self._instruments = instruments
             identities = instruments.connect(self._check_goes_on)
             self._check_identities(identities)
             if self.store.session(self.id).demands_certified:
@@ -317,8 +326,13 @@ class CaptureSession:
             failure = error
         self._writes.close()
         self.safe = instruments.make_safe()
-        instruments.close()
-        self._instruments = None
+        mine = self._held.acquire(timeout=STOP_S)  # no driver that hangs holds the run up
+        try:
+            instruments.close()
+            self._instruments = None
+        finally:
+            if mine:
+                self._held.release()
         if failure is not None and not (self._ended_by is not None and isinstance(failure, Exception)):
             raise _plain(failure, self.safe.complaints) from failure
         if self.safe.complaints:

@@ -79,6 +79,8 @@ def diagnose(
         raise InputError(
             f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, or 0"
         )
+    if scheduler is not None and not bootstrap:
+        raise InputError(f"--scheduler {scheduler}: only the draws of --bootstrap are spread; give both, or neither")
     from lab.formats.results import FitResult
     from lab.workers import Workers
 

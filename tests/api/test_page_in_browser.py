@@ -401,6 +401,14 @@ def test_a_halt_is_answered_beside_its_button_also_without_a_network(browser: An
     page.wait_for_selector("#lost", state="hidden")
     page.click("#halt")
     page.wait_for_selector(".station .state:text-is('free')")
+    # Both places tell what the instruments answered last, whoever asked.
+    page.wait_for_selector(".station .halted:not(.unsafe):has-text('shutter closed')")
+    lab.bench.unplugged.add("monochromator")
+    page.click("#halt")
+    page.wait_for_selector("#halt-told.unsafe:has-text('NOT CONFIRMED')")
+    lab.bench.unplugged.clear()
+    page.click(".station button:has-text('Halt')")
+    page.wait_for_selector("#halt-told:not(.unsafe):has-text('shutter closed')")
     watched.complaints = [line for line in watched.complaints if "ERR_INTERNET_DISCONNECTED" not in line]
     watched.close()
 

@@ -132,3 +132,45 @@ def test_two_stations_at_one_shutter_are_asked_once(running: Running) -> None:
     with running.client("operate") as client:
         found = client.post("/api/v1/halt").json()["stations"]
         assert [(one["name"], one["safety"]["shutter"]) for one in found] == [("fakes", "closed"), ("twin", "closed")]
+
+
+def test_a_run_that_only_packs_is_halted_and_its_station_asked(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes no instrument up: a connection of the halt's own asks. A second halt shares it."""
+    packs, go_on, connects, answers = (threading.Event() for _ in range(4))
+    chunk, connect = nexus._chunk, fake_bench.FakeMonochromator.connect
+
+    def slow(frame: Any) -> bytes:
+        packs.set()
+        assert go_on.wait(30.0)
+        return chunk(frame)
+
+    def held_up(self: fake_bench.FakeMonochromator) -> None:
+        connects.set()
+        assert answers.wait(30.0)
+        connect(self)
+
+    monkeypatch.setattr(nexus, "_chunk", slow)
+    with running.client("operate") as client:
+        session = client.post("/api/v1/sessions", json=DARKS).json()["id"]
+        assert packs.wait(30.0)
+        client.post(f"/api/v1/sessions/{session}/abort")
+        go_on.set()
+        until_state(client, session, "interrupted")
+        packs.clear(), go_on.clear()
+        assert client.post(f"/api/v1/sessions/{session}/resume").status_code == 202
+        assert packs.wait(30.0)
+        running.bench.opened = True  # by hand
+        monkeypatch.setattr(fake_bench.FakeMonochromator, "connect", held_up)
+        live = running.app.state.service.live
+        station = running.app.state.service.station("fakes")
+        first = live.halt(None, "one")[session]
+        assert connects.wait(30.0)
+        shared = live.make_safe(station)
+        answers.set()
+        first.result(30.0), shared.result(30.0)
+        assert (found := live.safety.find(station)).state == "safe" and found.shutter == "closed", found
+        assert not running.bench.opened and running.bench.log.count("stop monochromator") <= 4
+        go_on.set()
+        until_state(client, session, "interrupted")

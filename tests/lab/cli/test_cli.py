@@ -358,6 +358,8 @@ def test_a_threshold_needs_more_than_a_few_draws(flats: Path, capsys: pytest.Cap
     assert cli.main(["diagnose", str(flats), "--bootstrap", "3"]) == 2
     said = capsys.readouterr().err
     assert "--bootstrap 3" in said and "10" in said
+    assert cli.main(["diagnose", str(flats), "--scheduler", "tcp://127.0.0.1:1"]) == 2
+    assert "only the draws of --bootstrap are spread" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(
