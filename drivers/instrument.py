@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
 
 #: Called with every piece of a conversation as it happens: the transcript of a session is made of these.
 Recorder = Callable[[Literal["sent", "received"], bytes], None]
+
+
+#: A setting's value as an instrument reports it.
+Setting = str | bool | int | float
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,14 @@ class Instrument(ABC):
     @abstractmethod
     def identity(self) -> Identity:
         """Maker, model, serial number and firmware as the instrument reports them."""
+
+    def settings(self) -> Mapping[str, Setting]:
+        """Every setting that bears on what is measured, by its name, as the instrument reports it now."""
+        return {}
+
+    def departures(self) -> tuple[str, ...]:
+        """What of it can't be set as a measurement wants it, in words: it belongs to all that is recorded with it."""
+        return ()
 
     @abstractmethod
     def stop(self) -> None:

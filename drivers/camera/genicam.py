@@ -19,16 +19,16 @@ from drivers.camera.base import TEMPERATURE_NS, Frame, SensorInfo, StreamingCame
 from drivers.camera.buffers import Grabbed
 from drivers.camera.genicam_settings import (
     Features,
-    Setting,
     black_level,
     give_pulses,
+    make_neutral,
     set_if_there,
-    switch_processing_off,
+    snapshot,
     trigger_line,
 )
 from drivers.camera.pixel_format import PREFERENCE, PixelFormat
 from drivers.errors import Disconnected, InstrumentError, Interrupted, NoAnswer, Repeated
-from drivers.instrument import Identity, Recorder
+from drivers.instrument import Identity, Recorder, Setting
 
 _LOOK_S = 0.1
 #: The exposure time's names: SFNC's, and that of cameras before it.
@@ -117,6 +117,7 @@ class GenicamCamera(StreamingCamera):
         self._fired: datetime | None = None
         self._owed = 0  # frames of software triggers that didn't come yet
         self._before: tuple[int, int | None] | None = None  # number and time of the frame before
+        self._departures: tuple[str, ...] = ()
         self._has_temperature = False
         self._temperature: tuple[int, float] | None = None  # when (ns of the camera's clock), and degrees
 
@@ -168,7 +169,12 @@ class GenicamCamera(StreamingCamera):
     def _prepare(self, features: CameraFeatures) -> None:
         set_if_there(features, "AcquisitionMode", "Continuous")
         set_if_there(features, "ExposureMode", "Timed")
-        switch_processing_off(features, self._who)
+        self._departures = make_neutral(features, self._who)
+        for name in (
+            "All",
+            "AnalogAll",
+        ):  # the gain that is set is the one before the converter, where there are several
+            set_if_there(features, "GainSelector", name)
         set_if_there(features, "TriggerSelector", "FrameStart")
         if not features.has("TriggerMode"):
             raise InstrumentError(
@@ -194,6 +200,14 @@ class GenicamCamera(StreamingCamera):
     def identity(self) -> Identity:
         with self._used():
             return self._identity
+
+    def settings(self) -> dict[str, Setting]:
+        with self._used() as features:
+            return snapshot(features)
+
+    def departures(self) -> tuple[str, ...]:
+        with self._used():
+            return tuple(f"{told}: its codes aren't the converter's" for told in self._departures)
 
     def sensor(self) -> SensorInfo:
         with self._used() as features:
