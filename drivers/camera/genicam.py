@@ -13,12 +13,12 @@ import time
 from abc import abstractmethod
 from collections.abc import Collection, Iterator
 from datetime import UTC, datetime
-from typing import Protocol
 
 from drivers.camera.base import TEMPERATURE_NS, Frame, SensorInfo, StreamingCamera, Trigger
 from drivers.camera.buffers import Grabbed
+from drivers.camera.found_features import RememberedFeatures
 from drivers.camera.genicam_settings import (
-    Features,
+    CameraFeatures,
     black_level,
     give_pulses,
     make_neutral,
@@ -28,6 +28,7 @@ from drivers.camera.genicam_settings import (
 )
 from drivers.camera.pixel_format import PREFERENCE, PixelFormat
 from drivers.errors import Disconnected, InstrumentError, Interrupted, NoAnswer, Repeated
+from drivers.found_settings import FoundSettings
 from drivers.instrument import Identity, Recorder, Setting
 
 _LOOK_S = 0.1
@@ -37,16 +38,6 @@ _EXPOSURES = ("ExposureTime", "ExposureTimeAbs")
 
 class NoFrame(NoAnswer):
     """A frame is missing from a camera that answers otherwise."""
-
-
-class CameraFeatures(Features, Protocol):
-    """A camera's features, with limits and commands."""
-
-    def limits(self, name: str) -> tuple[float, float]:
-        """Least and greatest value of a number."""
-
-    def execute(self, name: str) -> None:
-        """Run a command."""
 
 
 class _Transcribed:
@@ -108,7 +99,7 @@ class GenicamCamera(StreamingCamera):
         self._who = f"camera {address}"
         self._lock = threading.RLock()
         self._stopped = threading.Event()
-        self._features: CameraFeatures | None = None
+        self._features: RememberedFeatures | None = None
         self._identity = Identity("", "")
         self._format: PixelFormat = PREFERENCE[0]
         self._armed: Trigger | None = None
@@ -159,10 +150,13 @@ class GenicamCamera(StreamingCamera):
                 features, self._identity = self._open()
                 if self._recorder is not None and not self._records_bytes:
                     features = _Transcribed(features, self._recorder)
-                self._features = features
-                self._who = f"camera {self._identity.serial_number or self.address}"
+                name = self._identity.serial_number or self.address
+                self._who = f"camera {name}"
+                self._features = RememberedFeatures(features, FoundSettings(f"camera-{name}", self._who))
+                self._features.restore()  # what a process that was killed, or an unplugged camera, left changed
                 self._prepare(self._features)
             except InstrumentError:
+                self._restore()
                 self._drop()
                 raise
 
@@ -393,6 +387,7 @@ class GenicamCamera(StreamingCamera):
         self._stopped.set()
         with self._lock:
             self._stopped.clear()
+            self._restore()
             self._drop()
 
     # --- inside -----------------------------------------------------------------------------------------------------
@@ -418,6 +413,13 @@ class GenicamCamera(StreamingCamera):
         if self._armed is not None:
             self._armed = None
             self._halt()
+
+    def _restore(self) -> None:
+        """Set everything as it was found, where the camera can be reached."""
+        if self._features is not None:
+            with contextlib.suppress(InstrumentError):
+                self._stop_acquisition()
+                self._features.restore()
 
     def _drop(self) -> None:
         with contextlib.suppress(Exception):  # libraries raise what they like, and the camera may be gone

@@ -31,6 +31,16 @@ class Features(Protocol):
         """Names of an enumeration's entries."""
 
 
+class CameraFeatures(Features, Protocol):
+    """A camera's features, with limits and commands."""
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Least and greatest value of a number."""
+
+    def execute(self, name: str) -> None:
+        """Run a command."""
+
+
 @dataclass(frozen=True)
 class Neutral:
     """A feature that changes exposure, gain or codes, and the value at which it leaves the converter's codes alone.

@@ -2,8 +2,8 @@
 
 The driver works in handshake mode, in which every statement is answered by the status byte: `00`, or `20` (hex) for an error whose
 number `ERROR?` tells. A Cornerstone 260 sends it when the motion is done, and echoes every character. A CS260B sends it on receipt:
-the driver asks `IDLE?` until nothing moves; its echo may be off. On closing, handshake and units are as they were found: the next
-program that talks to it expects its own. Sources: the manual's appendix on low level commands (p. 50-51); the MCS260B manual.
+the driver asks `IDLE?` until nothing moves; its echo may be off. On closing, handshake and units are as they were found, by a process
+that was killed, too: the next program that talks to it expects its own. Sources: the manual's appendix on low level commands (p. 50-51); the MCS260B manual.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.found_settings import FoundSettings
 from drivers.instrument import Identity, Recorder
 from drivers.monochromator.base import (
     Monochromator,
@@ -81,8 +82,7 @@ class Cornerstone260(WireInstrument, Monochromator):
         self._identity = Identity("Newport", "Cornerstone 260")
         self._echoes = True
         self._tells_idle = False
-        self._found_handshake: bool | None = None
-        self._found_units = ""
+        self._found: FoundSettings | None = None
 
     # --- the abstraction --------------------------------------------------------------------------------------------
 
@@ -164,21 +164,26 @@ class Cornerstone260(WireInstrument, Monochromator):
         line.write(b"\r\n")
         line.write(b"ABORT\r\n")
         line.drain(quiet_s=0.3)  # an instrument that moves is slow to echo
-        model, _, serial_number = self._first_answer().partition(" SN ")
+        reply, handshake = self._first_answer()
+        model, _, serial_number = reply.partition(" SN ")
         self._identity = Identity("Newport", model.strip() or "Cornerstone 260", serial_number.strip())
+        self._found = FoundSettings(f"monochromator-{serial_number.strip() or line.address}", line.name)
+        if not handshake:
+            self._found.note("HANDSHAKE", 0)
         self._say("HANDSHAKE 1")
         with suppress(NoAnswer):  # its own status byte: waited for, as a busy computer hands it over late
             self._line("HANDSHAKE 1", _HANDSHAKE_S)
         line.drain(quiet_s=0.1)  # an error that stood from before
         self._ask("ERROR?")
         self._tells_idle = self._knows("IDLE?")
-        self._found_units = self._found_units or self._ask("UNITS?").strip().upper()
+        if (units := self._ask("UNITS?").strip().upper()) != "NM":
+            self._found.note("UNITS", units)
         self._do("UNITS NM")
         if self.grating is not None and self._ask("GRAT?").partition(",")[0].strip() != str(self.grating):
             self._do(f"GRAT {self.grating}")
 
-    def _first_answer(self) -> str:
-        """The reply to INFO?, and by what comes with it: whether the instrument echoes, and whether a host before left handshake mode on.
+    def _first_answer(self) -> tuple[str, bool]:
+        """The reply to INFO?, and whether handshake mode is on; by what comes with it also whether the instrument echoes.
 
         Late answers to what was sent before are skipped.
         """
@@ -194,9 +199,7 @@ class Cornerstone260(WireInstrument, Monochromator):
         complains = "INFO?" in reply.upper() or reply.upper().startswith(("ER:", "ERROR"))  # another instrument does
         if complains or reply in _FAILED or len(more) > 1 or any(len(word) > 2 for word in more):
             raise self._strange("INFO?", " ".join([first, reply, *more]))
-        if self._found_handshake is None:
-            self._found_handshake = bool(more)
-        return reply
+        return reply, bool(more)
 
     def _knows(self, query: str) -> bool:
         try:
@@ -208,12 +211,16 @@ class Cornerstone260(WireInstrument, Monochromator):
         return True
 
     def _let_go(self) -> None:
-        if self._found_units in {"UM", "WN"}:
-            self._do(f"UNITS {self._found_units}")
-        if not self._found_handshake:
+        found = self._found
+        if found is None:
+            return
+        if (units := str(found.get("UNITS", ""))) in {"UM", "WN"}:
+            self._do(f"UNITS {units}")
+        found.forget("UNITS")
+        if "HANDSHAKE" in found:
             self._transport.write(b"HANDSHAKE 0\r\n")
             self._transport.drain(quiet_s=0.1)
-        self._found_handshake, self._found_units = None, ""
+            found.forget("HANDSHAKE")
 
     def _make_safe(self) -> None:
         self._do("SHUTTER C")

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 import usb.core
 
 from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.found_settings import FoundSettings
 from drivers.instrument import Identity, Recorder
 from drivers.monochromator.base import (
     Monochromator,
@@ -63,7 +64,7 @@ class Cornerstone260B(Monochromator):
         self._stopping = threading.Lock()  # a stop ends what others wait for, but no stop
         self._open: UsbTmc | None = None
         self._met = False
-        self._found_units = ""
+        self._found: FoundSettings | None = None
         self._identity = Identity("Newport", "CS260B")
 
     # --- the abstraction --------------------------------------------------------------------------------------------
@@ -149,10 +150,11 @@ class Cornerstone260B(Monochromator):
             with contextlib.suppress(InstrumentError):
                 self.stop()
         with self._lock:
-            if self._open is not None and self._found_units in {"UM", "WN"}:
+            if self._open is not None and self._found is not None and self._found:
                 with contextlib.suppress(InstrumentError):
-                    self._open.write(f"units {self._found_units.lower()}")
-            self._found_units, self._met = "", False
+                    self._open.write(f"units {str(self._found.get('UNITS', 'NM')).lower()}")
+                    self._found.forget("UNITS")
+            self._met = False
             self._drop()
 
     # --- the wire ---------------------------------------------------------------------------------------------------
@@ -188,7 +190,9 @@ class Cornerstone260B(Monochromator):
             for _ in range(32):  # errors that stood from before
                 if self._error() is None:
                     break
-            self._found_units = self._found_units or wire.ask("units?").upper()
+            self._found = FoundSettings(f"monochromator-{self._identity.serial_number or self.address}", self._who)
+            if (units := wire.ask("units?").upper()) in {"UM", "WN"}:
+                self._found.note("UNITS", units)
             self._do("units nm")
             if self.grating is not None and round(self._number(wire, "grating?")) != self.grating:
                 self._do(f"grating {self.grating}")
