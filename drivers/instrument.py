@@ -55,7 +55,10 @@ class Instrument(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Bring it into its safe state and close the connection. Never raises; may be called twice."""
+        """Bring it into its safe state and close the connection, in any case; may be called twice.
+
+        Raises `InstrumentError` where light may get out still: a shutter that says it is open, or that was opened and doesn't answer.
+        """
 
     def __enter__(self) -> Self:
         self.connect()
@@ -64,4 +67,9 @@ class Instrument(ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except Exception as unsafe:
+            if error is None:
+                raise
+            error.add_note(str(unsafe))

@@ -16,10 +16,14 @@ from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refu
 from drivers.found_settings import FoundSettings
 from drivers.instrument import Identity, Recorder
 from drivers.monochromator.base import (
+    DISPERSION_NM,
+    NO_SLIT,
+    HandSlits,
     Monochromator,
     checked_slit_um,
     checked_wavelength_nm,
     filter_place,
+    lines_per_mm,
     order_sorting_filters,
 )
 from drivers.transport import Transport, WireInstrument, shown
@@ -45,15 +49,14 @@ _LOOK_S = 0.1
 _LATE, _LATE_LINES = {"", "ABORT", *_DONE}, 6
 #: Longest time (s) that the status byte of HANDSHAKE itself is waited for.
 _HANDSHAKE_S = 1.0
-#: Reciprocal linear dispersion with 1200 l/mm: 1e6 nm / (1200 per mm x 260 mm) x cos(9.6 deg).
-_DISPERSION_NM_PER_MM = 3.16
 
 
 class Cornerstone260(WireInstrument, Monochromator):
     """A Cornerstone 260.
 
     `filters`: the order-sorting filters (rows of `place`, `from_nm`, `to_nm`; None: the default table; an empty list:
-    no wheel). `grating`: which one to use, None: the one that stands. `move_timeout_s`: longest motion.
+    no wheel). `grating`: which one to use, None: the one that stands. `dispersion_nm_per_mm`: None: by the lines of the grating in use.
+    `slit_um`: the width of slits that are set by hand. `move_timeout_s`: longest motion.
     """
 
     def __init__(
@@ -62,7 +65,8 @@ class Cornerstone260(WireInstrument, Monochromator):
         *,
         filters: Sequence[object] | None = None,
         grating: int | None = None,
-        dispersion_nm_per_mm: float = _DISPERSION_NM_PER_MM,
+        dispersion_nm_per_mm: float | None = None,
+        slit_um: float | None = None,
         upper_nm: float = 1400.0,
         tolerance_nm: float = 0.5,
         timeout_s: float = 2.0,
@@ -76,6 +80,8 @@ class Cornerstone260(WireInstrument, Monochromator):
         self.filters = order_sorting_filters(filters)
         self.grating = grating
         self.dispersion_nm_per_mm = dispersion_nm_per_mm
+        self._slits = HandSlits(None if slit_um is None else checked_slit_um(slit_um))
+        self._by_hand = slit_um is not None
         self.upper_nm = upper_nm
         self.tolerance_nm = tolerance_nm
         self.move_timeout_s = move_timeout_s
@@ -95,6 +101,13 @@ class Cornerstone260(WireInstrument, Monochromator):
 
     def check_slit_um(self, width_um: float) -> None:
         checked_slit_um(width_um)
+        if self._by_hand:
+            self._slits.set(width_um, self._transport.name)
+
+    def departures(self) -> tuple[str, ...]:
+        with self._conversation():
+            self._slit_um()
+            return self._slits.departures(self._transport.name) if self._by_hand else ()
 
     def shut_at_once(self) -> bool:
         with self._lock:
@@ -121,6 +134,7 @@ class Cornerstone260(WireInstrument, Monochromator):
 
     def open_shutter(self) -> None:
         with self._conversation():
+            self._may_shine = True
             self._do("SHUTTER O")
 
     def close_shutter(self) -> None:
@@ -144,17 +158,41 @@ class Cornerstone260(WireInstrument, Monochromator):
             return round(self._number("FILTER?"))
 
     def slit_um(self) -> float:
+        width_um = self._slit_um()
+        if width_um is None:
+            raise InstrumentError("; ".join(self._slits.departures(self._transport.name)))
+        return width_um
+
+    def _slit_um(self) -> float | None:
+        """Width of the entrance slit, or what is stated of one that is set by hand."""
         with self._conversation():
-            return self._number("SLIT1MICRONS?")
+            if not self._by_hand:
+                try:
+                    return self._number("SLIT1MICRONS?")
+                except Refused as refusal:
+                    if refusal.code not in NO_SLIT:
+                        raise
+                    self._by_hand = True
+            return self._slits.stated_um
 
     def set_slit_um(self, width_um: float) -> None:
         wanted = checked_slit_um(width_um)
         with self._conversation():
+            if self._slit_um() is None or self._by_hand:
+                self._slits.set(wanted, self._transport.name)
+                return
             for slit in (1, 2):
                 self._do(f"SLIT{slit}MICRONS {round(wanted)}")
 
     def bandwidth_nm(self) -> float:
-        return self.slit_um() * 1e-3 * self.dispersion_nm_per_mm
+        with self._conversation():
+            width_um = self._slit_um()
+            if width_um is None:
+                return 0.0
+            dispersion = self.dispersion_nm_per_mm
+            if dispersion is None:
+                dispersion = DISPERSION_NM / lines_per_mm(self._ask("GRAT?"), self._transport.name)
+            return width_um * 1e-3 * dispersion
 
     # --- the wire ---------------------------------------------------------------------------------------------------
 
@@ -224,6 +262,9 @@ class Cornerstone260(WireInstrument, Monochromator):
 
     def _make_safe(self) -> None:
         self._do("SHUTTER C")
+
+    def _make_safe_for_good(self) -> InstrumentError | None:
+        return self._shut_for_good()
 
     def _do(self, statement: str) -> None:
         """A command: its echo, its status byte, and the end of its motion."""

@@ -74,12 +74,14 @@ def _self_test(name: str, instrument: Instrument) -> SelfTest:
             contract.everyday(instrument)
             instrument.stop()
             contract.is_safe(instrument)
+            works, words = True, "works, and is in its safe state"
         except (InstrumentError, NotMet) as error:
-            told.append(SelfTest(name, who, False, str(error)))
-        else:
-            told.append(SelfTest(name, who, True, "works, and is in its safe state"))
-        finally:
+            works, words = False, str(error)
+        try:
             instrument.close()
+        except InstrumentError as error:
+            works, words = False, str(error)
+        told.append(SelfTest(name, who, works, words))
 
     worker = threading.Thread(target=test, daemon=True)
     worker.start()

@@ -67,7 +67,6 @@ def killed(kept: Path) -> Iterator[Callable[[type, str, str], None]]:
         user.wait(30)
 
 
-
 def _registers(device: U3vDevice) -> dict[str, int]:
     names = ("WIDTH", "PIXEL_FORMAT", "TRIGGER_CONTROL", "EXPOSURE_TICKS", "GAIN", "GAMMA_ENABLE", "LIGHT_SOURCE")
     module = sys.modules[U3vDevice.__module__]
