@@ -94,6 +94,7 @@ class GenicamCamera(StreamingCamera):
     ) -> None:
         self.address = address
         self._wanted_format, self._timeout_s = pixel_format, timeout_s
+        self.readout_s = timeout_s
         self._wanted_line, self._output_line, self._output_source = trigger_line, output_line, output_source
         self._recorder = recorder
         self._who = f"camera {address}"
