@@ -141,7 +141,8 @@ def probe(address: str) -> Iterator[tuple[str, Identity | InstrumentError]]:
         else:
             return
         finally:
-            instrument.close()
+            with suppress(InstrumentError):
+                instrument.close()
 
 
 def _is_serial(made: Any) -> bool:

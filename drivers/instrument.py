@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
 
 #: Called with every piece of a conversation as it happens: the transcript of a session is made of these.
 Recorder = Callable[[Literal["sent", "received"], bytes], None]
+
+
+#: A setting's value as an instrument reports it.
+Setting = str | bool | int | float
 
 
 @dataclass(frozen=True)
@@ -37,13 +41,24 @@ class Instrument(ABC):
     def identity(self) -> Identity:
         """Maker, model, serial number and firmware as the instrument reports them."""
 
+    def settings(self) -> Mapping[str, Setting]:
+        """Every setting that bears on what is measured, by its name, as the instrument reports it now."""
+        return {}
+
+    def departures(self) -> tuple[str, ...]:
+        """What of it can't be set as a measurement wants it, in words: it belongs to all that is recorded with it."""
+        return ()
+
     @abstractmethod
     def stop(self) -> None:
         """Bring the instrument into its safe state now, from any thread: motion ends, shutters close, screens go dark."""
 
     @abstractmethod
     def close(self) -> None:
-        """Bring it into its safe state and close the connection. Never raises; may be called twice."""
+        """Bring it into its safe state and close the connection, in any case; may be called twice.
+
+        Raises `InstrumentError` where light may get out still: a shutter that says it is open, or that was opened and doesn't answer.
+        """
 
     def __enter__(self) -> Self:
         self.connect()
@@ -52,4 +67,9 @@ class Instrument(ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except Exception as unsafe:
+            if error is None:
+                raise
+            error.add_note(str(unsafe))

@@ -263,15 +263,21 @@ class WireInstrument(Instrument):
                     self._make_safe()
 
     def close(self) -> None:
-        if self._met:
-            with suppress(InstrumentError):
-                self.stop()
+        unsafe = self._make_safe_for_good() if self._met else None
         with self._lock:
             if self._live:
                 with suppress(InstrumentError):
                     self._let_go()
             self._live = self._met = False
             self._transport.close()
+        if unsafe is not None:
+            raise unsafe
+
+    def _make_safe_for_good(self) -> InstrumentError | None:
+        """The safe state before the connection ends. Returns what is to be raised afterwards: light may get out."""
+        with suppress(InstrumentError):
+            self.stop()
+        return None
 
     @contextmanager
     def _conversation(self) -> Iterator[Transport]:

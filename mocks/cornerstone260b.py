@@ -145,9 +145,18 @@ class MockCornerstone260B(UsbDevice):
             for part in line.split(";"):
                 command = " ".join(part.upper().split())
                 if command in ("IDLE?", "ABORT", "SYSTEM:ERROR?", "SYST:ERR?"):
+                    if command.startswith("SYST"):
+                        self._catch_up()
                     self._obey(command)
                 elif command:
                     self._enqueue(command)
+
+    def _catch_up(self) -> None:
+        """Let what was said before be taken, but for what waits for a motion: its error is asked for next."""
+        with self.changed:
+            self.changed.wait_for(
+                lambda: not self._waiting or self._waiting[0].text in ("*WAI", "*OPC?") or not self.plugged, timeout=5.0
+            )
 
     def _enqueue(self, command: str) -> None:
         with self.changed:
@@ -171,6 +180,7 @@ class MockCornerstone260B(UsbDevice):
             with self.changed:
                 if self._waiting and self._waiting[0] is entry:
                     self._waiting.popleft()
+                    self.changed.notify_all()
 
     def _begin_motion(self, seconds: float, arrive: Callable[[], None]) -> None:
         with self.changed:

@@ -34,6 +34,33 @@ def calibration_csv(departure_percent: float = 0.8) -> str:
     )
 
 
+#: Long forms of the words that it knows.
+_SHORT = {
+    "SYSTEM": "SYST",
+    "ZCHECK": "ZCH",
+    "ERROR": "ERR",
+    "CURRENT": "CURR",
+    "RANGE": "RANG",
+    "MEASURE": "MEAS",
+    "CONFIGURE": "CONF",
+    "FORMAT": "FORM",
+    "ELEMENTS": "ELEM",
+}
+#: Bits of the standard event register (IEEE 488.2), and of the status byte: error queue, summary of the events.
+_OPERATION_COMPLETE, _DEVICE_ERROR, _COMMAND_ERROR, _POWER_ON = 0x01, 0x08, 0x20, 0x80
+_ERRORS_THERE, _EVENTS_THERE = 0x04, 0x20
+
+
+def _short(command: str) -> str:
+    """A command without its leading colon and the optional SENSE, each word in its short form."""
+    head, space, argument = command.removeprefix(":").partition(" ")
+    asks = "?" if head.endswith("?") else ""
+    words = [_SHORT.get(word, word) for word in head.removesuffix("?").split(":")]
+    if words[0] in ("SENS", "SENSE") and len(words) > 1:
+        words = words[1:]
+    return ":".join(words) + asks + space + argument
+
+
 class MockScpiMeter(Grammar):
     """The meter; `light` is what the diode sees, `seed` that of its noise."""
 
@@ -47,6 +74,7 @@ class MockScpiMeter(Grammar):
         self._rng = np.random.default_rng(seed)
         self._line = bytearray()
         self._errors: deque[str] = deque()
+        self._events, self._events_enabled = _POWER_ON, 0
         self._zero_check = True
         self._waiting: deque[str] = deque()
         self._done_at: float | None = None
@@ -80,18 +108,18 @@ class MockScpiMeter(Grammar):
         return out
 
     def _obey(self, command: str) -> bytes:
-        if command in ("SYST:ERR?", "SYSTEM:ERROR?"):
+        command = _short(command)
+        if command in ("SYST:ERR?", "SYST:ERR:NEXT?"):
             return (self._errors.popleft() if self._errors else '0,"No error"').encode() + b"\n"
         if (code := self._failure()) is not None:
             self._errors.append(f'{code},"System error"')
+            self._events |= _DEVICE_ERROR
             return b""
-        if command == "*IDN?":
-            return f"KEITHLEY INSTRUMENTS INC.,MODEL 6485,{self._serial_number},B03\n".encode()
-        if command == "*CLS":
-            self._errors.clear()
-        elif command == "*RST":
-            self._zero_check = True
-        elif command.startswith("SYST:ZCH "):
+        if command.startswith("*") and (answer := self._common(command)) is not None:
+            return answer
+        if command == "SYST:ZCH?":
+            return b"%d\n" % self._zero_check
+        if command.startswith("SYST:ZCH "):
             self._zero_check = command.endswith(("ON", "1"))
         elif command in ("READ?", "MEAS?", "MEAS:CURR?", "MEAS:CURR:DC?"):
             self._done_at = self.clock.now() + 0.1  # five cycles of the mains
@@ -103,7 +131,35 @@ class MockScpiMeter(Grammar):
             "FORM:ELEM READ",
         ):
             self._errors.append('-113,"Undefined header"')
+            self._events |= _COMMAND_ERROR
         return b""
+
+    def _common(self, command: str) -> bytes | None:
+        """The answer to a command that IEEE 488.2 asks of every instrument; None: it isn't one that is known."""
+        events = self._events
+        status = (_ERRORS_THERE if self._errors else 0) | (_EVENTS_THERE if events & self._events_enabled else 0)
+        told = {
+            "*IDN?": f"KEITHLEY INSTRUMENTS INC.,MODEL 6485,{self._serial_number},B03",
+            "*OPC?": "1",  # a reading is waited for before the next command is obeyed
+            "*STB?": str(status),
+            "*ESR?": str(events),
+            "*ESE?": str(self._events_enabled),
+            "*TST?": "0",
+        }
+        if command == "*CLS":
+            self._errors.clear()
+            self._events = 0
+        elif command == "*ESR?":
+            self._events = 0
+        elif command == "*RST":
+            self._zero_check = True
+        elif command == "*OPC":
+            self._events |= _OPERATION_COMPLETE
+        elif command.startswith("*ESE ") and command[5:].strip().isdigit():
+            self._events_enabled = int(command[5:]) & 0xFF
+        elif command not in told and command != "*WAI" and not command.startswith("*SRE "):
+            return None
+        return told[command].encode() + b"\n" if command in told else b""
 
     def _reading(self) -> bytes:
         current_a = 0.0 if self._zero_check else DARK_A + self._photocurrent()

@@ -18,7 +18,7 @@ from mocks.lamp import tristimulus
 from mocks.wire import LONGEST_LINE, Grammar, MeasuredLight, Reply
 from sim.spectrum import Spectrum
 
-ACK, BEL, NAK, ESCAPE = b"\x06", b"\x07", b"\x15", 0x1B
+ETX, ACK, BEL, NAK, ESCAPE = b"\x03", b"\x06", b"\x07", b"\x15", 0x1B
 COMMAND, PARAMETER, CONFIGURATION, CONTROL, FETCH, MEASURE = 4, 20, 21, 22, 24, 25
 OVER_EXPOSED, UNDER_EXPOSED, NOTHING_MEASURED, OUT_OF_RANGE, BROKEN_OFF = 120, 121, 138, 141, 147
 #: Radiance x integration time (W s sr^-1 m^-2 nm^-1) at which the detector is full.
@@ -37,6 +37,9 @@ _SETTINGS: dict[str, tuple[float, float, float]] = {
     "cycmod": (0, 1, 0),
     "cyctim": (0, 1e9, 0),
     "splitt": (0, 65000, 1000),
+    "maxaver": (2, 1000, 2),
+    "syncmod": (0, 1, 0),
+    "syncfreq": (0, 1e4, 0),
 }
 
 
@@ -64,6 +67,7 @@ class MockSpecbos1211(Grammar):
         """`told_nm`: the range that it says it measures, where that isn't the one for which it is calibrated."""
         super().__init__(light.clock)
         self._model = model
+        self._is_spectraval = model.startswith("spectraval")
         self._calibrated_nm = calibrated_nm
         self._told_nm = told_nm or calibrated_nm
         self._light = light
@@ -152,6 +156,7 @@ class MockSpecbos1211(Grammar):
             "specbos 1211": b"JETI_SB1211\r",
             "specbos 1201": b"SB05\r",
             "spectraval 1501": b"JETI_SDCM3 1501427\r",
+            "spectraval 1511": b"JETI_SDCM3 1511427\r",
         }[self._model]
 
     def _version(self) -> bytes:
@@ -159,7 +164,11 @@ class MockSpecbos1211(Grammar):
 
     def _last_error(self) -> bytes:
         code, self._error = self._error, 0
-        return b"Error Code: %d\r" % code
+        return self._told("Error Code: ", f"{code}")
+
+    def _told(self, label: str, value: str) -> bytes:
+        """An answer: a spectraval tells the value alone."""
+        return f"{'' if self._is_spectraval else label}{value}\r".encode("ascii")
 
     def _default(self) -> bytes:
         self._settings = {name: default for name, (_, _, default) in _SETTINGS.items()}
@@ -168,7 +177,7 @@ class MockSpecbos1211(Grammar):
 
     def _whole_range(self) -> tuple[float, float, float]:
         """A specbos begins with the visible, a spectraval with all that it measures."""
-        return (*self._calibrated_nm, 1.0) if self._model == "spectraval 1501" else (380.0, 780.0, 1.0)
+        return (*self._calibrated_nm, 1.0) if self._is_spectraval else (380.0, 780.0, 1.0)
 
     def _save(self) -> bytes:
         return ACK
@@ -181,12 +190,12 @@ class MockSpecbos1211(Grammar):
                 raise _SpecbosRefusal(wrong)
             self._range_nm = (numbers[0], numbers[1], numbers[2])
             return ACK
-        if name == "maxtint" and self._model == "spectraval 1501":
+        if name == "maxtint" and self._is_spectraval:
             name = "maxtin"
         # Firmware of the 1201 up to 1.8.3 doesn't know maxtin; a spectraval has its settings under para alone.
         if name not in _SETTINGS or (name == "maxtin" and self._model == "specbos 1201"):
             raise _SpecbosRefusal(COMMAND)
-        if self._model == "spectraval 1501" and tree.startswith("conf"):
+        if self._is_spectraval and tree.startswith("conf"):
             raise _SpecbosRefusal(COMMAND)
         lower, upper, _ = _SETTINGS[name]
         value = _number(text, wrong)
@@ -197,24 +206,27 @@ class MockSpecbos1211(Grammar):
 
     def _get(self, tree: str, name: str) -> bytes:
         first_nm, last_nm, step_nm = self._range_nm
+        if self._is_spectraval and tree.startswith("conf"):  # of its hardware: a display, Bluetooth
+            if name not in ("dispen", "bten"):
+                raise _SpecbosRefusal(COMMAND)
+            return b"%d\r" % (name == "dispen" and self._model == "spectraval 1511")
         if name == "wavbeg":
             return b"Predefined start wave: %.1f\r" % self._told_nm[0]
         if name == "wavend":
             return b"Predefined end wave: %.1f\r" % self._told_nm[1]
         if name == "spnum":
-            return f"spectrometer number: {self._serial_number}\r".encode("ascii")
+            return self._told("spectrometer number: ", self._serial_number)
         if name == "wran":
-            bare = self._model == "spectraval 1501"
-            return b"%s%.0f %.0f %.0f\r" % (b"" if bare else b"wran: ", first_nm, last_nm, step_nm)
+            return self._told("wran: ", f"{first_nm:.0f} {last_nm:.0f} {step_nm:.0f}")
         if name in _SETTINGS:
-            return f"{name}: {self._settings[name]:g}\r".encode("ascii")
+            return self._told(f"{name}: ", f"{self._settings[name]:g}")
         raise _SpecbosRefusal(COMMAND)
 
     def _head(self) -> bytes:
         return b"mhead: 0\r"
 
     def _laser_state(self) -> bytes:
-        return b"laser: %d\r" % self._laser
+        return self._told("laser: ", f"{self._laser}")
 
     def _set_laser(self, text: str) -> bytes:
         self._laser = int(text)
@@ -229,8 +241,12 @@ class MockSpecbos1211(Grammar):
         self._done_at = self.clock.now() + seconds
         return ACK
 
+    def _adapts(self) -> bool:
+        """Whether it chooses its integration time: a spectraval does where it is told 0."""
+        return self._settings["tint"] == 0 if self._is_spectraval else self._settings["expo"] == 1
+
     def _integration_ms(self) -> float:
-        if self._settings["expo"] != 1:
+        if not self._adapts():
             return max(_SHORTEST_MS, self._settings["tint"])
         peak = max(self._light.radiance().value)
         longest_ms = self._settings["maxtin"]
@@ -248,12 +264,14 @@ class MockSpecbos1211(Grammar):
         filled = max(radiance.value) * tint_ms * 1e-3 / _FULL
         if filled > 1.0:
             raise _SpecbosRefusal(OVER_EXPOSED)
-        if self._settings["expo"] != 1 and filled < 1e-4:
+        if not self._adapts() and filled < 1e-4:
             raise _SpecbosRefusal(UNDER_EXPOSED)
         wavelength_nm = np.arange(first_nm, last_nm + step_nm / 1000.0, step_nm)
         self._measured = Spectrum.of(wavelength_nm, radiance.at(wavelength_nm))
         # A later measurement without adaptation integrates as long as this one.
-        self._settings["tint"] = self._measured_tint_ms = tint_ms
+        self._measured_tint_ms = tint_ms
+        if not self._is_spectraval:
+            self._settings["tint"] = tint_ms
 
     def _spectrum(self) -> Spectrum:
         if self._measured is None:
@@ -263,14 +281,29 @@ class MockSpecbos1211(Grammar):
     def _calculate_spectrum(self) -> bytes:
         """A spectraval's: wavelength and value a line, if it was told to speak text."""
         spectrum = self._spectrum()
-        if self._model != "spectraval 1501" or self._settings["form"] != 2:
+        if not self._is_spectraval or self._settings["form"] != 2:
             raise _SpecbosRefusal(COMMAND)
         lines = [f"{w:.1f} {v:.6e}" for w, v in zip(spectrum.wavelength_nm, spectrum.value, strict=True)]
-        return "\r".join([*lines, ""]).encode("ascii")
+        return "\r".join([*lines, ""]).encode("ascii") + ETX
+
+    def _calculate(self, what: str) -> bytes:
+        """A spectraval's luminance, or its chromaticity."""
+        if not self._is_spectraval:
+            raise _SpecbosRefusal(COMMAND)
+        x, y, z = tristimulus(self._spectrum())
+        if what.startswith("photo"):
+            return f"{y:.5e}\r".encode("ascii")
+        total = x + y + z
+        return f"{x / total:.4f} {y / total:.4f}\r".encode("ascii") if total > 0 else b"0.0000 0.0000\r"
+
+    def _remote(self) -> bytes:
+        if not self._is_spectraval:
+            raise _SpecbosRefusal(COMMAND)
+        return ACK
 
     def _fetch_spectrum(self, form: str | None) -> bytes:
         spectrum = self._spectrum()
-        if self._model == "spectraval 1501":
+        if self._is_spectraval:
             raise _SpecbosRefusal(COMMAND)
         number = int(form) if form else int(self._settings["form"])
         if number in (7, 10):  # for a terminal: wavelength and value, blocks ended by an empty line
@@ -280,9 +313,13 @@ class MockSpecbos1211(Grammar):
         return "\r".join([*header, *(f"{v:.6e}" for v in spectrum.value), "", ""]).encode("ascii")
 
     def _fetch(self, form: str | None) -> bytes:
+        if self._is_spectraval:
+            raise _SpecbosRefusal(COMMAND)
         return self._fetch_spectrum(form)
 
     def _fetch_xyz(self) -> bytes:
+        if self._is_spectraval:
+            raise _SpecbosRefusal(COMMAND)
         x, y, z = tristimulus(self._spectrum())
         return f"X: {x:.6e}\rY: {y:.6e}\rZ: {z:.6e}\r".encode("ascii")
 
@@ -321,6 +358,8 @@ class MockSpecbos1211(Grammar):
         (r"\*init(?:iate)?|\*meas(?:ure)?:refer", _init),
         (r"\*fetch:sprad(?: (\d{1,2}))?", _fetch_spectrum),
         (r"\*calc:sprad", _calculate_spectrum),
+        (r"\*calc:(photo(?:metric)?|chromxy)", _calculate),
+        (r"\*remote [01]", _remote),
         (r"\*fetch(?: (\d{1,2}))?", _fetch),
         (r"\*fetch:xyz(?: \d{1,2})?", _fetch_xyz),
         (r"\*fetch:photo(?:metric)?(?: (\d{1,2}))?", _fetch_luminance),

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import importlib.resources
 import io
-import math
 import string
 import struct
 import threading
@@ -19,6 +18,8 @@ import time
 import zipfile
 from collections import deque
 from dataclasses import dataclass
+
+import numpy as np
 
 from mocks.bench import UInt16Array
 from mocks.pixels import BAYER_RG8, BAYER_RG12, BAYER_RG12P, encode, payload_bytes
@@ -59,8 +60,15 @@ SBRM, SIRM, MANIFEST, XML, FEATURES = 0x1_0000, 0x2_0000, 0x3_0000, 0x4_0000, 0x
     GAMMA_ENABLE,
     BLACK_LEVEL,
     PARAMS_LOCKED,
-) = (FEATURES + 4 * n for n in range(26))
-FEATURE_BYTES = 4 * 26
+    WHITE_AUTO,
+    LIGHT_SOURCE,
+    TEST_PATTERN,
+    BALANCE_SELECTOR,
+    BALANCE_RED,  # one word a channel
+    BALANCE_GREEN,
+    BALANCE_BLUE,
+) = (FEATURES + 4 * n for n in range(33))
+FEATURE_BYTES = 4 * 33
 
 TICKS_PER_US = 10
 MOST_EXPOSURE_US = 60e6
@@ -68,6 +76,9 @@ MOST_GAIN_DB = 24.0
 TRIGGER_ON = 1 << 0
 SOURCE_SHIFT, SOURCE_SOFTWARE, SOURCE_LINE = 4, 0, 1
 _MOST_QUEUED = 4
+#: Gains of red, green and blue after the converter, by `LightSourcePreset`: Off, Daylight5000K, Tungsten.
+_PRESETS = ((1.0, 1.0, 1.0), (1.7, 1.0, 1.9), (1.1, 1.0, 2.6))
+_MOST_CODE = 4095
 
 #: What the faults of serial instruments are to a camera's frames (`UsbDevice.fail`).
 _AS_FRAMES = {
@@ -128,6 +139,15 @@ def _zipped(xml: bytes) -> bytes:
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(zipfile.ZipInfo("MockU3V_v1.0.2.xml"), xml, zipfile.ZIP_DEFLATED)
     return buffer.getvalue()
+
+
+def _float_of(bits: int) -> float:
+    """A register's 32 bits as a float."""
+    return float(struct.unpack("<f", struct.pack("<I", bits))[0])
+
+
+def _float_bits(value: float) -> int:
+    return int(struct.unpack("<I", struct.pack("<f", value))[0])
 
 
 # --- the device -------------------------------------------------------------------------------------------------------
@@ -272,6 +292,10 @@ class U3vDevice(UsbDevice):
             (PIXEL_PITCH, round(pitch_um * 1000)),
             (LINE_MODE_1, 0),
             (GAMMA_ENABLE, 1),  # as cameras leave the factory
+            (LIGHT_SOURCE, 1),
+            (BALANCE_RED, _float_bits(1.0)),
+            (BALANCE_GREEN, _float_bits(1.0)),
+            (BALANCE_BLUE, _float_bits(1.0)),
             (BLACK_LEVEL, 64),
         ):
             self._put(register, value)
@@ -386,10 +410,10 @@ class U3vDevice(UsbDevice):
     def _check_value(register: int, value: int) -> None:
         if register == EXPOSURE_TICKS and not 10 * TICKS_PER_US <= value <= MOST_EXPOSURE_US * TICKS_PER_US:
             raise _GenCpRefusal(0x8002)
-        if register == GAIN:
-            (gain_db,) = struct.unpack("<f", struct.pack("<I", value))
-            if not (math.isfinite(gain_db) and 0 <= gain_db <= MOST_GAIN_DB):
-                raise _GenCpRefusal(0x8002)
+        if register == GAIN and not 0 <= _float_of(value) <= MOST_GAIN_DB:
+            raise _GenCpRefusal(0x8002)
+        if BALANCE_RED <= register <= BALANCE_BLUE and not 0.0625 <= _float_of(value) <= 16:
+            raise _GenCpRefusal(0x8002)
         highest = {
             LINE_SELECTOR: 1,
             LINE_MODE_1: 1,
@@ -397,6 +421,10 @@ class U3vDevice(UsbDevice):
             GAMMA_ENABLE: 1,
             BLACK_LEVEL: 255,
             PARAMS_LOCKED: 1,
+            WHITE_AUTO: 2,
+            LIGHT_SOURCE: 2,
+            TEST_PATTERN: 1,
+            BALANCE_SELECTOR: 2,
         }
         if register in highest and value > highest[register]:
             raise _GenCpRefusal(0x8002)
@@ -524,12 +552,24 @@ class U3vDevice(UsbDevice):
     def _work(self) -> None:
         while (start_s := self._next_start()) is not None:
             exposure_s = self._get(EXPOSURE_TICKS) / TICKS_PER_US * 1e-6
-            (gain_db,) = struct.unpack("<f", struct.pack("<I", self._get(GAIN)))
-            raw = self._bench.expose(self.side, exposure_s, gain_db, start_s)
-            self._send(raw, start_s)
+            raw = self._bench.expose(self.side, exposure_s, _float_of(self._get(GAIN)), start_s)
+            self._send(self._processed(raw), start_s)
             if self._get(ACQUISITION_MODE) == 1:
                 with self.changed:
                     self._acquiring = False
+
+    def _processed(self, raw: UInt16Array) -> UInt16Array:
+        """What the camera makes of the converter's codes: channel by channel times its white balance and its preset for the light."""
+        if self._get(TEST_PATTERN):
+            ramp = np.linspace(0.0, _MOST_CODE, raw.shape[1]).astype(np.uint16)
+            return np.ascontiguousarray(np.broadcast_to(ramp, raw.shape))
+        ratios = (_float_of(self._get(BALANCE_RED + 4 * channel)) for channel in range(3))
+        red, green, blue = (a * b for a, b in zip(ratios, _PRESETS[self._get(LIGHT_SOURCE)], strict=True))
+        if red == green == blue == 1.0:
+            return raw
+        factors = np.array([[red, green], [green, blue]])
+        tiled = np.tile(factors, (-(-raw.shape[0] // 2), -(-raw.shape[1] // 2)))[: raw.shape[0], : raw.shape[1]]
+        return np.minimum(np.round(raw * tiled), _MOST_CODE).astype(np.uint16)
 
     def _send(self, raw: UInt16Array, start_s: float) -> None:
         top, left = self._get(OFFSET_Y), self._get(OFFSET_X)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from drivers.found_settings import FoundSettings
 
 # No test states a time: a busy machine's pause of a second is no fault of what is tested.
 settings.register_profile("any machine", settings.default, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -13,6 +16,15 @@ settings.load_profile("any machine")
 
 # Whoever starts the suite in the background may have it ignore Ctrl-C, and with it the commands that tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+_tests = itertools.count()
+
+
+@pytest.fixture(autouse=True)
+def instruments_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Settings found on a mock are this test's: the next one's mock has the same serial number."""
+    FoundSettings.keep_in(tmp_path_factory.getbasetemp() / "found" / str(next(_tests)) / "instruments")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -16,9 +16,8 @@ from typing import Any, TypeVar
 
 from drivers.camera.buffers import Grabbed
 from drivers.camera.genicam import GenicamCamera
-from drivers.camera.genicam_settings import Setting
 from drivers.errors import Disconnected, InstrumentError, InUse, NoAnswer
-from drivers.instrument import Identity
+from drivers.instrument import Identity, Setting
 
 _T = TypeVar("_T")
 _DISTRIBUTION = "/usr/lib/python3/dist-packages"

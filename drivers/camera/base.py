@@ -63,6 +63,9 @@ class Camera(Instrument):
     `capture` does all three; `capture_together` interleaves them for cameras wired to trigger one another.
     """
 
+    #: Longest time (s) beyond an exposure until its frame is there, or an error: whoever waits for `collect` waits as long.
+    readout_s = 3.0
+
     @abstractmethod
     def sensor(self) -> SensorInfo:
         """Size, format and colour filters as the camera reports them."""

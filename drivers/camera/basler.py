@@ -11,9 +11,8 @@ from typing import Any, TypeVar
 
 from drivers.camera.buffers import Grabbed
 from drivers.camera.genicam import GenicamCamera
-from drivers.camera.genicam_settings import Setting
 from drivers.errors import Disconnected, InstrumentError, InUse
-from drivers.instrument import Identity
+from drivers.instrument import Identity, Setting
 
 _T = TypeVar("_T")
 _READY_S = 1.0

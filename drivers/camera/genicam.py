@@ -13,22 +13,23 @@ import time
 from abc import abstractmethod
 from collections.abc import Collection, Iterator
 from datetime import UTC, datetime
-from typing import Protocol
 
 from drivers.camera.base import TEMPERATURE_NS, Frame, SensorInfo, StreamingCamera, Trigger
 from drivers.camera.buffers import Grabbed
+from drivers.camera.found_features import RememberedFeatures
 from drivers.camera.genicam_settings import (
-    Features,
-    Setting,
+    CameraFeatures,
     black_level,
     give_pulses,
+    make_neutral,
     set_if_there,
-    switch_processing_off,
+    snapshot,
     trigger_line,
 )
 from drivers.camera.pixel_format import PREFERENCE, PixelFormat
 from drivers.errors import Disconnected, InstrumentError, Interrupted, NoAnswer, Repeated
-from drivers.instrument import Identity, Recorder
+from drivers.found_settings import FoundSettings
+from drivers.instrument import Identity, Recorder, Setting
 
 _LOOK_S = 0.1
 #: The exposure time's names: SFNC's, and that of cameras before it.
@@ -37,16 +38,6 @@ _EXPOSURES = ("ExposureTime", "ExposureTimeAbs")
 
 class NoFrame(NoAnswer):
     """A frame is missing from a camera that answers otherwise."""
-
-
-class CameraFeatures(Features, Protocol):
-    """A camera's features, with limits and commands."""
-
-    def limits(self, name: str) -> tuple[float, float]:
-        """Least and greatest value of a number."""
-
-    def execute(self, name: str) -> None:
-        """Run a command."""
 
 
 class _Transcribed:
@@ -103,12 +94,13 @@ class GenicamCamera(StreamingCamera):
     ) -> None:
         self.address = address
         self._wanted_format, self._timeout_s = pixel_format, timeout_s
+        self.readout_s = timeout_s
         self._wanted_line, self._output_line, self._output_source = trigger_line, output_line, output_source
         self._recorder = recorder
         self._who = f"camera {address}"
         self._lock = threading.RLock()
         self._stopped = threading.Event()
-        self._features: CameraFeatures | None = None
+        self._features: RememberedFeatures | None = None
         self._identity = Identity("", "")
         self._format: PixelFormat = PREFERENCE[0]
         self._armed: Trigger | None = None
@@ -117,6 +109,7 @@ class GenicamCamera(StreamingCamera):
         self._fired: datetime | None = None
         self._owed = 0  # frames of software triggers that didn't come yet
         self._before: tuple[int, int | None] | None = None  # number and time of the frame before
+        self._departures: tuple[str, ...] = ()
         self._has_temperature = False
         self._temperature: tuple[int, float] | None = None  # when (ns of the camera's clock), and degrees
 
@@ -158,17 +151,25 @@ class GenicamCamera(StreamingCamera):
                 features, self._identity = self._open()
                 if self._recorder is not None and not self._records_bytes:
                     features = _Transcribed(features, self._recorder)
-                self._features = features
-                self._who = f"camera {self._identity.serial_number or self.address}"
+                name = self._identity.serial_number or self.address
+                self._who = f"camera {name}"
+                self._features = RememberedFeatures(features, FoundSettings(f"camera-{name}", self._who))
+                self._features.restore()  # what a process that was killed, or an unplugged camera, left changed
                 self._prepare(self._features)
             except InstrumentError:
+                self._restore()
                 self._drop()
                 raise
 
     def _prepare(self, features: CameraFeatures) -> None:
         set_if_there(features, "AcquisitionMode", "Continuous")
         set_if_there(features, "ExposureMode", "Timed")
-        switch_processing_off(features, self._who)
+        self._departures = make_neutral(features, self._who)
+        for name in (
+            "All",
+            "AnalogAll",
+        ):  # the gain that is set is the one before the converter, where there are several
+            set_if_there(features, "GainSelector", name)
         set_if_there(features, "TriggerSelector", "FrameStart")
         if not features.has("TriggerMode"):
             raise InstrumentError(
@@ -194,6 +195,14 @@ class GenicamCamera(StreamingCamera):
     def identity(self) -> Identity:
         with self._used():
             return self._identity
+
+    def settings(self) -> dict[str, Setting]:
+        with self._used() as features:
+            return snapshot(features)
+
+    def departures(self) -> tuple[str, ...]:
+        with self._used():
+            return tuple(f"{told}: its codes aren't the converter's" for told in self._departures)
 
     def sensor(self) -> SensorInfo:
         with self._used() as features:
@@ -379,6 +388,7 @@ class GenicamCamera(StreamingCamera):
         self._stopped.set()
         with self._lock:
             self._stopped.clear()
+            self._restore()
             self._drop()
 
     # --- inside -----------------------------------------------------------------------------------------------------
@@ -404,6 +414,13 @@ class GenicamCamera(StreamingCamera):
         if self._armed is not None:
             self._armed = None
             self._halt()
+
+    def _restore(self) -> None:
+        """Set everything as it was found, where the camera can be reached."""
+        if self._features is not None:
+            with contextlib.suppress(InstrumentError):
+                self._stop_acquisition()
+                self._features.restore()
 
     def _drop(self) -> None:
         with contextlib.suppress(Exception):  # libraries raise what they like, and the camera may be gone

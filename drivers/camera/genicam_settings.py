@@ -7,12 +7,12 @@ serve every library that reaches such cameras: `drivers.camera.genapi`, pypylon,
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from typing import Protocol
 
 from drivers.errors import Disconnected, InstrumentError, NoAnswer
-
-Setting = str | bool | int | float
+from drivers.instrument import Setting
 
 
 class Features(Protocol):
@@ -31,27 +31,152 @@ class Features(Protocol):
         """Names of an enumeration's entries."""
 
 
-#: Features that change exposure or gain between frames, or codes after the converter, with the value that switches each off.
-PROCESSING: tuple[tuple[str, Setting], ...] = (
-    ("ExposureAuto", "Off"),
-    ("GainAuto", "Off"),
-    ("BalanceWhiteAuto", "Off"),
-    ("BlackLevelAuto", "Off"),
-    ("GammaEnable", False),
-    ("GammaEnabled", False),
-    ("Gamma", 1.0),
-    ("BslBrightness", 0.0),
-    ("BslContrast", 0.0),
-    ("DigitalShift", 0),
-    ("LUTEnable", False),
-    ("SharpeningEnable", False),
-    ("DefectCorrectStaticEnable", False),
-    ("DefectCorrectDynamicEnable", False),
-    ("BslDefectPixelCorrectionMode", "Off"),
+class CameraFeatures(Features, Protocol):
+    """A camera's features, with limits and commands."""
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Least and greatest value of a number."""
+
+    def execute(self, name: str) -> None:
+        """Run a command."""
+
+
+@dataclass(frozen=True)
+class Neutral:
+    """A feature that changes exposure, gain or codes, and the value at which it leaves the converter's codes alone.
+
+    `selector`: the feature that chooses which of several is meant; all of its entries are set, or those that begin as one of `entries`.
+    `switch`: features that switch it off: where the camera has one, its own value doesn't matter. `must`: a camera on which it stays on is
+    refused, as its frames can't be compared, or aren't proportional to light; otherwise that is told, and belongs to its frames.
+    """
+
+    name: str
+    value: Setting
+    must: bool = False
+    selector: str = ""
+    entries: tuple[str, ...] = ("",)
+    switch: tuple[str, ...] = ()
+
+
+#: Entries of `GainSelector` that multiply codes after the converter, or channel by channel.
+_NOT_THE_GAIN = ("Digital", "Red", "Green", "Blue")
+
+#: In the order in which they are set: what is automatic first, for it locks the others.
+NEUTRAL: tuple[Neutral, ...] = (
+    Neutral("ExposureAuto", "Off", must=True),
+    Neutral("GainAuto", "Off", must=True),
+    Neutral("GainAutoBalance", "Off", must=True),
+    Neutral("BalanceWhiteAuto", "Off", must=True),
+    Neutral("BlackLevelAuto", "Off", must=True),
+    Neutral("BlackLevelAutoBalance", "Off", must=True),
+    Neutral("BlackLevelClampingEnable", False),
+    Neutral("GammaEnable", False, must=True),
+    Neutral("GammaEnabled", False, must=True),
+    Neutral("Gamma", 1.0, must=True, switch=("GammaEnable", "GammaEnabled")),
+    Neutral("LUTEnable", False, must=True, selector="LUTSelector"),
+    Neutral("BslContrastMode", "Linear", must=True),
+    Neutral("BslContrast", 0.0, must=True),
+    Neutral("BslBrightness", 0.0, must=True),
+    Neutral("TestPattern", "Off", must=True, selector="TestPatternGeneratorSelector"),
+    Neutral("TestImageSelector", "Off", must=True),
+    Neutral("IspEnable", False),
+    Neutral("ProcessedRawEnable", False),
+    Neutral("LightSourcePreset", "Off"),
+    Neutral("BslLightSourcePreset", "Off"),
+    Neutral("LightSourceSelector", "Off"),
+    Neutral("BalanceRatio", 1.0, selector="BalanceRatioSelector"),
+    Neutral("BalanceRatioAbs", 1.0, selector="BalanceRatioSelector"),
+    Neutral("BalanceWhiteEnable", False),
+    Neutral("Gain", 0.0, selector="GainSelector", entries=_NOT_THE_GAIN),
+    Neutral("DigitalShift", 0),
+    Neutral("BslColorSpace", "Off"),
+    Neutral("BslColorSpaceMode", "RGB"),
+    Neutral("ColorTransformationEnable", False, selector="ColorTransformationSelector"),
+    Neutral("ColorCorrectionMatrixEnable", False),
+    Neutral("CCMEnable", False),
+    Neutral("ColorAdjustmentEnable", False),
+    Neutral("RgbTransformLightSource", "General"),
+    Neutral("HueEnable", False),
+    Neutral("SaturationEnable", False),
+    Neutral("BslHue", 0.0),
+    Neutral("BslSaturation", 1.0),
+    Neutral("SharpnessEnable", False),
+    Neutral("SharpeningEnable", False),
+    Neutral("SharpnessAuto", "Off", must=True),
+    Neutral("SharpnessEnhancement", 0.0),
+    Neutral("BslSharpnessEnhancement", 0.0),
+    Neutral("NoiseReduction", 0.0),
+    Neutral("NoiseReductionEnable", False),
+    Neutral("BslNoiseReduction", 0.0),
+    Neutral("DenoiseEnable", False),
+    Neutral("PgiMode", "Off"),
+    Neutral("DefectCorrectStaticEnable", False),
+    Neutral("DefectCorrectDynamicEnable", False),
+    Neutral("DefectPixelCorrectionEnable", False),
+    Neutral("BslDefectPixelCorrectionMode", "Off"),
+    Neutral("DefectCorrectionMode", "Off"),
+    Neutral("ShadingEnable", False),
+    Neutral("ShadingCorrectionMode", "Off"),
+    Neutral("LensShadingCorrectionEnable", False),
+    Neutral("BslVignettingCorrectionMode", "Off"),
+    Neutral("FlatFieldCorrectionEnable", False),
+    Neutral("FlatFieldCorrection", "Off"),
+    Neutral("ImageCompressionMode", "Off"),
+    Neutral("BinningHorizontal", 1),
+    Neutral("BinningVertical", 1),
+    Neutral("DecimationHorizontal", 1),
+    Neutral("DecimationVertical", 1),
 )
 
-#: Features that do nothing while a switch of theirs, one of `PROCESSING`, is off: those switches' names.
-SWITCHES = {"Gamma": ("GammaEnable", "GammaEnabled")}
+#: Features whose value depends on a selector's.
+SELECTORS = {one.name: one.selector for one in NEUTRAL if one.selector} | {
+    "BlackLevel": "BlackLevelSelector",
+    "TriggerMode": "TriggerSelector",
+    "TriggerSource": "TriggerSelector",
+    "LineMode": "LineSelector",
+    "LineSource": "LineSelector",
+}
+
+#: What else belongs to a frame: identity, sensor, region, exposure, trigger. `snapshot` reads these and all of `NEUTRAL`.
+RECORDED = (
+    "DeviceVendorName",
+    "DeviceModelName",
+    "DeviceSerialNumber",
+    "DeviceID",
+    "DeviceVersion",
+    "DeviceFirmwareVersion",
+    "DeviceUserID",
+    "DeviceTemperature",
+    "SensorWidth",
+    "SensorHeight",
+    "SensorPixelWidth",
+    "SensorShutterMode",
+    "SensorReadoutMode",
+    "Width",
+    "Height",
+    "OffsetX",
+    "OffsetY",
+    "ReverseX",
+    "ReverseY",
+    "PixelFormat",
+    "PixelSize",
+    "AcquisitionMode",
+    "AcquisitionFrameRateEnable",
+    "AcquisitionFrameRate",
+    "ExposureMode",
+    "ExposureTime",
+    "ExposureTimeAbs",
+    "GainRaw",
+    "BlackLevel",
+    "BlackLevelRaw",
+    "ConversionGainMode",
+    "TriggerSelector",
+    "TriggerMode",
+    "TriggerSource",
+    "TriggerActivation",
+    "TriggerDelay",
+    "DeviceLinkThroughputLimit",
+)
 
 
 def set_if_there(features: Features, name: str, value: Setting) -> None:
@@ -67,28 +192,101 @@ def set_if_there(features: Features, name: str, value: Setting) -> None:
             raise
 
 
-def switch_processing_off(features: Features, who: str) -> None:
-    """Switch off everything automatic, gamma, look-up table, sharpening and defect correction.
+def make_neutral(features: Features, who: str) -> tuple[str, ...]:
+    """Switch off all that changes the converter's codes, and read it back. Returns what stays on, `Feature = value` each.
 
-    Raises `InstrumentError` that names what stays on: codes of such a camera aren't proportional to light.
+    Raises `InstrumentError` that names what stays on and must not: codes of such a camera aren't proportional to light.
     """
-    for name, off in PROCESSING:
-        if not features.has(name) or (isinstance(off, str) and off not in features.entries(name)):
+    stays: list[str] = []
+    for one in NEUTRAL:
+        if not _is_offered(features, one) or any(features.has(switch) for switch in one.switch):
             continue
-        if features.get(name) == off or any(features.has(switch) for switch in SWITCHES.get(name, ())):
-            continue
-        refused: InstrumentError | None = None
-        try:
-            features.set(name, off)
-        except (NoAnswer, Disconnected):
-            raise
-        except InstrumentError as error:
-            refused = error
-        if refused is not None or features.get(name) != off:
-            raise InstrumentError(
-                f"{who}: {name} is {features.get(name)} and can't be set to {off}: its codes aren't the converter's; "
-                "switch it off with the maker's program and save that as the camera's default"
-            ) from refused
+        for where in _places(features, one):
+            refused = _neutralised(features, one)
+            found = features.get(one.name)
+            if _is_neutral(found, one.value):
+                continue
+            if one.must:
+                raise InstrumentError(
+                    f"{who}: {one.name} is {found} and can't be set to {one.value}: its codes aren't the converter's; "
+                    "switch it off with the maker's program and save that as the camera's default"
+                ) from refused
+            stays.append(f"{one.name}{where} = {found}")
+    return tuple(stays)
+
+
+def _is_offered(features: Features, one: Neutral) -> bool:
+    return features.has(one.name) and not (isinstance(one.value, str) and one.value not in features.entries(one.name))
+
+
+def _places(features: Features, one: Neutral) -> Iterator[str]:
+    """Each entry of the selector in turn, selected, as `[Entry]`; nothing where there is no selector. The one that was selected is so again."""
+    if not one.selector or not features.has(one.selector):
+        if one.entries == ("",):
+            yield ""
+        return
+    selected = features.get(one.selector)
+    try:
+        for entry in features.entries(one.selector):
+            if entry.startswith(one.entries) and _selects(features, one.selector, entry) and features.has(one.name):
+                yield f"[{entry}]"
+    finally:
+        _selects(features, one.selector, str(selected))
+
+
+def _selects(features: Features, selector: str, entry: str) -> bool:
+    """Whether the entry could be selected: a camera may list some that it doesn't have now."""
+    if features.get(selector) == entry:
+        return True
+    try:
+        features.set(selector, entry)
+    except (NoAnswer, Disconnected):
+        raise
+    except InstrumentError:
+        return False
+    return True
+
+
+def _neutralised(features: Features, one: Neutral) -> InstrumentError | None:
+    """Set the feature unless it is neutral; why that failed."""
+    if _is_neutral(features.get(one.name), one.value):
+        return None
+    try:
+        features.set(one.name, one.value)
+    except (NoAnswer, Disconnected):
+        raise
+    except InstrumentError as error:
+        return error
+    return None
+
+
+def _is_neutral(found: Setting, neutral: Setting) -> bool:
+    """Whether a value is the neutral one, but for a register's rounding: a thousandth."""
+    if isinstance(neutral, float) and isinstance(found, int | float):
+        return abs(found - neutral) <= 1e-3
+    return found == neutral
+
+
+def snapshot(features: Features) -> dict[str, Setting]:
+    """All settings that bear on a frame, as the camera reports them; those that it can't tell now are left out."""
+    found: dict[str, Setting] = {}
+    for name in (*RECORDED, "Gain"):
+        _note(features, name, name, found)
+    for one in NEUTRAL:
+        if features.has(one.name):
+            for where in _places(features, one):
+                _note(features, one.name, f"{one.name}{where}", found)
+    return found
+
+
+def _note(features: Features, name: str, key: str, found: dict[str, Setting]) -> None:
+    try:
+        if features.has(name):
+            found[key] = features.get(name)
+    except (NoAnswer, Disconnected):
+        raise
+    except InstrumentError:
+        return  # it has the feature, and doesn't tell its value now
 
 
 def black_level(features: Features) -> float | None:

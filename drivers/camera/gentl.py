@@ -24,9 +24,8 @@ import numpy as np
 
 from drivers.camera.buffers import Grabbed
 from drivers.camera.genicam import GenicamCamera
-from drivers.camera.genicam_settings import Setting
 from drivers.errors import Disconnected, InstrumentError, InUse
-from drivers.instrument import Identity
+from drivers.instrument import Identity, Setting
 
 _T = TypeVar("_T")
 _logger = logging.getLogger(__name__)  # the library tells here what it also raises

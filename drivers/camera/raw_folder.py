@@ -79,6 +79,7 @@ class RawFolderCamera(Camera):
         self.folder = Path(address)
         self.trigger_command, self.settings_command, self.base_iso = trigger_command, settings_command, base_iso
         self.timeout_s, self.settle_s = timeout_s, settle_s
+        self.readout_s = timeout_s
         self._record = recorder or (lambda direction, data: None)
         self._who = f"camera folder {address}"
         self._lock = threading.RLock()

@@ -34,8 +34,8 @@ from drivers.camera.gencp import (
     GenCp,
     read_xml,
 )
-from drivers.camera.genicam import CameraFeatures, GenicamCamera, NoFrame
-from drivers.camera.genicam_settings import set_if_there
+from drivers.camera.genicam import GenicamCamera, NoFrame
+from drivers.camera.genicam_settings import CameraFeatures, set_if_there
 from drivers.camera.u3v_stream import LEADER, TRAILER, StreamLayout, U3vStream
 from drivers.errors import Garbled, InstrumentError, NoAnswer
 from drivers.instrument import Identity

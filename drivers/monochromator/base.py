@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from drivers.errors import InstrumentError
 from drivers.instrument import Instrument
 
+#: How often the shutter is told to close, and asked whether it is, before that is given up.
+SHUT_ATTEMPTS = 2
+
 
 @dataclass(frozen=True)
 class OrderSortingFilter:
@@ -81,6 +84,28 @@ def filter_place(filters: Sequence[OrderSortingFilter], wavelength_nm: float) ->
 class Monochromator(Instrument):
     """A monochromator behind a light source. `stop` and `close` leave the shutter closed."""
 
+    #: Whether light may get out, as far as this driver's own commands and the instrument's answers say.
+    _may_shine = False
+
+    def _shut_for_good(self) -> InstrumentError | None:
+        """Close the shutter and read it back, a second time where that fails. Returns why it can't be said to be closed, or None."""
+        failure: InstrumentError | None = None
+        for _ in range(SHUT_ATTEMPTS):
+            try:
+                self.stop()
+                if not self.shutter_is_open():
+                    self._may_shine = False
+                    return None
+                failure = InstrumentError(
+                    "monochromator: its shutter is open though it was told to close; block the light by hand"
+                )
+                self._may_shine = True
+            except InstrumentError as error:
+                failure = failure or error
+                if not self._may_shine:
+                    return None  # it can't be asked, and wasn't opened
+        return InstrumentError(f"monochromator: its shutter may be open ({failure}); block the light by hand")
+
     def shut_at_once(self) -> bool:
         """Close the shutter before anything else is said: the first thing after a crash, and in a halt.
 
@@ -135,7 +160,10 @@ class Monochromator(Instrument):
 
     @abstractmethod
     def bandwidth_nm(self) -> float:
-        """Full width at half maximum (nm) of the light: slit width x reciprocal linear dispersion."""
+        """Full width at half maximum (nm) of the light: slit width x reciprocal linear dispersion of the grating in use.
+
+        0 where it isn't known, as the slits are set by hand and their width isn't stated; `departures` says so.
+        """
 
 
 #: Narrowest and widest slit (um) of the motorised slits of Cornerstone 260 and CS260B.
@@ -150,6 +178,46 @@ def checked_slit_um(width_um: float) -> float:
             f"monochromator: a slit of {width_um:g} um is outside {low:g}..{high:g} um; ask for a width in this range"
         )
     return width_um
+
+
+#: Reciprocal linear dispersion (nm/mm) of Cornerstone 260 and CS260B, times the grating's lines per mm: 1e6 nm/mm x cos(9.6 deg) / 260 mm.
+DISPERSION_NM = 1e6 / 260.0 * math.cos(math.radians(9.6))
+#: What the instruments say of slits that aren't motorised: no such accessory, or a statement that isn't known.
+NO_SLIT = {1, 6, -113, -241}
+
+
+@dataclass(frozen=True)
+class HandSlits:
+    """Slits that a micrometer sets: what is known of them is the width (um) that the station file states, or nothing."""
+
+    stated_um: float | None
+
+    def set(self, wanted_um: float, who: str) -> None:
+        """Raise `InstrumentError` unless they have this width (um) already."""
+        if self.stated_um is None or abs(self.stated_um - wanted_um) > 0.5:
+            raise InstrumentError(
+                f"{who}: its slits are set by hand, and slit_um in its table of the station file says {self.stated_um}; turn them to "
+                f"{wanted_um:g} um and state that there"
+            )
+
+    def departures(self, who: str) -> tuple[str, ...]:
+        """What isn't known of the light, in words."""
+        if self.stated_um is not None:
+            return ()
+        return (f"{who}: its slits are set by hand, and no slit_um is stated: the bandwidth of its light isn't known",)
+
+
+def lines_per_mm(told: str, who: str) -> float:
+    """Lines per mm of the grating in use, of the answer `1,1200,VIS` to GRAT?. Raises `InstrumentError` for another answer."""
+    try:
+        lines = float(told.split(",")[1])
+    except (IndexError, ValueError):
+        lines = 0.0
+    if not lines > 0.0:
+        raise InstrumentError(
+            f"{who}: says {told!r} of its grating, which has no lines per mm; state dispersion_nm_per_mm in the station file"
+        )
+    return lines
 
 
 def checked_wavelength_nm(wavelength_nm: float, upper_nm: float) -> float:

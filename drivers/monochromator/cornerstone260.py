@@ -2,8 +2,8 @@
 
 The driver works in handshake mode, in which every statement is answered by the status byte: `00`, or `20` (hex) for an error whose
 number `ERROR?` tells. A Cornerstone 260 sends it when the motion is done, and echoes every character. A CS260B sends it on receipt:
-the driver asks `IDLE?` until nothing moves; its echo may be off. On closing, handshake and units are as they were found: the next
-program that talks to it expects its own. Sources: the manual's appendix on low level commands (p. 50-51); the MCS260B manual.
+the driver asks `IDLE?` until nothing moves; its echo may be off. On closing, handshake and units are as they were found, by a process
+that was killed, too: the next program that talks to it expects its own. Sources: the manual's appendix on low level commands (p. 50-51); the MCS260B manual.
 """
 
 from __future__ import annotations
@@ -12,13 +12,18 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 
-from drivers.errors import Garbled, InstrumentError, NoAnswer, Refused
+from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.found_settings import FoundSettings
 from drivers.instrument import Identity, Recorder
 from drivers.monochromator.base import (
+    DISPERSION_NM,
+    NO_SLIT,
+    HandSlits,
     Monochromator,
     checked_slit_um,
     checked_wavelength_nm,
     filter_place,
+    lines_per_mm,
     order_sorting_filters,
 )
 from drivers.transport import Transport, WireInstrument, shown
@@ -48,15 +53,14 @@ _STALE_LINES = 24
 _ASKED = 2
 #: Longest time (s) that the status byte of HANDSHAKE itself is waited for.
 _HANDSHAKE_S = 1.0
-#: Reciprocal linear dispersion with 1200 l/mm: 1e6 nm / (1200 per mm x 260 mm) x cos(9.6 deg).
-_DISPERSION_NM_PER_MM = 3.16
 
 
 class Cornerstone260(WireInstrument, Monochromator):
     """A Cornerstone 260.
 
     `filters`: the order-sorting filters (rows of `place`, `from_nm`, `to_nm`; None: the default table; an empty list:
-    no wheel). `grating`: which one to use, None: the one that stands. `move_timeout_s`: longest motion.
+    no wheel). `grating`: which one to use, None: the one that stands. `dispersion_nm_per_mm`: None: by the lines of the grating in use.
+    `slit_um`: the width of slits that are set by hand. `move_timeout_s`: longest motion.
     """
 
     def __init__(
@@ -65,7 +69,8 @@ class Cornerstone260(WireInstrument, Monochromator):
         *,
         filters: Sequence[object] | None = None,
         grating: int | None = None,
-        dispersion_nm_per_mm: float = _DISPERSION_NM_PER_MM,
+        dispersion_nm_per_mm: float | None = None,
+        slit_um: float | None = None,
         upper_nm: float = 1400.0,
         tolerance_nm: float = 0.5,
         timeout_s: float = 2.0,
@@ -79,14 +84,15 @@ class Cornerstone260(WireInstrument, Monochromator):
         self.filters = order_sorting_filters(filters)
         self.grating = grating
         self.dispersion_nm_per_mm = dispersion_nm_per_mm
+        self._slits = HandSlits(None if slit_um is None else checked_slit_um(slit_um))
+        self._by_hand = slit_um is not None
         self.upper_nm = upper_nm
         self.tolerance_nm = tolerance_nm
         self.move_timeout_s = move_timeout_s
         self._identity = Identity("Newport", "Cornerstone 260")
         self._echoes = True
         self._tells_idle = False
-        self._found_handshake: bool | None = None
-        self._found_units = ""
+        self._found: FoundSettings | None = None
         self._info = ""  # the reply to INFO?, which is nothing else's
 
     # --- the abstraction --------------------------------------------------------------------------------------------
@@ -100,6 +106,13 @@ class Cornerstone260(WireInstrument, Monochromator):
 
     def check_slit_um(self, width_um: float) -> None:
         checked_slit_um(width_um)
+        if self._by_hand:
+            self._slits.set(width_um, self._transport.name)
+
+    def departures(self) -> tuple[str, ...]:
+        with self._conversation():
+            self._slit_um()
+            return self._slits.departures(self._transport.name) if self._by_hand else ()
 
     def shut_at_once(self) -> bool:
         with self._lock:
@@ -135,6 +148,7 @@ class Cornerstone260(WireInstrument, Monochromator):
 
     def open_shutter(self) -> None:
         with self._conversation():
+            self._may_shine = True
             self._do("SHUTTER O")
 
     def close_shutter(self) -> None:
@@ -158,17 +172,41 @@ class Cornerstone260(WireInstrument, Monochromator):
             return round(self._number("FILTER?"))
 
     def slit_um(self) -> float:
+        width_um = self._slit_um()
+        if width_um is None:
+            raise InstrumentError("; ".join(self._slits.departures(self._transport.name)))
+        return width_um
+
+    def _slit_um(self) -> float | None:
+        """Width of the entrance slit, or what is stated of one that is set by hand."""
         with self._conversation():
-            return self._number("SLIT1MICRONS?")
+            if not self._by_hand:
+                try:
+                    return self._number("SLIT1MICRONS?")
+                except Refused as refusal:
+                    if refusal.code not in NO_SLIT:
+                        raise
+                    self._by_hand = True
+            return self._slits.stated_um
 
     def set_slit_um(self, width_um: float) -> None:
         wanted = checked_slit_um(width_um)
         with self._conversation():
+            if self._slit_um() is None or self._by_hand:
+                self._slits.set(wanted, self._transport.name)
+                return
             for slit in (1, 2):
                 self._do(f"SLIT{slit}MICRONS {round(wanted)}")
 
     def bandwidth_nm(self) -> float:
-        return self.slit_um() * 1e-3 * self.dispersion_nm_per_mm
+        with self._conversation():
+            width_um = self._slit_um()
+            if width_um is None:
+                return 0.0
+            dispersion = self.dispersion_nm_per_mm
+            if dispersion is None:
+                dispersion = DISPERSION_NM / lines_per_mm(self._ask("GRAT?"), self._transport.name)
+            return width_um * 1e-3 * dispersion
 
     # --- the wire ---------------------------------------------------------------------------------------------------
 
@@ -178,22 +216,26 @@ class Cornerstone260(WireInstrument, Monochromator):
         line.write(b"\r\n")
         line.write(b"ABORT\r\n")
         line.drain(quiet_s=0.3)  # an instrument that moves is slow to echo
-        self._info = self._first_answer()
+        self._info, handshake = self._first_answer()
         model, _, serial_number = self._info.partition(" SN ")
         self._identity = Identity("Newport", model.strip() or "Cornerstone 260", serial_number.strip())
+        self._found = FoundSettings(f"monochromator-{serial_number.strip() or line.address}", line.name)
+        if not handshake:
+            self._found.note("HANDSHAKE", 0)
         self._say("HANDSHAKE 1")
         with suppress(NoAnswer):  # its own status byte: waited for, as a busy computer hands it over late
             self._line("HANDSHAKE 1", _HANDSHAKE_S)
         line.drain(quiet_s=0.1)  # an error that stood from before
         self._ask("ERROR?")
         self._tells_idle = self._knows("IDLE?")
-        self._found_units = self._found_units or self._ask("UNITS?").strip().upper()
+        if (units := self._ask("UNITS?").strip().upper()) != "NM":
+            self._found.note("UNITS", units)
         self._do("UNITS NM")
         if self.grating is not None and self._ask("GRAT?").partition(",")[0].strip() != str(self.grating):
             self._do(f"GRAT {self.grating}")
 
-    def _first_answer(self) -> str:
-        """The reply to INFO?, and by what comes with it: whether the instrument echoes, and whether a host before left handshake mode on.
+    def _first_answer(self) -> tuple[str, bool]:
+        """The reply to INFO?, and whether handshake mode is on; by what comes with it also whether the instrument echoes.
 
         Late answers to what was sent before are skipped.
         """
@@ -209,9 +251,7 @@ class Cornerstone260(WireInstrument, Monochromator):
         complains = "INFO?" in reply.upper() or reply.upper().startswith(("ER:", "ERROR"))  # another instrument does
         if complains or reply in _FAILED or len(more) > 1 or any(len(word) > 2 for word in more):
             raise self._strange("INFO?", " ".join([first, reply, *more]))
-        if self._found_handshake is None:
-            self._found_handshake = bool(more)
-        return reply
+        return reply, bool(more)
 
     def _knows(self, query: str) -> bool:
         try:
@@ -223,12 +263,16 @@ class Cornerstone260(WireInstrument, Monochromator):
         return True
 
     def _let_go(self) -> None:
-        if self._found_units in {"UM", "WN"}:
-            self._do(f"UNITS {self._found_units}")
-        if not self._found_handshake:
+        found = self._found
+        if found is None:
+            return
+        if (units := str(found.get("UNITS", ""))) in {"UM", "WN"}:
+            self._do(f"UNITS {units}")
+        found.forget("UNITS")
+        if "HANDSHAKE" in found:
             self._transport.write(b"HANDSHAKE 0\r\n")
             self._transport.drain(quiet_s=0.1)
-        self._found_handshake, self._found_units = None, ""
+            found.forget("HANDSHAKE")
 
     def _make_safe(self) -> None:
         self._do("SHUTTER C")
@@ -240,6 +284,9 @@ class Cornerstone260(WireInstrument, Monochromator):
             if self._line("INFO?") == self._info:
                 return self._line("INFO?") in _DONE
         return False
+
+    def _make_safe_for_good(self) -> InstrumentError | None:
+        return self._shut_for_good()
 
     def _do(self, statement: str) -> None:
         """A command: its echo, its status byte, and the end of its motion."""

@@ -14,12 +14,17 @@ from collections.abc import Iterator, Sequence
 import usb.core
 
 from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.found_settings import FoundSettings
 from drivers.instrument import Identity, Recorder
 from drivers.monochromator.base import (
+    DISPERSION_NM,
+    NO_SLIT,
+    HandSlits,
     Monochromator,
     checked_slit_um,
     checked_wavelength_nm,
     filter_place,
+    lines_per_mm,
     order_sorting_filters,
 )
 from drivers.transport import shown
@@ -33,7 +38,7 @@ _LOOK_S = 0.05
 class Cornerstone260B(Monochromator):
     """A CS260B or CS130B at `usb://SERIAL` or `usbip://HOST:PORT/SERIAL` (or an already found pyusb `device`).
 
-    `filters`, `grating`, `dispersion_nm_per_mm`, `upper_nm`, `tolerance_nm`: as of `cornerstone260`. `move_timeout_s`: longest motion;
+    `filters`, `grating`, `dispersion_nm_per_mm`, `slit_um`, `upper_nm`, `tolerance_nm`: as of `cornerstone260`. `move_timeout_s`: longest motion;
     a change of the grating takes 29 s.
     """
 
@@ -43,7 +48,8 @@ class Cornerstone260B(Monochromator):
         *,
         filters: Sequence[object] | None = None,
         grating: int | None = None,
-        dispersion_nm_per_mm: float = 3.16,
+        dispersion_nm_per_mm: float | None = None,
+        slit_um: float | None = None,
         upper_nm: float = 1400.0,
         tolerance_nm: float = 0.5,
         timeout_s: float = 2.0,
@@ -55,6 +61,8 @@ class Cornerstone260B(Monochromator):
         self.filters = order_sorting_filters(filters)
         self.grating = grating
         self.dispersion_nm_per_mm, self.upper_nm, self.tolerance_nm = dispersion_nm_per_mm, upper_nm, tolerance_nm
+        self._slits = HandSlits(None if slit_um is None else checked_slit_um(slit_um))
+        self._by_hand = slit_um is not None
         self.timeout_s, self.move_timeout_s = timeout_s, move_timeout_s
         self._recorder = recorder
         self._who = f"Cornerstone 260B at {address}"
@@ -63,7 +71,7 @@ class Cornerstone260B(Monochromator):
         self._stopping = threading.Lock()  # a stop ends what others wait for, but no stop
         self._open: UsbTmc | None = None
         self._met = False
-        self._found_units = ""
+        self._found: FoundSettings | None = None
         self._identity = Identity("Newport", "CS260B")
 
     # --- the abstraction --------------------------------------------------------------------------------------------
@@ -81,6 +89,12 @@ class Cornerstone260B(Monochromator):
 
     def check_slit_um(self, width_um: float) -> None:
         checked_slit_um(width_um)
+        if self._by_hand:
+            self._slits.set(width_um, self._who)
+
+    def departures(self) -> tuple[str, ...]:
+        self._slit_um()
+        return self._slits.departures(self._who) if self._by_hand else ()
 
     def move_nm(self, wavelength_nm: float) -> None:
         wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
@@ -99,6 +113,7 @@ class Cornerstone260B(Monochromator):
             return self._number(wire, "wave?")
 
     def open_shutter(self) -> None:
+        self._may_shine = True
         self._do("shutter 1")
 
     def close_shutter(self) -> None:
@@ -121,17 +136,43 @@ class Cornerstone260B(Monochromator):
             return round(self._number(wire, "filter?"))
 
     def slit_um(self) -> float:
+        width_um = self._slit_um()
+        if width_um is None:
+            raise InstrumentError("; ".join(self._slits.departures(self._who)))
+        return width_um
+
+    def _slit_um(self) -> float | None:
+        """Width of the entrance slit, or what is stated of one that is set by hand: it doesn't answer the question then, and has an error."""
         with self._conversation() as wire:
-            return self._number(wire, "slit1microns?")
+            if not self._by_hand:
+                try:
+                    return self._number(wire, "slit1microns?")
+                except NoAnswer:
+                    wire.clear()
+                    error = self._error()
+                    if error is None or error[0] not in NO_SLIT:
+                        raise
+                    self._by_hand = True
+            return self._slits.stated_um
 
     def set_slit_um(self, width_um: float) -> None:
         wanted = checked_slit_um(width_um)
         with self._conversation():
+            if self._slit_um() is None or self._by_hand:
+                self._slits.set(wanted, self._who)
+                return
             for slit in (1, 2):
                 self._do(f"slit{slit}microns {round(wanted)}")
 
     def bandwidth_nm(self) -> float:
-        return self.slit_um() * 1e-3 * self.dispersion_nm_per_mm
+        with self._conversation() as wire:
+            width_um = self._slit_um()
+            if width_um is None:
+                return 0.0
+            dispersion = self.dispersion_nm_per_mm
+            if dispersion is None:
+                dispersion = DISPERSION_NM / lines_per_mm(wire.ask("grat?"), self._who)
+            return width_um * 1e-3 * dispersion
 
     def stop(self) -> None:
         if not self._met:
@@ -145,15 +186,16 @@ class Cornerstone260B(Monochromator):
                     self._do("shutter 0")
 
     def close(self) -> None:
-        if self._met:
-            with contextlib.suppress(InstrumentError):
-                self.stop()
+        unsafe = self._shut_for_good() if self._met else None
         with self._lock:
-            if self._open is not None and self._found_units in {"UM", "WN"}:
+            if self._open is not None and self._found is not None and self._found:
                 with contextlib.suppress(InstrumentError):
-                    self._open.write(f"units {self._found_units.lower()}")
-            self._found_units, self._met = "", False
+                    self._open.write(f"units {str(self._found.get('UNITS', 'NM')).lower()}")
+                    self._found.forget("UNITS")
+            self._met = False
             self._drop()
+        if unsafe is not None:
+            raise unsafe
 
     # --- the wire ---------------------------------------------------------------------------------------------------
 
@@ -188,7 +230,9 @@ class Cornerstone260B(Monochromator):
             for _ in range(32):  # errors that stood from before
                 if self._error() is None:
                     break
-            self._found_units = self._found_units or wire.ask("units?").upper()
+            self._found = FoundSettings(f"monochromator-{self._identity.serial_number or self.address}", self._who)
+            if (units := wire.ask("units?").upper()) in {"UM", "WN"}:
+                self._found.note("UNITS", units)
             self._do("units nm")
             if self.grating is not None and round(self._number(wire, "grating?")) != self.grating:
                 self._do(f"grating {self.grating}")

@@ -14,6 +14,7 @@ import contextlib
 import math
 import re
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -26,6 +27,8 @@ from drivers.photodiode.base import IrradianceMeasurement, Photodiode
 from drivers.transport import shown
 
 COLUMNS = ["wavelength_nm", "responsivity_a_per_w"]
+#: Bytes that are read at once.
+_PIECE = 4096
 #: What SCPI meters report instead of a reading beyond their range.
 _OVERLOAD = 9.8e37
 #: What sets a meter to direct current, by what its identity holds; the last one is every other meter's.
@@ -76,6 +79,7 @@ class ScpiPhotodiode(Photodiode):
         self._lock = threading.RLock()
         self._stopped = threading.Event()
         self._open: Any = None
+        self._tried = False
         self._identity = Identity("", "")
         self._dark_a, self._var_dark = 0.0, 0.0
 
@@ -129,7 +133,7 @@ class ScpiPhotodiode(Photodiode):
         with self._lock:
             self._stopped.clear()
             if self._open is None:
-                self._establish()
+                self._meet()
             try:
                 yield
             except (Refused, Interrupted):
@@ -137,6 +141,16 @@ class ScpiPhotodiode(Photodiode):
             except InstrumentError:
                 self._drop()
                 raise
+
+    def _meet(self) -> None:
+        """Open the connection; twice if it was tried before, as a late answer to what was asked then may still arrive."""
+        again, self._tried = self._tried, True
+        try:
+            self._establish()
+        except (NoAnswer, Garbled):
+            if not again:
+                raise
+            self._establish()
 
     def _establish(self) -> None:
         try:
@@ -206,9 +220,25 @@ class ScpiPhotodiode(Photodiode):
 
     def _ask(self, query: str) -> str:
         self._say(query)
-        answer = str(self._do(query, self._open.read))
-        self._record("received", answer.encode("latin-1", "replace") + b"\n")
-        return answer.strip()
+        answer: bytes = self._do(query, self._answer)
+        self._record("received", answer)
+        return answer.decode("latin-1").strip()
+
+    def _answer(self) -> bytes:
+        """The next line. The library reads on as long as anything comes: here it ends with the time-out, whatever comes."""
+        from pyvisa.constants import StatusCode
+
+        until, line = time.monotonic() + self.timeout_s, bytearray()
+        while True:
+            with self._open.ignore_warning(StatusCode.success_max_count_read):
+                piece, status = self._open.visalib.read(self._open.session, _PIECE)
+            line += piece
+            if b"\n" in line or status != StatusCode.success_max_count_read:
+                return bytes(line)
+            if time.monotonic() > until:
+                raise Garbled(
+                    f"{self._who}: sends without end, {shown(bytes(line[:24]))} ...; check that a SCPI meter is at this address"
+                )
 
     def _do(self, command: str, action: Any) -> Any:
         from pyvisa.constants import StatusCode

@@ -2,7 +2,8 @@
 
 A setting is answered by ACK or NAK; after a NAK, `*stat:err?` tells why. A measurement (`*init`, a spectraval's `*meas:refer`) is
 answered by ACK, and by BEL once it is done; ENQ in between is passed over. Without flow control a spectrum can lose characters on its
-way: it is asked for again. A spectraval takes `*para:` where a specbos takes `*conf:`, and tells its spectrum on `*calc:sprad`
+way: it is asked for again. A spectraval takes `*para:` where a specbos takes `*conf:`, tells its error as a bare number, chooses its
+integration time with `*para:tint 0`, and its spectrum on `*calc:sprad` ends with ETX
 (unverified without the instrument: after the behaviour of a public client, ArgyllCMS).
 """
 
@@ -18,7 +19,7 @@ from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiomete
 from drivers.transport import Transport, WireInstrument, shown
 from sim.spectrum import Spectrum
 
-ENQ, ACK, BEL, NAK = b"\x05", b"\x06", b"\x07", b"\x15"
+ETX, ENQ, ACK, BEL, NAK = b"\x03", b"\x05", b"\x06", b"\x07", b"\x15"
 ERRORS = {
     4: ("command not understood", "check that a specbos is at this address"),
     120: ("over-exposed", "dim the light or measure at a greater distance"),
@@ -124,7 +125,17 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         self._transport.device = self._identity.model
         self._spectraval = model.startswith("spectraval")
         if self._spectraval:
-            settings = ["*para:aver 1", f"*para:maxtint {round(self.max_integration_s * 1000)}"]
+            if self._ask("*conf:dispen?").strip() == "1":  # one with a display is under its own keys' control
+                self._identity = Identity("JETI", "spectraval 1511", serial_number, firmware)
+                self._transport.device = self._identity.model
+                with suppress(Refused):  # newer firmware doesn't know it
+                    self._set("*REMOTE 1")
+            settings = [
+                "*para:calibn 0",
+                "*para:tint 0",
+                "*para:aver 1",
+                f"*para:maxtint {round(self.max_integration_s * 1000)}",
+            ]
         else:
             settings = ["*conf:default", "*para:calibn 0", "*para:expo 1"]
             settings += [f"*conf:maxtin {round(self.max_integration_s * 1000)}"]
@@ -261,18 +272,24 @@ class Specbos1211(WireInstrument, Spectroradiometer):
 
     def _fetch_once(self) -> Spectrum:
         line = self._transport
-        # A specbos says two lines, then a value a line; a spectraval a wavelength and its value a line.
+        # A specbos says two lines, then a value a line; a spectraval a wavelength and its value a line, and ETX.
         query, header = ("*calc:sprad", 0) if self._spectraval else ("*fetch:sprad", _HEADER_LINES)
         wavelengths = range(self.from_nm, self.to_nm + 1)
         line.write(query.encode("ascii") + b"\r")
         first = self._byte(query, self.fetch_timeout_s)
         if first == NAK:
             raise self._refusal(query)
-        began = first if first == b"\r" else first + line.read_until(b"\r", self.fetch_timeout_s, query)
-        # Within a reply characters follow each other: a pause of a second is where it broke off.
-        pause_s = min(1.0, self.fetch_timeout_s)
-        rest_of_it = (line.read_until(b"\r", pause_s, query) for _ in range(header + len(wavelengths) - 1))
-        told = [piece.replace(ENQ, b"").strip() for piece in (began, *rest_of_it)]
+        if self._spectraval:
+            text = (first + line.read_until(ETX, self.fetch_timeout_s, query)).removesuffix(ETX).replace(ENQ, b"")
+            told = [piece for piece in text.split(b"\r") if piece.strip()]
+            if len(told) != len(wavelengths):
+                raise Garbled(f"{line.name}: sent {len(told)} values where {len(wavelengths)} were asked for")
+        else:
+            began = first if first == b"\r" else first + line.read_until(b"\r", self.fetch_timeout_s, query)
+            # Within a reply characters follow each other: a pause of a second is where it broke off.
+            pause_s = min(1.0, self.fetch_timeout_s)
+            rest_of_it = (line.read_until(b"\r", pause_s, query) for _ in range(header + len(wavelengths) - 1))
+            told = [piece.replace(ENQ, b"").strip() for piece in (began, *rest_of_it)]
         values = [self._value(query, nm, text) for nm, text in zip(wavelengths, told[header:], strict=True)]
         rest = line.drain(quiet_s=AFTER_S)
         if rest.strip():

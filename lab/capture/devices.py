@@ -34,8 +34,8 @@ from sim.spectrum import Spectrum
 WriteFrame = Callable[[str, Side, NDArray[np.uint16]], StoredFile]
 WriteSpectrum = Callable[[str, Spectrum], StoredFile]
 
-#: Time-outs (s) of a move, of placing a target (a person may do it), of a measurement of light, and of a camera's readout. The
-#: drivers' own time-outs are shorter, and their messages say more.
+#: Time-outs (s) of a move, of placing a target (a person may do it), of a measurement of light, and of what a camera does beside the
+#: exposures and the readouts, whose own time-outs (`Camera.readout_s`) come on top: the drivers' messages say more.
 MOVE_S, PLACE_S, MEASURE_S, READOUT_S = 90.0, 660.0, 180.0, 30.0
 
 
@@ -369,7 +369,11 @@ class CamerasDevice(Device):
             for side, camera in self.cameras.items():
                 camera.configure(shot.exposure_s[side], shot.gain_db)
 
-        return Status("cameras", configure, READOUT_S)
+        return Status("cameras", configure, READOUT_S + self._readout_s)
+
+    @property
+    def _readout_s(self) -> float:
+        return max(camera.readout_s for camera in self.cameras.values())
 
     def _expose(self, shot: Shot) -> Sequence[Frame]:
         """A frame of each camera, the next of the series under way if there is one. A lost or incomplete frame is taken again."""
@@ -420,7 +424,8 @@ class CamerasDevice(Device):
             self.frames = frames
             self.in_series = bool(shot.paths)
 
-        return Status("cameras", take, (1 + MOST_LOST) * max(shot.exposure_s.values()) + READOUT_S)
+        once_s = max(shot.exposure_s.values()) + self._readout_s
+        return Status("cameras", take, (1 + MOST_LOST) * once_s + READOUT_S)
 
     def _keep(self, frames: Mapping[Side, Frame], shot: Shot) -> None:
         """Levels of the frames, and the files of those that are kept, all sides at once: hashing and the disk wait for nobody."""

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.camera.base import SensorInfo
 from drivers.errors import InstrumentError
 from drivers.instrument import Identity, Instrument
 from drivers.monochromator.base import Monochromator
@@ -34,6 +35,7 @@ from lab.capture.station import Drivers, Station
 from lab.capture_kinds.base import CaptureLimits, FixedExposure, Step
 from lab.capture_kinds.irradiance import irradiance_nm
 from lab.errors import DeviceError
+from lab.formats.recording_set import DataSheet
 from sim.camera import Side
 from sim.parameters import Frozen
 
@@ -118,17 +120,8 @@ class Instruments:
             except InstrumentError as error:
                 raise DeviceError(named_complaint(name, error)) from error
         for side, camera in self.drivers.cameras.items():
-            sensor, sheet = camera.sensor(), self.station.cameras[side].datasheet
-            if (sensor.rows, sensor.cols) != (sheet.rows, sheet.cols):
-                raise DeviceError(
-                    f"camera {side}: has {sensor.rows} x {sensor.cols} pixels, its data sheet in the station file says "
-                    f"{sheet.rows} x {sheet.cols}; correct rows and cols there, or the camera's region"
-                )
-            if sensor.cfa not in (None, sheet.cfa):
-                raise DeviceError(
-                    f"camera {side}: says its colour filters are {sensor.cfa}, its data sheet in the station file says "
-                    f"{sheet.cfa}; correct cfa there"
-                )
+            if (said := contradiction(side, camera.sensor(), self.station.cameras[side].datasheet)) is not None:
+                raise DeviceError(said)
         return found
 
     def check(self, steps: Sequence[Step]) -> None:
@@ -238,6 +231,24 @@ def _complaints(stopping: Mapping[str, Future[None]]) -> dict[str, str]:
         except Exception as error:
             complaints[name] = named_complaint(name, error)
     return complaints
+
+
+def contradiction(side: str, sensor: SensorInfo, sheet: DataSheet) -> str | None:
+    """What a camera says of itself that its data sheet in the station file contradicts, in a line; None: nothing."""
+    where = "its data sheet in the station file says"
+    if (sensor.rows, sensor.cols) != (sheet.rows, sheet.cols):
+        return (
+            f"camera {side}: has {sensor.rows} x {sensor.cols} pixels, {where} {sheet.rows} x {sheet.cols}; correct rows and cols "
+            "there, or the camera's region"
+        )
+    if sensor.cfa not in (None, sheet.cfa):
+        return f"camera {side}: says its colour filters are {sensor.cfa}, {where} {sheet.cfa}; correct cfa there"
+    if sensor.bit_depth not in (None, sheet.bit_depth):
+        return (
+            f"camera {side}: its codes have {sensor.bit_depth} bits, {where} {sheet.bit_depth}; correct bit_depth there, or give the "
+            "camera a pixel_format"
+        )
+    return None
 
 
 def named_complaint(name: str, error: Exception) -> str:

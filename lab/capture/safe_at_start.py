@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from drivers.found_settings import FoundSettings
 from drivers.registry import driver
 from lab.capture.file_lock import Lock
 
@@ -125,6 +126,7 @@ class Rescue:
     """
 
     def __init__(self, data: Path, tell: Callable[[str], None] = lambda _: None) -> None:
+        FoundSettings.keep_in(data / "instruments")
         self._stations: list[_Station] = []
         taken: set[str] = set()
         for session_id, document in _under_way(data / "registry.sqlite"):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from drivers.camera.base import Camera, SensorInfo
@@ -15,8 +16,10 @@ from drivers.errors import InstrumentError
 from drivers.instrument import Instrument
 from drivers.registry import driver
 from drivers.transcript import TranscriptFile
+from lab.capture.instruments import contradiction
 from lab.capture.station import Address, Drivers, Station, drivers_of
 from lab.errors import DeviceError, InputError
+from lab.formats.recording_set import DataSheet
 
 #: Longest time (s) for the self-test of one instrument: a measurement of a dark source takes minutes.
 TEST_S = 300.0
@@ -35,16 +38,24 @@ class SelfTest:
     words: str
 
 
-def self_tests(drivers: Drivers) -> Iterator[SelfTest]:
-    """Connect to each instrument, bring it into its safe state, use it once for its purpose, check that it is safe, and disconnect."""
+def self_tests(drivers: Drivers, sheets: Mapping[str, DataSheet] = MappingProxyType({})) -> Iterator[SelfTest]:
+    """Connect to each instrument, bring it into its safe state, use it once for its purpose, check that it is safe, and disconnect.
+
+    `sheets`: the cameras' data sheets by side, held against what the cameras say.
+    """
     for name, instrument in drivers.all.items():
-        yield _self_test(name, instrument)
+        yield _self_test(name, instrument, sheets.get(name.partition(" ")[2]))
 
 
 def self_test(station: Station, name: str, connect: Callable[[Station], Drivers] = drivers_of) -> SelfTest:
     """The self-test of one instrument (`monochromator`, `cameras.left`, ...). Raises InputError if the station hasn't got it."""
     _entry(station, name)
-    return _self_test(_said(name), connect(station).all[_said(name)])
+    side = _said(name).partition(" ")[2]
+    return _self_test(_said(name), connect(station).all[_said(name)], _sheets(station).get(side))
+
+
+def _sheets(station: Station) -> dict[str, DataSheet]:
+    return {side: camera.datasheet for side, camera in station.cameras.items()}
 
 
 def _said(name: str) -> str:
@@ -60,7 +71,7 @@ def _entry(station: Station, name: str) -> Address:
     return entry
 
 
-def _self_test(name: str, instrument: Instrument) -> SelfTest:
+def _self_test(name: str, instrument: Instrument, sheet: DataSheet | None = None) -> SelfTest:
     told: list[SelfTest] = []
 
     def test() -> None:
@@ -74,12 +85,17 @@ def _self_test(name: str, instrument: Instrument) -> SelfTest:
             contract.everyday(instrument)
             instrument.stop()
             contract.is_safe(instrument)
+            works, words = True, "works, and is in its safe state"
+            if sheet is not None and isinstance(instrument, Camera):
+                said = contradiction(name.partition(" ")[2], instrument.sensor(), sheet)
+                works, words = said is None, said or words
         except (InstrumentError, NotMet) as error:
-            told.append(SelfTest(name, who, False, str(error)))
-        else:
-            told.append(SelfTest(name, who, True, "works, and is in its safe state"))
-        finally:
+            works, words = False, str(error)
+        try:
             instrument.close()
+        except InstrumentError as error:
+            works, words = False, str(error)
+        told.append(SelfTest(name, who, works, words))
 
     worker = threading.Thread(target=test, daemon=True)
     worker.start()
@@ -112,7 +128,7 @@ def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
 
 def check_station(station: Station) -> list[SelfTest]:
     """The self-tests of a whole station."""
-    return list(self_tests(drivers_of(station)))
+    return list(self_tests(drivers_of(station), _sheets(station)))
 
 
 def station_text(found: Iterable[Found]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast, get_args
+from typing import Any, Self, TypeVar, cast, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -42,7 +42,13 @@ class Address(BaseModel):
     model_config = ConfigDict(frozen=True, extra="allow")
 
     driver: str
-    address: str
+    address: str = ""
+
+    @model_validator(mode="after")
+    def _reachable(self) -> Self:
+        if "address" not in self.model_fields_set and self.driver != "prompt":
+            raise ValueError("address is missing; only the driver prompt, which asks a person, needs none")
+        return self
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -31,6 +31,7 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session, defer, sessionmaker
 
+from drivers.found_settings import FoundSettings
 from lab.capture.durable_files import npy_bytes, write_durably
 from lab.capture.file_lock import Lock
 from lab.capture.nexus import write_nexus
@@ -82,6 +83,7 @@ class Store:
         self._write = sessionmaker(self._engine.execution_options(writes=True), expire_on_commit=False)
         self._keys: tuple[float, list[tuple[str, str, str]]] = (0.0, [])
         upgrade(self._engine, self.root)
+        FoundSettings.keep_in(self.root / "instruments")
 
     @classmethod
     def open(cls, settings: Settings | None = None) -> Store:

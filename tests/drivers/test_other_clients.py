@@ -87,6 +87,8 @@ def test_cornerstone260b_by_python_usbtmc() -> None:
         assert theirs.ask("*opc?").strip() == "1"
         assert float(theirs.ask("wave?")) == pytest.approx(600.0, abs=0.1)
         assert theirs.ask("system:error?").startswith("0")
+        theirs.write("nonsense 1")
+        assert theirs.ask("system:error?").startswith("-113")
     finally:
         theirs.close()
     with Cornerstone260B("usb://mock", device=usb.core.find(backend=backend)) as mono:
@@ -202,6 +204,16 @@ def test_scpi_meter_by_pyvisa(served: Callable[..., str], tmp_path: Path) -> Non
         # 5 standard deviations of one reading
         assert float(theirs.query("READ?").split("A")[0]) == pytest.approx(DARK_A, abs=5.0 * NOISE_A)
         assert theirs.query("SYST:ERR?").startswith("0")
+        # as pymeasure asks: a leading colon, long forms, and what IEEE 488.2 has of every instrument
+        assert theirs.query(":SYSTem:ZCHeck?") == "0"
+        assert float(theirs.query(":READ?").split("A")[0]) == pytest.approx(DARK_A, abs=5.0 * NOISE_A)
+        assert theirs.query("*OPC?") == "1"
+        assert int(theirs.query("*ESR?")) == 0  # our driver cleared it
+        assert int(theirs.query("*STB?")) == 0
+        theirs.write(":NONSENSE 1")
+        assert int(theirs.query("*STB?")) & 0x04
+        assert int(theirs.query("*ESR?")) & 0x20
+        assert theirs.query(":SYST:ERR?").startswith("-113")
     finally:
         theirs.close()
         manager.close()

@@ -171,6 +171,7 @@ def test_a_frame_byte_by_byte(host: Host, bench: Bench) -> None:
         host.put(host.register(name + "Reg"), value)
     assert struct.unpack("<I", host.read(host.register("PayloadSizeReg"), 4)) == (1024,)
     host.put(host.register("ExposureTicksReg"), 20_000)  # 2 ms
+    host.put(host.register("LightSourcePresetReg"), 0)  # its codes are the bench's
     host.put(ABRM_SIRM + 0x1C, 0)
     host.stream(transfer=800, count=1, final=224)
     host.put(0x10002C, 1)  # trigger on, by software

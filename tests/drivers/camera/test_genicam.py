@@ -36,7 +36,7 @@ class TestBasler:
         assert np.diff(ids, axis=0).tolist() == [[1, 1], [1, 1]]
         for frame in pairs[0]:
             assert frame.raw.shape == (1040, 1024)
-            assert frame.raw.max() > 3000  # its test image
+            assert frame.raw.min() == frame.raw.max() > 0  # its test image is switched off; what is left is grey
 
     @pytest.mark.parametrize(
         ("name", "cfa", "bits"), [("BayerRG12", "RGGB", 12), ("BayerGB8", "GBRG", 8), ("Mono12", "MONO", 12)]

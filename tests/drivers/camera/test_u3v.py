@@ -23,7 +23,16 @@ from drivers.camera.u3v_stream import LEADER, LEADER_MAGIC, StreamLayout, U3vStr
 from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Refused
 from mocks.bench import Bench
 from mocks.pixels import pack_12p
-from mocks.u3v import GAMMA_ENABLE, U3vDevice
+from mocks.u3v import (
+    BALANCE_BLUE,
+    BALANCE_GREEN,
+    BALANCE_RED,
+    GAMMA_ENABLE,
+    LIGHT_SOURCE,
+    TEST_PATTERN,
+    WHITE_AUTO,
+    U3vDevice,
+)
 from mocks.usb import InProcessBackend, UsbIpServer, serve_usbip, stereo_pair
 from mocks.wire import parse_faults
 
@@ -481,3 +490,24 @@ def test_a_transfer_that_comes_while_a_wait_ends_is_taken_whole(monkeypatch: pyt
     stream._device, stream._endpoint, stream._ending = cast(Any, device), 0x81, threading.Event()
     piece = array("B", bytes(16))
     assert stream._fill(piece, time.monotonic() + 30.0) == 16 and piece.tobytes() == b"0123456789abcdef"
+
+
+def test_codes_are_the_converters(bench: Bench) -> None:
+    """The mock powers up with a preset for daylight and a white balance; a second camera without either has the same codes."""
+    balanced, plain = U3vDevice(bench, "left", "CB-8"), U3vDevice(bench, "left", "CB-9")
+    for at, register in enumerate((BALANCE_RED, BALANCE_GREEN, BALANCE_BLUE)):
+        balanced._put(register, int.from_bytes(struct.pack("<f", 1.8 + at), "little"))
+    balanced._put(WHITE_AUTO, 2)
+    balanced._put(TEST_PATTERN, 1)
+    plain._put(LIGHT_SOURCE, 0)
+    means = []
+    for device in (balanced, plain):
+        with camera_of(device) as camera:
+            camera.configure(0.002)
+            means.append([camera.capture().raw[row::2, col::2].mean() for row in (0, 1) for col in (0, 1)])
+            told = camera.settings()
+            assert camera.departures() == ()
+        assert (told["LightSourcePreset"], told["BalanceWhiteAuto"], told["TestPattern"]) == ("Off", "Off", "Off")
+        assert [told[f"BalanceRatio[{name}]"] for name in ("Red", "Green", "Blue")] == [1.0, 1.0, 1.0]
+    # noise of a mean over 76800 pixels of some hundred codes: below 0.1 %
+    np.testing.assert_allclose(means[0], means[1], rtol=0.005)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, 
 from drivers.monochromator.cornerstone260 import Cornerstone260
 from mocks.bench import Bench, Clock
 from mocks.cornerstone260 import MockCornerstone260 as Mock
+from mocks.cornerstone260 import _Cs260Refusal
 from mocks.cornerstone260b_serial import MockCornerstone260BSerial
 from mocks.lamp import Lamp
 from mocks.wire import Pty, Tcp
@@ -27,11 +29,11 @@ def test_golden_transcript(scripted: Callable[[str], Any]) -> None:
         mono.open_shutter()
         assert mono.shutter_is_open()
         assert mono.wavelength_nm() == 500.0
-        assert mono.bandwidth_nm() == pytest.approx(0.5 * 3.16)
+        assert mono.bandwidth_nm() == pytest.approx(0.5 * 3.16, rel=1e-3)
         assert mono.identity().model == "Cornerstone 260"
     assert peer.strange == []
     assert b"FILTER 2\r\n" in peer.requests
-    assert peer.requests[-3:] == [b"SHUTTER C\r\n", b"UNITS UM\r\n", b"HANDSHAKE 0\r\n"]
+    assert peer.requests[-4:] == [b"SHUTTER C\r\n", b"SHUTTER?\r\n", b"UNITS UM\r\n", b"HANDSHAKE 0\r\n"]
 
 
 def test_a_cs260b_by_its_serial_port_is_asked_until_it_stands_still(scripted: Callable[[str], Any]) -> None:
@@ -142,7 +144,7 @@ def test_round_trip_with_the_mock(served: Callable[..., str], endpoint: Callable
         )
     mono.open_shutter()
     assert bench.light.shutter_open
-    assert (mono.slit_um(), bench.light.slit_um, mono.bandwidth_nm()) == (1000, 1000, pytest.approx(3.16))
+    assert (mono.slit_um(), bench.light.slit_um, mono.bandwidth_nm()) == (1000, 1000, pytest.approx(3.16, rel=1e-3))
     assert mono.identity().serial_number == "0427"
     mono.close()
     assert not bench.light.shutter_open
@@ -255,3 +257,55 @@ def test_a_wrong_instrument_at_the_address_is_named(scripted: Callable[[str], An
 def test_closing_what_was_never_opened_touches_nothing() -> None:
     Cornerstone260("/dev/no-such-line").close()
     Cornerstone260("/dev/no-such-line").stop()
+
+
+@pytest.mark.parametrize("fault", range(9, 21))
+def test_closing_leaves_the_shutter_closed_or_says_so(served: Callable[..., str], fault: int) -> None:
+    bench = Bench()
+    mono = Cornerstone260(served(Mock(bench), Pty(), f"error@{fault}"), timeout_s=20.0)
+    with suppress(InstrumentError):
+        mono.connect()
+        mono.open_shutter()
+    mono.close()
+    assert not bench.light.shutter_open
+
+
+def test_a_shutter_that_sticks_is_told_on_closing(served: Callable[..., str]) -> None:
+    class Stuck(Mock):
+        _shutter = property(lambda self: "O", lambda self, text: None)
+
+    mono = Cornerstone260(served(Stuck(Bench()), Pty()))
+    mono.open_shutter()
+    with pytest.raises(InstrumentError, match=r"its shutter may be open .*; block the light by hand"):
+        mono.close()
+    with pytest.raises(ValueError, match="of the body") as caught, mono:
+        mono.open_shutter()
+        raise ValueError("of the body")
+    assert "its shutter may be open" in caught.value.__notes__[0]
+
+
+class MicrometerSlits(Mock):
+    """Slits without motors."""
+
+    def _slit_at(self, number: str) -> int:
+        raise _Cs260Refusal(6)
+
+
+def test_slits_set_by_hand(served: Callable[..., str]) -> None:
+    address = served(MicrometerSlits(Bench()), Pty())
+    with Cornerstone260(address) as mono:
+        mono.move_nm(500.0)
+        assert mono.bandwidth_nm() == 0.0
+        assert "the bandwidth of its light isn't known" in mono.departures()[0]
+        with pytest.raises(InstrumentError, match="turn them to 500 um and state that"):
+            mono.set_slit_um(500.0)
+    with Cornerstone260(address, slit_um=500.0) as mono:
+        mono.set_slit_um(500.0)
+        assert mono.departures() == ()
+        assert mono.slit_um() == 500.0
+
+
+def test_the_bandwidth_is_that_of_the_grating_in_use(served: Callable[..., str]) -> None:
+    with Cornerstone260(served(Mock(Bench()), Pty()), grating=2) as mono:
+        mono.set_slit_um(500.0)
+        assert mono.bandwidth_nm() == pytest.approx(0.5 * 2 * 3.16, rel=1e-3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +14,7 @@ import pytest
 
 pytest.importorskip("pyvisa", reason="PyVISA isn't installed (the extra `visa`)")
 
-from drivers.errors import Disconnected, InstrumentError, NoAnswer, Refused
+from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Refused
 from drivers.photodiode.scpi import ScpiPhotodiode
 from mocks.lamp import Lamp
 from mocks.scpi_meter import AREA_M2, DARK_A, NOISE_A, MockScpiMeter, calibration_csv
@@ -144,3 +146,34 @@ def test_nobody_there_is_one_line(calibration: str) -> None:
 def test_settings_are_checked(calibration: str, settings: dict[str, Any], said: str) -> None:
     with pytest.raises(InstrumentError, match=said):
         diode_at("socket://127.0.0.1:1", settings.pop("calibration", calibration), **settings)
+
+
+@pytest.mark.timeout(60)
+def test_a_line_that_never_ends_is_given_up(calibration: str) -> None:
+    """A fast talker without line ends: PyVISA itself would read on for ever."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def babble() -> None:
+            with listener.accept()[0] as host:
+                try:
+                    while True:
+                        host.sendall(b"x" * 65536)
+                except OSError:
+                    return
+
+        talker = threading.Thread(target=babble)
+        talker.start()
+        diode = diode_at(f"socket://127.0.0.1:{listener.getsockname()[1]}", calibration, timeout_s=0.5)
+        with pytest.raises(Garbled, match="sends without end, 'xxx"):
+            diode.connect()
+        talker.join(30)
+        assert not talker.is_alive()
+
+
+def test_a_late_first_answer_fails_one_call_alone(served: Callable[..., str], calibration: str) -> None:
+    address = served(MockScpiMeter(Line(550.0, 1.0)), Tcp("127.0.0.1", 0), "late=0.8@1")
+    diode = diode_at(address, calibration, readings=2, timeout_s=0.5)
+    with pytest.raises(NoAnswer):
+        diode.connect()
+    assert diode.measure(550.0).irradiance_w_m2 > 0
+    diode.close()

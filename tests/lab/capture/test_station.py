@@ -85,7 +85,7 @@ def test_a_station_survives_the_registry(tmp_path: Path) -> None:
         ('kind = "cap"', 'kind = "hat"', "targets.cap"),
         ("angle_deg = 5.0\n[", "angle_deg = 5.0\ntilt = 3\n[", "tilt"),
         ('"g.csv"', '"missing.csv"', "missing.csv"),
-        ('address = "/dev/null"', "", "monochromator.address"),
+        ('address = "/dev/null"', "", "monochromator: address is missing"),
         ("[stage]", "[stage", "isn't TOML"),
         ("socket://127.0.0.1:1", "/dev/null", "[monochromator] and [stage] both have the address /dev/null"),
         ("[cameras.left]", "[cameras.middle]", "cameras.middle"),
@@ -134,3 +134,15 @@ def test_an_unknown_driver_is_a_device_error(tmp_path: Path) -> None:
 def test_a_setting_that_the_driver_does_not_know_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="colour"):
         drivers_of(read_station(written(tmp_path, TEXT.replace("move_timeout_s = 12.0", 'colour = "red"'))))
+
+
+def test_a_person_at_a_prompt_needs_no_address(tmp_path: Path) -> None:
+    camera = '[cameras.left]\ndriver = "u3v"\naddress = "usb://1"\n[cameras.left.datasheet]\nrows = 2\ncols = 2\nbit_depth = 12\ncfa = "RGGB"\n'
+    file = tmp_path / "station.toml"
+    file.write_text(f'{camera}[stage]\ndriver = "prompt"\n')
+    stage = read_station(file).stage
+    assert stage is not None
+    assert stage.address == ""
+    file.write_text(f'{camera}[stage]\ndriver = "operator"\n')
+    with pytest.raises(InputError, match="stage: address is missing; only the driver prompt"):
+        read_station(file)

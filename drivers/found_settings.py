@@ -1,0 +1,90 @@
+"""What an instrument was set to before it was changed, on disk until it is set so again: a process that is killed can't do that itself.
+
+A file for each instrument, `instruments/NAME.json` in the data folder, from the first change to the last restoration. Whoever connects
+next finds it there, and restores what it says before anything else.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import ClassVar
+
+from drivers.errors import InstrumentError
+from drivers.instrument import Setting
+
+_lock = threading.Lock()
+
+
+class FoundSettings:
+    """The settings found on one instrument, by name, in the order in which they were changed. `who`: its name in messages.
+
+    `name`: of the instrument, the same in every process that reaches it: its family and serial number, or its address.
+    """
+
+    _kept_in: ClassVar[Path | None] = None
+
+    @classmethod
+    def keep_in(cls, folder: Path | None) -> None:
+        """Keep the files in this folder from now on. None: in `instruments` of the data folder that CALIBENCH_DATA names, or `calibench-data`."""
+        cls._kept_in = folder
+
+    def __init__(self, name: str, who: str) -> None:
+        self._who = who
+        folder = self._kept_in or Path(os.environ.get("CALIBENCH_DATA", "calibench-data")) / "instruments"
+        self._file = folder.absolute() / f"{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}.json"
+        self._values: dict[str, Setting] = {}
+        with suppress(FileNotFoundError, ValueError):  # torn by a full disk: nothing was changed after it
+            self._values = dict(json.loads(self._file.read_text(encoding="utf-8")))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def __bool__(self) -> bool:
+        return bool(self._values)
+
+    def last_first(self) -> Iterator[tuple[str, Setting]]:
+        """(name, value) of each, what was changed last first."""
+        return iter(list(reversed(self._values.items())))
+
+    def get(self, name: str, otherwise: Setting) -> Setting:
+        """What was found, or `otherwise` where it wasn't changed."""
+        return self._values.get(name, otherwise)
+
+    def note(self, name: str, value: Setting) -> None:
+        """Keep a value, once, before it is changed. Raises `InstrumentError` where it can't be kept."""
+        if name not in self._values:
+            self._values[name] = value
+            self._write()
+
+    def forget(self, name: str) -> None:
+        """A value is set as it was found."""
+        if self._values.pop(name, None) is not None:
+            self._write()
+
+    def _write(self) -> None:
+        fresh = self._file.with_suffix(f".{os.getpid()}")
+        try:
+            with _lock:
+                if not self._values:
+                    self._file.unlink(missing_ok=True)
+                    with suppress(OSError):  # other instruments' are there, too
+                        self._file.parent.rmdir()
+                        self._file.parent.parent.rmdir()
+                    return
+                self._file.parent.mkdir(parents=True, exist_ok=True)
+                with fresh.open("w", encoding="utf-8") as file:
+                    json.dump(self._values, file)
+                    file.flush()
+                    os.fsync(file.fileno())
+                fresh.replace(self._file)
+        except OSError as error:
+            raise InstrumentError(
+                f"{self._who}: its settings can't be kept in {self._file} ({error.strerror}), to be restored later; make room, or set "
+                "CALIBENCH_DATA to a folder of yours"
+            ) from error
