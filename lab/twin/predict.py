@@ -43,6 +43,8 @@ QUANTITIES = (CHART, NOISE, SLANTED_EDGE, DARK)
 NYQUIST_CY_PER_PX = 0.5
 #: Share of the full well from which on a pixel counts as clipped.
 NEAR_FULL = 0.985
+#: Share of saturation above which a level isn't predicted, as some of its pixels clip.
+HIGHEST_SHARE = 0.95
 #: Usual scatter of a dark frame's mean, DN, where the model doesn't say.
 USUAL_JITTER_DN = 0.02
 #: Relative standard deviation of the sensitivities where the model has none.
@@ -140,6 +142,12 @@ def _side(
     effects = content.effects
     mean, covariance = _distribution(model, effects, posterior, growth_std, light_std)
     use = np.array([is_predicted(b, label) for b in blocks for label in b.labels])
+    is_level = np.array([b.measurement.is_level for b in blocks for _ in b.labels])
+    full = is_level & (mean > HIGHEST_SHARE * study.saturation_dn)
+    if full.any():
+        reason = f"{full.sum()} levels are above {100 * HIGHEST_SHARE:g} % of saturation, {study.saturation_dn:.4g} DN: plan shorter exposures"
+        skipped.append(Skipped(step="twin saturation", reason=reason, side=side))
+        use &= ~full
     without = {}
     for i, effect in enumerate(effects):
         if not isinstance(effect, ModelDiscrepancy):
