@@ -118,3 +118,30 @@ def _print(found: TwinScore) -> None:
     out.print(f"chi2 {found.chi2:.1f} of {found.n} numbers; {found.missing} predicted numbers weren't measured")
     for effect in found.effects:
         out.print(escape(f"{effect.side}: {effect.name}: {effect.verdict} (log likelihood {effect.gain:+.1f})"))
+
+
+@commands.command()
+def budget(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="a camera file")],
+    use: Annotated[str, typer.Option("--use", metavar="USE,...", help="MTF50, patches, variance, dark mean")],
+    json: Json = None,
+) -> None:
+    """Which effects and parameters, at their present uncertainty, matter for a use, and how much each adds to its variance."""
+    from lab.formats.camera_file import read_camera
+    from lab.twin.budget import budget as budgeted
+    from lab.twin.budget import parse_uses
+
+    uses = parse_uses(use)
+    check_writable(json)
+    found = budgeted(read_camera(model), uses)
+    write_json(found, json)
+    if str(json) == "-":
+        return
+    for one in found.uses:
+        out.print(escape(f"{one.use}: standard deviation {one.std_percent:.3g} %"))
+        table = Table(box=None, pad_edge=False)
+        for heading in ("what", "share of the variance", "alone"):
+            table.add_column(heading, justify="left" if heading == "what" else "right")
+        for part in one.contributions:
+            table.add_row(escape(part.name), f"{part.share_percent:.1f} %", f"{part.std_percent:.3g} %")
+        out.print(table)

@@ -219,6 +219,12 @@ def _distribution(
     bare = MeasurementModel(tuple(_without_nuisances(b) for b in model.blocks), model.camera)
     covariance = bare.gaussian(effects).covariance - _forms(bare, effects)
     for block, at in zip(model.blocks, model.slices, strict=True):
+        if block.measurement is DARK and model.noise is not None:
+            # shot noise of the dark charge, which the scatter of the fitted session's frames needn't have
+            camera, black = model.camera, model.noise.black
+            charge_dn = np.maximum(model.mean(effects)[at] - black, 0.0)
+            variance = (model.noise.gain * charge_dn + model.noise.read_dn**2) / (camera.rows * camera.cols)
+            covariance[at, at] += np.diag(variance)
         if block.measurement is CHART:
             covariance[at, at] += light_std**2 * np.outer(block.scale, block.scale)
             patches = _patch_columns(block, at, len(covariance))

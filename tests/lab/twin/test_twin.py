@@ -77,9 +77,21 @@ def _plan() -> RecordingSet:
     corners = ((10.0, 10.0), (10.0, 150.0), (110.0, 150.0), (110.0, 10.0))
     take("chart", 0.7 * full_s, 4, chart="ColorChecker24", corners=corners, radiance="lamp.csv")
     for angle in (5.0, 95.0):
-        take("slanted_edge", 0.6 * full_s, 4, region=REGION, angle_deg=angle, light_radiance="lamp.csv", field_mm=(0.0, 0.0))
+        take(
+            "slanted_edge",
+            0.6 * full_s,
+            4,
+            region=REGION,
+            angle_deg=angle,
+            light_radiance="lamp.csv",
+            field_mm=(0.0, 0.0),
+        )
     keys = ("rows", "cols", "pixel_pitch_um", "fill_factor", "cfa", "bit_depth", "black_level_dn", "white_level_dn")
-    sheet = {key: getattr(camera, key) for key in keys} | {"f_number": 4.0, "focal_length_mm": 8.0, "lens_transmittance": 1.0}
+    sheet = {key: getattr(camera, key) for key in keys} | {
+        "f_number": 4.0,
+        "focal_length_mm": 8.0,
+        "lens_transmittance": 1.0,
+    }
     sheet["quantum_efficiency"] = {c: f"{c}.csv" for c in camera.channels}
     manifest = Manifest.model_validate({"name": "plan", "cameras": {"left": sheet}, "captures": captures})
     spectra = {"lamp.csv": LAMP} | {f"{c}.csv": q for c, q in camera.quantum_efficiency.items()}
@@ -89,7 +101,7 @@ def _plan() -> RecordingSet:
 PLAN = _plan()
 
 
-def _trained(seed: int, wrong: bool = False) -> CameraFile:
+def trained(seed: int, wrong: bool = False) -> CameraFile:
     """The improved model of one drawn session. `wrong`: with a veil that the camera hasn't, too."""
     session = future_session(TRUTH, PLAN, "left", Changes(), seed)
     fit = fit_recording_set(session, steps=("noise",))
@@ -102,17 +114,17 @@ def _trained(seed: int, wrong: bool = False) -> CameraFile:
 
 @pytest.fixture(scope="module")
 def content() -> CameraFile:
-    return _trained(1)
+    return trained(1)
 
 
-def _captured(changes: Changes, seed: int) -> RecordingSet:
+def captured(changes: Changes, seed: int) -> RecordingSet:
     """The session that is captured in the changed configuration, by the true camera."""
     return future_session(carried(TRUTH, changes), PLAN, "left", changes, seed)
 
 
 @pytest.mark.parametrize("name", TRANSFERS)
 def test_intervals_hold_in_a_configuration_that_nobody_has_seen(content: CameraFile, name: str) -> None:
-    found = score(predict({"left": content}, PLAN, TRANSFERS[name], light_std=0.0), _captured(TRANSFERS[name], 7))
+    found = score(predict({"left": content}, PLAN, TRANSFERS[name], light_std=0.0), captured(TRANSFERS[name], 7))
     assert {q.quantity for q in found.quantities} == {"chart", "noise", "slanted_edge", "dark"} and found.missing == 0
     inside = sum(q.n * q.within_95_percent_interval for q in found.quantities) / found.n
     # 95 % of some 300 numbers, of which errors of the parameters are common to many: 100 effectively, 4 standard deviations
@@ -122,7 +134,7 @@ def test_intervals_hold_in_a_configuration_that_nobody_has_seen(content: CameraF
 
 def test_an_effect_that_the_camera_lacks_is_withdrawn() -> None:
     changes = Changes(radiance_factor=0.5)
-    found = score(predict({"left": _trained(2, wrong=True)}, PLAN, changes, light_std=0.0), _captured(changes, 8))
+    found = score(predict({"left": trained(2, wrong=True)}, PLAN, changes, light_std=0.0), captured(changes, 8))
     verdicts = {effect.name: effect.verdict for effect in found.effects}
     assert verdicts == {"dark_current_temperature": "survives", "veiling_glare": "withdrawn"}
 
@@ -162,7 +174,7 @@ def test_an_edited_seal_and_another_session_are_refused(content: CameraFile, tmp
     assert open_seal(file, hashed) == open_seal(file) == prediction
     for other, said in ((Changes(), "f_number"), (changes.model_copy(update={"gain_db": 6.0}), "gain_db")):
         with pytest.raises(InputError, match=said):
-            score(prediction, _captured(other, 9))
+            score(prediction, captured(other, 9))
     file.write_text(file.read_text().replace('"n', '"m', 1))
     with pytest.raises(InputError, match="was edited"):
         open_seal(file)
@@ -170,8 +182,8 @@ def test_an_edited_seal_and_another_session_are_refused(content: CameraFile, tmp
 
 def test_the_commands_predict_and_score(content: CameraFile, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     changes = TRANSFERS["f/8"]
-    write(_captured(Changes(), 1), tmp_path / "plan")
-    write(_captured(changes, 7), tmp_path / "taken")
+    write(captured(Changes(), 1), tmp_path / "plan")
+    write(captured(changes, 7), tmp_path / "taken")
     write_camera(tmp_path / "left.toml", content)
     sealed, result = str(tmp_path / "sealed.json"), tmp_path / "score.json"
     given = ["twin", "predict", str(tmp_path), "--plan", str(tmp_path / "plan"), "--out", sealed]
