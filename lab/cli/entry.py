@@ -12,6 +12,7 @@ from lab.cli import calibrations, capturing, devices, diagnosis, effects, fittin
 from lab.cli.challenge import commands as challenge
 from lab.cli.console import err
 from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
+from lab.cli.twin import commands as twin
 from lab.errors import DeviceError, InputError, failure_of_environment
 
 app = typer.Typer(
@@ -27,6 +28,7 @@ app = typer.Typer(
 for _group in (capturing, fitting, diagnosis, effects, recordings, kinds, simulation):
     app.registered_commands += _group.commands.registered_commands
 app.add_typer(challenge)
+app.add_typer(twin)
 app.add_typer(calibrations.calibrations)
 app.add_typer(devices.devices)
 app.add_typer(devices.station)

@@ -30,8 +30,10 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from lab.errors import InputError
+from lab.formats.model_posterior import ModelPosterior
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
+from lab.formats.result_file import read_result, write_result
 from lab.formats.results import CameraFit
 from lab.formats.spectrum_csv import parse_spectrum
 from lab.predict.camera_model import camera_model
@@ -46,18 +48,20 @@ from sim.spectrum import Spectrum
 FORMAT, VERSION = "calibench-camera", 1
 HEADER = "# A camera for calibench: each key is a parameter, and ends in its unit. docs/reference/camera-file.md says what they do."
 #: Keys of the file that don't belong to the camera model.
-OWN_KEYS = ("format", "version", "name", "effects")
+OWN_KEYS = ("format", "version", "name", "effects", "posterior")
 CURVES = ("quantum_efficiency", "quantum_efficiency_std")
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """The content of a camera file: the model, the effects that act in it, and the prescription of a traced lens."""
+    """The content of a camera file: the model, the effects that act in it, the prescription of a traced lens, and how well its parameters are
+    known together (None: nobody says)."""
 
     name: str
     camera: CameraModel
     effects: tuple[Effect, ...] = ()
     prescription: Path | None = None
+    posterior: ModelPosterior | None = None
 
 
 # --- reading -----------------------------------------------------------------------------------------------------------
@@ -103,7 +107,16 @@ def read_camera(
     name = content.get("name", file.stem)
     if not isinstance(name, str):
         raise InputError(f"{file}: name is {name!r}, not text; put it into quotes")
-    return CameraFile(name, camera, tuple(_effect(file, k, one) for k, one in enumerate(acting)), prescription)
+    posterior = _posterior(file, content["posterior"], sent) if "posterior" in content else None
+    effects_of = tuple(_effect(file, k, one) for k, one in enumerate(acting))
+    return CameraFile(name, camera, effects_of, prescription, posterior)
+
+
+def _posterior(file: Path, given: Any, sent: bool) -> ModelPosterior:
+    """The posterior in the JSON file that the key `posterior` names."""
+    if not isinstance(given, str):
+        raise InputError(f"{file}: posterior is {given!r}, not a file's name; name the JSON file, or leave the key out")
+    return read_result(ModelPosterior, _beside(file, "posterior", given, sent))
 
 
 def _beside(file: Path, key: str, path: str, sent: bool) -> Path:
@@ -294,6 +307,10 @@ def _lines(file: Path, content: CameraFile) -> Iterator[str]:
     yield f"format = {_text(FORMAT)}"
     yield f"version = {VERSION}"
     yield f"name = {_text(content.name)}"
+    if content.posterior is not None:
+        beside = file.with_name(f"{file.stem}-posterior.json")
+        write_result(content.posterior, beside)
+        yield f"posterior = {_text(beside.name)}  # how well the parameters are known together"
     yield ""
     yield from _parameters(camera, skip=(*CURVES, "lens", "geometry", "std"))
     for curves, what in zip(

@@ -118,6 +118,13 @@ def camera_for(
     content = default_camera() if camera is None else read_camera(camera, cache, progress)
     if lens is None:
         return content
+    return with_lens(content, lens, cache, progress)
+
+
+def with_lens(
+    content: CameraFile, lens: Path, cache: Path | None = None, progress: Progress | None = None
+) -> CameraFile:
+    """The camera with the lens of a prescription, f-number and focal length included. Raises InputError for a file that can't be used."""
     table = traced_table(lens, cache, progress)
     model = content.camera
     try:
@@ -129,7 +136,7 @@ def camera_for(
         )
     except ValidationError as error:
         raise InputError(f"{lens}: {_line(error)}") from error
-    return CameraFile(content.name, model.model_copy(update={"lens": traced}), content.effects, lens)
+    return replace(content, camera=model.model_copy(update={"lens": traced}), prescription=lens)
 
 
 def simulate(options: SimulateOptions, content: CameraFile, progress: Progress | None = None) -> Simulation:

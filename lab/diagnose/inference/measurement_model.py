@@ -22,6 +22,7 @@ import numpy as np
 
 from lab.diagnose.inference.gaussian import ROUNDING, BlockCovariance, Gaussian
 from lab.diagnose.measurements.block import Block, Effects, Prediction
+from lab.diagnose.measurements.noise_guess import NoiseGuess
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.spectrum import FloatArray
@@ -53,7 +54,8 @@ class MeasurementModel:
 
     `always` are effects that the baseline has: they act first, and their laws have tolerances like those of others.
     `unstated_jacobian` has columns (n,) by nuisance parameters that stand for what nobody states, per prior standard
-    deviation. `gain_is_known`: whether the camera's conversion gain is stated or measured, and not 1 for want of both. Predictions are cached by block, as most effects act on few blocks.
+    deviation. `gain_is_known`: whether the camera's conversion gain is stated or measured, and not 1 for want of both. `noise`: the first estimates about
+    which the predictions are linear. Predictions are cached by block, as most effects act on few blocks.
     """
 
     blocks: tuple[Block, ...]
@@ -61,6 +63,7 @@ class MeasurementModel:
     always: tuple[Effect, ...] = ()
     unstated_jacobian: Mapping[str, FloatArray] = field(default_factory=dict)
     gain_is_known: bool = True
+    noise: NoiseGuess | None = None
     _predictions: dict[tuple[int, ...], Prediction] = field(default_factory=dict)
     _covariances: dict[tuple[bytes, tuple[int, ...], tuple[float, float]], BlockCovariance] = field(
         default_factory=dict

@@ -283,7 +283,7 @@ def _fit(
     u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
     low, high = (np.array(b) for b in zip(*(c.bounds for c in coords), strict=True))
     typical = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])
-    prior_centre, prior_std = _prior(coords)
+    prior_centre, prior_std = coordinate_prior(coords)
     tolerated = _likeliest_tolerance(model, moved(effects, coords, u), policy, tolerance)
     for turn in range(passes or (ROUGH_PASSES if rough else PASSES)):
 
@@ -342,12 +342,12 @@ def _fit(
 def is_of_usual_size(effects: Effects, camera: CameraModel) -> bool:
     """Say whether all parameters lie within the width of a fit's prior."""
     coords = coordinates(effects, camera)
-    centre, std = _prior(coords)
+    centre, std = coordinate_prior(coords)
     u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
     return bool(np.all(np.abs(u - centre) <= std))
 
 
-def _prior(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArray]:
+def coordinate_prior(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArray]:
     """Centre and standard deviation of every coordinate's prior, infinite where none is declared."""
     centre = np.array(
         [c.to_u(c.quantity.prior[0]) if c.quantity.prior and c.quantity.linear_power == 1 else 0.0 for c in coords]

@@ -82,7 +82,8 @@ def measurement_model(
     always = baseline.effects if baseline is not None else ()
     if not blocks:
         return None, tuple(skipped)
-    model = MeasurementModel(tuple(blocks), study.camera, always, gain_is_known=study.noise.gain_is_known)
+    known = study.noise.gain_is_known
+    model = MeasurementModel(tuple(blocks), study.camera, always, gain_is_known=known, noise=study.noise)
     if study.stated.fill_factor is None and baseline is None:
         model = replace(model, unstated_jacobian=_any_aperture(model))
     return model, tuple(skipped)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lab.capture_kinds.chart import ChartCapture
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
@@ -24,6 +25,8 @@ from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import LEVEL, SPECTRAL, FieldPoints, Uniform
+
+StrArray = NDArray[np.str_]
 
 PATCH_STD = 0.01  # relative standard deviation of a patch's reflectance, common to the channels
 PATCH_COLOUR_STD = 0.004  # the same, independent in each channel
@@ -170,21 +173,27 @@ def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> F
     tail = np.array([p.tail for p in points])
     names = np.array([p.name for p in points])
     channel = np.array([p.channel for p in points])
-    perfect = np.array([signal[channel == c].max() / 0.9 for c in channel])  # DN of a perfect diffuser
     temporal = (noise.gain * signal + noise.read_dn**2) / pixels / repeats
     digits = rounding_std_dn(noise.spread_dn2(signal))
-    fixed = np.sqrt((noise.prnu * signal) ** 2 / pixels + (PATCH_COLOUR_STD * signal) ** 2 + digits**2)
+    fixed = np.sqrt((noise.prnu * signal) ** 2 / pixels + digits**2)
     same = names[:, None] == names
     covariance = np.diag(temporal + noise.jitter_dn**2) + same * (channel[:, None] == channel) * np.outer(fixed, fixed)
-    covariance += same * (
-        np.outer(tail, tail) * study.tail_std**2
-        + np.outer(signal, signal) * PATCH_STD**2
-        + np.outer(perfect, perfect) * PATCH_LEVEL_STD**2
-    )
+    covariance += same * np.outer(tail, tail) * study.tail_std**2
+    covariance += reflectance_covariance(names, channel, signal)
     taken = np.array([p.captures[0].id for p in points])
     lamp = signal * noise.jitter_lamp / np.sqrt(repeats)
     covariance += (taken[:, None] == taken) * np.outer(lamp, lamp)
     return np.asarray(covariance)
+
+
+def reflectance_covariance(names: StrArray, channel: StrArray, signal: FloatArray) -> FloatArray:
+    """Covariance (n, n), DN^2, of n patches' levels by the tolerances of their reflectances: one common to repeats and channels, one for
+    each channel. `names`, `channel`: (n,) of the patches; `signal`: their levels above dark, DN."""
+    same = names[:, None] == names
+    perfect = np.array([signal[channel == c].max() / 0.9 for c in channel])  # DN of a perfect diffuser
+    common = np.outer(signal, signal) * PATCH_STD**2 + np.outer(perfect, perfect) * PATCH_LEVEL_STD**2
+    own = (channel[:, None] == channel) * np.outer(signal, signal) * PATCH_COLOUR_STD**2
+    return np.asarray(same * (common + own))
 
 
 def _spread(study: Study, plane: FloatArray, channel: str, light: str) -> FloatArray:

@@ -41,25 +41,15 @@ def variance_block(study: Study) -> Block:
     value = np.array([p[3] for p in points])
     factor = np.array([p[0].gain for p in points])
     covariance = np.diag(np.square(value) * (np.square([p[4] for p in points]) + VARIANCE_FLOOR**2))
-    noise, camera = study.noise, study.camera
+    noise = study.noise
     rounding = [variance_rounding_std(v, (noise.prnu * level) ** 2) for v, level in zip(value, signal, strict=True)]
     covariance += np.diag(np.square(rounding))
     settings = sorted(set(factor.tolist()))
-    light = study.field.light / study.field.light.mean()
 
     def predict(effects: Effects) -> Prediction:
-        gain = noise.gain * factor
-        electrons, slope = behind(signal / gain, light, effects, study)
-        model = Uniform(camera, effects)
-        shot = np.maximum(model.shot_e2(electrons), 0.0) * np.square(slope)
-        read = (noise.read_dn / noise.gain) ** 2
-        dn2 = gain[:, None] ** 2 * shot
-        if not model.has_even_codes:
-            dn2 = coded_variance(
-                noise.black + gain[:, None] * electrons, dn2 + noise.read_dn**2, effects, study
-            ) - np.square(noise.read_dn)
-        mean = dn2.mean(1) + gain**2 * read
-        jacobian = {"gain": GAIN_STD * dn2.mean(1)}
+        shot_dn2 = shot_variance(study, signal, noise.gain * factor, effects)
+        mean = shot_dn2 + np.square(noise.read_dn * factor)
+        jacobian = {"gain": GAIN_STD * shot_dn2}
         for setting in settings:
             name = "read" if setting == 1.0 else f"read:{setting:.4g}"
             jacobian[name] = np.where(factor == setting, READ_STD * (noise.read_dn * setting) ** 2 + 0.05, 0.0)
@@ -70,6 +60,19 @@ def variance_block(study: Study) -> Block:
         labels=tuple(Label(p[2], p[1], f"{p[0].exposure_s:.4g} s", p[0].captures, p[0].held_out) for p in points),
         reads=frozenset({"signal.response", "charge.variance_e2", "codes.codes"}), predict=predict, scale=value,
     )  # fmt: skip
+
+
+def shot_variance(study: Study, signal_dn: FloatArray, gain_dn_per_e: FloatArray, effects: Effects) -> FloatArray:
+    """Variance (n,), DN^2, of uniform light without read noise, at mean signals above black (n,), DN, of captures with the given gains (n,)."""
+    noise, model = study.noise, Uniform(study.camera, effects)
+    light = study.field.light / study.field.light.mean()
+    electrons, slope = behind(signal_dn / gain_dn_per_e, light, effects, study)
+    shot = np.maximum(model.shot_e2(electrons), 0.0) * np.square(slope)
+    dn2 = gain_dn_per_e[:, None] ** 2 * shot
+    if not model.has_even_codes:
+        dn = noise.black + gain_dn_per_e[:, None] * electrons
+        dn2 = coded_variance(dn, dn2 + noise.read_dn**2, effects, study) - np.square(noise.read_dn)
+    return np.asarray(dn2.mean(1))
 
 
 def channel_planes(study: Study) -> dict[str, list[str]]:

@@ -20,6 +20,7 @@ from lab.errors import NotDetermined
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
 from lab.measure.mishaps import CopiedFrames, copied_frames
+from lab.measure.stated_light import most_frequent_gain_db
 from sim.camera import CameraModel, Side
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
@@ -45,7 +46,8 @@ class Study:
 
     `camera`: the baseline; its gain, black level, dark current, read noise and full well are those of the noise fit, or first estimates
     where there is none (`noise_guess`). `saturation_dn`: code from which on pixels clip (None: estimated). `misstated`: ids of flats whose stated number of photons contradicts
-    the others. `fitted`: the side's noise fit, None where its recordings don't determine one.
+    the others. `fitted`: the side's noise fit, None where its recordings don't determine one. `noise`: known figures in the place of all
+    estimates; the baseline then is `camera` as it is.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class Study:
         saturation_dn: float | None = None,
         misstated: frozenset[str] = frozenset(),
         fitted: NoiseFit | None = None,
+        noise: NoiseGuess | None = None,
     ) -> None:
         self.misstated, self.fitted = misstated, fitted
         #: Captures that are left out, as their frames weren't taken anew.
@@ -77,7 +80,11 @@ class Study:
         self.field = FieldPoints.of(camera)
         if saturation_dn is None:
             self.saturation_dn = clipping_level_dn(self)
-        self.noise: NoiseGuess = noise_guess(self)
+        #: Amplification, dB, of most of the flats: that of `noise.gain`.
+        self.usual_gain_db = most_frequent_gain_db(self.recordings.captures(FlatCapture, side))
+        self.noise: NoiseGuess = noise_guess(self) if noise is None else noise
+        if noise is not None:
+            return
         self.camera = camera.model_copy(
             update={
                 "conversion_gain_dn_per_e": self.noise.gain,

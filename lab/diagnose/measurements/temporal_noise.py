@@ -45,7 +45,7 @@ class Repeats:
 
     captures: tuple[str, ...]
     exposure_s: float
-    gain: float  # factor on the conversion gain by the gain setting in dB
+    gain: float  # factor on the study's conversion gain, that of its usual setting, by the setting in dB
     held_out: bool
     signal: dict[str, float]  # mean above black, DN
     variance: dict[str, float | None]  # DN^2; None where the plane clips, or rounding hides the noise
@@ -118,7 +118,7 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
     return Repeats(
         captures=tuple(c.id for c in use),
         exposure_s=captures[0].exposure_s,
-        gain=10.0 ** ((captures[0].gain_db or 0.0) / 20.0),
+        gain=10.0 ** (((captures[0].gain_db or 0.0) - study.usual_gain_db) / 20.0),
         held_out=held_out,
         signal=signal,
         variance={n: v if clean[n] and moving else None for n, v in variance.items()},

@@ -9,13 +9,16 @@ from typing import Literal
 
 import numpy as np
 
+from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.inference.discrepancy import Discrepancy
 from lab.diagnose.inference.measurement_model import MeasurementModel, form_name
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.curves import freed_curve
+from lab.diagnose.outcome.model_posterior import model_posterior
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
+from lab.measure.stated_light import most_frequent_gain_db
 from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
@@ -103,7 +106,9 @@ def improved_model(
     improved = camera.model_copy(update={"quantum_efficiency": curves})
     unknown = "" if model.gain_is_known else ", conversion gain unknown: electrons of 1 DN/e are DN"
     name = f"{recordings.manifest.name} {side}{unknown}".strip()
-    return CameraFile(name, improved, tuple(acting)), tuple(corrections)
+    gain_db = most_frequent_gain_db(recordings.captures(FlatCapture, side))
+    posterior = model_posterior(model, effects, improved, kernels, gain_db)
+    return CameraFile(name, improved, tuple(acting), posterior=posterior), tuple(corrections)
 
 
 def _nearest_form(effect: Effect, estimates: Mapping[str, float]) -> Effect:

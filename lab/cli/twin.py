@@ -1,0 +1,147 @@
+"""`calibench twin`: predictions before the capture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from lab.cli.console import check_writable, out, write_json
+from lab.cli.sources import Json, StoreFolder, camera_path, recordings_of
+from lab.errors import InputError
+
+if TYPE_CHECKING:
+    from lab.formats.camera_file import CameraFile
+    from lab.formats.recording_set import RecordingSet
+    from lab.twin.score import TwinScore
+    from sim.camera import Side
+
+commands = typer.Typer(name="twin", help="Predict a session before it is captured, and open the prediction against it.")
+
+
+@commands.command()
+def predict(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="a camera file, or a folder of SIDE.toml")],
+    plan: Annotated[
+        str, typer.Option("--plan", metavar="PLAN", help="a recording set whose captures are planned again")
+    ],
+    out_file: Annotated[
+        Path, typer.Option("--out", metavar="SEALED", help="the sealed prediction; its hash is written beside it")
+    ],
+    change: Annotated[
+        str,
+        typer.Option(
+            "--change",
+            metavar="KEY=VALUE,...",
+            help="f_number, temperature_c, lamp, lens, distance_mm, exposure_factor, gain_db, radiance_factor",
+        ),
+    ] = "",
+    light_std_percent: Annotated[float, typer.Option(help="standard deviation of the light to come, per cent")] = 0.3,
+    data: StoreFolder = None,
+) -> None:
+    """Predict the measured numbers of a session that hasn't been captured, with their covariance, and seal them by hash."""
+    from lab.twin.changes import parse_changes
+    from lab.twin.predict import predict as predicted
+    from lab.twin.sealed import seal
+
+    changes = parse_changes(change)
+    changes.spectrum()
+    check_writable(out_file)
+    if not model.exists():
+        raise InputError(f"{model}: isn't there; name a camera file, or the folder of `diagnose --save`")
+    recordings = recordings_of(plan, data)
+    found = predicted(
+        _models(recordings, model), recordings, changes, model=str(model), light_std=light_std_percent / 100.0
+    )
+    hashed = seal(found, out_file)
+    for side, one in found.sides.items():
+        for skipped in one.skipped:
+            out.print(escape(f"{side}: not predicted: {skipped.reason}"))
+        out.print(escape(f"{side}: {len(one.numbers)} numbers predicted"))
+    out.print(escape(f"sealed: {out_file}, SHA-256 {hashed}"))
+
+
+def _models(recordings: RecordingSet, path: Path) -> dict[Side, CameraFile]:
+    """The cameras of a file, or of those SIDE.toml that a folder has."""
+    from lab.formats.camera_file import read_camera
+
+    files = {side: camera_path(recordings, side, path) for side in recordings.sides}
+    there = {side: file for side, file in files.items() if file.is_file()}
+    if not there:
+        raise InputError(
+            f"{path}: has no {' or '.join(f'{s}.toml' for s in files)}; name the folder of `diagnose --save`"
+        )
+    return {side: read_camera(file) for side, file in there.items()}
+
+
+@commands.command()
+def score(
+    sealed: Annotated[Path, typer.Argument(metavar="SEALED", help="a sealed prediction")],
+    source: Annotated[
+        str, typer.Argument(metavar="SET", help="the session that was predicted: a recording set or a stored session")
+    ],
+    json: Json = None,
+    sha256: Annotated[
+        str | None,
+        typer.Option("--sha256", metavar="HASH", help="the hash as it was told, in place of the file beside"),
+    ] = None,
+    data: StoreFolder = None,
+) -> None:
+    """Open a sealed prediction against the recordings: deviations, intervals, and names that don't survive."""
+    from lab.twin.score import score as scored
+    from lab.twin.sealed import open_seal
+
+    check_writable(json)
+    prediction = open_seal(sealed, sha256)
+    found = scored(prediction, recordings_of(source, data))
+    write_json(found, json)
+    if str(json) != "-":
+        _print(found)
+
+
+def _print(found: TwinScore) -> None:
+    from lab.twin.score import title
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("quantity", "n", "median", "95 % of all within", "in 95 % intervals", "chi2 / n"):
+        table.add_column(heading, justify="left" if heading == "quantity" else "right")
+    for one in found.quantities:
+        unit = " %" if one.unit == "%" else ""
+        table.add_row(
+            title(one.quantity), str(one.n), f"{one.median:.3g}{unit}", f"{one.largest_of_95_percent:.3g}{unit}",
+            f"{100 * one.within_95_percent_interval:.1f} %", f"{one.chi2 / one.n:.2f}",
+        )  # fmt: skip
+    out.print(table)
+    out.print(f"chi2 {found.chi2:.1f} of {found.n} numbers; {found.missing} predicted numbers weren't measured")
+    for effect in found.effects:
+        out.print(escape(f"{effect.side}: {effect.name}: {effect.verdict} (log likelihood {effect.gain:+.1f})"))
+
+
+@commands.command()
+def budget(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="a camera file")],
+    use: Annotated[str, typer.Option("--use", metavar="USE,...", help="MTF50, patches, variance, dark mean")],
+    json: Json = None,
+) -> None:
+    """Which effects and parameters, at their present uncertainty, matter for a use, and how much each adds to its variance."""
+    from lab.formats.camera_file import read_camera
+    from lab.twin.budget import budget as budgeted
+    from lab.twin.budget import parse_uses
+
+    uses = parse_uses(use)
+    check_writable(json)
+    found = budgeted(read_camera(model), uses)
+    write_json(found, json)
+    if str(json) == "-":
+        return
+    for one in found.uses:
+        out.print(escape(f"{one.use}: standard deviation {one.std_percent:.3g} %"))
+        table = Table(box=None, pad_edge=False)
+        for heading in ("what", "share of the variance", "alone"):
+            table.add_column(heading, justify="left" if heading == "what" else "right")
+        for part in one.contributions:
+            table.add_row(escape(part.name), f"{part.share_percent:.1f} %", f"{part.std_percent:.3g} %")
+        out.print(table)

@@ -1,0 +1,146 @@
+"""How well the seen numbers determine the parameters of an improved model, all together.
+
+With A the Jacobian (n, k) by all parameters, P their prior covariance, C that of the n seen numbers with everything marginalised:
+
+    mean = P A' C^-1 (y - m),   covariance = P - P A' C^-1 A P
+
+(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, eq. 2.25, 2.26).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.refit import Coordinate, coordinate_prior, coordinates, moved
+from lab.diagnose.measurements.chart import CHART, reflectance_covariance
+from lab.diagnose.measurements.noise import GAIN_STD
+from lab.diagnose.measurements.noise_guess import NoiseGuess
+from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
+from sim.camera import CameraModel
+from sim.effects.base import Effect
+from sim.sensor.electrons import gain_dn_per_e
+from sim.spectrum import FloatArray
+
+#: Nuisance parameters, and beginnings of their names, that stay with the camera and its place before the chart from session to session.
+#: Others belong to one session: its edges' light, its lamp's flicker.
+LASTING = ("gain", "black", "dark", "chart:scale", "chart:x", "chart:y")
+LASTING_PREFIXES = ("curve:", "read", "level:", "form ")
+#: Step of a difference by an effect's parameter, as a share of its typical size.
+STEP = 0.02
+#: Prior standard deviation of a coordinate without one, in typical sizes.
+WIDE = 100.0
+
+
+def model_posterior(
+    model: MeasurementModel,
+    effects: Sequence[Effect],
+    camera: CameraModel,
+    discrepancies: Mapping[int, FloatArray] | None = None,
+    gain_db: float = 0.0,
+) -> ModelPosterior | None:
+    """The posterior of the parameters of `model` with `effects`, about `camera`, the improved model.
+
+    discrepancies : covariances of model discrepancies by block, which stand beside the effects
+    gain_db : amplification for which the estimates of `model` hold
+
+    Returns None for a model without first estimates.
+    """
+    if model.noise is None:
+        return None
+    given = discrepancies or {}
+    seen = model.seen
+    nuisance = {
+        name: column[seen]
+        for name, column in model.nuisance_jacobian(effects).items()
+        if name in LASTING or name.startswith(LASTING_PREFIXES)
+    }
+    coords = coordinates(effects, model.camera)
+    by_effects = effect_jacobian(model, effects, coords)[seen]
+    patch_names, by_patches, patch_prior = _patches(model)
+    _, wide = coordinate_prior(coords) if coords else (np.zeros(0), np.zeros(0))
+    typical = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])
+    width = np.where(np.isfinite(wide), wide, WIDE * typical)
+    names = (*nuisance, *(coordinate_name(effects, c) for c in coords), *patch_names)
+    size = len(nuisance)
+    prior = np.zeros((len(names), len(names)))
+    prior[:size, :size] = np.eye(size)
+    at_effects = np.arange(size, size + len(coords))
+    prior[at_effects, at_effects] = width**2
+    prior[size + len(coords) :, size + len(coords) :] = patch_prior
+    columns = [np.column_stack([*nuisance.values(), np.zeros((seen.sum(), 0))]), by_effects, by_patches[seen]]
+    jacobian = np.column_stack(columns) @ prior
+    gaussian = model.seen_gaussian(effects)
+    for index, kernel in given.items():
+        inside = seen[model.slices[index]]
+        gaussian = gaussian.with_discrepancy(index, kernel[np.ix_(inside, inside)])
+    with_effects = np.column_stack([gaussian.shared_jacobian, by_effects * width])
+    gaussian = replace(gaussian, shared_jacobian=with_effects)
+    white = gaussian.whiten(np.column_stack([jacobian, model.seen_value - gaussian.mean]))
+    mean = white[:, :-1].T @ white[:, -1]
+    covariance = prior - white[:, :-1].T @ white[:, :-1]
+    mean[at_effects] = 0.0  # the file states them at their best values
+    moves = _from_first(model.noise, camera, gain_db)
+    for i, name in enumerate(names):
+        if name.startswith("curve:"):
+            mean[i] = 0.0  # the file's curves have taken it up
+        mean[i] += moves.get(name, 0.0)
+    return ModelPosterior.of(_first(model.noise), names, mean, covariance)
+
+
+def _first(noise: NoiseGuess) -> FirstEstimates:
+    return FirstEstimates(
+        dark_temperature_c=noise.dark_c,
+        read_noise_dn=noise.read_dn,
+        black_level_std_dn=noise.black_std,
+        dark_current_std_dn_per_s=noise.dark_std,
+        level_jitter_dn=noise.jitter_dn,
+        lamp_jitter=noise.jitter_lamp,
+    )
+
+
+def _from_first(noise: NoiseGuess, camera: CameraModel, gain_db: float) -> dict[str, float]:
+    """What the first estimates differ by from what `camera` states, in prior standard deviations, by the nuisance parameter's name."""
+    gain = gain_dn_per_e(camera, gain_db)
+    return {
+        "gain": (noise.gain / gain - 1.0) / GAIN_STD,
+        "black": (noise.black - camera.black_level_dn) / noise.black_std,
+        "dark": (noise.dark_dn_per_s - camera.dark_current_e_per_s * gain) / noise.dark_std,
+    }
+
+
+def coordinate_name(effects: Sequence[Effect], coordinate: Coordinate) -> str:
+    """How a posterior calls the parameter of an effect."""
+    return f"{effects[coordinate.index].name}.{coordinate.name}"
+
+
+def effect_jacobian(model: MeasurementModel, effects: Sequence[Effect], coords: Sequence[Coordinate]) -> FloatArray:
+    """Derivatives (n, p) of the predicted numbers by the coordinates of the effects' parameters, by differences within the bounds."""
+    columns = [np.zeros((len(model.value), 0))]
+    for c in coords:
+        value = float(getattr(effects[c.index], c.name))
+        u, (low, high) = c.to_u(value), c.bounds
+        step = max(STEP * c.typical(value), c.quantity.smooth_over)
+        ends = np.clip([u - step, u + step], low, high)
+        below, above = (model.mean(moved(effects, [c], np.array([end]))) for end in ends)
+        columns.append(((above - below) / (ends[1] - ends[0]))[:, None])
+    return np.column_stack(columns)
+
+
+def _patches(model: MeasurementModel) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
+    """Names (q,) of the chart's reflectances, the Jacobian (n, q) by their relative errors, and the prior covariance (q, q) of these."""
+    for block, at in zip(model.blocks, model.slices, strict=True):
+        if block.measurement is CHART:
+            key = [f"{PATCH}{label.condition}:{label.channel}" for label in block.labels]
+            first = {name: i for i, name in reversed(list(enumerate(key)))}
+            jacobian = np.zeros((len(model.value), len(first)))
+            for row, name in enumerate(key):
+                jacobian[at.start + row, list(first).index(name)] = block.scale[row]
+            rows = list(first.values())
+            names, channel = (np.array([getattr(block.labels[i], of) for i in rows]) for of in ("condition", "channel"))
+            signal = block.scale[rows]
+            return tuple(first), jacobian, reflectance_covariance(names, channel, signal) / np.outer(signal, signal)
+    return (), np.zeros((len(model.value), 0)), np.zeros((0, 0))

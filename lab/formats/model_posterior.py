@@ -1,0 +1,69 @@
+"""How well the parameters of a camera model are known together: a JSON file beside the camera file.
+
+A parameter is a nuisance parameter of the diagnosis (`gain`, `curve:G:0`), a parameter of an effect (`veiling_glare.share_percent`), or the
+reflectance of a chart's patch in one channel (`patch:white:G`).
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from sim.parameters import Frozen
+from sim.spectrum import FloatArray
+
+#: Beginning of the names of patches' reflectances.
+PATCH = "patch:"
+
+
+class FirstEstimates(Frozen):
+    """The figures about which a session's predictions were linear, and the scatter of its levels from repeat to repeat."""
+
+    dark_temperature_c: float | None  # that the camera's dark current holds for; None: not known
+    read_noise_dn: float  # as recorded, rounding included
+    black_level_std_dn: float
+    dark_current_std_dn_per_s: float
+    level_jitter_dn: float  # standard deviation of a dark frame's mean
+    lamp_jitter: float  # relative standard deviation of a flat frame's mean
+
+
+class ModelPosterior(Frozen):
+    """Posterior mean (k,) and covariance (k, k) of a camera model's parameters.
+
+    A nuisance parameter is in prior standard deviations of the diagnosis from what the camera file states. An effect's parameter is in its
+    coordinate (`Quantity.linear_power`, `logarithmic`) from what the file states, a reflectance relative to the published one.
+    """
+
+    format: Literal["calibench-posterior"] = "calibench-posterior"
+    version: Literal[1] = 1
+    first: FirstEstimates
+    names: tuple[str, ...]
+    mean: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        k = len(self.names)
+        if len(self.mean) != k or len(self.covariance) != k or any(len(row) != k for row in self.covariance):
+            raise ValueError(f"{k} names need {k} means and a covariance of {k} x {k}; write the file again")
+        return self
+
+    @classmethod
+    def of(cls, first: FirstEstimates, names: tuple[str, ...], mean: FloatArray, covariance: FloatArray) -> Self:
+        """The posterior of these arrays, in the nine digits that its file keeps."""
+        rows = [[float(f"{value:.9g}") for value in row] for row in 0.5 * (covariance + covariance.T)]
+        return cls(
+            first=first, names=names, mean=tuple(float(f"{m:.9g}") for m in mean), covariance=tuple(map(tuple, rows))
+        )
+
+    def taken(self, names: list[str]) -> tuple[FloatArray, FloatArray]:
+        """Mean (n,) and covariance (n, n) of the parameters `names`. One that isn't known here has its prior: mean 0, variance 1."""
+        known = {name: i for i, name in enumerate(self.names)}
+        mean, covariance = np.zeros(len(names)), np.eye(len(names))
+        at = [i for i, name in enumerate(names) if name in known]
+        here = [known[names[i]] for i in at]
+        mean[at] = np.array(self.mean)[here]
+        covariance[np.ix_(at, at)] = np.array(self.covariance).reshape(len(known), -1)[np.ix_(here, here)]
+        return mean, covariance

@@ -1,0 +1,218 @@
+"""Which parameters, as well as they are known at present, matter for a stated use of the camera.
+
+g = d use / d z at the model, by differences; the variance of the use is g' V g with V the posterior covariance. What a group k of parameters
+adds is what knowing it exactly would take away (linear propagation, conditional covariance):
+
+    added_k = g' V g - g_r' (V_rr - V_rk V_kk^-1 V_kr) g_r,   r: all others
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from lab.diagnose.inference.refit import coordinates, moved
+from lab.diagnose.measurements.curves import freed_curve
+from lab.diagnose.measurements.noise import GAIN_STD, READ_STD
+from lab.diagnose.outcome.model_posterior import STEP, coordinate_name
+from lab.errors import InputError
+from lab.formats.camera_file import CameraFile
+from lab.formats.model_posterior import ModelPosterior
+from lab.one_blas_thread import one_blas_thread
+from lab.twin.predict import posterior_of
+from sim.camera import CameraModel
+from sim.effects.base import Effect
+from sim.parameters import Frozen
+from sim.point import optical_transfer
+from sim.scene.colorchecker import reflectances
+from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import FieldPoints, Uniform, electron_rate
+
+#: The light of all uses, of equal energy, and how far it fills the brightest channel.
+LIGHT, FILLED = Spectrum.of((380.0, 780.0), (0.01, 0.01)), 0.7
+FREQUENCY = np.linspace(0.0, 1.0, 101)  # cy/px
+Effects = tuple[Effect, ...]
+
+
+class Contribution(Frozen):
+    """What one effect, or one part of the camera, adds to the variance of a use: its share, and the standard deviation, per cent of the use,
+    that its own uncertainty makes."""
+
+    name: str
+    parameters: tuple[str, ...]
+    share_percent: float
+    std_percent: float
+
+
+class UseBudget(Frozen):
+    """One use: its standard deviation (per cent, rms over its numbers), and the contributions, largest first."""
+
+    use: str
+    std_percent: float
+    contributions: tuple[Contribution, ...]
+
+
+class BudgetResult(Frozen):
+    """The result of `calibench twin budget`."""
+
+    model: str
+    uses: tuple[UseBudget, ...]
+
+
+def _exposure_s(camera: CameraModel) -> float:
+    return FILLED * camera.full_well_e / max(electron_rate(camera, c, LIGHT) for c in camera.channels)
+
+
+def _mtf50(camera: CameraModel, effects: Effects, exposure_s: float) -> FloatArray:
+    """MTF50, cy/px, along rows and columns by channel."""
+    found = []
+    for channel in camera.channels:
+        for fx, fy in ((FREQUENCY, 0.0 * FREQUENCY), (0.0 * FREQUENCY, FREQUENCY)):
+            mtf = np.abs(optical_transfer(camera, channel, LIGHT, fx, fy, effects))
+            below = int(np.argmax(mtf < 0.5)) or len(FREQUENCY) - 1
+            found.append(np.interp(-0.5, -mtf[below - 1 : below + 1], FREQUENCY[below - 1 : below + 1]))
+    return np.array(found)
+
+
+def _patches(camera: CameraModel, effects: Effects, exposure_s: float) -> FloatArray:
+    """Levels above black, DN, of the chart's patches by channel."""
+    model = Uniform(camera, effects)
+    field = model.field(FieldPoints.of(camera))
+    found: list[float] = []
+    for patch in reflectances("ColorChecker24").values():
+        rates = {c: electron_rate(camera, c, LIGHT, effects, "chart", reflectance=patch) for c in camera.channels}
+        found += [float(v) for v in model.mean_dn(model.electrons(rates, exposure_s, field=field)).values()]
+    return np.array(found)
+
+
+def _variance(camera: CameraModel, effects: Effects, exposure_s: float) -> FloatArray:
+    """Temporal variance, DN^2, at five signals of the dark to `FILLED` of the full well."""
+    signal = np.linspace(0.0, FILLED, 5) * camera.full_well_e
+    return np.asarray(
+        camera.conversion_gain_dn_per_e**2 * (Uniform(camera, effects).shot_e2(signal) + camera.read_noise_e**2)
+    )
+
+
+def _dark_mean(camera: CameraModel, effects: Effects, exposure_s: float) -> FloatArray:
+    """Dark signal of one second, DN, at the reference temperature and ten degrees above it."""
+    model, reference_c = Uniform(camera, effects), camera.dark_current_reference_c
+    rates = [float(np.mean(model.dark_e_per_s(reference_c + rise))) for rise in (0.0, 10.0)]
+    return camera.conversion_gain_dn_per_e * np.array(rates)
+
+
+#: What a camera is used for: name -> its numbers.
+USES: dict[str, Callable[[CameraModel, Effects, float], FloatArray]] = {
+    "MTF50": _mtf50,
+    "patches": _patches,
+    "variance": _variance,
+    "dark mean": _dark_mean,
+}
+
+
+def parse_uses(text: str) -> tuple[str, ...]:
+    """The uses of "MTF50, patches". Raises InputError for one that isn't known."""
+    names = {name.lower(): name for name in USES}
+    found = [one.strip() for one in text.split(",") if one.strip()]
+    unknown = [one for one in found if one.lower() not in names]
+    if unknown or not found:
+        raise InputError(
+            f"--use {text!r}: {unknown[0] if unknown else 'nothing'} isn't a use; take some of {', '.join(USES)}"
+        )
+    return tuple(dict.fromkeys(names[one.lower()] for one in found))
+
+
+@one_blas_thread
+def budget(content: CameraFile, uses: tuple[str, ...]) -> BudgetResult:
+    """The budget of every use. Raises InputError where the model states no uncertainties."""
+    posterior = posterior_of(content)
+    covariance = np.array(posterior.covariance)
+    return BudgetResult(model=content.name, uses=tuple(_use(content, posterior, covariance, use) for use in uses))
+
+
+def _use(content: CameraFile, posterior: ModelPosterior, covariance: FloatArray, use: str) -> UseBudget:
+    exposure_s = _exposure_s(content.camera)
+
+    def numbers(changed: CameraFile) -> FloatArray:
+        return USES[use](changed.camera, changed.effects, exposure_s)
+
+    base = numbers(content)
+    gradient = np.array([_slope(content, posterior, name, base, numbers) for name in posterior.names])
+    gradient = gradient / np.maximum(np.abs(base), 1e-12)  # (k, m), relative
+    whole = float(np.mean(np.einsum("km,kl,lm->m", gradient, covariance, gradient)))
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(posterior.names):
+        if gradient[i].any():
+            groups.setdefault(_group(name), []).append(i)
+    found = []
+    for name, members in groups.items():
+        rest = [i for i in range(len(gradient)) if i not in members]
+        inside = covariance[np.ix_(members, members)]
+        between = covariance[np.ix_(rest, members)]
+        left = covariance[np.ix_(rest, rest)] - between @ np.linalg.pinv(inside) @ between.T
+        remaining = float(np.mean(np.einsum("km,kl,lm->m", gradient[rest], left, gradient[rest])))
+        share = (whole - remaining) / whole if whole > 0 else 0.0
+        alone = float(np.mean(np.einsum("km,kl,lm->m", gradient[members], inside, gradient[members])))
+        found.append(
+            Contribution(
+                name=name, parameters=tuple(posterior.names[i] for i in members), share_percent=100.0 * share,
+                std_percent=100.0 * float(np.sqrt(max(alone, 0.0))),
+            )
+        )  # fmt: skip
+    found.sort(key=lambda one: -one.share_percent)
+    return UseBudget(use=use, std_percent=100.0 * float(np.sqrt(max(whole, 0.0))), contributions=tuple(found))
+
+
+def _group(name: str) -> str:
+    """The effect, or the part of the camera, that a parameter belongs to."""
+    kind, _, rest = name.partition(":")
+    return f"sensitivity {rest[0]}" if kind == "curve" else name.partition(".")[0]
+
+
+def _slope(
+    content: CameraFile,
+    posterior: ModelPosterior,
+    name: str,
+    base: FloatArray,
+    numbers: Callable[[CameraFile], FloatArray],
+) -> FloatArray:
+    """Derivative (m,) of a use's numbers by one parameter of the posterior; 0 where the use doesn't know it."""
+    camera, effects, first = content.camera, content.effects, posterior.first
+    coords = {coordinate_name(effects, c): c for c in coordinates(effects, camera)}
+    update: dict[str, object] = {}
+    step = 0.1
+    if name in coords:
+        c = coords[name]
+        value = float(getattr(effects[c.index], c.name))
+        high = c.bounds[1]
+        step = max(STEP * c.typical(value), c.quantity.smooth_over)
+        step = step if c.to_u(value) + step <= high else -step
+        acting = moved(effects, [c], np.array([c.to_u(value) + step]))
+        return (numbers(CameraFile(content.name, camera, acting)) - base) / step
+    if name.startswith("curve:"):
+        channel = name.split(":")[1]
+        # the same resampling on both sides, so that the difference is the parameter's alone
+        ends = [freed_curve(camera.quantum_efficiency[channel], channel, {name: at}) for at in (0.0, step)]
+        values = []
+        for end in ends:
+            curves = camera.quantum_efficiency | {channel: end}
+            values.append(
+                numbers(CameraFile(content.name, camera.model_copy(update={"quantum_efficiency": curves}), effects))
+            )
+        return np.asarray((values[1] - values[0]) / step)
+    gain = camera.conversion_gain_dn_per_e
+    if name == "gain":
+        update["conversion_gain_dn_per_e"] = gain * (1.0 + GAIN_STD * step)
+        # electrons times gain are measured: the curves are about that product
+        curves = {
+            c: Spectrum.of(q.wavelength_nm, np.array(q.value) / (1.0 + GAIN_STD * step))
+            for c, q in camera.quantum_efficiency.items()
+        }
+        update["quantum_efficiency"] = curves
+    elif name == "read":
+        update["read_noise_e"] = camera.read_noise_e * np.sqrt(1.0 + READ_STD * step)
+    elif name == "dark":
+        update["dark_current_e_per_s"] = camera.dark_current_e_per_s + step * first.dark_current_std_dn_per_s / gain
+    else:
+        return np.zeros_like(base)
+    return np.asarray((numbers(CameraFile(content.name, camera.model_copy(update=update), effects)) - base) / step)

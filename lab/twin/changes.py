@@ -1,0 +1,131 @@
+"""What is changed between the session that a model was fitted to and the one that is predicted, and the model that carries it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import ValidationError
+
+from lab.errors import InputError
+from lab.fit.noise.dark_current import DOUBLING_C_STD
+from lab.formats.camera_file import CameraFile
+from lab.formats.spectrum_csv import parse_spectrum
+from lab.predict.simulate import with_lens
+from sim.effects.dark_current_temperature import DarkCurrentTemperature
+from sim.optics.illumination import irradiance_factor
+from sim.optics.imaging import DiffractionLimited
+from sim.parameters import Frozen, Quantity
+from sim.spectrum import Spectrum
+
+#: Change of the temperature (C) that needs no law of dark current.
+SAME_C = 0.5
+
+
+class Changes(Frozen):
+    """The changes of one session; None: as in the plan."""
+
+    f_number: Annotated[float | None, Quantity("1", "f-number", lower=0.5, upper=64.0)] = None
+    temperature_c: Annotated[float | None, Quantity("C", "sensor temperature", lower=-273.0, upper=200.0)] = None
+    lamp: Path | None = None
+    lens: Path | None = None
+    distance_mm: Annotated[float | None, Quantity("mm", "distance of the scene", lower=1.0)] = None
+    exposure_factor: Annotated[float | None, Quantity("1", "factor on exposures", lower=1e-4, upper=1e4)] = None
+    gain_db: Annotated[float | None, Quantity("dB", "analogue gain", lower=-40.0, upper=80.0)] = None
+    radiance_factor: Annotated[float | None, Quantity("1", "factor on the light", lower=1e-6, upper=1e6)] = None
+
+    def spectrum(self) -> Spectrum | None:
+        """The changed lamp's radiance, W sr^-1 m^-2 nm^-1; None: the plan's. Raises InputError for a file that can't be used."""
+        if self.lamp is None:
+            return None
+        try:
+            return parse_spectrum(self.lamp.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(
+                f"lamp: {self.lamp} can't be read ({getattr(error, 'strerror', error)}); name the CSV of its radiance"
+            ) from error
+        except InputError as error:
+            raise InputError(f"lamp: {self.lamp}: {error}") from error
+
+
+def parse_changes(text: str) -> Changes:
+    """The changes of `key=value,key=value`. Raises InputError for an unknown key and a value that can't be used."""
+    values: dict[str, str] = {}
+    known = ", ".join(Changes.model_fields)
+    for part in filter(None, (one.strip() for one in text.split(","))):
+        key, equals, value = (one.strip() for one in part.partition("="))
+        if key not in Changes.model_fields:
+            raise InputError(f"--change {part}: {key!r} isn't a change; take some of {known}")
+        if not equals or not value or key in values:
+            raise InputError(f"--change {part}: give {key}=VALUE, once")
+        values[key] = value
+    try:
+        return Changes.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        told = first["msg"].removeprefix("Value error, ")
+        raise InputError(f"--change {first['loc'][0]}={first['input']}: {told}; correct it") from error
+
+
+def carried(content: CameraFile, changes: Changes) -> CameraFile:
+    """The model with the changes to its lens. Raises InputError where it can't carry one of the changes."""
+    if changes.lens is not None:
+        if not changes.lens.is_file():
+            raise InputError(f"lens: {changes.lens} isn't there; name the prescription, a .zmx file")
+        content = with_lens(content, changes.lens)
+    camera = content.camera
+    if changes.f_number is not None:
+        if not isinstance(camera.lens.imaging, DiffractionLimited):
+            raise InputError(
+                f"f_number={changes.f_number:g}: the model's lens is {camera.lens.imaging.kind}, which holds for f/{camera.lens.f_number:g} alone; "
+                "give lens=FILE.zmx at that aperture"
+            )
+        lens = camera.lens.model_copy(update={"f_number": changes.f_number})
+        content = replace(content, camera=camera.model_copy(update={"lens": lens}))
+    reference_c = reference_temperature_c(content)
+    if changes.temperature_c is not None:
+        if reference_c is None:
+            raise InputError(
+                f"temperature_c={changes.temperature_c:g}: the model doesn't say at which temperature its dark current holds; fit darks with temperature_c"
+            )
+        if abs(changes.temperature_c - reference_c) > SAME_C and not has_dark_law(content):
+            raise InputError(
+                f"temperature_c={changes.temperature_c:g}: the model has no law of dark current beyond {reference_c:g} C; fit darks at two temperatures, or state "
+                "dark_current_doubling_c in the camera file"
+            )
+    if changes.distance_mm is not None:
+        focal_mm = camera.lens.focal_length_mm
+        if changes.distance_mm <= 2.0 * focal_mm:
+            raise InputError(
+                f"distance_mm={changes.distance_mm:g}: isn't above twice the focal length, {focal_mm:g} mm; give a larger one, or state focal_length_mm"
+            )
+    return content
+
+
+def reference_temperature_c(content: CameraFile) -> float | None:
+    """Temperature of the sensor, C, that the model's dark current holds for; None where nobody says."""
+    if content.posterior is not None:
+        return content.posterior.first.dark_temperature_c
+    return content.camera.dark_current_reference_c
+
+
+def has_dark_law(content: CameraFile) -> bool:
+    """Whether the model says how dark current changes with temperature."""
+    acts = any(isinstance(e, DarkCurrentTemperature) and e.doublings_per_c != 0.0 for e in content.effects)
+    return acts or content.camera.dark_current_doubling_c is not None
+
+
+def doubling_std_c(content: CameraFile) -> float:
+    """Standard deviation of the camera's own doubling temperature, C."""
+    return content.camera.std.get("dark_current_doubling_c", DOUBLING_C_STD)
+
+
+def light_factor(content: CameraFile, changes: Changes) -> float:
+    """Factor on the light of all lit captures: dimmer lamps, and a nearer scene, whose image is larger."""
+    factor = changes.radiance_factor or 1.0
+    if changes.distance_mm is None:
+        return factor
+    lens = content.camera.lens
+    magnification = lens.focal_length_mm / (changes.distance_mm - lens.focal_length_mm)
+    return float(factor * irradiance_factor(lens.f_number, magnification) / irradiance_factor(lens.f_number))

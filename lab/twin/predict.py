@@ -1,0 +1,308 @@
+"""Predict the measured numbers of a session to come, with the covariance of their noise and of the model's parameters.
+
+mean = m(effects) + J E(z),   covariance = S + J cov(z) J'
+
+J is the Jacobian of the diagnosis's measurement model by nuisance parameters, effects' parameters and patches' reflectances, z their
+posterior (`lab.formats.model_posterior`), S noise, floors and the laws' tolerances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from lab.capture_kinds.base import Capture
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.refit import coordinates
+from lab.diagnose.measurements.block import Block, Effects, Label, Prediction
+from lab.diagnose.measurements.chart import CHART, reflectance_covariance
+from lab.diagnose.measurements.dark_level import DARK, added_dark_e_per_s
+from lab.diagnose.measurements.noise import GAIN_STD, NOISE, READ_STD, shot_variance
+from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, USUAL_LAMP, NoiseGuess
+from lab.diagnose.measurements.slanted_edge import ASIDE, SLANTED_EDGE
+from lab.diagnose.measurements.study import Study
+from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian
+from lab.errors import InputError, NotDetermined
+from lab.formats.camera_file import CameraFile
+from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import Skipped
+from lab.one_blas_thread import one_blas_thread
+from lab.twin.changes import Changes, carried, doubling_std_c, reference_temperature_c
+from lab.twin.sealed import PredictedNumber, SealedPrediction, SidePrediction
+from lab.twin.session import future_session
+from sim.camera import CameraModel, Side
+from sim.effects.model_discrepancy import ModelDiscrepancy
+from sim.sensor.electrons import dark_current_e_per_s, gain_dn_per_e
+from sim.spectrum import FloatArray
+
+#: The measurements that a twin predicts.
+QUANTITIES = (CHART, NOISE, SLANTED_EDGE, DARK)
+NYQUIST_CY_PER_PX = 0.5
+#: Share of the full well from which on a pixel counts as clipped.
+NEAR_FULL = 0.985
+#: Share of saturation above which a level isn't predicted, as some of its pixels clip.
+HIGHEST_SHARE = 0.95
+#: Usual scatter of a dark frame's mean, DN, where the model doesn't say.
+USUAL_JITTER_DN = 0.02
+#: Relative standard deviation of the sensitivities where the model has none.
+CURVE_STD = 0.01
+#: Step (C) of the difference by temperature.
+STEP_C = 0.1
+
+
+@one_blas_thread
+def predict(
+    models: Mapping[Side, CameraFile],
+    plan: RecordingSet,
+    changes: Changes,
+    *,
+    model: str = "",
+    light_std: float = 0.003,
+) -> SealedPrediction:
+    """The prediction for every side that plan and models have in common.
+
+    light_std : relative standard deviation of the light to come, beside what the plan states
+
+    Raises InputError for a change that a model can't carry, before anything is computed, and where nothing can be predicted.
+    """
+    sides = [side for side in plan.sides if side in models]
+    if not sides:
+        raise InputError(f"{plan.source}: no camera that the model has; give the plan of the same cameras")
+    changes.spectrum()
+    checked = {side: (carried(models[side], changes), posterior_of(models[side])) for side in sides}
+    found = {}
+    for side, (content, posterior) in checked.items():
+        found[side] = _side(content, posterior, plan, side, changes, light_std)
+    return SealedPrediction(
+        model=model, plan=plan.source, changes=changes, sides=found,
+        cameras={side: content.camera.model_dump_json() for side, (content, _) in checked.items()},
+    )  # fmt: skip
+
+
+def posterior_of(content: CameraFile) -> ModelPosterior:
+    """How well the model's parameters are known: its posterior, else one of independent parameters by the camera's `std`. Raises InputError
+    where it states neither."""
+    if content.posterior is not None:
+        return content.posterior
+    camera = content.camera
+    if not camera.std:
+        raise InputError(
+            f"{content.name}: the model states no uncertainties; take one that `diagnose --save` or `fit --write-cameras` wrote"
+        )
+    gain, std = camera.conversion_gain_dn_per_e, camera.std
+    first = FirstEstimates(
+        dark_temperature_c=camera.dark_current_reference_c,
+        read_noise_dn=float(np.hypot(camera.read_noise_e * gain, 12.0**-0.5)),
+        black_level_std_dn=std.get("black_level_dn", 0.1),
+        dark_current_std_dn_per_s=max(std.get("dark_current_e_per_s", 0.1 * camera.dark_current_e_per_s) * gain, 1e-9),
+        level_jitter_dn=USUAL_JITTER_DN,
+        lamp_jitter=USUAL_LAMP,
+    )
+    known = {
+        "gain": std.get("conversion_gain_dn_per_e", 0.01 * gain) / gain / GAIN_STD,
+        "read": 2.0 * std.get("read_noise_e", 0.03 * camera.read_noise_e) / max(camera.read_noise_e, 1e-9) / READ_STD,
+    }
+    variances = np.square(list(known.values()))
+    return ModelPosterior.of(first, tuple(known), np.zeros(len(known)), np.diag(variances))
+
+
+def measured_blocks(study: Study) -> tuple[list[Block], list[Skipped]]:
+    """The blocks that the recordings determine, with the numbers that a twin predicts, and why others are missing."""
+    blocks, skipped = [], []
+    for measurement in QUANTITIES:
+        try:
+            blocks.append(measurement.make(study))
+        except NotDetermined as refused:
+            skipped.append(Skipped(step=f"twin {refused.step}", reason=refused.reason, side=study.side))
+    return blocks, skipped
+
+
+def is_predicted(block: Block, label: Label) -> bool:
+    """Whether a twin predicts a block's number: transfer functions by their real parts up to Nyquist, all else wholly."""
+    return block.measurement is not SLANTED_EDGE or (
+        label.x <= NYQUIST_CY_PER_PX and not label.condition.endswith(ASIDE)
+    )
+
+
+def _side(
+    content: CameraFile, posterior: ModelPosterior, plan: RecordingSet, side: Side, changes: Changes, light_std: float
+) -> SidePrediction:
+    session = future_session(content, plan, side, changes)
+    captures = session.captures(side=side)
+    study, growth_std = _study(content, posterior, session, side)
+    blocks, skipped = measured_blocks(study)
+    if not blocks:
+        raise InputError(
+            f"{plan.source}: nothing can be predicted ({skipped[0].reason}); plan other captures or changes"
+        )
+    model = MeasurementModel(tuple(blocks), study.camera, gain_is_known=True, noise=study.noise)
+    effects = content.effects
+    mean, covariance = _distribution(model, effects, posterior, growth_std, light_std)
+    use = np.array([is_predicted(b, label) for b in blocks for label in b.labels])
+    is_level = np.array([b.measurement.is_level for b in blocks for _ in b.labels])
+    full = is_level & (mean > HIGHEST_SHARE * study.saturation_dn)
+    if full.any():
+        reason = f"{full.sum()} levels are above {100 * HIGHEST_SHARE:g} % of saturation, {study.saturation_dn:.4g} DN: plan shorter exposures"
+        skipped.append(Skipped(step="twin saturation", reason=reason, side=side))
+        use &= ~full
+    without = {}
+    for i, effect in enumerate(effects):
+        if not isinstance(effect, ModelDiscrepancy):
+            rest = (*effects[:i], *effects[i + 1 :])
+            without[effect.name] = tuple((mean + model.mean(rest) - model.mean(effects))[use].tolist())
+    kept = covariance[np.ix_(use, use)]
+    numbers = [n for n, used in zip(_numbers(study, model, effects, mean, covariance), use, strict=True) if used]
+    lens = content.camera.lens
+    return SidePrediction(
+        camera=session.camera(side),
+        captures=tuple(captures),
+        lens={"f_number": lens.f_number, "focal_length_mm": lens.focal_length_mm},
+        numbers=tuple(numbers),
+        covariance=tuple(float(f"{v:.9g}") for v in kept[np.tril_indices(len(kept))]),
+        without=without,
+        skipped=tuple(skipped),
+    )
+
+
+def _study(content: CameraFile, posterior: ModelPosterior, session: RecordingSet, side: Side) -> tuple[Study, float]:
+    """The study of the session to come, whose figures are the model's; and the relative standard deviation of its dark current by the
+    camera's own doubling temperature."""
+    camera, first = content.camera, posterior.first
+    captures: list[Capture] = session.captures(side=side)
+    gain = gain_dn_per_e(camera, captures[0].gain_db or 0.0)
+    amplified = gain / camera.conversion_gain_dn_per_e
+    reference_c = reference_temperature_c(content)
+    warm = [c.temperature_c for c in captures if c.temperature_c is not None]
+    now_c = float(np.median(warm)) if warm else None
+    if reference_c is not None:
+        camera = camera.model_copy(update={"dark_current_reference_c": reference_c})
+    dark = dark_current_e_per_s(camera, now_c)
+    growth = dark / camera.dark_current_e_per_s if camera.dark_current_e_per_s > 0 else 1.0
+    growth_std = 0.0
+    if now_c is not None and reference_c is not None and camera.dark_current_doubling_c is not None:
+        rise = now_c - reference_c
+        growth_std = abs(np.log(2.0) * rise / camera.dark_current_doubling_c**2) * doubling_std_c(content)
+    noise = NoiseGuess(
+        black=camera.black_level_dn, dark_dn_per_s=dark * gain, dark_c=reference_c, gain=gain, gain_is_known=True,
+        read_dn=float(np.hypot(np.sqrt(max(first.read_noise_dn**2 - 1.0 / 12.0, 0.0)) * amplified, 12.0**-0.5)),
+        prnu=0.01 * camera.prnu_percent, jitter_dn=max(first.level_jitter_dn, BLACK_FLOOR_DN), jitter_freedom=0.0,
+        jitter_lamp=first.lamp_jitter, black_std=first.black_level_std_dn,
+        dark_std=first.dark_current_std_dn_per_s * amplified * growth,
+    )  # fmt: skip
+    seen: CameraModel = camera.model_copy(
+        update={
+            "conversion_gain_dn_per_e": gain,
+            "dark_current_e_per_s": dark,
+            "dark_current_doubling_c": None,
+            "read_noise_e": noise.read_dn / gain,
+        }
+    )
+    clipped = camera.black_level_dn + NEAR_FULL * camera.full_well_e * gain
+    return Study(session, side, seen, clipped, noise=noise), growth_std
+
+
+def _distribution(
+    model: MeasurementModel, effects: Effects, posterior: ModelPosterior, growth_std: float, light_std: float
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (n,) and covariance (n, n) of all numbers."""
+    columns = {k: v for k, v in model.nuisance_jacobian(effects).items() if k != "warmth"}
+    coords = coordinates(effects, model.camera)
+    by_effect = effect_jacobian(model, effects, coords).T
+    columns |= {
+        name: column
+        for c, column in zip(coords, by_effect, strict=True)
+        if (name := coordinate_name(effects, c)) in posterior.names
+    }
+    bare = MeasurementModel(tuple(_without_nuisances(b) for b in model.blocks), model.camera)
+    covariance = bare.gaussian(effects).covariance - _forms(bare, effects)
+    for block, at in zip(model.blocks, model.slices, strict=True):
+        if block.measurement is DARK and model.noise is not None:
+            # shot noise of the dark charge, which the scatter of the fitted session's frames needn't have
+            camera, black = model.camera, model.noise.black
+            charge_dn = np.maximum(model.mean(effects)[at] - black, 0.0)
+            variance = (model.noise.gain * charge_dn + model.noise.read_dn**2) / (camera.rows * camera.cols)
+            covariance[at, at] += np.diag(variance)
+        if block.measurement is CHART:
+            covariance[at, at] += light_std**2 * np.outer(block.scale, block.scale)
+            patches = _patch_columns(block, at, len(covariance))
+            if set(patches) & set(posterior.names):
+                kept = np.array([f"{PATCH}{la.condition}:{la.channel}" in posterior.names for la in block.labels])
+                names, channel = (np.array([getattr(la, of) for la in block.labels]) for of in ("condition", "channel"))
+                tolerance = reflectance_covariance(names, channel, block.scale)
+                covariance[at, at] -= tolerance * np.outer(kept, kept)
+                columns |= {name: column for name, column in patches.items() if name in posterior.names}
+    jacobian = np.column_stack([*columns.values(), np.zeros((len(covariance), 0))])
+    mean, known = posterior.taken(list(columns))
+    covariance += jacobian @ known @ jacobian.T
+    if growth_std:
+        for block, at in zip(model.blocks, model.slices, strict=True):
+            if "dark" in columns and block.measurement is DARK and model.noise is not None:
+                change = columns["dark"][at] / model.noise.dark_std * model.noise.dark_dn_per_s * growth_std
+                covariance[at, at] += np.outer(change, change)
+    return np.asarray(model.mean(effects) + jacobian @ mean), np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _forms(model: MeasurementModel, effects: Effects) -> FloatArray:
+    """The part (n, n) of a bare model's covariance by other forms of the laws, which the posterior knows better."""
+    columns = [*model.nuisance_jacobian(effects).values()]
+    return np.asarray(sum((np.outer(c, c) for c in columns), np.zeros((len(model.value),) * 2)))
+
+
+def _without_nuisances(block: Block) -> Block:
+    def bare(effects: Effects) -> Prediction:
+        return Prediction(block.predict(effects).mean, {})
+
+    return replace(block, predict=bare)
+
+
+def _patch_columns(block: Block, at: slice, size: int) -> dict[str, FloatArray]:
+    """Derivatives (size,) of all numbers by the patches' relative reflectances, by name."""
+    found: dict[str, FloatArray] = {}
+    for row, label in enumerate(block.labels):
+        column = found.setdefault(f"{PATCH}{label.condition}:{label.channel}", np.zeros(size))
+        column[at.start + row] = block.scale[row]
+    return found
+
+
+def _numbers(
+    study: Study, model: MeasurementModel, effects: Effects, mean: FloatArray, covariance: FloatArray
+) -> list[PredictedNumber]:
+    """Every number, with how it follows exposure, temperature and level."""
+    noise, more, offset = study.noise, added_dark_e_per_s(study, effects), study.offset(effects)
+    found = []
+    for block, at in zip(model.blocks, model.slices, strict=True):
+        name = block.measurement.name
+        levels = np.array([label.x for label in block.labels])
+        slope = np.zeros(len(levels))
+        if block.measurement is NOISE:
+            gains, step = np.full(len(levels), noise.gain), 0.01 * levels
+            ends = [shot_variance(study, levels + sign * step, gains, effects) for sign in (1.0, -1.0)]
+            slope = (ends[0] - ends[1]) / (2.0 * step)
+        for k, label in enumerate(block.labels):
+            value, std = float(mean[at][k]), float(np.sqrt(covariance[at.start + k, at.start + k]))
+            capture = study.recordings.capture(label.captures[0])
+            update: dict[str, float | None] = {"fixed": value}
+            if block.measurement is NOISE:
+                update |= {"level_dn": float(levels[k]), "level_slope": float(slope[k])}
+            elif block.measurement in (DARK, CHART):
+                temperature = capture.temperature_c
+                rate = noise.dark_dn_per_s + noise.gain * more(temperature)
+                later = rate if temperature is None else noise.dark_dn_per_s + noise.gain * more(temperature + STEP_C)
+                warmth = float(np.log(later / rate)) / STEP_C if rate > 0 and later > 0 else 0.0
+                update |= {
+                    "fixed": noise.black + offset(capture),
+                    "dark": rate * capture.exposure_s,
+                    "warmth_per_c": warmth,
+                }
+            found.append(
+                PredictedNumber.model_validate(
+                    {
+                        "quantity": name, "captures": label.captures, "channel": label.channel, "where": label.condition,
+                        "x": label.x, "predicted": value, "std": std, **update,
+                    }
+                )
+            )  # fmt: skip
+    return found

@@ -1,0 +1,238 @@
+"""Open a sealed prediction against the recordings of the session that it foretold."""
+
+from __future__ import annotations
+
+import json
+from typing import Literal
+
+import numpy as np
+from scipy.stats import norm
+
+from lab.capture_kinds.base import Capture
+from lab.diagnose.inference.gaussian import chi2
+from lab.diagnose.measurements.library import measurement_title
+from lab.diagnose.measurements.study import Study
+from lab.errors import InputError
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import Skipped
+from lab.one_blas_thread import one_blas_thread
+from lab.twin.predict import is_predicted, measured_blocks
+from lab.twin.sealed import PredictedNumber, SealedPrediction, SidePrediction
+from sim.camera import CameraModel, Side
+from sim.parameters import Frozen
+from sim.spectrum import FloatArray
+
+#: Half width of a 95 % interval, in standard deviations.
+WIDTH_95 = float(norm.ppf(0.975))
+#: Most relative change of an exposure, change of a temperature (C) and of a corner (px) that still is the session that was predicted.
+MOST_EXPOSURE, MOST_C, MOST_PX = 0.25, 3.0, 4.0
+#: Least change of the logarithm of the likelihood that an effect makes for its name to be tested.
+LEAST_GAIN = 2.0
+#: Keys of the data sheet that have to be those of the prediction.
+SHEET = ("rows", "cols", "cfa", "bit_depth", "f_number")
+
+
+class ScoredNumber(Frozen):
+    """One number: predicted, moved to the exposure and temperature that were really set, and measured."""
+
+    side: Side
+    quantity: str
+    captures: tuple[str, ...]
+    channel: str
+    where: str
+    x: float
+    predicted: float
+    std: float
+    measured: float
+    deviation: float
+    deviation_sigma: float
+    deviation_percent: float
+
+
+class QuantityScore(Frozen):
+    """All numbers of one quantity. Deviations of an MTF are absolute, all others in per cent."""
+
+    quantity: str
+    n: int
+    unit: Literal["%", "1"]
+    median: float
+    largest_of_95_percent: float
+    within_95_percent_interval: float
+    chi2: float
+
+
+class TestedEffect(Frozen):
+    """Whether an effect's name survives. `gain`: log likelihood of the numbers with it less that without it."""
+
+    side: Side
+    name: str
+    gain: float
+    verdict: Literal["survives", "withdrawn", "untested"]
+
+
+class TwinScore(Frozen):
+    """The result of `calibench twin score`."""
+
+    format: Literal["calibench-twin-score"] = "calibench-twin-score"
+    version: Literal[1] = 1
+    source: str
+    quantities: tuple[QuantityScore, ...]
+    effects: tuple[TestedEffect, ...]
+    chi2: float
+    n: int
+    numbers: tuple[ScoredNumber, ...]
+    missing: int
+    skipped: tuple[Skipped, ...] = ()
+
+
+@one_blas_thread
+def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
+    """Predicted beside measured. Raises InputError where the recordings aren't of the session that was predicted."""
+    for side, prediction in sealed.sides.items():
+        check_session(prediction, recordings, side)
+    numbers: list[ScoredNumber] = []
+    effects: list[TestedEffect] = []
+    skipped: list[Skipped] = []
+    whole, missing = 0.0, 0
+    parts: dict[str, float] = {}
+    for side, prediction in sealed.sides.items():
+        camera = CameraModel.model_validate(json.loads(sealed.cameras[side]))
+        study = Study(_with_curves(recordings, prediction, camera, side), side, camera)
+        blocks, left_out = measured_blocks(study)
+        skipped += left_out
+        measured = {
+            _key(b.measurement.name, label): (float(v), label.x)
+            for b in blocks
+            for v, label in zip(b.value, b.labels, strict=True)
+            if is_predicted(b, label)
+        }
+        here = [i for i, number in enumerate(prediction.numbers) if number.key in measured]
+        missing += len(prediction.numbers) - len(here)
+        if not here:
+            raise InputError(
+                f"{recordings.source}: none of the {side} camera's predicted numbers is measured there; give the session that was predicted"
+            )
+        moved = np.array([_moved(prediction.numbers[i], prediction, recordings, measured) for i in here])
+        seen = np.array([measured[prediction.numbers[i].key][0] for i in here])
+        covariance = _square(prediction)[np.ix_(here, here)]
+        whole += chi2(seen - moved, covariance)
+        for name in dict.fromkeys(prediction.numbers[i].quantity for i in here):
+            mine = np.array([prediction.numbers[i].quantity == name for i in here])
+            parts[name] = parts.get(name, 0.0) + chi2((seen - moved)[mine], covariance[np.ix_(mine, mine)])
+        for name, values in prediction.without.items():
+            change = np.array([values[i] - prediction.numbers[i].predicted for i in here])
+            effects.append(_tested(side, name, seen - moved, change, covariance))
+        numbers += [_scored(side, prediction.numbers[i], m, v) for i, m, v in zip(here, moved, seen, strict=True)]
+    return TwinScore(
+        source=recordings.source, quantities=tuple(_quantity(name, numbers, value) for name, value in parts.items()),
+        effects=tuple(effects), chi2=whole, n=len(numbers), numbers=tuple(numbers), missing=missing, skipped=tuple(skipped),
+    )  # fmt: skip
+
+
+def check_session(prediction: SidePrediction, recordings: RecordingSet, side: Side) -> None:
+    """Raises InputError where the recordings aren't of the session that was predicted: another data sheet, gain or setting."""
+    stated = recordings.camera(side)
+    isnt = f"{recordings.source}: isn't the session that was predicted:"
+    for key in SHEET:
+        there, wanted = getattr(stated, key), getattr(prediction.camera, key)
+        if there != wanted:
+            raise InputError(f"{isnt} {key} of the {side} camera is {there}, predicted {wanted}; give that session")
+    found = {c.id: c for c in recordings.captures(side=side)}
+    for planned in prediction.captures:
+        taken = found.get(planned.id)
+        if taken is None or taken.kind != planned.kind:
+            raise InputError(f"{isnt} it has no {planned.kind} capture {planned.id}; give that session")
+        for key, there, wanted, most in _settings(taken, planned):
+            if abs(there - wanted) > most:
+                raise InputError(f"{isnt} {key} of {planned.id} is {there:g}, predicted {wanted:g}; give that session")
+
+
+def _settings(taken: Capture, planned: Capture) -> list[tuple[str, float, float, float]]:
+    """(key, as taken, as predicted, largest difference)."""
+    found = [
+        ("gain_db", taken.gain_db or 0.0, planned.gain_db or 0.0, 0.01),
+        ("exposure_s", taken.exposure_s, planned.exposure_s, MOST_EXPOSURE * planned.exposure_s),
+    ]
+    if taken.temperature_c is not None and planned.temperature_c is not None:
+        found.append(("temperature_c", taken.temperature_c, planned.temperature_c, MOST_C))
+    for key in ("corners", "region"):
+        there, wanted = (np.ravel(getattr(c, key, None) or 0.0) for c in (taken, planned))
+        if there.shape == wanted.shape:
+            found += [(key, float(a), float(b), MOST_PX) for a, b in zip(there, wanted, strict=True)]
+    return found
+
+
+def _with_curves(recordings: RecordingSet, prediction: SidePrediction, camera: CameraModel, side: Side) -> RecordingSet:
+    """The recordings under the data sheet of the prediction, without which the chart isn't measured."""
+    sheet = recordings.camera(side).model_copy(
+        update={"quantum_efficiency": prediction.camera.quantum_efficiency, "pixel_pitch_um": camera.pixel_pitch_um}
+    )
+    cameras = dict(recordings.manifest.cameras) | {side: sheet}
+    return recordings.under(recordings.manifest.model_copy(update={"cameras": cameras}))
+
+
+def _key(quantity: str, label: object) -> tuple[object, ...]:
+    return PredictedNumber(
+        quantity=quantity, captures=label.captures, channel=label.channel, where=label.condition, x=label.x, predicted=0.0, std=0.0  # type: ignore[attr-defined]
+    ).key  # fmt: skip
+
+
+def _moved(
+    number: PredictedNumber,
+    prediction: SidePrediction,
+    recordings: RecordingSet,
+    measured: dict[tuple[object, ...], tuple[float, float]],
+) -> float:
+    """The prediction at the exposure, temperature and level that were really set."""
+    if number.level_dn is not None:
+        return number.predicted + number.level_slope * (measured[number.key][1] - number.level_dn)
+    taken = recordings.capture(number.captures[0])
+    planned = next(c for c in prediction.captures if c.id == taken.id)
+    longer = taken.exposure_s / planned.exposure_s if planned.exposure_s > 0 else 1.0
+    warmer = 0.0
+    if taken.temperature_c is not None and planned.temperature_c is not None:
+        warmer = taken.temperature_c - planned.temperature_c
+    light = number.predicted - number.fixed - number.dark
+    return float(number.fixed + longer * (light + number.dark * np.exp(number.warmth_per_c * warmer)))
+
+
+def _square(prediction: SidePrediction) -> FloatArray:
+    """The covariance (n, n) of a prediction."""
+    n = len(prediction.numbers)
+    out = np.zeros((n, n))
+    out[np.tril_indices(n)] = prediction.covariance
+    return np.asarray(out + np.tril(out, -1).T)
+
+
+def _tested(side: Side, name: str, residual: FloatArray, change: FloatArray, covariance: FloatArray) -> TestedEffect:
+    gain = 0.5 * (chi2(residual - change, covariance) - chi2(residual, covariance))
+    told = 0.5 * chi2(change, covariance) >= LEAST_GAIN
+    verdict: Literal["survives", "withdrawn", "untested"] = (
+        "untested" if not told else "survives" if gain > 0 else "withdrawn"
+    )
+    return TestedEffect(side=side, name=name, gain=gain, verdict=verdict)
+
+
+def _scored(side: Side, number: PredictedNumber, moved: float, seen: float) -> ScoredNumber:
+    away = seen - moved
+    return ScoredNumber(
+        side=side, quantity=number.quantity, captures=number.captures, channel=number.channel, where=number.where, x=number.x,
+        predicted=moved, std=number.std, measured=seen, deviation=away, deviation_sigma=away / number.std,
+        deviation_percent=100.0 * away / max(abs(moved), 1e-12),
+    )  # fmt: skip
+
+
+def _quantity(name: str, numbers: list[ScoredNumber], value: float) -> QuantityScore:
+    mine = [n for n in numbers if n.quantity == name]
+    is_share = name == "slanted_edge"
+    away = np.abs([n.deviation if is_share else n.deviation_percent for n in mine])
+    return QuantityScore(
+        quantity=name, n=len(mine), unit="1" if is_share else "%", median=float(np.median(away)),
+        largest_of_95_percent=float(np.quantile(away, 0.95)),
+        within_95_percent_interval=float(np.mean([abs(n.deviation_sigma) <= WIDTH_95 for n in mine])), chi2=value,
+    )  # fmt: skip
+
+
+def title(quantity: str) -> str:
+    """A quantity as a lab reads it."""
+    return measurement_title(quantity)

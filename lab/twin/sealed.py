@@ -1,0 +1,103 @@
+"""A sealed prediction: its file, canonical JSON, and beside it the SHA-256 of that file, as `sha256sum -c` reads it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Literal
+
+from lab.capture_kinds.base import AnyCapture
+from lab.errors import InputError
+from lab.formats.raw_file import replacing
+from lab.formats.recording_set import DataSheet
+from lab.formats.result_file import read_result
+from lab.formats.results import Skipped
+from lab.twin.changes import Changes
+from sim.camera import Side
+from sim.parameters import Frozen
+
+
+class PredictedNumber(Frozen):
+    """One number that will be measured: its place, its value, and how it follows what a session can't repeat exactly.
+
+    quantity : the measurement: `chart`, `noise` (a temporal variance), `slanted_edge` (an MTF), `dark`
+    fixed : the part that neither exposure nor temperature changes
+    dark : the part by dark current, in proportion to the exposure, growing by exp(`warmth_per_c` x rise)
+    level_dn, level_slope : of a variance: the mean signal above black that it is predicted for, and its derivative by that
+    """
+
+    quantity: str
+    captures: tuple[str, ...]
+    channel: str
+    where: str
+    x: float
+    predicted: float
+    std: float
+    fixed: float = 0.0
+    dark: float = 0.0
+    warmth_per_c: float = 0.0
+    level_dn: float | None = None
+    level_slope: float = 0.0
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What the same number of a recording set has in common with it."""
+        place = () if self.quantity == "noise" else (self.where, round(self.x, 3))
+        return self.quantity, self.captures, self.channel, *place
+
+
+class SidePrediction(Frozen):
+    """The predictions of one camera. `covariance`: the lower triangle (n (n + 1) / 2), row by row, of noise and parameters together. `without`: the
+    numbers (n,) as they would be without an effect, by its name."""
+
+    camera: DataSheet
+    captures: tuple[AnyCapture, ...]
+    lens: dict[str, float]
+    numbers: tuple[PredictedNumber, ...]
+    covariance: tuple[float, ...]
+    without: dict[str, tuple[float, ...]] = {}
+    skipped: tuple[Skipped, ...] = ()
+
+
+class SealedPrediction(Frozen):
+    """What `calibench twin predict` writes."""
+
+    format: Literal["calibench-twin"] = "calibench-twin"
+    version: Literal[1] = 1
+    model: str
+    plan: str
+    changes: Changes
+    sides: dict[Side, SidePrediction]
+    cameras: dict[Side, str]  # the changed camera models, as JSON
+
+
+def seal_path(file: Path) -> Path:
+    """The file that holds the hash of `file`."""
+    return file.with_name(file.name + ".sha256")
+
+
+def seal(prediction: SealedPrediction, file: Path) -> str:
+    """Write a prediction and its hash; returns the hash (hexadecimal)."""
+    text = (
+        json.dumps(prediction.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), ensure_ascii=True) + "\n"
+    )
+    found = hashlib.sha256(text.encode()).hexdigest()
+    for path, content in ((file, text), (seal_path(file), f"{found}  {file.name}\n")):
+        with replacing(path) as partial:
+            partial.write_text(content, encoding="utf-8")
+    return found
+
+
+def open_seal(file: Path, expected: str | None = None) -> SealedPrediction:
+    """Read a sealed prediction. Raises InputError where its hash isn't `expected` (None: the one beside it)."""
+    try:
+        found = hashlib.sha256(file.read_bytes()).hexdigest()
+        told = expected or seal_path(file).read_text(encoding="utf-8").split()[0]
+    except (OSError, UnicodeDecodeError, IndexError) as error:
+        raise InputError(f"{file}: it or its hash {seal_path(file).name} can't be read; give both files") from error
+    if found != told.lower():
+        raise InputError(
+            f"{file}: was edited: its SHA-256 is {found}, sealed was {told}; take the file that was sealed"
+        )
+    return read_result(SealedPrediction, file)

@@ -1,0 +1,131 @@
+"""The session that is to come: the plan's captures with the changes, drawn by the model, so that the measuring layer can look at them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.chart import ChartCapture
+from lab.capture_kinds.dark import DarkCapture
+from lab.capture_kinds.flat import FlatCapture
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
+from lab.errors import InputError
+from lab.formats.camera_file import CameraFile
+from lab.formats.recording_set import DataSheet, RecordingSet
+from lab.formats.recording_set.files import MemoryFiles
+from lab.twin.changes import Changes, light_factor
+from sim.camera import Side
+from sim.frame import Exposure, dark_electrons, expected_electrons, is_steady, read_out
+from sim.scene.scenes import EdgeRegion, KnifeEdge, Scene
+from sim.sensor import electrons as sensor
+from sim.spectrum import Spectrum
+
+#: Kinds of captures whose measurements a twin predicts.
+PREDICTED = (DarkCapture, FlatCapture, ChartCapture, SlantedEdgeCapture)
+#: Seed of the drawn noise: the same model and plan give the same prediction.
+SEED = 1288
+#: What model and plan have to agree in.
+SENSOR = ("rows", "cols", "cfa", "bit_depth")
+
+
+def future_session(
+    content: CameraFile, plan: RecordingSet, side: Side, changes: Changes, seed: int = SEED
+) -> RecordingSet:
+    """The captures of one side that a twin predicts, with `changes`, as `content` draws them. Raises InputError where the plan is of another
+    camera, doesn't say where its edges are, or holds several gains."""
+    stated = plan.camera(side)
+    check_sensor(content, stated, plan.source)
+    captures = [_changed(c, changes) for c in plan.captures(side=side) if isinstance(c, PREDICTED)]
+    gains = {c.gain_db or 0.0 for c in captures}
+    if not captures or len(gains) > 1:
+        what = f"{len(gains)} gains" if captures else "no darks, flats, charts or edges"
+        raise InputError(f"{plan.source}: {what} of the {side} camera; plan these captures, at one gain_db")
+    lamp, factor = changes.spectrum(), light_factor(content, changes)
+    paths = {path for c in captures if (path := light_path(c)) is not None}
+    spectra = {path: (lamp or plan.spectrum(path)).scale(factor) for path in paths}
+    curves = {c: f"twin/{side}-{c}.csv" for c in content.camera.channels}
+    spectra |= {path: content.camera.quantum_efficiency[c] for c, path in curves.items()}
+    lens = content.camera.lens
+    sheet = stated.model_copy(
+        update={
+            "quantum_efficiency": curves,
+            "f_number": lens.f_number,
+            "focal_length_mm": lens.focal_length_mm,
+            "pixel_pitch_um": content.camera.pixel_pitch_um,
+        }
+    )
+    manifest = plan.manifest.model_copy(update={"cameras": {side: sheet}, "captures": tuple(captures)})
+    frames = _drawn(content, captures, spectra, plan.source, seed)
+    return RecordingSet(manifest, files=MemoryFiles(frames, spectra, {}), source=plan.source)
+
+
+def check_sensor(content: CameraFile, stated: DataSheet, source: str) -> None:
+    """Raises InputError where the plan's camera isn't the model's."""
+    for name in SENSOR:
+        if getattr(stated, name) != getattr(content.camera, name):
+            raise InputError(
+                f"{source}: {name} is {getattr(stated, name)}, the model's is {getattr(content.camera, name)}; give the plan of this camera"
+            )
+
+
+def light_path(capture: Capture) -> str | None:
+    """The file of the light before the camera; None in the dark, and where it isn't stated."""
+    return getattr(capture, "radiance", None) or getattr(capture, "light_radiance", None)
+
+
+def _changed(capture: Capture, changes: Changes) -> Capture:
+    update: dict[str, Any] = {"exposure_s": capture.exposure_s * (changes.exposure_factor or 1.0)}
+    if changes.gain_db is not None:
+        update["gain_db"] = changes.gain_db
+    if changes.temperature_c is not None:
+        update["temperature_c"] = changes.temperature_c
+    return capture.model_copy(update=update)
+
+
+def _drawn(
+    content: CameraFile, captures: list[Capture], spectra: dict[str, Spectrum], source: str, seed: int
+) -> dict[str, np.ndarray[Any, Any]]:
+    """A frame (rows, cols), DN, by its path. Captures of one path share one frame."""
+    camera, effects, rng = content.camera, content.effects, np.random.default_rng(seed)
+    pattern = sensor.FixedPattern.draw(camera, rng)
+    start = min((c.time.timestamp() for c in captures if c.time is not None), default=0.0)
+    by_frame: dict[str, list[Capture]] = {}
+    for capture in captures:
+        by_frame.setdefault(capture.frame, []).append(capture)
+    frames: dict[str, np.ndarray[Any, Any]] = {}
+    kept: tuple[object, Any] = (None, None)
+    for path, members in by_frame.items():
+        first = members[0]
+        elapsed = 0.0 if first.time is None else first.time.timestamp() - start
+        scene = _scene(members, spectra, source)
+        exposure = Exposure(scene, first.exposure_s, first.gain_db or 0.0, first.temperature_c, elapsed, placed="image")
+        told = [c.model_dump(exclude={"id", "frame", "time"}) for c in members]
+        key = repr(told) if is_steady(camera, effects) else path
+        if kept[0] != key:
+            kept = key, expected_electrons(camera, exposure, effects)
+        frames[path] = sensor.sample_from(
+            kept[1], camera, rng, pattern, dark_electrons=dark_electrons(camera, exposure, effects),
+            gain_db=exposure.gain_db, read_out=read_out(camera, exposure, effects),
+        )  # fmt: skip
+    return frames
+
+
+def _scene(members: list[Capture], spectra: dict[str, Spectrum], source: str) -> Scene:
+    """What stands before the camera. Raises InputError where the plan doesn't tell."""
+    first = members[0]
+    if not isinstance(first, SlantedEdgeCapture):
+        scene = first.scene(spectra.__getitem__)
+        if scene is None:
+            raise InputError(f"{source}: {first.id} has no radiance; state the light that it will have")
+        return scene
+    regions = []
+    for one in members:
+        if not isinstance(one, SlantedEdgeCapture) or one.region is None or one.angle_deg is None:
+            raise InputError(f"{source}: {one.id} has no region and angle_deg; state where its edge will be")
+        if one.light_radiance is None:
+            raise InputError(f"{source}: {one.id} has no light_radiance; state the light that it will have")
+        regions.append(EdgeRegion(one.region, one.angle_deg))
+    light = spectra[first.light_radiance or ""]
+    return KnifeEdge(tuple(regions), light.scale(0.0), light)

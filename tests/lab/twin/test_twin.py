@@ -1,0 +1,194 @@
+"""Predictions of a session in another configuration, against recordings of a camera whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.cli import main
+from lab.diagnose.inference.refit import refit
+from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.outcome.improved_model import improved_model
+from lab.diagnose.policy import DecisionPolicy
+from lab.errors import InputError
+from lab.fit import fit_recording_set
+from lab.formats.camera_file import CameraFile, read_camera, write_camera
+from lab.formats.recording_set import Manifest, RecordingSet, write
+from lab.formats.recording_set.files import MemoryFiles
+from lab.twin.changes import Changes, carried, parse_changes
+from lab.twin.predict import predict
+from lab.twin.score import score
+from lab.twin.sealed import open_seal, seal
+from lab.twin.session import future_session
+from sim.camera import CameraModel, Lens
+from sim.effects.dark_current_temperature import DarkCurrentTemperature
+from sim.effects.veiling_glare import VeilingGlare
+from sim.spectrum import Spectrum
+from sim.uniform import electron_rate
+
+ROWS, COLS = 120, 160
+NM = np.arange(400.0, 721.0, 5.0)
+LAMP = Spectrum.of(NM, 0.02 * (1.0 + 0.1 * np.sin(NM / 60.0)))
+REGION = (20, 40, 100, 120)
+TRANSFERS = {
+    "f/8": Changes(f_number=8.0, radiance_factor=4.0),
+    "exposure x8, gain x4": Changes(exposure_factor=8.0, gain_db=12.041, radiance_factor=1.0 / 32.0),
+    "15 degrees warmer": Changes(temperature_c=40.0),
+}
+
+
+def _curve(centre_nm: float) -> Spectrum:
+    return Spectrum.of(NM, 0.55 * np.exp(-0.5 * ((NM - centre_nm) / 40.0) ** 2) + 0.01)
+
+
+TRUTH = CameraFile(
+    "truth",
+    CameraModel(
+        rows=ROWS, cols=COLS, pixel_pitch_um=4.0, fill_factor=0.9, cfa="RGGB", bit_depth=12, black_level_dn=64.0, white_level_dn=4095.0,
+        conversion_gain_dn_per_e=0.38, full_well_e=10500.0, read_noise_e=4.0, dark_current_e_per_s=20.0, dark_current_doubling_c=7.0, dsnu_e=0.8,
+        prnu_percent=0.6, quantum_efficiency={"R": _curve(605.0), "G": _curve(530.0), "B": _curve(455.0)},
+        lens=Lens(f_number=4.0, focal_length_mm=8.0),
+    ),
+)  # fmt: skip
+
+
+def _plan() -> RecordingSet:
+    """Darks at three temperatures, flats, the chart and four edges at f/4 and 25 C; no frames."""
+    camera = TRUTH.camera
+    full_s = camera.full_well_e / max(electron_rate(camera, c, LAMP) for c in camera.channels)
+    captures: list[dict[str, object]] = []
+
+    def take(kind: str, exposure_s: float, repeats: int, temperature_c: float = 25.0, **more: object) -> None:
+        for _ in range(repeats):
+            k = len(captures)
+            time = f"2026-03-02T09:{k // 60:02d}:{k % 60:02d}Z"
+            captures.append(
+                {"id": f"c{k:03d}", "kind": kind, "side": "left", "frame": f"frames/{k:03d}.npy", "exposure_s": exposure_s,
+                 "temperature_c": temperature_c, "time": time} | more
+            )  # fmt: skip
+
+    for exposure_s, temperature_c in ((0.001, 25.0), (2.0, 25.0), (5.0, 25.0), (5.0, 35.0), (5.0, 45.0)):
+        take("dark", exposure_s, 4, temperature_c)
+    for level in (0.05, 0.12, 0.22, 0.35, 0.5, 0.65, 0.8):
+        take("flat", level * full_s, 4, radiance="lamp.csv")
+    corners = ((10.0, 10.0), (10.0, 150.0), (110.0, 150.0), (110.0, 10.0))
+    take("chart", 0.7 * full_s, 4, chart="ColorChecker24", corners=corners, radiance="lamp.csv")
+    for angle in (5.0, 95.0):
+        take(
+            "slanted_edge",
+            0.6 * full_s,
+            4,
+            region=REGION,
+            angle_deg=angle,
+            light_radiance="lamp.csv",
+            field_mm=(0.0, 0.0),
+        )
+    keys = ("rows", "cols", "pixel_pitch_um", "fill_factor", "cfa", "bit_depth", "black_level_dn", "white_level_dn")
+    sheet = {key: getattr(camera, key) for key in keys} | {
+        "f_number": 4.0,
+        "focal_length_mm": 8.0,
+        "lens_transmittance": 1.0,
+    }
+    sheet["quantum_efficiency"] = {c: f"{c}.csv" for c in camera.channels}
+    manifest = Manifest.model_validate({"name": "plan", "cameras": {"left": sheet}, "captures": captures})
+    spectra = {"lamp.csv": LAMP} | {f"{c}.csv": q for c, q in camera.quantum_efficiency.items()}
+    return RecordingSet(manifest, files=MemoryFiles({}, spectra, {}), source="plan")
+
+
+PLAN = _plan()
+
+
+def trained(seed: int, wrong: bool = False) -> CameraFile:
+    """The improved model of one drawn session. `wrong`: with a veil that the camera hasn't, too."""
+    session = future_session(TRUTH, PLAN, "left", Changes(), seed)
+    fit = fit_recording_set(session, steps=("noise",))
+    model, _ = measurement_model(session, "left", fit)
+    assert model is not None
+    found = refit(model, (DarkCurrentTemperature(doublings_per_c=0.1),), DecisionPolicy(), of_any_size=True).effects
+    effects = (*found, VeilingGlare(share_percent=5.0)) if wrong else found
+    return improved_model(session, "left", fit, None, model, effects, ())[0]
+
+
+@pytest.fixture(scope="module")
+def content() -> CameraFile:
+    return trained(1)
+
+
+def captured(changes: Changes, seed: int) -> RecordingSet:
+    """The session that is captured in the changed configuration, by the true camera."""
+    return future_session(carried(TRUTH, changes), PLAN, "left", changes, seed)
+
+
+@pytest.mark.parametrize("name", TRANSFERS)
+def test_intervals_hold_in_a_configuration_that_nobody_has_seen(content: CameraFile, name: str) -> None:
+    found = score(predict({"left": content}, PLAN, TRANSFERS[name], light_std=0.0), captured(TRANSFERS[name], 7))
+    assert {q.quantity for q in found.quantities} == {"chart", "noise", "slanted_edge", "dark"} and found.missing == 0
+    inside = sum(q.n * q.within_95_percent_interval for q in found.quantities) / found.n
+    # 95 % of some 300 numbers, of which errors of the parameters are common to many: 100 effectively, 4 standard deviations
+    assert inside > 0.95 - 4.0 * np.sqrt(0.95 * 0.05 / 100.0)
+    assert found.chi2 < 1.5 * found.n
+
+
+def test_an_effect_that_the_camera_lacks_is_withdrawn() -> None:
+    changes = Changes(radiance_factor=0.5)
+    found = score(predict({"left": trained(2, wrong=True)}, PLAN, changes, light_std=0.0), captured(changes, 8))
+    verdicts = {effect.name: effect.verdict for effect in found.effects}
+    assert verdicts == {"dark_current_temperature": "survives", "veiling_glare": "withdrawn"}
+
+
+def test_the_posterior_goes_through_the_camera_file(content: CameraFile, tmp_path: Path) -> None:
+    write_camera(tmp_path / "left.toml", content)
+    assert read_camera(tmp_path / "left.toml").posterior == content.posterior
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("fnumber=8", "isn't a change"),
+        ("f_number=soon", "f_number=soon"),
+        ("lamp=none.csv", "lamp: none.csv can't be read"),
+        ("lens=none.zmx", "lens: none.zmx isn't there"),
+        ("distance_mm=9", "twice the focal length"),
+    ],
+)
+def test_a_change_that_cant_be_carried_is_one_line(content: CameraFile, change: str, said: str) -> None:
+    with pytest.raises(InputError) as refused:
+        predict({"left": content}, PLAN, parse_changes(change))
+    assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_temperature_needs_a_law_of_dark_current(content: CameraFile) -> None:
+    without = CameraFile(content.name, content.camera, (), None, content.posterior)
+    with pytest.raises(InputError, match="no law of dark current"):
+        predict({"left": without}, PLAN, Changes(temperature_c=60.0))
+
+
+def test_an_edited_seal_and_another_session_are_refused(content: CameraFile, tmp_path: Path) -> None:
+    changes = Changes(f_number=8.0, radiance_factor=4.0)
+    file = tmp_path / "sealed.json"
+    prediction = predict({"left": content}, PLAN, changes)
+    hashed = seal(prediction, file)
+    assert open_seal(file, hashed) == open_seal(file) == prediction
+    for other, said in ((Changes(), "f_number"), (changes.model_copy(update={"gain_db": 6.0}), "gain_db")):
+        with pytest.raises(InputError, match=said):
+            score(prediction, captured(other, 9))
+    file.write_text(file.read_text().replace('"n', '"m', 1))
+    with pytest.raises(InputError, match="was edited"):
+        open_seal(file)
+
+
+def test_the_commands_predict_and_score(content: CameraFile, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    changes = TRANSFERS["f/8"]
+    write(captured(Changes(), 1), tmp_path / "plan")
+    write(captured(changes, 7), tmp_path / "taken")
+    write_camera(tmp_path / "left.toml", content)
+    sealed, result = str(tmp_path / "sealed.json"), tmp_path / "score.json"
+    given = ["twin", "predict", str(tmp_path), "--plan", str(tmp_path / "plan"), "--out", sealed]
+    assert main([*given, "--change", "f_number=8,radiance_factor=4"]) == 0
+    assert main(["twin", "score", sealed, str(tmp_path / "taken"), "--json", str(result)]) == 0
+    assert json.loads(result.read_text())["n"] > 100
+    assert main([*given, "--change", "colour=red"]) == 2
+    assert "isn't a change" in capfd.readouterr().err
