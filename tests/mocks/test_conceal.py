@@ -72,6 +72,7 @@ CASES = (
     Case("left:amplifier_glow:glow_e_per_s=300,reach_mm=0.2,corner=bottom_left", (DARK,)),
     Case("left:astigmatism:defocus_x_um=40", (EDGE, SCREEN)),
     Case("left:axial_chromatic_aberration:slope_um=40", (EDGE, SCREEN)),
+    Case("left:bit_weights:third_dn=3", (DARK, FLAT)),
     Case("left:black_level_drift:drift_dn_per_min=5", (LATER, replace(DARK, wait_s=60.0))),
     Case("left:blooming:share_percent=40", (OVERFULL,)),
     Case("left:brighter_fatter:loss_percent=60,shared_percent=30", (FLAT,)),

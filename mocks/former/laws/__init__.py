@@ -58,10 +58,10 @@ from mocks.former.laws.imaging import (
 )
 from mocks.former.laws.readout import (
     AdcNonlinearityLaw,
+    BitWeightsLaw,
     BlackLevelDriftLaw,
     BlackLevelTemperatureLaw,
     ColumnNoiseLaw,
-    CompandingKneeLaw,
     DefectInterpolationLaw,
     DigitalGainLaw,
     JitteredRowsLaw,
@@ -72,6 +72,7 @@ from mocks.former.laws.readout import (
     PeriodicBandingLaw,
     PinkNoiseLaw,
     RandomTelegraphNoiseLaw,
+    ResponseKneeLaw,
     RowNoiseLaw,
     TapOffsetLaw,
 )
@@ -133,6 +134,8 @@ LISTED: tuple[type[Law], ...] = (
     AmbientLightLaw,
     DoubleImageLaw,
     SourceInstabilityLaw,
+    BitWeightsLaw,
+    ResponseKneeLaw,
 )
 
 #: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.
@@ -155,7 +158,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     TreeRingsLaw,
     PulsedLightLaw,
     ResponseTailLaw,
-    CompandingKneeLaw,
     DefectInterpolationLaw,
     DigitalGainLaw,
     LossyCodesLaw,
