@@ -77,6 +77,7 @@ CASES = (
     Case("left:blooming:share_percent=40", (OVERFULL,)),
     Case("left:brighter_fatter:loss_percent=60,shared_percent=30", (FLAT,)),
     Case("left:charge_diffusion:length_um=2.5", (EDGE, SCREEN)),
+    Case("left:coloured_line_noise:noise_e=3,exponent=1", (DARK,), tolerance=0.5),
     Case("left:column_noise:offset_e=6,odd_even_e=4", (DARK,)),
     Case("left:coma:w131_x_um=0.5", (EDGE, SCREEN)),
     Case("left:cover_glass:thickness_mm=20", (EDGE, SCREEN)),

@@ -61,6 +61,7 @@ from mocks.former.laws.readout import (
     BitWeightsLaw,
     BlackLevelDriftLaw,
     BlackLevelTemperatureLaw,
+    ColouredLineNoiseLaw,
     ColumnNoiseLaw,
     DefectInterpolationLaw,
     DigitalGainLaw,
@@ -136,6 +137,7 @@ LISTED: tuple[type[Law], ...] = (
     SourceInstabilityLaw,
     BitWeightsLaw,
     ResponseKneeLaw,
+    ColouredLineNoiseLaw,
 )
 
 #: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.

@@ -188,6 +188,31 @@ class RowNoiseLaw(Law):
         return {"noise_e": self.strength}
 
 
+class ColouredLineNoiseLaw(Law):
+    """Noise of lines by fluctuators of many time constants, the sum of which has a spectrum of about 1/f (Machlup 1954). Variants: rows;
+    columns; rows, the slow fluctuators twice as strong in power (steeper)."""
+
+    name = effect = "coloured_line_noise"
+    variants, unit, nominal, limits, power, shown_by = 3, "e", 3.0, (0.2, 40.0), 2.0, DARK
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        count = shape[1] if self.variant == 1 else shape[0]
+        rng, total, whole = self.rng(15, k), np.zeros(count), 0.0
+        for octave in range(8):  # correlated over 0.5, 1, 2, ... 64 lines
+            keep, weight = np.exp(-(2.0 ** (1 - octave))), 2.0**octave if self.variant == 2 else 1.0
+            white = rng.standard_normal(count)
+            wave = np.empty(count)
+            wave[0] = white[0]
+            for i in range(1, count):
+                wave[i] = keep * wave[i - 1] + np.sqrt(1.0 - keep * keep) * white[i]
+            total, whole = total + np.sqrt(weight) * wave, whole + weight
+        noise = self.strength * total / np.sqrt(whole)
+        return np.broadcast_to(noise[None, :] if self.variant == 1 else noise[:, None], shape)
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"noise_e": self.strength} if self.variant < 2 else {}
+
+
 class PeriodicBandingLaw(Law):
     """A sinusoidal offset over the rows, of fixed period and random phase in each frame (related to row noise)."""
 

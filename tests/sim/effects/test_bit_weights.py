@@ -51,10 +51,14 @@ def test_widths_repeat_and_sum_to_their_period() -> None:
 
 
 def test_moments_are_those_of_frames() -> None:
-    """600 000 dark pixels whose noise is 2 DN: the mean to 4.5 standard deviations, and what 24 parts leave."""
+    """600 000 dark pixels whose noise is 2 DN. Codes twice as wide as others round with a bias that moments leave out:
+    0.04 DN. The mean of a single level would be 0.3 DN off.
+    """
     camera = CAMERA.model_copy(update={"read_noise_e": 4.0})
     out = ReadOut(codes=BitWeights(third_dn=1.0).on_codes(Codes(camera)).convert)
     frame = sample_from(np.zeros((600, 1000)), camera, np.random.default_rng(5), read_out=out).astype(float)
     mean, variance = dn_moments(np.zeros((1, 1)), camera, read_out=out)
-    assert frame.mean() == pytest.approx(float(mean[0, 0]), abs=4.5 * frame.std() / np.sqrt(frame.size) + 0.01)
+    assert frame.mean() == pytest.approx(float(mean[0, 0]), abs=4.5 * frame.std() / np.sqrt(frame.size) + 0.04)
     assert frame.var() == pytest.approx(float(variance[0, 0]), rel=0.02)
+    single = float(out.codes(np.array(camera.black_level_dn)))  # type: ignore[misc]
+    assert abs(frame.mean() - single) > 0.1
