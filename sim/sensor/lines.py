@@ -51,7 +51,7 @@ class LineNoise:
         if self.exponent == 0.0:
             return _correlate(rng.standard_normal(along), self.correlation)
         count = FOLDED * max(along)  # a part of a longer line: its ends have nothing in common
-        power = _power_law(np.fft.rfftfreq(count), self.exponent)
+        power = _power_law(np.asarray(np.fft.rfftfreq(count), np.float64), self.exponent)
         wave = np.fft.irfft(np.fft.rfft(rng.standard_normal(count)) * np.sqrt(power), count)
         return np.asarray(wave[: max(along)]).reshape(along)
 
