@@ -14,6 +14,7 @@ from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic import ValidationError
+from pydantic.fields import FieldInfo
 
 from sim.camera import Side
 from sim.effects.base import Effect
@@ -82,8 +83,13 @@ def _made(spec: str, kind: type[Effect], text: str) -> Effect:
         if field in values:
             raise ConcealError(f"--conceal {spec}: {field} is given twice; give it once")
         values[field] = value
+    # a number among listed ones is no string that pydantic would take for it
+    listed = {
+        name: value for name in values for value in _integers(kind.choices().get(name)) if str(value) == values[name]
+    }
     try:
-        effect = kind.model_validate_strings(values)
+        effect = kind.model_validate_strings({name: text for name, text in values.items() if name not in listed})
+        effect = effect.replace_fields(**listed)
     except ValidationError as error:
         first = error.errors()[0]
         field = str(first["loc"][0]) if first["loc"] else ""
@@ -95,6 +101,13 @@ def _made(spec: str, kind: type[Effect], text: str) -> Effect:
     if effect == kind():
         raise ConcealError(f"--conceal {spec}: nothing of {kind.name} would be there; give a value of {known}")
     return effect
+
+
+def _integers(choice: FieldInfo | None) -> tuple[int, ...]:
+    """Integers among which a choice is made."""
+    annotation = None if choice is None else choice.annotation
+    values = get_args(annotation) if get_origin(annotation) is Literal else ()
+    return tuple(value for value in values if isinstance(value, int))
 
 
 def _is_one_value(annotation: Any) -> bool:

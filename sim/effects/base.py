@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self, get_args, get_origin
 
 import numpy as np
 from pydantic.fields import FieldInfo
@@ -20,6 +20,16 @@ from sim.stages import Charge, Codes, Image, Light, Signal
 
 #: The stages in the order of the light, and the method by which an effect acts on each.
 STAGES = {"light": "on_light", "image": "on_image", "charge": "on_charge", "signal": "on_signal", "codes": "on_codes"}
+
+
+def _is_told(field: FieldInfo) -> bool:
+    types = [field.annotation]
+    while types:
+        one = types.pop()
+        if get_origin(one) is Literal:
+            return True
+        types += get_args(one)
+    return field.annotation is int and any(hasattr(bound, "ge") or hasattr(bound, "le") for bound in field.metadata)
 
 
 class Effect(Frozen):
@@ -72,6 +82,13 @@ class Effect(Frozen):
         """The fields that no fit changes, by name: a material, a corner, the seed of a drawn pattern."""
         quantities = cls.quantities()
         return {name: field for name, field in cls.model_fields.items() if name not in quantities}
+
+    @classmethod
+    def told_choices(cls) -> tuple[str, ...]:
+        """Names of the choices that a finding tells: those among listed values, and integers with declared bounds. The
+        seed of a drawn pattern has none.
+        """
+        return tuple(name for name, field in cls.choices().items() if _is_told(field))
 
     @classmethod
     def stages(cls) -> tuple[str, ...]:

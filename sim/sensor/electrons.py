@@ -18,7 +18,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from sim.camera import CameraModel, Cfa
 from sim.sensor.mosaic import planes
@@ -260,14 +260,32 @@ def dn_moments(
     noise_e2 = variance + camera.read_noise_e**2 + camera.row_noise_e**2 + read_out.added_e2
     dn2 = gain**2 * noise_e2
     if read_out.codes is not None:
-        bent = read_out.codes(dn)
-        dn2 = dn2 * (read_out.codes(dn + 0.5) - read_out.codes(dn - 0.5)) ** 2
-        dn = bent
+        dn, dn2 = _convert_moments(read_out.codes, dn, dn2)
     if read_out.processing is not None:
         dn = filter_planes(dn, read_out.processing, camera.cfa)
         dn2 = filter_planes(np.broadcast_to(dn2, dn.shape), np.square(read_out.processing), camera.cfa)
     skewness = np.minimum(electrons / np.maximum(noise_e2, 1e-12) ** 1.5, 1.0)
     return coded_moments(dn, dn2, np.inf if by_charge else camera.white_level_dn, skewness)
+
+
+#: Equal parts of a normal distribution over which a converter's law is averaged.
+CODE_PARTS = 24
+
+
+def _convert_moments(
+    codes: Callable[[FloatArray], FloatArray], dn: FloatArray, dn2: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of normal levels after the converter's law, which may differ from code to code: over the
+    middles of `CODE_PARTS` equal parts of the distribution.
+    """
+    middle = ndtri((np.arange(CODE_PARTS) + 0.5) / CODE_PARTS)
+    std = np.sqrt(dn2)
+    first, second = np.zeros(np.broadcast_shapes(dn.shape, std.shape)), np.zeros(())
+    for z in middle / middle.std():
+        away = codes(dn + std * z) - dn
+        first = first + away / CODE_PARTS
+        second = second + np.square(away) / CODE_PARTS
+    return dn + first, np.maximum(second - np.square(first), 0.0)
 
 
 def sample_from(

@@ -11,6 +11,10 @@ from sim.spectrum import FloatArray
 
 #: Lines of pixels that may share a disturbance.
 Lines = Literal["rows", "columns"]
+#: Below this frequency a power law is level, cycles a line: no read-out's noise grows without end.
+KNEE_CY_PER_LINE = 1e-3
+#: Lines of a power law's noise that are drawn for each one that is read.
+FOLDED = 4
 #: What makes the fixed offsets of rows and of columns different draws of one seed.
 _STREAM = {"columns": 3, "rows": 4}
 
@@ -18,7 +22,8 @@ _STREAM = {"columns": 3, "rows": 4}
 @dataclass(frozen=True)
 class LineNoise:
     """Electrons that all pixels of a row (or column) share: a normal variable in every frame, of which lines n apart
-    have `correlation`^n in common; fixed offsets drawn once by `seed`, of mean 0 over the lines; a step from even to
+    have `correlation`^n in common, or, with an `exponent` above 0, of power f^-exponent at f cycles a line, level
+    below `KNEE_CY_PER_LINE`; fixed offsets drawn once by `seed`, of mean 0 over the lines; a step from even to
     odd lines.
     """
 
@@ -28,6 +33,7 @@ class LineNoise:
     fixed_e: float = 0.0
     odd_even_e: float = 0.0
     seed: int = 0
+    exponent: float = 0.0
 
     def _axis_shape(self, shape: tuple[int, ...]) -> tuple[int, int]:
         return (shape[0], 1) if self.lines == "rows" else (1, shape[1])
@@ -37,8 +43,17 @@ class LineNoise:
         along = self._axis_shape(shape)
         total = np.broadcast_to(np.asarray(self.mean_e(shape), float), along)
         if self.temporal_e > 0.0:
-            total = total + self.temporal_e * _correlate(rng.standard_normal(along), self.correlation)
+            total = total + self.temporal_e * self._colour(rng, along)
         return total
+
+    def _colour(self, rng: np.random.Generator, along: tuple[int, int]) -> FloatArray:
+        """Draw noise of variance 1 along the lines."""
+        if self.exponent == 0.0:
+            return _correlate(rng.standard_normal(along), self.correlation)
+        count = FOLDED * max(along)  # a part of a longer line: its ends have nothing in common
+        power = _power_law(np.asarray(np.fft.rfftfreq(count), np.float64), self.exponent)
+        wave = np.fft.irfft(np.fft.rfft(rng.standard_normal(count)) * np.sqrt(power), count)
+        return np.asarray(wave[: max(along)]).reshape(along)
 
     def mean_e(self, shape: tuple[int, ...]) -> FloatArray | float:
         """The fixed part, of the same shape; 0 for none."""
@@ -60,6 +75,8 @@ class LineNoise:
         even = np.ones(np.shape(frequency_cy_per_px))
         if fixed:
             return self.fixed_e**2 * even
+        if self.exponent != 0.0:
+            return self.temporal_e**2 * _power_law(np.asarray(frequency_cy_per_px, float), self.exponent)
         c = self.correlation
         turn = np.cos(2.0 * np.pi * np.asarray(frequency_cy_per_px))
         return np.asarray(self.temporal_e**2 * (1.0 - c * c) / (1.0 - 2.0 * c * turn + c * c))
@@ -77,3 +94,13 @@ def _correlate(white: FloatArray, correlation: float) -> FloatArray:
     fresh = np.sqrt(1.0 - correlation**2)
     filtered = lfilter([fresh], [1.0, -correlation], np.concatenate([line[:1] / fresh, line[1:]]))
     return np.asarray(filtered).reshape(white.shape)
+
+
+def _power_law(frequency_cy_per_px: FloatArray, exponent: float) -> FloatArray:
+    """Power (f^2 + knee^2)^(-exponent / 2), of mean 1 over -0.5..0.5 cy/px."""
+
+    def law(f: FloatArray) -> FloatArray:
+        return np.asarray((np.square(f) + KNEE_CY_PER_LINE**2) ** (-0.5 * exponent))
+
+    grid = np.geomspace(1e-3 * KNEE_CY_PER_LINE, 0.5, 2001)
+    return law(frequency_cy_per_px) / (2.0 * np.trapezoid(law(grid), grid))

@@ -9,16 +9,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydantic import Field
 from typer.testing import CliRunner
 
 from lab.challenge.live import typical_spec
 from mocks.bench import MARGIN_PX, OVERSAMPLE, SCREEN_OVERSAMPLE, Bench
 from mocks.command import commands
-from mocks.conceal import NOT_SHOWN, OF_THE_RADIOMETER, SIDES, ConcealError, parse
+from mocks.conceal import NOT_SHOWN, OF_THE_RADIOMETER, SIDES, ConcealError, _made, parse
 from mocks.light_path import LightSettings
 from mocks.targets import ShownCells, scene
 from mocks.truth import HiddenCamera, hidden_truth
@@ -72,10 +74,13 @@ CASES = (
     Case("left:amplifier_glow:glow_e_per_s=300,reach_mm=0.2,corner=bottom_left", (DARK,)),
     Case("left:astigmatism:defocus_x_um=40", (EDGE, SCREEN)),
     Case("left:axial_chromatic_aberration:slope_um=40", (EDGE, SCREEN)),
+    Case("left:bit_weights:third_dn=3", (DARK, FLAT)),
     Case("left:black_level_drift:drift_dn_per_min=5", (LATER, replace(DARK, wait_s=60.0))),
     Case("left:blooming:share_percent=40", (OVERFULL,)),
     Case("left:brighter_fatter:loss_percent=60,shared_percent=30", (FLAT,)),
     Case("left:charge_diffusion:length_um=2.5", (EDGE, SCREEN)),
+    # 1/f noise of 96 rows has the power of some five free modes: its mean square scatters by half of itself
+    Case("left:coloured_line_noise:noise_e=12,exponent=1", (DARK,), tolerance=0.6),
     Case("left:column_noise:offset_e=6,odd_even_e=4", (DARK,)),
     Case("left:coma:w131_x_um=0.5", (EDGE, SCREEN)),
     Case("left:cover_glass:thickness_mm=20", (EDGE, SCREEN)),
@@ -267,6 +272,19 @@ def test_what_cannot_be_concealed_is_one_line(spec: str, complaint: str) -> None
     assert complaint in str(raised.value)
     assert spec in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+class _Rows(Effect):
+    name: ClassVar[str] = "rows"
+    period: Annotated[Literal[4, 8], Field(description="rows from one to the next")] = 8
+    first_row: Annotated[int, Field(description="first of them", ge=0, lt=8)] = 0
+
+
+def test_integer_choices_are_concealed() -> None:
+    assert _made("left:rows:period=4,first_row=3", _Rows, "period=4,first_row=3") == _Rows(period=4, first_row=3)
+    for text, complaint in (("period=5", "Input should be 4 or 8"), ("first_row=9", "less than 8")):
+        with pytest.raises(ConcealError, match=complaint):
+            _made(f"left:rows:{text}", _Rows, text)
 
 
 def test_an_effect_is_concealed_once() -> None:

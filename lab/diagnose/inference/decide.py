@@ -127,7 +127,12 @@ def decide(
                 continue
             named = [told for _, told in sized if told is not None]
             effects = tuple(c.effect for c in named)
-            told = tuple(_with_every_mode(model, tied_family(c, policy), effects, policy) for c in named)
+            told = tuple(
+                _with_equal_choices(
+                    model, _with_every_mode(model, tied_family(c, policy), effects, policy), effects, policy
+                )
+                for c in named
+            )
             plain = Verdict(model, threshold, top, before, told, tuple(abstained), after, (), models=search.models())
             return _verdict(plain, left, refused, policy)
         # the weakest goes first: without it, what is left may be within the other laws' tolerances
@@ -271,6 +276,23 @@ def _with_every_mode(
         unsigned=frozenset(signed) if is_unsigned else frozenset(),
         modes=tuple({n: float(getattr(one, n)) for n in signed} for one in modes[1:]),
     )
+
+
+def _with_equal_choices(
+    model: MeasurementModel, candidate: Candidate, effects: tuple[Effect, ...], policy: DecisionPolicy
+) -> Candidate:
+    """Return the candidate with those other choices among its prototypes by which the recordings are as likely, all parameters as they
+    are."""
+    kind = type(candidate.effect)
+    names = kind.told_choices()
+    if not names:
+        return candidate
+    others = tuple(e for e in effects if e.name != candidate.effect.name)
+    told = tuple(getattr(candidate.effect, n) for n in names)
+    every = dict.fromkeys(tuple(getattr(p, n) for n in names) for group in kind.prototypes(model.camera) for p in group)
+    least = log_likelihood(model, (*others, candidate.effect), policy) - policy.equal_mode_log_odds
+    tried = [candidate.effect.model_copy(update=dict(zip(names, v, strict=True))) for v in every if v != told]
+    return replace(candidate, alike=tuple(e for e in tried if log_likelihood(model, (*others, e), policy) >= least))
 
 
 def _is_part_of_unknown(

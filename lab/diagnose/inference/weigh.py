@@ -39,7 +39,7 @@ class Candidate:
     `among_listed`: probabilities of the effect and its rivals if the cause is one of them, likeliest first; empty where none was weighed.
     `intervals`: of sizes that no normal distribution describes, from low to high; their standard deviation is None.
     `unsigned`: parameters whose sign, turned together, the recordings don't tell. `modes`: values of the parameters in other modes of the
-    posterior that are as likely.
+    posterior that are as likely. `alike`: the effect by others of its choices, of which the recordings don't tell it.
     `members`: where the family is named and not the effect, the family's effects with their probabilities, likeliest first.
     """
 
@@ -54,6 +54,7 @@ class Candidate:
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     unsigned: frozenset[str] = frozenset()
     modes: tuple[dict[str, float], ...] = ()
+    alike: tuple[Effect, ...] = ()
     remark: str = ""
     among_listed: tuple[tuple[str, float], ...] = ()
     members: tuple[tuple[str, float], ...] = ()

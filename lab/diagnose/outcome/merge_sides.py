@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lab.diagnose.effect_list import choice_values
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.outcome.effect_sets import set_sentences
@@ -124,7 +123,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
             parameters[told] = ParameterValue(
                 value=value, std=None if interval else std, unit=unit, sign_known=is_signed, interval=interval
             )
-        chosen = [_choices(c.effect) for c in candidates]
+        chosen = [_choices(c.effect, c.alike) for c in candidates]
         choices = {
             field: " and ".join(dict.fromkeys(one[field] for one in chosen if field in one)) for field in chosen[0]
         }
@@ -174,10 +173,14 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
     return named
 
 
-def _choices(effect: Effect) -> dict[str, str]:
-    """Which of its alternatives an effect is, by field."""
-    chosen = {name: getattr(effect, name) for name, field in effect.choices().items() if choice_values(field)}
-    return {name: str(value) for name, value in chosen.items() if value is not None}
+def _choices(effect: Effect, alike: Sequence[Effect] = ()) -> dict[str, str]:
+    """Which of its alternatives an effect is, by field; and those that the recordings don't tell from it."""
+    told: dict[str, str] = {}
+    for name in type(effect).told_choices():
+        values = dict.fromkeys(getattr(one, name) for one in (effect, *alike))
+        if getattr(effect, name) is not None:
+            told[name] = " or ".join(str(value) for value in values if value is not None)
+    return told
 
 
 def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:

@@ -58,10 +58,11 @@ from mocks.former.laws.imaging import (
 )
 from mocks.former.laws.readout import (
     AdcNonlinearityLaw,
+    BitWeightsLaw,
     BlackLevelDriftLaw,
     BlackLevelTemperatureLaw,
+    ColouredLineNoiseLaw,
     ColumnNoiseLaw,
-    CompandingKneeLaw,
     DefectInterpolationLaw,
     DigitalGainLaw,
     JitteredRowsLaw,
@@ -72,6 +73,7 @@ from mocks.former.laws.readout import (
     PeriodicBandingLaw,
     PinkNoiseLaw,
     RandomTelegraphNoiseLaw,
+    ResponseKneeLaw,
     RowNoiseLaw,
     TapOffsetLaw,
 )
@@ -133,6 +135,9 @@ LISTED: tuple[type[Law], ...] = (
     AmbientLightLaw,
     DoubleImageLaw,
     SourceInstabilityLaw,
+    BitWeightsLaw,
+    ResponseKneeLaw,
+    ColouredLineNoiseLaw,
 )
 
 #: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.
@@ -155,7 +160,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     TreeRingsLaw,
     PulsedLightLaw,
     ResponseTailLaw,
-    CompandingKneeLaw,
     DefectInterpolationLaw,
     DigitalGainLaw,
     LossyCodesLaw,

@@ -29,15 +29,63 @@ class NonlinearityLaw(Law):
         return {"quadratic_percent": -self.strength} if self.variant == 0 else {}
 
 
-class CompandingKneeLaw(Law):
-    """The response has a knee, a smaller slope above it (related to nonlinearity)."""
+class ResponseKneeLaw(Law):
+    """The slope is smaller above a level between 0.3 and 0.6 of full well. Variants: a sharp knee; one that is rounded over 3 % of full
+    well; two knees of half the change, 0.2 of full well apart."""
 
-    name, unit, nominal, limits = "companding_knee", "%", 3.0, (0.05, 20.0)
-    families = frozenset({"response_to_light"})
+    name = effect = "response_knee"
+    variants, unit, nominal, limits = 3, "%", 3.0, (0.05, 20.0)
+
+    @property
+    def knee_share(self) -> float:
+        """The level over full well."""
+        return 0.3 + 0.3 * float(self.uniform[0])
 
     def response(self, electrons: Array) -> Array:
-        knee = (0.3 + 0.3 * self.uniform[0]) * self.camera.full_well_e
-        return electrons - self.strength / 100 * np.maximum(electrons - knee, 0)
+        full = self.camera.full_well_e
+        over = electrons / full - self.knee_share
+        if self.variant == 0:
+            over = np.where(over > 0, over, 0.0)
+        elif self.variant == 1:
+            over = 0.03 * np.logaddexp(0.0, over / 0.03)
+        else:
+            over = 0.5 * (np.clip(over, 0, None) + np.clip(over - 0.2, 0, None))
+        return electrons - self.strength / 100.0 * full * over
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"slope_percent": -self.strength, "knee_share": self.knee_share} if self.variant == 0 else {}
+
+
+class BitWeightsLaw(Law):
+    """Successive approximation with lowest bits of wrong weight. Variants: of the two lowest; a table of four unequal widths, as of a last
+    stage of two bits; of the third-lowest only. Strength: the largest error of a weight, or departure of a width."""
+
+    name = effect = "bit_weights"
+    variants, unit, nominal, limits, signed = 3, "DN", 0.25, (0.01, 0.95), True
+
+    @property
+    def _errors(self) -> tuple[float, float, float]:
+        """Of the weights of the lowest bit, the next, and the one after that."""
+        e = self.signed_strength
+        return (e, -0.5 * e, 0.0) if self.variant == 0 else (0.0, 0.0, e)
+
+    def adc_output(self, dn: Array) -> Array:
+        left = np.clip(dn + 0.5, 0.0, None)
+        code = np.zeros_like(left)
+        if self.variant == 1:
+            away = self.rng(14).uniform(-1.0, 1.0, 4)
+            away -= away.mean()
+            begins = np.append(0.0, np.cumsum(1.0 + self.strength * away / np.abs(away).max())[:3])
+            return 4.0 * (left // 4.0) + np.searchsorted(begins, left % 4.0, side="right") - 1.0
+        for bit in reversed(range(16)):
+            weight = 2.0**bit + (self._errors[bit] if bit < 3 else 0.0)
+            taken = left >= weight
+            left, code = np.where(taken, left - weight, left), code + 2.0**bit * taken
+        return code
+
+    def library_parameters(self) -> dict[str, float]:
+        last, second, third = self._errors
+        return {} if self.variant == 1 else {"last_dn": last, "second_dn": second, "third_dn": third}
 
 
 class AdcNonlinearityLaw(Law):
@@ -138,6 +186,31 @@ class RowNoiseLaw(Law):
 
     def library_parameters(self) -> dict[str, float]:
         return {"noise_e": self.strength}
+
+
+class ColouredLineNoiseLaw(Law):
+    """Noise of lines by fluctuators of many time constants, the sum of which has a spectrum of about 1/f (Machlup 1954). Variants: rows;
+    columns; rows, the slow fluctuators twice as strong in power (steeper)."""
+
+    name = effect = "coloured_line_noise"
+    variants, unit, nominal, limits, power, shown_by = 3, "e", 3.0, (0.2, 40.0), 2.0, DARK
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        count = shape[1] if self.variant == 1 else shape[0]
+        rng, total, whole = self.rng(15, k), np.zeros(count), 0.0
+        for octave in range(8):  # correlated over 0.5, 1, 2, ... 64 lines
+            keep, weight = np.exp(-(2.0 ** (1 - octave))), 2.0**octave if self.variant == 2 else 1.0
+            white = rng.standard_normal(count)
+            wave = np.empty(count)
+            wave[0] = white[0]
+            for i in range(1, count):
+                wave[i] = keep * wave[i - 1] + np.sqrt(1.0 - keep * keep) * white[i]
+            total, whole = total + np.sqrt(weight) * wave, whole + weight
+        noise = self.strength * total / np.sqrt(whole)
+        return np.broadcast_to(noise[None, :] if self.variant == 1 else noise[:, None], shape)
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"noise_e": self.strength} if self.variant < 2 else {}
 
 
 class PeriodicBandingLaw(Law):

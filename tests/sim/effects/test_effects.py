@@ -30,8 +30,9 @@ from sim.optics.imaging import ZernikePupil
 from sim.optics.pupil import pupil_otf, seidel
 from sim.point import TRANSFER, Blur, displaced_um, edge_profile, even_share, halos, optical_transfer
 from sim.scene.scenes import Darkness, EdgeRegion, KnifeEdge, PlanarTarget, PointArray, UniformField
+from sim.sensor.mosaic import phases as mosaic_phases
 from sim.spectrum import Spectrum
-from sim.stages import charge_of
+from sim.stages import charge_of, signal_of
 from sim.uniform import Uniform, electron_rate
 
 ALL = list(effects().values())
@@ -178,6 +179,36 @@ def test_a_blur_conserves_light(one: Effect) -> None:
     zero = np.zeros(1)
     factor = _transfer(one, zero, zero, 480.0, PLACE_UM)
     assert float(np.real(factor[0])) == pytest.approx(1.0, abs=1e-12)
+
+
+def _acting(field: str) -> list[Effect]:
+    return [group[0] for kind in ALL if field in may_change(kind) for group in kind.prototypes(CAMERA)[:1]]
+
+
+@pytest.mark.parametrize("one", _acting("charge.collected"), ids=lambda e: e.name)
+def test_pixels_of_a_colour_keep_their_mean(one: Effect) -> None:
+    """In even light, by colour: levels don't ask what pixels of one colour do unlike others."""
+    even = np.full((64, 64), 1000.0)
+    after = charge_of(CAMERA, (one,)).collect_light(even.copy())
+    assert np.any(after != even)
+    for colour, phases in mosaic_phases(CAMERA.cfa).items():
+        means = [after[row::2, col::2].mean() for row, col in phases]
+        assert np.mean(means) == pytest.approx(1000.0, rel=1e-12), colour
+
+
+@pytest.mark.parametrize("one", _acting("charge.exchange") + _acting("charge.kernels"), ids=lambda e: e.name)
+def test_charge_between_pixels_is_conserved(one: Effect) -> None:
+    """Far from the rim, whatever two unequal pixels hold; and equal pixels exchange none."""
+    frame = np.full((17, 17), 1000.0)
+    even = charge_of(CAMERA, (one,)).move_charge(frame.copy())
+    np.testing.assert_allclose(even, frame, rtol=1e-12)
+    frame[8, 8] = 6000.0
+    assert charge_of(CAMERA, (one,)).move_charge(frame.copy()).sum() == pytest.approx(frame.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("one", _acting("signal.response"), ids=lambda e: e.name)
+def test_no_electrons_are_read_as_none(one: Effect) -> None:
+    assert signal_of(CAMERA, (one,)).read(np.zeros(1))[0] == 0.0
 
 
 def test_charge_that_moves_is_conserved() -> None:

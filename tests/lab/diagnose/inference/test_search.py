@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 import pytest
+from pydantic import Field
 
-from lab.diagnose.inference.decide import _with_every_mode, decide
+from lab.diagnose.inference.decide import _with_equal_choices, _with_every_mode, decide
 from lab.diagnose.inference.gaussian import BlockCovariance
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.naming import _still_certain, named_members
@@ -330,3 +331,26 @@ def test_what_a_name_needs_is_a_probability() -> None:
     assert search.needed_log_odds == pytest.approx(np.log(45.0 * 9.0), abs=0.01)
     raised = Search(model, candidates(), (), 40.0, above_noise=24.0)
     assert raised.needed_log_odds == pytest.approx(search.needed_log_odds + 12.0)
+
+
+class _EveryOther(_Curve):
+    """A size times a power of the time; `name_only` changes nothing that is measured."""
+
+    name: ClassVar[str] = "every_other"
+    power: Annotated[Literal[1, 2], Field(description="power of the time")] = 1
+    name_only: Annotated[int, Field(description="which of three", ge=0, le=2)] = 0
+
+    def added_dn(self, elapsed_s: float) -> float:
+        return self.size_dn * elapsed_s**self.power
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return tuple((cls(size_dn=0.1, power=power, name_only=k),) for power in (1, 2) for k in range(3))
+
+
+def test_choices_that_the_recordings_cannot_tell_are_kept_beside_the_one_told() -> None:
+    truth = _EveryOther(size_dn=0.5, name_only=1)
+    model = _model((truth,), np.random.default_rng(6))
+    candidate = Candidate(truth, {"size_dn": 0.01}, 1.0, (), 50.0)
+    found = _with_equal_choices(model, candidate, (truth,), DecisionPolicy())
+    assert {(e.power, e.name_only) for e in found.alike} == {(1, 0), (1, 2)}  # type: ignore[attr-defined]

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
 from lab.diagnose.outcome.merge_sides import _choices
 from lab.formats.results import NamedEffect, ParameterValue
 from lab.report.answers import effect_line
+from sim.effects.base import Effect
 from sim.effects.library import effect
+
+
+class _Rows(Effect):
+    name: ClassVar[str] = "test_rows"
+    period: Annotated[Literal[4, 8], Field(description="rows from one to the next")] = 8
+    first_row: Annotated[int, Field(description="first of them", ge=0, lt=8)] = 0
+    seed: Annotated[int, Field(description="which pattern")] = 0
 
 
 def test_the_choices_of_a_law_are_its_alternatives_and_no_seeds() -> None:
@@ -13,6 +25,14 @@ def test_the_choices_of_a_law_are_its_alternatives_and_no_seeds() -> None:
     assert _choices(glow) == {"corner": "bottom_right"}
     assert _choices(effect("row_noise")(noise_e=3.0, pattern_seed=4)) == {}
     assert _choices(effect("optical_low_pass_filter")(displacement_x_um=2.0)) == {}
+
+
+def test_integers_with_bounds_are_told_and_all_that_are_alike() -> None:
+    """A period among listed numbers, and a row; what the recordings can't tell from them stands beside them."""
+    found = _Rows(first_row=3, seed=5)
+    assert _choices(found) == {"period": "8", "first_row": "3"}
+    alike = (_Rows(first_row=1), _Rows(first_row=3, period=4))
+    assert _choices(found, alike) == {"period": "8 or 4", "first_row": "3 or 1"}
 
 
 def test_a_finding_says_which_alternative_it_is() -> None:

@@ -1,0 +1,54 @@
+"""Effects of the wider library are named where the former conceals them strongly, by its own form of the law, and not on
+healthy cameras.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+
+from lab.challenge.recordings import recordings_of
+from lab.diagnose import diagnose
+from lab.formats.results import DiagnosisResult
+from mocks.former import ConcealedCamera, Law, Plan
+from mocks.former.laws import BitWeightsLaw, ColouredLineNoiseLaw, ResponseKneeLaw
+
+pytestmark = pytest.mark.timeout(300)
+
+#: One strong case of each; the forms of each law.
+STRONG: tuple[Law, ...] = (
+    BitWeightsLaw(0.25, 0, 9),
+    BitWeightsLaw(0.25, 1, 9),
+    ResponseKneeLaw(10.0, 0, 9),
+    ResponseKneeLaw(10.0, 1, 9),
+    # three repeats of 192 rows tell 1/f from rows that are correlated over some in three of four draws; else the family
+    ColouredLineNoiseLaw(5.0, 0, 11),
+    ColouredLineNoiseLaw(5.0, 1, 9),
+)
+NEW = {str(law.effect) for law in STRONG}
+
+
+@cache
+def _diagnosed(law: Law | None, cfa: str = "MONO", seed: int = 930) -> DiagnosisResult:
+    camera = ConcealedCamera(seed, [] if law is None else [law], cfa=cfa, rows=192, cols=256)
+    return diagnose(recordings_of(camera, Plan(kinds=("dark", "flat", "narrowband"))), at_once=False)
+
+
+@pytest.mark.parametrize("law", STRONG, ids=lambda law: f"{law.name}-{law.variant}")
+def test_a_strong_one_is_named_and_sized(law: Law) -> None:
+    (named,) = _diagnosed(law).effects
+    assert named.name == law.effect
+    for name, truth in law.library_parameters().items():
+        if truth != 0.0:
+            found = named.parameters[name]
+            # 4 of its own standard deviations
+            assert found.std is not None
+            assert found.value == pytest.approx(truth, abs=4.0 * found.std)
+
+
+@pytest.mark.parametrize(("cfa", "seed"), [("MONO", 930), ("RGGB", 931)])
+def test_healthy_cameras_have_none(cfa: str, seed: int) -> None:
+    found = _diagnosed(None, cfa, seed)
+    assert not NEW & {e.name for e in found.effects}
+    assert found.verdict == "no_mismatch"
