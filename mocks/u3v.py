@@ -569,7 +569,7 @@ class U3vDevice(UsbDevice):
             return raw
         factors = np.array([[red, green], [green, blue]])
         tiled = np.tile(factors, (-(-raw.shape[0] // 2), -(-raw.shape[1] // 2)))[: raw.shape[0], : raw.shape[1]]
-        return np.minimum(np.round(raw * tiled), _MOST_CODE).astype(np.uint16)
+        return np.asarray(np.minimum(np.round(raw * tiled), _MOST_CODE), np.uint16)
 
     def _send(self, raw: UInt16Array, start_s: float) -> None:
         top, left = self._get(OFFSET_Y), self._get(OFFSET_X)

@@ -179,13 +179,13 @@ class GenicamCamera(StreamingCamera):
         offered = features.entries("PixelFormat")
         names = [item.name for item in PREFERENCE] if self._wanted_format is None else [self._wanted_format]
         known = {item.name: item for item in PREFERENCE}
-        name = next((name for name in names if name in offered and name in known), None)
-        if name is None:
+        chosen = next((name for name in names if name in offered and name in known), None)
+        if chosen is None:
             raise InstrumentError(
                 f"{self._who}: pixel format {self._wanted_format or 'raw'} isn't offered or known; it offers {', '.join(offered)}"
             )
-        features.set("PixelFormat", name)
-        self._format = known[name]
+        features.set("PixelFormat", chosen)
+        self._format = known[chosen]
         if self._wanted_line not in (None, "Software"):
             trigger_line(features, self._who, self._wanted_line)
         if self._output_line is not None:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 
-from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.errors import Garbled, InstrumentError, NoAnswer, Refused
 from drivers.found_settings import FoundSettings
 from drivers.instrument import Identity, Recorder
 from drivers.monochromator.base import (
