@@ -54,7 +54,7 @@ class EmpiricalLaw(Effect):
     reference: ClassVar[str] = (
         "IEEE Std 1241-2010, differential nonlinearity by code density; EMVA Standard 1288 release 4.0, profiles"
     )
-    form_tolerance: ClassVar[float] = 0.0
+    form_tolerance: ClassVar[float] = 0.02
     sentence: ClassVar[str] = (
         "Recordings depart from the model by a table along codes, rows or columns that holds in captures it wasn't "
         "taken from. No effect of the library says why."
