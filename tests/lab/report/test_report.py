@@ -19,6 +19,7 @@ from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import (
     CameraFit,
     DiagnosisResult,
+    DiscoveredLaw,
     EffectSet,
     FitResult,
     MakerDeparture,
@@ -35,6 +36,7 @@ from lab.predict.both_models import BothModels, SensitivityCurve
 from lab.report import charts, provenance_of, render_report, write_report
 from lab.report.answers import odds
 from lab.report.chart_data import figure_json, plotly_base64
+from lab.report.diagnosis import context
 from lab.report.figures import KeyFigure, by_side, rotation_vector_mrad
 from lab.report.pictures import (
     difference_picture,
@@ -198,6 +200,24 @@ def test_mismatch_without_a_name(small_set: Callable[..., RecordingSet], made_up
     assert page.text.count(nameless.check) == 1  # whatever the number of measurements that say so
     assert page.text.index(nameless.check) < page.text.index("a slow fall")
     assert "significance false alarm rate 0.01 healthy cameras" in page.text
+
+
+def test_a_law_without_a_name_is_told_and_drawn(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> None:
+    """Its table with two standard deviations in per cent, on an axis that says by what it repeats."""
+    recordings = small_set()
+    fit, validation, diagnosis = made_up()
+    law = DiscoveredLaw(
+        side="left", stage="codes", along="code", period=2, table=(1.04, 0.96), shown_period=2, shown_departure=(0.04, -0.04),
+        shown_std=(0.01, 0.01), chi2_before=900.0, chi2_after=120.0, n=100, suspects="a heavy bit", statement="Codes repeat.",
+    )  # fmt: skip
+    changed = diagnosis.model_copy(update={"verdict": "partly_explained", "discovered": (law,)})
+    page = Page(render_report(recordings, fit, validation, changed, provenance_of(recordings)))
+    assert "Codes repeat." in page.text
+    ((_, figure),) = context(changed, ("left",))["discovered"]
+    (points,) = figure["data"]
+    assert points["y"] == pytest.approx([4.0, -4.0])
+    assert points["error_y"]["array"] == pytest.approx([2.0, 2.0])
+    assert figure["layout"]["xaxis"]["title"]["text"] == "code mod 2"
 
 
 def test_each_capture_that_settled_a_tie_is_told_with_what_stood_before_it(
