@@ -10,15 +10,18 @@ the counts of single codes repeat beyond any period, the table is one by code.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import sparse
 from scipy.signal import savgol_coeffs
+from scipy.sparse.linalg import spsolve
+from scipy.stats import chi2 as chi_squared
 from scipy.stats import f as f_distribution
 
 from lab.diagnose.measurements.block import Effects
-from lab.diagnose.measurements.code_density import WIDEST, CodeCounts, counted, prepared, widths
+from lab.diagnose.measurements.code_density import CodeCounts, counted, prepared, widths
 from lab.diagnose.measurements.dark_readout import dark_readout
 from lab.diagnose.measurements.even_flats import flats
 from lab.diagnose.measurements.study import Study
@@ -50,6 +53,7 @@ SUSPECTS: dict[tuple[Stage, Along], str] = {
     ("signal", "row"): "shared read-out of neighbouring rows does that, or pick-up at a fraction of the line rate",
     ("signal", "column"): "interleaved column converters with offsets of their own do that",
 }
+BY_CODE_SUSPECTS = "a converter's own differential nonlinearity does that, or a look-up table after it"
 MOST_TOLD = 16  # entries of a table
 LINES: tuple[Along, ...] = ("row", "column")
 #: What the table is of, by stage.
@@ -63,23 +67,34 @@ class Profile:
     index     (n,) index of each number
     residual  (n,) departure, filtered
     variance  (n,) of the residuals
-    spread    (N, k) departures by every index, before the filter -> (n, k) after it
+    matrix    (n, N) sparse: departures by every index -> the residuals that they leave after the filter
     """
 
     index: np.ndarray
     residual: FloatArray
     variance: FloatArray
-    spread: Callable[[FloatArray], FloatArray]
-    count: int  # N
+    matrix: sparse.csr_array
+
+    @property
+    def count(self) -> int:
+        """The number N of indices."""
+        return int(self.matrix.shape[1])
 
     def classes(self, period: int) -> FloatArray:
         """Return the columns (n, period) of a table with that period."""
-        return self.spread(np.eye(period)[np.arange(self.count) % period])
+        return np.asarray(self.matrix @ np.eye(period)[np.arange(self.count) % period])
 
-    def chi2(self, departure: FloatArray) -> float:
-        """Return chi2 of the residuals less a departure by every index (N,)."""
-        left = self.residual - self.spread(departure[:, None])[:, 0]
-        return float(np.sum(np.square(left) / self.variance))
+    def left_by(self, table: FloatArray) -> FloatArray:
+        """Return the residuals (n,) less a table of departures, repeated over the index."""
+        return np.asarray(self.residual - self.matrix @ np.resize(table, self.count))
+
+    def chi2(self, table: FloatArray) -> float:
+        """Return chi2 of the residuals less a table of departures, repeated over the index."""
+        return float(np.sum(np.square(self.left_by(table)) / self.variance))
+
+    def part(self, used: np.ndarray) -> Profile:
+        """Return the profile of some (n,) of its numbers."""
+        return Profile(self.index[used], self.residual[used], self.variance[used], self.matrix[np.flatnonzero(used)])
 
 
 @dataclass(frozen=True)
@@ -116,22 +131,26 @@ def discover(study: Study, effects: Effects, policy: DecisionPolicy) -> tuple[Fo
     limit = float(order[below[-1]]) if len(below) else -np.inf
     found = []
     for look, own in zip(looks, tables, strict=True):
-        kept = [table for table in own if table.log_probability <= limit]
-        if not kept:
-            continue
-        # of the tables that hold, the one of the least description length: n ln chi2 + k ln n
-        best = min(kept, key=lambda table: _description_length(look.seen, table))
-        if not _predicts_other_half(look.seen, best.period):
-            continue
-        judged = _judged(look, best)
-        gain = judged.chi2[0] - judged.chi2[1]
-        if gain < policy.least_discovery_share * judged.chi2[0]:
-            continue
-        shorter = (_judged(look, table) for table in kept if table.period < best.period)
-        base = next((one for one in shorter if one.chi2[0] - one.chi2[1] >= SHORTER_SHARE * gain), None)
-        judged = replace(judged, shorter=() if base is None else (base,))
-        found.append(_by_code(judged) if look.stage == "codes" else judged)
+        one = _periodic(look, [table for table in own if table.log_probability <= limit], policy)
+        if look.stage == "codes":
+            one = _by_code(look, one, policy)
+        if one is not None:
+            found.append(one)
     return tuple(sorted(found, key=lambda one: one.log_probability))
+
+
+def _periodic(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> Found | None:
+    """Return the table of the least description length, n ln chi2 + k ln n, that predicts what it wasn't taken from."""
+    if not kept:
+        return None
+    best = min(kept, key=lambda table: _description_length(look.seen, table))
+    judged = _judged(look, best)
+    gain = judged.chi2[0] - judged.chi2[1]
+    if gain < policy.least_discovery_share * judged.chi2[0] or not _predicts_other_half(look.seen, best.period):
+        return None
+    shorter = (_judged(look, table) for table in kept if table.period < best.period)
+    base = next((one for one in shorter if one.chi2[0] - one.chi2[1] >= SHORTER_SHARE * gain), None)
+    return replace(judged, shorter=() if base is None else (base,))
 
 
 def told(side: Side, study: Study, found: Sequence[Found]) -> tuple[DiscoveredLaw, ...]:
@@ -152,7 +171,7 @@ def told(side: Side, study: Study, found: Sequence[Found]) -> tuple[DiscoveredLa
                 chi2_before=one.chi2[0],
                 chi2_after=one.chi2[1],
                 n=one.chi2[2],
-                suspects=SUSPECTS[one.look.stage, one.look.along],
+                suspects=SUSPECTS[one.look.stage, one.look.along] if shortest.period else BY_CODE_SUSPECTS,
                 statement=_statement(side, one),
             )
         )
@@ -221,73 +240,55 @@ def _fitted(profile: Profile, period: int) -> Table:
 
 def _description_length(profile: Profile, table: Table) -> float:
     n = len(profile.residual)
-    left = profile.chi2(np.resize(table.departure, profile.count))
-    return float(n * np.log(left) + (table.period - 1) * np.log(n))
+    return float(n * np.log(profile.chi2(table.departure)) + (table.period - 1) * np.log(n))
 
 
 def _predicts_other_half(profile: Profile, period: int) -> bool:
     """Whether a table from each half of the index lowers chi2 of the other half: a few outlying lines don't."""
-    middle = float(np.median(profile.index))
-    for first in (profile.index < middle, profile.index >= middle):
-        table = _fitted(_part(profile, first), period).departure
-        other = _part(profile, ~first)
-        if other.chi2(np.resize(table, profile.count)) >= other.chi2(np.zeros(profile.count)):
+    low = profile.index < np.median(profile.index)
+    for one, other in ((low, ~low), (~low, low)):
+        table, judge = _fitted(profile.part(one), period).departure, profile.part(other)
+        if judge.chi2(table) >= judge.chi2(np.zeros(1)):
             return False
     return True
-
-
-def _part(profile: Profile, used: np.ndarray) -> Profile:
-    """Return the profile of a part (n,) of its numbers."""
-
-    def spread(departure: FloatArray) -> FloatArray:
-        return profile.spread(departure)[used]
-
-    return Profile(profile.index[used], profile.residual[used], profile.variance[used], spread, profile.count)
 
 
 def _judged(look: Look, table: Table) -> Found:
     """Return the table with chi2 of the captures held out; of the seen ones where none are."""
     judge = look.held_out or look.seen
-    before, after = judge.chi2(np.zeros(judge.count)), judge.chi2(np.resize(table.departure, judge.count))
-    chi2 = before, after, len(judge.residual)
+    chi2 = judge.chi2(np.zeros(1)), judge.chi2(table.departure), len(judge.residual)
     return Found(look, table.period, table.departure, table.std, table.log_probability, chi2)
 
 
-def _by_code(found: Found) -> Found:
-    """Return a table by every code where the captures held out show that widths differ beyond the period, else the same.
+def _by_code(look: Look, periodic: Found | None, policy: DecisionPolicy) -> Found | None:
+    """Return a table by every code where the captures held out show that widths differ beyond a period's, else that.
 
-    What the periodic table leaves of a code's width is weighed by the variance that its counts' noise doesn't explain
-    (empirical Bayes), and drawn only where it differs from its neighbours'.
+    The widths beyond the periodic table are normal with a variance tau^2 that is what the counts' noise doesn't explain
+    (empirical Bayes): d minimises |(r - A d) / sigma|^2 + |d|^2 / tau^2. The standard deviations are those given all
+    other widths. It has to take twice the standard deviation off chi2 of the captures held out, and
+    `least_discovery_share` of it.
     """
-    look = found.look
     if look.held_out is None:
-        return found
-    periodic = np.resize(found.departure, look.seen.count)
-    left = look.seen.residual - look.seen.spread(periodic[:, None])[:, 0]
-    scale = _own_change(look.seen)
-    noise = look.seen.variance / np.square(scale)
-    excess = max(float(np.mean(np.square(left / scale) - noise)), 0.0)
-    departure = np.zeros(look.seen.count)
-    departure[look.seen.index] = left / scale * excess / (excess + noise)
-    every = periodic + departure
-    std = np.full(look.seen.count, np.sqrt(excess))
-    std[look.seen.index] = np.sqrt(excess * noise / (excess + noise))
-    after = look.held_out.chi2(every)
-    if after >= found.chi2[1] - 2.0 * np.sqrt(2.0 * found.chi2[2]):
-        return found
-    chi2 = found.chi2[0], after, found.chi2[2]
-    return Found(look, 0, every, std, found.log_probability, chi2, (*found.shorter, found))
-
-
-def _own_change(profile: Profile) -> FloatArray:
-    """Return how much each residual changes with the departure at its own index, (n,): the diagonal of `spread`."""
-    step, found = 2 * 2 * WIDEST + 1, np.zeros(len(profile.index))  # farther apart than the filter reaches
-    for begin in range(step):
-        ones = np.zeros((profile.count, 1))
-        ones[begin::step] = 1.0
-        at = profile.index % step == begin
-        found[at] = profile.spread(ones)[at, 0]
-    return found
+        return periodic
+    seen, base = look.seen, np.zeros(1) if periodic is None else periodic.departure
+    own = np.asarray(seen.matrix[np.arange(len(seen.index)), seen.index]).ravel()  # change by the code's own width
+    left = seen.left_by(base)
+    excess = float(np.mean(np.square(left / own) - seen.variance / np.square(own)))
+    if excess <= 0.0:
+        return periodic
+    weighted = sparse.csr_array(seen.matrix / seen.variance[:, None])
+    normal = sparse.csc_array(seen.matrix.T @ weighted + sparse.eye_array(seen.count) / excess)
+    every = np.resize(base, seen.count) + spsolve(normal, weighted.T @ left)
+    std = 1.0 / np.sqrt(normal.diagonal())
+    n = len(look.held_out.residual)
+    first, before, after = (look.held_out.chi2(table) for table in (np.zeros(1), base, every))
+    if before - after < max(2.0 * np.sqrt(2.0 * n), policy.least_discovery_share * before):
+        return periodic
+    # chi2 of what the table takes off, as of one number
+    log_p = float(chi_squared.logsf(before - after, 1)) if periodic is None else periodic.log_probability
+    return Found(
+        look, 0, every, std, log_p, (first, after, n), () if periodic is None else (*periodic.shorter, periodic)
+    )
 
 
 # --- the profiles ----------------------------------------------------------------------------------------------------
@@ -310,19 +311,11 @@ def _codes(study: Study, effects: Effects) -> list[Look]:
 def _code_profile(codes: CodeCounts, effects: Effects, study: Study) -> Profile:
     used, rough = np.flatnonzero(codes.used), codes.rough
     known = rough @ (codes.expected * (widths(codes, effects, study) - 1.0)) if effects else 0.0
-    every = len(codes.count) + codes.first
-
-    def spread(departure: FloatArray) -> FloatArray:
-        return np.asarray((rough @ (codes.smooth[:, None] * departure[codes.first : every]))[used])
-
+    of_widths = sparse.coo_array((rough @ sparse.diags_array(codes.smooth))[used])
+    at = of_widths.coords[0], of_widths.coords[1] + codes.first
+    matrix = sparse.csr_array((of_widths.data, at), shape=(len(used), int(study.camera.white_level_dn) + 1))
     variance = rough.power(2) @ np.maximum(codes.smooth, 1.0)
-    return Profile(
-        used + codes.first,
-        (rough @ codes.count - known)[used],
-        variance[used],
-        spread,
-        int(study.camera.white_level_dn) + 1,
-    )
+    return Profile(used + codes.first, (rough @ codes.count - known)[used], variance[used], matrix)
 
 
 def _light_lines(study: Study, effects: Effects) -> list[Look]:
@@ -365,30 +358,25 @@ def _lines(study: Study, image: FloatArray, along: Along) -> Profile | None:
 
     The filter takes a running polynomial out. The variance is the square of the residuals' robust spread.
     """
-    axis, period = (0, mosaic.step(study.camera.cfa)) if along == "row" else (1, mosaic.step(study.camera.cfa))
+    axis, period = 0 if along == "row" else 1, mosaic.step(study.camera.cfa)
     count = image.shape[axis]
-    rows: list[np.ndarray] = []
-    values: list[FloatArray] = []
-    filters: list[FloatArray] = []
-    for channel_phases in mosaic.phases(study.camera.cfa).values():
-        for phase in channel_phases:
-            plane = image[phase[0] :: period, phase[1] :: period]
-            mean = plane.mean(axis=1 - axis)
+    index, residual, matrix = [], [], []
+    for phases in mosaic.phases(study.camera.cfa).values():
+        for phase in phases:
+            mean = image[phase[0] :: period, phase[1] :: period].mean(axis=1 - axis)
             taken = _polynomial_filter(len(mean))
             if taken is None:
                 return None
-            rows.append(np.arange(phase[axis], count, period)[: len(mean)])
-            filters.append(taken)
-            values.append(taken @ mean)
-    residual = np.concatenate(values)
-    spread_of = ROBUST * float(np.median(np.abs(residual - np.median(residual))))
-    if spread_of == 0.0:
+            own = np.arange(phase[axis], count, period)
+            index.append(own)
+            residual.append(taken @ mean)
+            matrix.append(np.zeros((len(own), count)))
+            matrix[-1][:, own] = taken
+    left = np.concatenate(residual)
+    spread = ROBUST * float(np.median(np.abs(left - np.median(left))))
+    if spread == 0.0:
         return None
-
-    def spread(departure: FloatArray) -> FloatArray:
-        return np.concatenate([taken @ departure[at] for taken, at in zip(filters, rows, strict=True)])
-
-    return Profile(np.concatenate(rows), residual, np.full(len(residual), spread_of**2), spread, count)
+    return Profile(np.concatenate(index), left, np.full(len(left), spread**2), sparse.csr_array(np.concatenate(matrix)))
 
 
 def _polynomial_filter(count: int) -> FloatArray | None:
@@ -414,16 +402,23 @@ def _statement(side: Side, found: Found) -> str:
     look, steps = found.look, (*found.shorter, found)
     line = "code" if look.along == "code" else look.along
     base, n = steps[0], found.chi2[2]
-    shown = ", ".join(_entry(look, value) for value in base.departure[:MOST_TOLD])
-    more = (", ..." if base.period > MOST_TOLD else "") + f" (each ± {_entry(look, float(np.median(base.std)), '')})"
-    suspects = SUSPECTS[look.stage, look.along]
+    what = f"No listed effect, but the {QUANTITIES[look.stage]} of the {side} camera"
+    if base.period:
+        shown = ", ".join(_entry(look, value) for value in base.departure[:MOST_TOLD])
+        more = ", ..." if base.period > MOST_TOLD else ""
+        each = f"each ± {_entry(look, float(np.median(base.std)), '')}"
+        what += f" repeat every {base.period} {line}s; by {line} mod {base.period}: {shown}{more} ({each})"
+        suspects = SUSPECTS[look.stage, look.along]
+    else:
+        rms = float(np.std(base.departure[look.seen.index]))
+        what += f" differ by {_entry(look, rms, '')} rms, without a period"
+        suspects = BY_CODE_SUSPECTS
     where = " of held-out captures" if look.held_out is not None else ""
     falls = ", ".join(
         f"to {one.chi2[1] / n:.3g} with {f'{one.period} numbers' if one.period else 'one by code'}" for one in steps
     )
     return (
-        f"No listed effect, but the {QUANTITIES[look.stage]} of the {side} camera repeat every {base.period} {line}s; "
-        f"by {line} mod {base.period}: {shown}{more}. {suspects[0].upper()}{suspects[1:]}. "
+        f"{what}. {suspects[0].upper()}{suspects[1:]}. "
         f"By such a table chi2 over n{where} falls from {found.chi2[0] / n:.3g} {falls}."
     )
 

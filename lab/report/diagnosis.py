@@ -60,16 +60,16 @@ def _law_chart(law: DiscoveredLaw) -> Figure:
             {
                 "type": "scatter",
                 "mode": "markers",
-                "x": list(range(law.shown_period)),
+                "x": list(range(len(law.shown_departure))),
                 "y": [factor * value for value in law.shown_departure],
                 "error_y": {"type": "data", "array": [2.0 * factor * std for std in law.shown_std], "color": "@fg"},
-                "marker": {"color": "@fg", "size": 7},
+                "marker": {"color": "@fg", "size": 7 if law.shown_period else 3},
                 "showlegend": False,
             }
         ],
         "layout": layout(
             200,
-            xaxis=axis(f"{law.along} mod {law.shown_period}", dtick=max(1, law.shown_period // 16)),
+            xaxis=axis(f"{law.along} mod {law.shown_period}" if law.shown_period else law.along),
             yaxis=axis(f"{quantity}, {unit}"),
         ),
     }

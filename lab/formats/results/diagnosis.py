@@ -111,7 +111,7 @@ class DiscoveredLaw(Frozen):
     model as `empirical_law`.
 
     `stage`, `along`, `period` and `table` are those of that effect. `shown_departure` is the shortest table that does
-    nearly as well, by index mod `shown_period`: departures from no change, relative or in DN (stage `signal`), with
+    nearly as well, by index mod `shown_period` (0: by index): departures from no change, relative or in DN (stage `signal`), with
     their standard deviations. chi2 is of the `n` numbers along the index
     in held-out captures (in the captures themselves where none are held out), without and with the law. `suspects`:
     what physics may do it; none of them is a name.

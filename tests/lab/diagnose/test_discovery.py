@@ -18,7 +18,7 @@ from lab.fit import FOR_DIAGNOSIS, fit_recording_set
 from lab.formats.importers import ImportOptions, read_foreign
 from lab.formats.recording_set import RecordingSet, read, write
 from mocks.former import ConcealedCamera, Law, Plan, record
-from mocks.former.laws import DigitalGainLaw
+from mocks.former.laws import DigitalGainLaw, LossyCodesLaw
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 LIT_AND_DARK = Plan(("dark", "flat", "narrowband"))
@@ -69,6 +69,17 @@ def test_a_gain_after_the_converter_shows_by_code() -> None:
     assert np.sort(base.departure)[0] < -0.8
     assert np.sort(base.departure)[1:] == pytest.approx(np.full(10, 0.1), abs=0.05)
     before, after, n = one.chi2
+    assert before - after > 0.9 * (before - n)
+
+
+def test_codes_without_a_period_are_a_table_by_code() -> None:
+    """Codes in equal steps of their square root: which of them occur follows no period, and is alike in all frames."""
+    (one,) = _found(recordings_of(ConcealedCamera(772021, (LossyCodesLaw(0.05),), rows=96, cols=128), LIT_AND_DARK))
+    assert (one.look.stage, one.period) == ("codes", 0)
+    held_out = one.look.held_out
+    assert held_out is not None
+    counted = held_out.part(np.isin(held_out.index, one.look.seen.index))  # of other codes no frame tells anything
+    before, after, n = counted.chi2(np.zeros(1)), counted.chi2(one.departure), len(counted.index)
     assert before - after > 0.9 * (before - n)
 
 
