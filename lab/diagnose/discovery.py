@@ -402,7 +402,7 @@ def _statement(side: Side, found: Found) -> str:
     look, steps = found.look, (*found.shorter, found)
     line = "code" if look.along == "code" else look.along
     base, n = steps[0], found.chi2[2]
-    what = f"No listed effect, but the {QUANTITIES[look.stage]} of the {side} camera"
+    what = f"No listed effect does this: the {QUANTITIES[look.stage]} of the {side} camera"
     if base.period:
         shown = ", ".join(_entry(look, value) for value in base.departure[:MOST_TOLD])
         more = ", ..." if base.period > MOST_TOLD else ""
@@ -415,7 +415,8 @@ def _statement(side: Side, found: Found) -> str:
         suspects = BY_CODE_SUSPECTS
     where = " of held-out captures" if look.held_out is not None else ""
     falls = ", ".join(
-        f"to {one.chi2[1] / n:.3g} with {f'{one.period} numbers' if one.period else 'one by code'}" for one in steps
+        f"to {one.chi2[1] / n:.3g} with {f'{one.period} numbers' if one.period else 'a width for every code'}"
+        for one in steps
     )
     return (
         f"{what}. {suspects[0].upper()}{suspects[1:]}. "

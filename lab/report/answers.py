@@ -13,6 +13,7 @@ from lab.effect_titles import at_beginning, effect_title
 from lab.formats.results import (
     Check,
     DiagnosisResult,
+    DiscoveredLaw,
     FitResult,
     NamedEffect,
     ParameterValue,
@@ -113,10 +114,18 @@ def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
     if diagnosis.unexplained:
         places = sorted({f"{measurement_title(item.measurement)} ({item.side})" for item in diagnosis.unexplained})
         yield f"Without a name so far: {', '.join(places)}."
+    yield from (_law_line(law) for law in diagnosis.discovered)
     named = {side for effect in diagnosis.effects for side in effect.sides}
     missed = named | {item.side for item in diagnosis.mismatches}
     if named and (clean := [side for side in fit.cameras if side not in missed]):
         yield f"The {' and '.join(clean)} camera shows no mismatch in these recordings."
+
+
+def _law_line(law: DiscoveredLaw) -> str:
+    """Say along what a law without a name acts, and what it takes off chi2."""
+    repeats = f"repeats every {law.shown_period} {law.along}s" if law.shown_period else f"goes by {law.along}"
+    before, after = law.chi2_before / law.n, law.chi2_after / law.n
+    return f"A law without a name, {law.side}, {repeats}: with it χ² per number falls from {before:.3g} to {after:.3g}."
 
 
 def _sure_of(effect: NamedEffect) -> str:

@@ -21,7 +21,7 @@ from lab.formats.results import (
     Visibility,
 )
 from lab.formats.results.in_words import plain_number, shown_unit
-from lab.report.charts import Figure, axis, layout
+from lab.report.charts import AFTER, Figure, Trace, axis, band, layout
 from lab.report.pictures import difference_picture
 from sim.camera import Side
 from sim.effects.library import effects as library
@@ -32,6 +32,8 @@ PICTURE_LIMIT = 6.0
 #: A chi2 above this quantile of its distribution under noise alone is marked.
 MARKED_QUANTILE = 0.999
 CURVES_A_SIDE = 8
+#: Share of the prior's standard deviation below which an entry of a table by code is determined.
+DETERMINED = 0.95
 #: Range of the heat maps' colours.
 DEEPEST_SIGMA = 12.0
 
@@ -52,27 +54,29 @@ def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[st
 
 
 def _law_chart(law: DiscoveredLaw) -> Figure:
-    """Draw the shortest table of a discovered law, with two standard deviations."""
+    """Draw the shortest table of a discovered law: a periodic one with two standard deviations of each entry, one by
+    code with the median of these as a band about no change.
+    """
     factor, unit = (1.0, "DN") if law.stage == "signal" else (100.0, "%")
-    quantity = {"codes": "width of a code less 1", "charge": "sensitivity less 1", "signal": "offset"}[law.stage]
-    return {
-        "data": [
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "x": list(range(len(law.shown_departure))),
-                "y": [factor * value for value in law.shown_departure],
-                "error_y": {"type": "data", "array": [2.0 * factor * std for std in law.shown_std], "color": "@fg"},
-                "marker": {"color": "@fg", "size": 7 if law.shown_period else 3},
-                "showlegend": False,
-            }
-        ],
-        "layout": layout(
-            200,
-            xaxis=axis(f"{law.along} mod {law.shown_period}" if law.shown_period else law.along),
-            yaxis=axis(f"{quantity}, {unit}"),
-        ),
-    }
+    quantity = {"codes": "width less 1", "charge": "factor less 1", "signal": "offset"}[law.stage]
+    departure, half = factor * np.array(law.shown_departure), 2.0 * factor * np.array(law.shown_std)
+    x = np.arange(len(departure))
+    points: Trace = {"type": "scatter", "mode": "markers", "showlegend": False}
+    data: list[Trace] = []
+    if law.shown_period:
+        points |= {
+            "error_y": {"type": "data", "array": half.tolist(), "color": "@fg"},
+            "marker": {"color": "@fg", "size": 7},
+        }
+    else:
+        x = x[half < half.max() * DETERMINED]
+        departure, half = departure[x], half[x]
+        ends, none = [int(x[0]), int(x[-1])], np.zeros(2)
+        data.append(band(ends, none, np.full(2, float(np.median(half))), AFTER))
+        points["marker"] = {"color": "@fg", "size": 2}
+    points |= {"x": x.tolist(), "y": departure.tolist()}
+    along = f"{law.along} mod {law.shown_period}" if law.shown_period else law.along
+    return {"data": [*data, points], "layout": layout(220, xaxis=axis(along), yaxis=axis(f"{quantity}, {unit}"))}
 
 
 def mood(chi2: float, n: int) -> str:
