@@ -177,12 +177,12 @@ def shut(monochromator: Monochromator) -> None:
     """Stop a monochromator and ask for its shutter. Raises InstrumentError where it says that it is open still.
 
     One that isn't connected yet ignores a stop: it is connected then, and told to close. A stop by another thread, which closes the shutter as well,
-    ends the question: it is asked again within `STOP_S`.
+    ends the question: it is asked again within `STOP_S`, without another stop, which would end the question of that thread in turn.
     """
     until = time.monotonic() + STOP_S
+    monochromator.stop()
     while True:
         try:
-            monochromator.stop()
             monochromator.connect()
             if opened := monochromator.shutter_is_open():
                 monochromator.close_shutter()

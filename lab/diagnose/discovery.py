@@ -108,7 +108,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Found:
+class PredictiveTable:
     """A table that predicts: departures from no change by class (period,) or by index (N,)."""
 
     look: Look
@@ -117,10 +117,10 @@ class Found:
     std: FloatArray  # of each departure
     log_probability: float
     chi2: tuple[float, float, int]  # of the held-out captures (of the seen ones without any), before, after, and n
-    shorter: tuple[Found, ...] = ()  # tables of fewer numbers that it rests on, the shortest first
+    shorter: tuple[PredictiveTable, ...] = ()  # tables of fewer numbers that it rests on, the shortest first
 
 
-def discover(study: Study, effects: Effects, policy: DecisionPolicy) -> tuple[Found, ...]:
+def discover(study: Study, effects: Effects, policy: DecisionPolicy) -> tuple[PredictiveTable, ...]:
     """Find tables that hold in what they weren't taken from, the most significant first; see the module."""
     looks = [look for make in (_codes, _light_lines, _dark_lines) for look in make(study, effects)]
     tables = [[_fitted(look.seen, period) for period in _periods(look.seen)] for look in looks]
@@ -139,7 +139,7 @@ def discover(study: Study, effects: Effects, policy: DecisionPolicy) -> tuple[Fo
     return tuple(sorted(found, key=lambda one: one.log_probability))
 
 
-def _periodic(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> Found | None:
+def _periodic(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> PredictiveTable | None:
     """Return the table of the least description length, n ln chi2 + k ln n, that predicts what it wasn't taken from."""
     if not kept:
         return None
@@ -153,7 +153,7 @@ def _periodic(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> Foun
     return replace(judged, shorter=() if base is None else (base,))
 
 
-def told(side: Side, study: Study, found: Sequence[Found]) -> tuple[DiscoveredLaw, ...]:
+def told(side: Side, study: Study, found: Sequence[PredictiveTable]) -> tuple[DiscoveredLaw, ...]:
     """Put discovered laws into results: the law as it stands in a camera file, its chi2, and sentences."""
     laws = []
     for one in found:
@@ -178,7 +178,7 @@ def told(side: Side, study: Study, found: Sequence[Found]) -> tuple[DiscoveredLa
     return tuple(laws)
 
 
-def law_of(found: Found, study: Study) -> EmpiricalLaw:
+def law_of(found: PredictiveTable, study: Study) -> EmpiricalLaw:
     """Return the law as an effect that acts on its stage, in its units."""
     look = found.look
     if look.stage == "signal":
@@ -253,14 +253,14 @@ def _predicts_other_half(profile: Profile, period: int) -> bool:
     return True
 
 
-def _judged(look: Look, table: Table) -> Found:
+def _judged(look: Look, table: Table) -> PredictiveTable:
     """Return the table with chi2 of the captures held out; of the seen ones where none are."""
     judge = look.held_out or look.seen
     chi2 = judge.chi2(np.zeros(1)), judge.chi2(table.departure), len(judge.residual)
-    return Found(look, table.period, table.departure, table.std, table.log_probability, chi2)
+    return PredictiveTable(look, table.period, table.departure, table.std, table.log_probability, chi2)
 
 
-def _by_code(look: Look, periodic: Found | None, policy: DecisionPolicy) -> Found | None:
+def _by_code(look: Look, periodic: PredictiveTable | None, policy: DecisionPolicy) -> PredictiveTable | None:
     """Return a table by every code where the captures held out show that widths differ beyond a period's, else that.
 
     The widths beyond the periodic table are normal with a variance tau^2 that is what the counts' noise doesn't explain
@@ -286,7 +286,7 @@ def _by_code(look: Look, periodic: Found | None, policy: DecisionPolicy) -> Foun
         return periodic
     # chi2 of what the table takes off, as of one number
     log_p = float(chi_squared.logsf(before - after, 1)) if periodic is None else periodic.log_probability
-    return Found(
+    return PredictiveTable(
         look, 0, every, std, log_p, (first, after, n), () if periodic is None else (*periodic.shorter, periodic)
     )
 
@@ -394,7 +394,7 @@ def _polynomial_filter(count: int) -> FloatArray | None:
 # --- in words --------------------------------------------------------------------------------------------------------
 
 
-def _statement(side: Side, found: Found) -> str:
+def _statement(side: Side, found: PredictiveTable) -> str:
     """Say which entries differ, what that may be, and by how much held-out captures are predicted better.
 
     The shortest table is told, and what longer ones take off chi2 besides.

@@ -60,15 +60,15 @@ class EmpiricalLaw(Effect):
         "taken from. No effect of the library says why."
     )
 
-    stage: Annotated[Stage, Field(description="stage on which the table acts")] = "codes"
+    stage: Annotated[Stage, Field(description="stage on which the table acts")] = "charge"
     along: Annotated[Along, Field(description="index of the table: `code` with `codes`, `row` or `column` else")] = (
-        "code"
+        "row"
     )
-    period: Annotated[int, Field(ge=0, description="indices after which the table repeats; 0: it doesn't")] = 4
+    period: Annotated[int, Field(ge=0, description="indices after which the table repeats; 0: it doesn't")] = 8
     first: Annotated[int, Field(ge=0, description="index of the first entry of a table that doesn't repeat")] = 0
     table: Annotated[
         tuple[float, ...], Field(min_length=2, description="relative widths, factors, or offsets in e")
-    ] = (1.1, 0.9, 1.1, 0.9)
+    ] = (0.8, 1.0, 1.0, 1.0, 1.2, 1.0, 1.0, 1.0)
     strength: Annotated[
         float, Quantity("1", "share of the law that acts", lower=0.0, upper=2.0, prior=(0.0, 1.0), absent=0.0)
     ] = 0.0

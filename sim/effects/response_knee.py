@@ -58,6 +58,10 @@ class ResponseKnee(Effect):
         float, Field(description="share of full well over which the knee is rounded", ge=0.0, le=0.2)
     ] = 0.0
 
+    def log_prior(self) -> float:
+        """Return -ln 10: a response that isn't straight bends smoothly in all cameras but those with a mode for it."""
+        return -float(np.log(10.0)) if self.slope_percent else 0.0
+
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         return tuple(

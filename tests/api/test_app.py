@@ -209,7 +209,7 @@ def test_a_device_that_fails_is_503_and_a_defect_500(
     [
         ({"station": "fakes", "sequences": ["magic"]}, "sequences.0: 'magic' is no sequence; choose from dark,"),
         ({"station": "fakes", "not_before": "2030-01-01T00:00:00Z"}, "not_before: goes with queue = true; give both"),
-        ({"station": "fakes", "quick": 7}, "quick: 7: Input should be a valid boolean"),
+        ({"station": "fakes", "quick": 7}, "quick: 7 isn't true or false; write one of them, without quotes"),
     ],
 )
 def test_a_refusal_names_the_field_and_its_value_once(shared: Running, body: dict[str, Any], said: str) -> None:

@@ -66,7 +66,7 @@ def test_the_first_start_prints_a_key_once_and_no_log_shows_one(tmp_path: Path) 
         with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {secret}"}) as client:
             assert client.get("/api/v1/me").json() == {"name": "first", "scope": "admin"}
             # A client that ignores all advice; the log must not keep what it did.
-            assert client.get("/api/v1/me", params={"key": secret}).status_code == 200
+            assert client.get("/api/v1/me", params={"key": secret}).status_code == 422  # a key is no query parameter
             assert client.get(f"/{secret}").status_code == 404
             assert client.post("/login", json={"key": secret}).status_code == 200
         process.send_signal(signal.SIGTERM)

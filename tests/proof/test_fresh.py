@@ -20,7 +20,6 @@ from lab.formats.results import DiagnosisResult
 from mocks.former import Law
 from mocks.former.laws import (
     AbsorptionBandLaw,
-    CompandingKneeLaw,
     CoverGlassFringeLaw,
     DustShadowLaw,
     InfraredCutFilterLaw,
@@ -36,7 +35,6 @@ PLAIN: tuple[type[Law], ...] = (OpticalLowPassFilterLaw, InfraredCutFilterLaw, N
 #: Of the kinds that no list names, some that are soon diagnosed.
 STRANGE: tuple[type[Law], ...] = (
     AbsorptionBandLaw,
-    CompandingKneeLaw,
     CoverGlassFringeLaw,
     DustShadowLaw,
     LampJumpLaw,

@@ -48,7 +48,7 @@ AROUND = 9  # side of the box in a plane of the mosaic whose mean is the light a
 STEP_OF_LEVELS = 0.2
 PARTS = 4  # of the range of codes, each with a chi2 of its own
 FINE = 8  # samples a code at which the converter's law is evaluated where it isn't straight
-JUMP = 0.5  # codes on which a sample lands, above which the law jumps within it
+JUMP = 1e-3  # codes by which a sample's middle may land off the mean of its ends, for the law to be straight in it
 STRAIGHT = 1e-9  # codes: second difference of a law between codes, of rounding alone
 MARGIN = 64  # codes beyond those that are counted
 
@@ -361,9 +361,9 @@ def widths(codes: CodeCounts, effects: Effects, study: Study) -> FloatArray:
     samples = edge[:-1][bent][:, None] + np.arange(FINE + 1) / FINE
     lands_on = law(samples.ravel() + codes.first).reshape(samples.shape) - codes.first
     low, high = (end(lands_on[:, :-1], lands_on[:, 1:]).ravel() for end in (np.minimum, np.maximum))
-    jumps = high - low > JUMP  # there the law isn't continuous: where its middle lands, as wide as without it
-    middle = law((samples[:, :-1].ravel() + 0.5 / FINE)[jumps] + codes.first) - codes.first
-    low[jumps], high[jumps] = middle - 0.5 / FINE, middle + 0.5 / FINE
+    middle = law((samples[:, :-1].ravel() + 0.5 / FINE) + codes.first) - codes.first
+    jumps = np.abs(middle - 0.5 * (low + high)) > JUMP  # there: where its middle lands, as wide as without the law
+    low[jumps], high[jumps] = middle[jumps] - 0.5 / FINE, middle[jumps] + 0.5 / FINE
     code = np.rint(high).astype(int)
     stretch = high - low
     above = np.where(stretch > 0.0, np.clip((high - code + 0.5) / np.maximum(stretch, 1e-12), 0.0, 1.0), 1.0)

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from tests.api.conftest import Running, until_state
 from tests.lab.calibration.test_life import fitted
 
 LIMITS = {"valid_days": 90, "limit": [{"figure": "noise read_noise_e", "good": [None, 2.5], "warn": [None, 3.0]}]}
+
+
+def of_names(named: dict[str, Any]) -> dict[str, Any]:
+    """What `/history` takes of an entry of `/figures`."""
+    return {key: named[key] for key in ("camera", "figure", "place")}
 
 
 def test_a_calibration_is_certified_and_its_history_is_told(running: Running) -> None:
@@ -31,10 +38,10 @@ def test_a_calibration_is_certified_and_its_history_is_told(running: Running) ->
         assert marks == {"left": "bad", "right": "bad"}
         names = [one for one in client.get("/api/v1/figures").json() if one["figure"] == "noise read_noise_e"]
         assert len(names) == 2
-        found = client.get("/api/v1/history", params=names[0]).json()
+        found = client.get("/api/v1/history", params=of_names(names[0])).json()
         assert [point["mark"] for point in found["points"]] == ["good", "bad", "bad"]
         assert [point["drifted"] for point in found["points"]] == [False, True, True]
-        assert client.get("/api/v1/history", params=names[0] | {"figure": "x"}).status_code == 404
+        assert client.get("/api/v1/history", params=of_names(names[0]) | {"figure": "x"}).status_code == 404
 
 
 def test_a_session_demands_a_certified_calibration(running: Running) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lab.challenge.recordings import recording_set, recordings_of
 from lab.diagnose import diagnose, examine
-from lab.diagnose.discovery import Found, discover, law_of
+from lab.diagnose.discovery import PredictiveTable, discover, law_of
 from lab.diagnose.measurements.blocks import study_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.fit import FOR_DIAGNOSIS, fit_recording_set
@@ -38,7 +38,7 @@ def _changed(seed: int, change: Callable[[Frame, str, float], Frame], cfa: str =
     return recording_set(session)
 
 
-def _found(recordings: RecordingSet) -> tuple[Found, ...]:
+def _found(recordings: RecordingSet) -> tuple[PredictiveTable, ...]:
     return discover(study_of(recordings, "left"), (), DecisionPolicy())
 
 

@@ -9,7 +9,7 @@ from lab.diagnose.metadata import misstatements
 from lab.formats.recording_set import Manifest, RecordingSet
 from tests.lab.diagnose.metadata.lies import told
 from tests.lab.diagnose.on_blocks import former
-from tests.lab.fit.noise.test_exchanged_frames import swapped
+from tests.lab.measure.test_exchanged_frames import swapped
 
 
 @cache
