@@ -19,6 +19,7 @@ from lab.formats.importers import ImportOptions, read_foreign
 from lab.formats.recording_set import RecordingSet, read, write
 from mocks.former import ConcealedCamera, Law, Plan, record
 from mocks.former.laws import DigitalGainLaw, LossyCodesLaw
+from sim.effects.column_noise import ColumnNoise
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 LIT_AND_DARK = Plan(("dark", "flat", "narrowband"))
@@ -118,6 +119,18 @@ def test_offsets_of_columns_are_told_from_gains() -> None:
     assert one.departure == pytest.approx(offset, abs=0.1)  # darks of 96 rows, rounded to 1 DN
     study = study_of(recordings, "left")
     assert np.array(law_of(one, study).table) * study.noise.gain == pytest.approx(one.departure)
+
+
+def test_what_a_named_effect_does_is_no_law() -> None:
+    """Odd columns 2 DN above even ones: a law by itself, and none beside the column noise that has this step."""
+
+    def shifted(frame: Frame, kind: str, black_dn: float) -> Frame:
+        return frame + np.resize([-1.0, 1.0], frame.shape[1])
+
+    study = study_of(_changed(772012, shifted), "left")
+    assert [one.period for one in discover(study, (), DecisionPolicy())] == [2]
+    named = ColumnNoise(odd_even_e=2.0 / study.noise.gain)
+    assert not discover(study, (named,), DecisionPolicy())
 
 
 def test_one_bright_line_is_no_law() -> None:
