@@ -87,7 +87,8 @@ class EmpiricalLaw(Effect):
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
-        return ((cls(strength=0.3),),)
+        widths = cls(stage="codes", along="code", period=4, table=(1.1, 0.9, 1.1, 0.9), strength=0.3)
+        return (cls(strength=0.3),), (widths,)
 
     def _by_line(self, count: int) -> FloatArray:
         """Return the table's departure from no change for lines 0 to count - 1, (count,)."""
