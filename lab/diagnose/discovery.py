@@ -24,6 +24,7 @@ from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.code_density import CodeCounts, counted, prepared, widths
 from lab.diagnose.measurements.dark_readout import dark_readout
 from lab.diagnose.measurements.even_flats import flats
+from lab.diagnose.measurements.flat_lines import without_dark
 from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
@@ -332,9 +333,8 @@ def _light_lines(study: Study, effects: Effects) -> list[Look]:
         made: dict[bool, Profile | None] = {}
         for held_out, (image, _) in images.items():
             part = [u for u in levels if u.held_out == held_out]
-            signal = max(float(np.mean([np.mean(list(u.mean.values())) for u in part])), 1e-9)
-            offsets = 0.0 if dark is None else np.asarray(dark.offsets_dn, float) / signal
-            made[held_out] = _lines(study, np.asarray(image, float) - offsets, along)
+            level = image if dark is None else without_dark(study, dark, part, image)[0]
+            made[held_out] = _lines(study, np.asarray(level, float), along)
         seen = made[False]
         if seen is not None:
             looks.append(Look("charge", along, seen, made.get(True)))
@@ -373,25 +373,27 @@ def _lines(study: Study, image: FloatArray, along: Along) -> Profile | None:
             own = np.arange(phase[axis], count, period)
             index.append(own)
             residual.append(taken @ mean)
-            matrix.append(np.zeros((len(own), count)))
-            matrix[-1][:, own] = taken
+            at = sparse.coo_array(taken)
+            matrix.append(sparse.csr_array((at.data, (at.coords[0], own[at.coords[1]])), shape=(len(own), count)))
     left = np.concatenate(residual)
     spread = ROBUST * float(np.median(np.abs(left - np.median(left))))
     if spread == 0.0:
         return None
-    return Profile(np.concatenate(index), left, np.full(len(left), spread**2), sparse.csr_array(np.concatenate(matrix)))
+    return Profile(np.concatenate(index), left, np.full(len(left), spread**2), sparse.csr_array(sparse.vstack(matrix)))
 
 
-def _polynomial_filter(count: int) -> FloatArray | None:
+def _polynomial_filter(count: int) -> sparse.csr_array | None:
     """Return the matrix (count, count) that takes a running polynomial out of lines; None for too few of them."""
     reach = min(REACH, (count - 1) // 4)
-    if 2 * reach + 1 <= 2 * DEGREE + 1:
+    size = 2 * reach + 1
+    if size <= 2 * DEGREE + 1:
         return None
-    matrix = np.eye(count)
-    for i in range(count):
-        low = min(max(i - reach, 0), count - 2 * reach - 1)
-        matrix[i, low : low + 2 * reach + 1] -= savgol_coeffs(2 * reach + 1, DEGREE, pos=i - low, use="dot")
-    return matrix
+    weights = np.array([savgol_coeffs(size, DEGREE, pos=place, use="dot") for place in range(size)])
+    line = np.arange(count)
+    first = np.clip(line - reach, 0, count - size)
+    at = np.repeat(line, size), (first[:, None] + np.arange(size)).ravel()
+    smooth = sparse.csr_array((weights[line - first].ravel(), at), shape=(count, count))
+    return sparse.csr_array(sparse.eye_array(count) - smooth)
 
 
 # --- in words --------------------------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ def line_block(study: Study) -> Block:
     for held_out, (whole_image, noise) in sorted(images.items()):
         part = [u for u in levels if u.held_out == held_out]
         members = tuple(c.id for u in part for c in u.captures)
-        image, of_dark = (whole_image, 0.0) if dark is None else _without_dark(study, dark, part, whole_image)
+        image, of_dark = (whole_image, 0.0) if dark is None else without_dark(study, dark, part, whole_image)
         for axis, name in ((0, "column"), (1, "row")):
             line, with_dark = (np.asarray(one.mean(axis=axis, dtype=float)) for one in (image, whole_image))
             shot = noise / image.shape[axis]
@@ -78,7 +78,7 @@ def line_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _without_dark(
+def without_dark(
     study: Study, dark: DarkReadOut, levels: Sequence[FlatLevel], image: FloatArray
 ) -> tuple[FloatArray, float]:
     """The mean image of flat `levels` without the offsets of dark frames, (rows, cols), and the variance that their noise adds to a pixel."""
