@@ -407,7 +407,7 @@ def _statement(side: Side, found: PredictiveTable) -> str:
     look, steps = found.look, (*found.shorter, found)
     line = "code" if look.along == "code" else look.along
     base, n = steps[0], found.chi2[2]
-    what = f"No listed effect does this: the {QUANTITIES[look.stage]} of the {side} camera"
+    what = f"No named effect accounts for this: the {QUANTITIES[look.stage]} of the {side} camera"
     if base.period:
         shown = ", ".join(_entry(look, value) for value in base.departure[:MOST_TOLD])
         more = ", ..." if base.period > MOST_TOLD else ""
