@@ -89,19 +89,20 @@ TAGS = [
     {"name": "jobs", "description": "Fits, validations, diagnoses, reports, whole pipelines."},
     {
         "name": "calibrations",
-        "description": "Candidate, certified, superseded, expired; figures and their history; camera models; comparisons.",
+        "description": "Candidate, certified, superseded, expired; figures and their history; camera models; "
+        "comparisons.",
     },
     {"name": "challenges", "description": "Concealed-effect data with sealed truths, and its scoring."},
     {"name": "knowledge", "description": "What the models know."},
 ]
-#: Statuses that the service answers before a route is asked: a foreign Host, a method that the path hasn't, a body that is too large,
-#: a foreign Origin; and a defect.
+#: Statuses that the service answers before a route is asked: a foreign Host, a method that the path hasn't, a body that
+#: is too large, a foreign Origin; and a defect.
 EVERYWHERE = (400, 405, 413, 500)
 EVERY_CHANGE = (*EVERYWHERE, 403)
 open_to_all = APIRouter()
 
 
-# --- what needs no key -------------------------------------------------------------------------------------------------
+# --- what needs no key ------------------------------------------------------------------------------------------------
 
 
 @open_to_all.get("/health", tags=["access"])
@@ -112,7 +113,8 @@ def health() -> Health:
 
 @open_to_all.get("/healthz", tags=["access"], responses=answers(503))
 def ready(service: Here) -> Health:
-    """Whether the service can work: its registry answers and its data folder takes files. For a supervisor or a balancer."""
+    """Whether the service can work: its registry answers and its data folder takes files. For a supervisor or a
+    balancer."""
     try:
         service.store.under_way()
         with tempfile.TemporaryFile(dir=service.store.root):
@@ -175,7 +177,7 @@ def favicon() -> Response:
     return Response(status_code=204, headers={"Cache-Control": "max-age=86400"})
 
 
-# --- the application ---------------------------------------------------------------------------------------------------
+# --- the application --------------------------------------------------------------------------------------------------
 
 
 def create_app(
@@ -191,9 +193,9 @@ def create_app(
     """The application on a store.
 
     `stations`: the folder of the station files, by default `stations` in the data folder. `hosts`: names under which
-    the service is reached, beside this computer's own. `connect` makes a station's drivers. When the application ends, it cancels
-    its jobs and aborts its sessions, which can be resumed; shutters are closed. `recovery` may have begun already; by default the
-    application's start begins it.
+    the service is reached, beside this computer's own. `connect` makes a station's drivers. When the application ends,
+    it cancels its jobs and aborts its sessions, which can be resumed; shutters are closed. `recovery` may have begun
+    already; by default the application's start begins it.
     """
     folder = stations or store.root / "stations"
     folder.mkdir(parents=True, exist_ok=True)

@@ -59,7 +59,8 @@ class DeviceChecks:
         return self._transcripts / station / f"{device}.txt"
 
     def start(self, name: str, station: Station, device: str, keep_transcript: bool) -> None:
-        """Check a device in the background. Raises Conflict while a session or a check is under way on the station's instruments."""
+        """Check a device in the background. Raises Conflict while a session or a check is under way on the station's
+        instruments."""
         if self._closed:
             raise Conflict("the service is being stopped; check the device when it is up again")
         let_go = self._live.hold(station)

@@ -91,8 +91,8 @@ def _problem(response: httpx.Response) -> ServiceProblem:
 
 
 class ServiceClient:
-    """The service at `url`, with a key. Every method raises ServiceProblem where the service refuses, httpx.TransportError where it isn't
-    reached, and those that wait TimeoutError."""
+    """The service at `url`, with a key. Every method raises ServiceProblem where the service refuses,
+    httpx.TransportError where it isn't reached, and those that wait TimeoutError."""
 
     def __init__(self, url: str, key: str, timeout_s: float = 30.0) -> None:
         self.url = url
@@ -111,7 +111,7 @@ class ServiceClient:
         """Close the connections."""
         self.http.close()
 
-    # --- requests --------------------------------------------------------------------------------------------------------
+    # --- requests -----------------------------------------------------------------------------------------------------
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Any request below `/api/v1`; a POST has a key, so that it is carried out once."""
@@ -123,7 +123,8 @@ class ServiceClient:
         return response
 
     def _fetched(self, path: str, file: Path) -> Path:
-        """Write the archive of a path to `file`, a .tar where its name ends so, else a .zip, as it arrives: completely, or not at all."""
+        """Write the archive of a path to `file`, a .tar where its name ends so, else a .zip, as it arrives: completely,
+        or not at all."""
         partial = file.with_name(f".{file.name}.partial")
         try:
             with self.http.stream("GET", f"{path}{file.suffix or '.zip'}") as response, partial.open("wb") as to:
@@ -180,7 +181,8 @@ class ServiceClient:
             response = self.request("GET", f"{self.url}{following}")
 
     def _ended(self, what: str, look: Callable[[], W], ends: tuple[str, ...], patience_s: float) -> W:
-        """What `look` finds once its state is one of `ends`. Raises ServiceProblem unless that is the first of them, the good one."""
+        """What `look` finds once its state is one of `ends`. Raises ServiceProblem unless that is the first of them,
+        the good one."""
         until = time.monotonic() + patience_s
         while (found := look()).state not in ends:
             if time.monotonic() > until:
@@ -209,7 +211,7 @@ class ServiceClient:
         """Name and scope of the key."""
         return self._get(Me, "/me")
 
-    # --- stations and sessions -------------------------------------------------------------------------------------------
+    # --- stations and sessions ----------------------------------------------------------------------------------------
 
     def stations(self) -> list[StationState]:
         """The stations that the service knows."""
@@ -325,7 +327,8 @@ class ServiceClient:
         demands_certified: bool = False,
         patience_s: float = PATIENCE_S,
     ) -> SessionDetail:
-        """Start a session and wait for its end. `parameters`: values in place of a full session's, as `{"narrowband": {"step_nm": 5}}`."""
+        """Start a session and wait for its end. `parameters`: values in place of a full session's, as `{"narrowband":
+        {"step_nm": 5}}`."""
         start = SessionStart.model_validate(
             {
                 "station": station,
@@ -380,10 +383,11 @@ class ServiceClient:
         frame: NDArray[np.uint16] = np.load(io.BytesIO(content), allow_pickle=False)
         return frame
 
-    # --- recordings and jobs ---------------------------------------------------------------------------------------------
+    # --- recordings and jobs ------------------------------------------------------------------------------------------
 
     def send_recordings(self, archive: Path, asked: SentAs | None = None) -> Recordings:
-        """Send in a recording set, a .zip, .tar or .tar.gz; with `asked`, recordings of another format, which become one."""
+        """Send in a recording set, a .zip, .tar or .tar.gz; with `asked`, recordings of another format, which become
+        one."""
         stated = {} if asked is None else asked.model_dump(mode="json", exclude_unset=True)
         return self._send(Recordings, "/recordings", archive, **stated)
 
@@ -476,7 +480,7 @@ class ServiceClient:
         """The page of a job of the kind `report` or `pipeline`."""
         return self.request("GET", f"/jobs/{job_id}/report").text
 
-    # --- challenges ------------------------------------------------------------------------------------------------------
+    # --- challenges ---------------------------------------------------------------------------------------------------
 
     def make_challenge(self, start: ChallengeStart) -> Job:
         """Make a challenge; the job's `challenge_id` is the challenge."""
@@ -510,7 +514,7 @@ class ServiceClient:
         """Delete a challenge for ever."""
         self.request("DELETE", f"/challenges/{challenge_id}")
 
-    # --- calibrations ----------------------------------------------------------------------------------------------------
+    # --- calibrations -------------------------------------------------------------------------------------------------
 
     def calibrations(self) -> Iterator[CalibrationRecord]:
         """All calibrations, the newest first."""
@@ -563,7 +567,7 @@ class ServiceClient:
         """A figure of a camera over its calibrations."""
         return self._get(History, "/history", camera=camera, figure=figure, place=place)
 
-    # --- what the models know --------------------------------------------------------------------------------------------
+    # --- what the models know -----------------------------------------------------------------------------------------
 
     def parameters(self) -> list[ParameterDescription]:
         """The parameters of the camera model, with unit, bounds and prior."""

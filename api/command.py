@@ -59,7 +59,8 @@ def _listening(host: str, port: int) -> socket.socket:
         return socket.create_server(address[:2], family=family, backlog=128)
     except OSError as error:
         raise InputError(
-            f"{host}:{port}: can't be listened at ({error.strerror}); choose another --port or --host, or end what uses it"
+            f"{host}:{port}: can't be listened at ({error.strerror}); choose another --port or --host, or end what "
+            "uses it"
         ) from error
 
 
@@ -101,7 +102,8 @@ def serve(
         _listening(host, port) as line,
         contextlib.closing(Recovery(store, made_safe=made_safe_at_start())) as recovery,
     ):
-        # Before the service itself is loaded, which takes seconds: an instrument that wasn't reached at once may be unsafe.
+        # Before the service itself is loaded, which takes seconds: an instrument that wasn't reached at once may be
+        # unsafe.
         recovery.start(RESCUE_FIRST_S)
 
         import uvicorn

@@ -71,7 +71,8 @@ _MEANINGS = {
 
 
 def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's error responses of a route. They are problem details whatever the route returns, so FastAPI's `model` doesn't fit."""
+    """OpenAPI's error responses of a route. They are problem details whatever the route returns, so FastAPI's `model`
+    doesn't fit."""
     content = {MEDIA_TYPE: {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
     return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
 
@@ -101,7 +102,8 @@ def _paths_of(request: Request) -> list[str]:
 
 
 def _unknown_in_path(request: Request, name: str) -> Response:
-    """404: what a path names can't be there, as it isn't even formed as such names are. Says which list to look into."""
+    """404: what a path names can't be there, as it isn't even formed as such names are. Says which list to look
+    into."""
     paths = request.app.openapi()["paths"]
     listed = next(path for path in _paths_of(request) if f"/{{{name}}}" in path).partition(f"/{{{name}}}")[0]
     where = listed

@@ -1,7 +1,7 @@
 """How often an address may send a key that isn't valid.
 
-A key that was valid before, from anywhere, is always compared: who works isn't locked out by who guesses behind the same proxy. Any
-other key from an address that has used up its failures isn't even compared.
+A key that was valid before, from anywhere, is always compared: who works isn't locked out by who guesses behind the
+same proxy. Any other key from an address that has used up its failures isn't even compared.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ ADDRESSES = 10_000
 
 
 def network_of(address: str) -> str:
-    """What is counted as one address: an IPv4 address, or the 64 bits of an IPv6 network, of which a client has all addresses."""
+    """What is counted as one address: an IPv4 address, or the 64 bits of an IPv6 network, of which a client has all
+    addresses."""
     try:
         parsed = ipaddress.ip_address(address)
     except ValueError:

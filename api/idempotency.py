@@ -32,7 +32,8 @@ PARAMETER = {
     "in": "header",
     "required": False,
     "schema": {"type": "string", "pattern": f"^{_KEY.pattern}$"},
-    "description": "a random text of the client's: the same request sent again within a day is answered as the first was, and "
+    "description": "a random text of the client's: the same request sent again within a day is answered as the first "
+    "was, and "
     "not carried out again",
 }
 
@@ -42,8 +43,8 @@ def _digest(*parts: bytes) -> str:
 
 
 class Idempotency:
-    """Answers a repeated POST below `prefix` from what was kept; only a success is kept. Of the bodies sent to `unread_paths`, which
-    may be larger than the memory, only the stated length is compared."""
+    """Answers a repeated POST below `prefix` from what was kept; only a success is kept. Of the bodies sent to
+    `unread_paths`, which may be larger than the memory, only the stated length is compared."""
 
     def __init__(self, app: ASGIApp, store: Store, prefix: str, unread_paths: frozenset[str]) -> None:
         self.app, self.store, self.prefix, self.unread_paths = app, store, prefix, unread_paths
@@ -84,7 +85,8 @@ class Idempotency:
         await self._carry_out(id, None if unread else body, scope, receive, send)
 
     async def _carry_out(self, id: str, body: bytes | None, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on and keep its answer. Where it fails, the key is free again. `body`: what was read of the request already."""
+        """Pass the request on and keep its answer. Where it fails, the key is free again. `body`: what was read of the
+        request already."""
         sent, status, location, answer = False, 500, "", b""
 
         async def again() -> Message:

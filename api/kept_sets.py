@@ -1,5 +1,5 @@
-"""What the service keeps as a recording set and hands out as one: sessions, recordings that were sent in, the cases of challenges. Handing out
-and deleting is one shape for all of them."""
+"""What the service keeps as a recording set and hands out as one: sessions, recordings that were sent in, the cases of
+challenges. Handing out and deleting is one shape for all of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from lab.formats.recording_set import ArchiveForm, RecordingSet, archive
 
 @dataclass(frozen=True)
 class KeptSet:
-    """`what` it is, in words; `source`: what jobs on it are registered under; `read` and `remove` raise InputError where that can't be now."""
+    """`what` it is, in words; `source`: what jobs on it are registered under; `read` and `remove` raise InputError
+    where that can't be now."""
 
     what: str
     source: str

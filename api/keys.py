@@ -1,7 +1,7 @@
 """Keys of the REST service, and what each allows.
 
-A key is 256 random bits. Only its SHA-256 is stored, and it is compared in constant time. A slow hash would protect a password; at
-256 bits it adds nothing.
+A key is 256 random bits. Only its SHA-256 is stored, and it is compared in constant time. A slow hash would protect a
+password; at 256 bits it adds nothing.
 """
 
 from __future__ import annotations

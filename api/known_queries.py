@@ -22,7 +22,8 @@ def _query(dependant: Dependant) -> list[Any]:
 
 
 async def check_query(request: Request) -> None:
-    """Raise 422, naming those that there are, where a request with a valid key has a query parameter that its route doesn't take."""
+    """Raise 422, naming those that there are, where a request with a valid key has a query parameter that its route
+    doesn't take."""
     if not request.query_params:
         return
     known = [name for field in _query(request.scope["route"].dependant) for name in _names(field)]

@@ -39,7 +39,8 @@ def _wake(followers: list[asyncio.Event]) -> None:
 
 
 class LiveSession:
-    """One session in a thread of its own. A follower gets the latest progress first, then later ones; a slow follower misses some."""
+    """One session in a thread of its own. A follower gets the latest progress first, then later ones; a slow follower
+    misses some."""
 
     def __init__(self, station: Station, changed: Callable[[], None], safety: KnownSafety) -> None:
         self.station = station
@@ -114,7 +115,8 @@ class LiveSession:
                 loop.call_soon_threadsafe(_wake, mine)
 
     def once(self, progress: Progress, make: Callable[[Progress], str]) -> str:
-        """What `make` makes of a progress, made once for all who follow. For one thread: that of the followers' loop."""
+        """What `make` makes of a progress, made once for all who follow. For one thread: that of the followers'
+        loop."""
         if self._made is None or self._made[0] is not progress:
             self._made = (progress, make(progress))
         return self._made[1]
@@ -124,8 +126,8 @@ class LiveSession:
         self._changed()
 
     async def follow(self, stopping: anyio.Event) -> AsyncIterator[Progress]:
-        """The latest progress, then later ones, until the run ends or the service stops. A slow follower misses some, never the
-        last."""
+        """The latest progress, then later ones, until the run ends or the service stops. A slow follower misses some,
+        never the last."""
         wake = asyncio.Event()
         me = (asyncio.get_running_loop(), wake)
         with self._lock:
@@ -150,8 +152,8 @@ class LiveSession:
 
 
 class LiveSessions:
-    """Starts, controls and ends sessions. Only one session at a time runs on an instrument, also across processes. `changed` is called at every
-    change of a session's state, by any thread."""
+    """Starts, controls and ends sessions. Only one session at a time runs on an instrument, also across processes.
+    `changed` is called at every change of a session's state, by any thread."""
 
     def __init__(
         self,
@@ -189,8 +191,8 @@ class LiveSessions:
         return live if live is not None and not live.ended else None
 
     def start(self, station: Station, plan: CapturePlan, name: str, notes: str, demands_certified: bool = False) -> str:
-        """Register a session and run it; its id. Raises Conflict if one runs on an instrument of the station, InputError if
-        the station lacks what the plan needs."""
+        """Register a session and run it; its id. Raises Conflict if one runs on an instrument of the station,
+        InputError if the station lacks what the plan needs."""
         with self._lock:
             self._check_free(station)
             live = LiveSession(station, self._changed, self.safety)
@@ -209,8 +211,9 @@ class LiveSessions:
         return capture.id
 
     def resume(self, session_id: str, moved: Station | None = None, in_turn: bool = False) -> None:
-        """Continue a paused session, or a session that ended early. `moved`: the station, if its instruments have other addresses
-        now. `in_turn`: only where it still waits in the queue and isn't held. Raises Conflict for a session that is running or finished."""
+        """Continue a paused session, or a session that ended early. `moved`: the station, if its instruments have other
+        addresses now. `in_turn`: only where it still waits in the queue and isn't held. Raises Conflict for a session
+        that is running or finished."""
         with self._lock:
             live = self.find(session_id)
             if live is not None and live.capture is not None:
@@ -239,8 +242,8 @@ class LiveSessions:
             live.begin(capture)
 
     def capturer(self, station: Station) -> Capturer:
-        """How a pipeline captures on `station`: as a session of this service, which can be followed, paused and aborted like any
-        other. Joins a session that is under way."""
+        """How a pipeline captures on `station`: as a session of this service, which can be followed, paused and aborted
+        like any other. Joins a session that is under way."""
 
         def captured(request: CaptureRequest, tell: Callable[[Progress], None]) -> str:
             session_id = request.session

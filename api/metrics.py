@@ -1,4 +1,5 @@
-"""Metrics in Prometheus' text format: requests by route, status and time to the first byte; sessions and jobs by state."""
+"""Metrics in Prometheus' text format: requests by route, status and time to the first byte; sessions and jobs by
+state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Long lists in pages: `limit` items, those after a cursor; the number of all items and the next page stand in headers."""
+"""Long lists in pages: `limit` items, those after a cursor; the number of all items and the next page stand in
+headers."""
 
 from __future__ import annotations
 

@@ -17,7 +17,8 @@ FRAMES, PICTURES, FIGURES = 4, 256, 1024
 
 
 class Pictures:
-    """Keeps the newest that were asked for. One is made at a time: a page full of pictures takes one core, not all of them."""
+    """Keeps the newest that were asked for. One is made at a time: a page full of pictures takes one core, not all of
+    them."""
 
     def __init__(self, store: Store) -> None:
         self._store = store

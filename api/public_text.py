@@ -1,8 +1,7 @@
 """Texts as an answer may have them: without a path of the server.
 
-Files of the data folder are named relative to it. Of any other absolute path only the last part stays: a person who can reach the
-file knows where it is. The service's own routes and the names of devices (`/dev/...`) stay as they are.
-"""
+Files of the data folder are named relative to it. Of any other absolute path only the last part stays: a person who can
+reach the file knows where it is. The service's own routes and the names of devices (`/dev/...`) stay as they are."""
 
 from __future__ import annotations
 
@@ -11,7 +10,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-#: An absolute path of two parts or more, where a text begins one; not the path of a URL, of this service, or of a device.
+#: An absolute path of two parts or more, where a text begins one; not the path of a URL, of this service, or of a
+#: device.
 _PATH = re.compile(
     r"(?<![\w/:.~\\-])/(?!api/|dev/|login\b|logout\b|docs\b|health|metrics\b|openapi|static/)"
     r"(?:[^\s/:;,'\"()\[\]<>|]+/)+(?P<last>[^\s/:;,'\"()\[\]<>|]*)"

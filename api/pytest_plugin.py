@@ -1,10 +1,13 @@
-"""pytest fixtures for those who test a camera's calibration: a running mock bench, its station, a service with a client, a reference.
+"""pytest fixtures for those who test a camera's calibration: a running mock bench, its station, a service with a
+client, a reference.
 
-An installation of calibench registers them; its extra `test` brings what they need. They are made when a test asks for one, once a run.
+An installation of calibench registers them; its extra `test` brings what they need. They are made when a test asks for
+one, once a run.
 
 `calibench_bench`      the mock bench, in a process of its own; `.station_file` is its station file
 `calibench_station`    that station, as `lab.capture.station.Station`
-`calibench_client`     an `api.client.ServiceClient` of a service that has the station as `bench`; its key may do everything
+`calibench_client`     an `api.client.ServiceClient` of a service that has the station as `bench`; its key may do
+everything
 `calibench_reference`  compares a fit with the reference that is kept beside the test, and fails where a figure drifted
 
 Nothing heavy is imported before a fixture is used: the plugin is loaded by every pytest of the environment.
@@ -41,7 +44,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--calibench-conceal",
         action="append",
         metavar="SIDE:EFFECT:PARAMETER=VALUE",
-        help="what the mock bench conceals, as `calibench bench --conceal`; may be repeated. Without any: a healthy bench",
+        help="what the mock bench conceals, as `calibench bench --conceal`; may be repeated. Without any: a healthy "
+        "bench",
     )
     group.addoption(
         "--calibench-update",
@@ -137,7 +141,8 @@ class FitReference:
     update: bool
 
     def check(self, fit: FitResult, name: str = "reference.json", fail_on: Sequence[str] = ("*",)) -> None:
-        """Fail the test where a figure changed against the kept fit `name` beyond its uncertainty, and by more than the rule says.
+        """Fail the test where a figure changed against the kept fit `name` beyond its uncertainty, and by more than the
+        rule says.
 
         `fail_on`: rules as `calibench compare --fail-on` takes them, `[SIDE:]FIGURE[>AMOUNT[%]]`.
         """
@@ -157,7 +162,8 @@ class FitReference:
         comparison = compare(read_result(FitResult, file), fit)
         if failed := failures(comparison, rules):
             rows = [
-                f"  {row.side or ''} {row.name} {row.where}: {row.a:.6g} +- {row.a_std:.2g} -> {row.b:.6g} +- {row.b_std:.2g}, "
+                f"  {row.side or ''} {row.name} {row.where}: {row.a:.6g} +- {row.a_std:.2g} -> {row.b:.6g} +- "
+                f"{row.b_std:.2g}, "
                 f"{row.significance_sigma:.1f} sigma"
                 for row in comparison.changes
                 if " ".join(part for part in (row.side, row.name, row.where) if part) in failed

@@ -1,4 +1,5 @@
-"""What is known of stations' safe states, by their instruments' own answers: after a run, after a halt, and since before the service's start."""
+"""What is known of stations' safe states, by their instruments' own answers: after a run, after a halt, and since
+before the service's start."""
 
 from __future__ import annotations
 
@@ -21,8 +22,9 @@ LOOKED_AT = 50
 
 
 class StationSafety(Frozen):
-    """Whether a station is safe: `halting` until its instruments have answered, `safe` when all did, else `not confirmed`, and somebody has to go
-    to the bench. `shutter` as the monochromator answered, `at` (UTC) when; `words`: why it isn't confirmed."""
+    """Whether a station is safe: `halting` until its instruments have answered, `safe` when all did, else `not
+    confirmed`, and somebody has to go to the bench. `shutter` as the monochromator answered, `at` (UTC) when; `words`:
+    why it isn't confirmed."""
 
     state: Literal["halting", "safe", "not confirmed"]
     shutter: Shutter
@@ -38,7 +40,8 @@ class StationSafety(Frozen):
 
 
 class KnownSafety:
-    """The latest of each station. Stations that share a monochromator share it. `changed` is called at every change, by any thread."""
+    """The latest of each station. Stations that share a monochromator share it. `changed` is called at every change, by
+    any thread."""
 
     def __init__(self, store: Store, changed: Callable[[], None] = lambda: None) -> None:
         self._changed, self._lock = changed, threading.Lock()
@@ -54,7 +57,8 @@ class KnownSafety:
                 )
 
     def find(self, station: Station) -> StationSafety | None:
-        """What is known of a station; None where its instruments haven't answered since the service's start, or a run uses them now."""
+        """What is known of a station; None where its instruments haven't answered since the service's start, or a run
+        uses them now."""
         return self._known.get(key_of(station))
 
     def note(self, station: Station, safety: StationSafety | None) -> None:

@@ -192,7 +192,8 @@ class HaltedStation(Schema):
 
 
 class Halted(Schema):
-    """Ids of the sessions that a halt ended, each can be resumed; and what the stations' instruments answered within 1.5 s."""
+    """Ids of the sessions that a halt ended, each can be resumed; and what the stations' instruments answered within
+    1.5 s."""
 
     sessions: tuple[str, ...]
     stations: tuple[HaltedStation, ...] = ()
@@ -304,7 +305,8 @@ class SessionDetail(StoredSession):
     runs: tuple[RunRecord, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
     captures: tuple[CaptureCount, ...] = Field(description="how many there are of each kind and side")
     results: dict[str, str] = Field(
-        description="kind -> id of the newest `fit` (also the id of its calibration and camera model), `validate`, `diagnose`, `report`"
+        description="kind -> id of the newest `fit` (also the id of its calibration and camera model), `validate`, "
+        "`diagnose`, `report`"
     )
 
 
@@ -330,18 +332,21 @@ class JobStart(Asked):
     kind: JobKind
     resolve: bool = Field(
         default=False,
-        description="pipeline of a session: while rivals are left, take the capture that tells them apart and diagnose again",
+        description="pipeline of a session: while rivals are left, take the capture that tells them apart and "
+        "diagnose again",
     )
     camera_model: str | None = Field(
         default=None,
         pattern=r"^[0-9a-f]{16}$",
-        description="validate, diagnose: id of a camera model that stands in for the fitted cameras, with its effects, as "
+        description="validate, diagnose: id of a camera model that stands in for the fitted cameras, with its "
+        "effects, as "
         "`--model` of the command line does; later reports don't rest on the result",
     )
     station: str | None = Field(
         default=None,
         max_length=100,
-        description="pipeline of a session: a station with the same instruments at other addresses; null: as in its last run",
+        description="pipeline of a session: a station with the same instruments at other addresses; null: as in its "
+        "last run",
     )
 
 
@@ -454,7 +459,8 @@ class Recordings(Schema):
 
 
 class ChallengeStart(Asked):
-    """A challenge to be made: recording sets of cameras that conceal something, their truths sealed until it is scored."""
+    """A challenge to be made: recording sets of cameras that conceal something, their truths sealed until it is
+    scored."""
 
     model_config = ConfigDict(
         json_schema_extra={"example": {"cases": 20, "size": "small", "name": "since the upgrade"}}

@@ -1,7 +1,8 @@
-"""Access control: keys and how often one may fail, the page's cookie, Host and Origin, security headers, limits of request bodies.
+"""Access control: keys and how often one may fail, the page's cookie, Host and Origin, security headers, limits of
+request bodies.
 
-A key is sent in the header `Authorization: Bearer KEY`, never in a URL. The operator's page exchanges it for a cookie that scripts
-can't read and other sites can't send.
+A key is sent in the header `Authorization: Bearer KEY`, never in a URL. The operator's page exchanges it for a cookie
+that scripts can't read and other sites can't send.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ COOKIE = "calibench"
 COOKIE_LIFETIME_S = 12 * 3600.0
 
 
-# --- logins of the page ------------------------------------------------------------------------------------------------
+# --- logins of the page -----------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -80,7 +81,8 @@ class Gate:
     _proven: set[str] = field(default_factory=set)
 
     def check(self, key: str, address: str) -> StoredKey | None:
-        """The stored key that `key` is, or None. Raises TooManyFailures without comparing where the address has none left."""
+        """The stored key that `key` is, or None. Raises TooManyFailures without comparing where the address has none
+        left."""
         mine = digest(key)
         if mine not in self._proven and (wait_s := self.failures.wait_s(address)):
             raise TooManyFailures(wait_s)
@@ -93,8 +95,8 @@ class Gate:
         return found
 
     def identify(self, request: Request) -> StoredKey | None:
-        """The key of a request, from the Authorization header, else from the page's cookie; None without a valid one. Raises
-        TooManyFailures. A request is identified once, however often it is asked."""
+        """The key of a request, from the Authorization header, else from the page's cookie; None without a valid one.
+        Raises TooManyFailures. A request is identified once, however often it is asked."""
         if not hasattr(request.state, "key"):
             request.state.key = self._identify(request)
         key: StoredKey | None = request.state.key
@@ -120,7 +122,8 @@ def address_of(request: Request) -> str:
 _BEARER = HTTPBearer(
     scheme_name="key",
     auto_error=False,
-    description="A key: `calibench key create NAME --scope SCOPE` makes one, the first start of the service makes the first.",
+    description="A key: `calibench key create NAME --scope SCOPE` makes one, the first start of the service makes the "
+    "first.",
 )
 _COOKIE = APIKeyCookie(
     name=COOKIE, scheme_name="login", auto_error=False, description="What `POST /login` gives the operator's page."
@@ -161,11 +164,12 @@ def set_cookie(response: Response, token: str, *, secure: bool) -> None:
     )
 
 
-# --- hosts -------------------------------------------------------------------------------------------------------------
+# --- hosts ------------------------------------------------------------------------------------------------------------
 
 
 class SameHost:
-    """Refuses a foreign Host (against DNS rebinding), and a foreign Origin where the request changes state (against cross-site requests)."""
+    """Refuses a foreign Host (against DNS rebinding), and a foreign Origin where the request changes state (against
+    cross-site requests)."""
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str]) -> None:
         self.app = app
@@ -202,7 +206,7 @@ class SameHost:
         return None
 
 
-# --- headers and bodies ------------------------------------------------------------------------------------------------
+# --- headers and bodies -----------------------------------------------------------------------------------------------
 
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
@@ -245,7 +249,8 @@ class SafeHeaders:
 
 
 class SmallBodies:
-    """Refuses bodies above `limit_bytes`, by their stated or their streamed size. `except_paths` have a limit of their own."""
+    """Refuses bodies above `limit_bytes`, by their stated or their streamed size. `except_paths` have a limit of their
+    own."""
 
     def __init__(self, app: ASGIApp, limit_bytes: int, except_paths: frozenset[str]) -> None:
         self.app, self.limit_bytes, self.except_paths = app, limit_bytes, except_paths

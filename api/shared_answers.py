@@ -1,8 +1,8 @@
 """While a session runs here, an answer that many clients ask for is made once for all who ask within half a second.
 
-The cores belong to the session then. Lists, a session, its captures and curves are shared; what a client changes, and every change of a session's
-or a job's state, is seen by the next request. Only the count of a running session's steps and captures may be half a second old. The key of
-each request is checked as ever.
+The cores belong to the session then. Lists, a session, its captures and curves are shared; what a client changes, and
+every change of a session's or a job's state, is seen by the next request. Only the count of a running session's steps
+and captures may be half a second old. The key of each request is checked as ever.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ class Shared:
 
 
 class SharedAnswers:
-    """Answers a GET below `prefix` with what another client was answered just now, as long as `busy` says that a session runs."""
+    """Answers a GET below `prefix` with what another client was answered just now, as long as `busy` says that a
+    session runs."""
 
     def __init__(self, app: ASGIApp, shared: Shared, prefix: str, busy: Callable[[], bool], gate: Gate) -> None:
         self.app, self.shared, self.prefix, self.busy, self.gate = app, shared, prefix, busy, gate

@@ -7,7 +7,8 @@ from typing import Any, Literal, get_args, get_origin
 
 
 def _kinds(annotation: Any) -> set[Any]:
-    """The plain kinds that an annotation allows for a value, those of a sequence's items and a mapping's values among them."""
+    """The plain kinds that an annotation allows for a value, those of a sequence's items and a mapping's values among
+    them."""
     if get_origin(annotation) is Literal:
         return {type(value) for value in get_args(annotation)}
     arguments = get_args(annotation)
@@ -19,7 +20,8 @@ def _kinds(annotation: Any) -> set[Any]:
 
 
 def check_kind(where: str, value: Any, annotation: Any) -> None:
-    """Raise ValueError where the value at `where` would only be taken for what the annotation says after a conversion."""
+    """Raise ValueError where the value at `where` would only be taken for what the annotation says after a
+    conversion."""
     _check(where, value, _kinds(annotation) - {type(None), Ellipsis})
 
 

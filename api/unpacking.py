@@ -1,8 +1,8 @@
 """Archives that are sent in, unpacked under caps: .zip, .tar and .tar.gz.
 
-Nothing that an archive states is trusted. All its names, kinds and stated sizes, their sum and the room on the disk are checked before the first
-byte is written; sizes are counted again while they are written. Names that lead out of the folder, links and devices are refused.
-"""
+Nothing that an archive states is trusted. All its names, kinds and stated sizes, their sum and the room on the disk are
+checked before the first byte is written; sizes are counted again while they are written. Names that lead out of the
+folder, links and devices are refused."""
 
 from __future__ import annotations
 
@@ -24,11 +24,13 @@ from typing import IO, Any
 from lab.errors import InputError
 
 CHUNK = 1 << 20
-#: Bytes of an archive's list of files, per file that is allowed: a name of 200 and what `zip` or `tar` writes beside it.
+#: Bytes of an archive's list of files, per file that is allowed: a name of 200 and what `zip` or `tar` writes beside
+#: it.
 _LISTED_BYTES = 400
 #: Bytes of the disk that uploads leave free: captures come first.
 RESERVE_BYTES = 1 << 30
-#: Most bytes that a byte of an archive may stand for, beyond what unpacks within a second anyway: frames, even dark ones, pack less.
+#: Most bytes that a byte of an archive may stand for, beyond what unpacks within a second anyway: frames, even dark
+#: ones, pack less.
 MOST_RATIO, FREE_BYTES = 100, 64 << 20
 _GZIP = b"\x1f\x8b"
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
@@ -47,7 +49,8 @@ def check_room(folder: Path, wanted_bytes: int) -> None:
     free = shutil.disk_usage(folder).free
     if free - wanted_bytes < RESERVE_BYTES:
         raise NoRoom(
-            f"the data folder has {free} bytes free, {wanted_bytes} are needed and {RESERVE_BYTES} are kept for captures; make room"
+            f"the data folder has {free} bytes free, {wanted_bytes} are needed and {RESERVE_BYTES} are kept for "
+            "captures; make room"
         )
 
 
@@ -134,8 +137,8 @@ class _Tar(_Archive):
 
 
 class _Bounded(io.RawIOBase):
-    """A file of which at most `at_once` bytes are read at a time, and whose end lies below `limit_bytes`: the readers of archives read as much
-    as an archive states, and a compressed one has no end that is known."""
+    """A file of which at most `at_once` bytes are read at a time, and whose end lies below `limit_bytes`: the readers
+    of archives read as much as an archive states, and a compressed one has no end that is known."""
 
     def __init__(self, file: IO[bytes], at_once: int, limit_bytes: int) -> None:
         self._file, self._at_once, self._limit_bytes = file, at_once, limit_bytes
@@ -202,7 +205,8 @@ def _opened(archive: Path, limit_bytes: int, limit_files: int) -> Iterator[_Arch
 
 
 def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> None:
-    """Unpack a .zip, .tar or .tar.gz into `folder`, which must not exist. Raises InputError, and TooMuch beyond a limit."""
+    """Unpack a .zip, .tar or .tar.gz into `folder`, which must not exist. Raises InputError, and TooMuch beyond a
+    limit."""
     try:
         with _opened(archive, limit_bytes, limit_files) as opened:
             members = _checked(opened, folder.parent, limit_bytes, limit_files)

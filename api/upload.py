@@ -1,7 +1,8 @@
-"""Recording sets that are sent in: streamed to the disk and unpacked, both with upper limits, into a folder of their own, and checked there.
+"""Recording sets that are sent in: streamed to the disk and unpacked, both with upper limits, into a folder of their
+own, and checked there.
 
-`api.unpacking` looks at what the archive states before it writes a byte; the reader of recording sets then checks the content.
-"""
+`api.unpacking` looks at what the archive states before it writes a byte; the reader of recording sets then checks the
+content."""
 
 from __future__ import annotations
 
@@ -53,7 +54,8 @@ async def receive(body: AsyncIterator[bytes], file: BinaryIO, limit_bytes: int) 
 
 @dataclass(frozen=True)
 class Foreign:
-    """What an archive holds that isn't a recording set: the format, which file or folder of it, and what the format doesn't say.
+    """What an archive holds that isn't a recording set: the format, which file or folder of it, and what the format
+    doesn't say.
 
     The files that `statements` name (`camera`, `light`, `white_patch`) are in the archive.
     """
@@ -128,8 +130,8 @@ class Inbox:
     def take_in(
         self, place: Path, archive: Path, limit_bytes: int, limit_files: int, foreign: Foreign | None = None
     ) -> tuple[str, RecordingSet]:
-        """Unpack a recording set, or what `foreign` says, check it completely, and keep it as a recording set. Raises InputError with all
-        problems; nothing is kept then."""
+        """Unpack a recording set, or what `foreign` says, check it completely, and keep it as a recording set. Raises
+        InputError with all problems; nothing is kept then."""
         unpacked = place / "set"
         sent = unpacked if foreign is None else place / "sent"
         unpack(archive, sent, limit_bytes, limit_files)
@@ -170,7 +172,8 @@ class Inbox:
 
 
 def take_cameras(place: Path, archive: Path, limit_bytes: int) -> dict[Side, CameraFile]:
-    """The camera files of an archive: SIDE.toml, with the curves and arrays that they name beside them. Raises InputError."""
+    """The camera files of an archive: SIDE.toml, with the curves and arrays that they name beside them. Raises
+    InputError."""
     sent = place / "sent"
     unpack(archive, sent, limit_bytes, _MODEL_FILES)
     folder = _top(sent, None)
@@ -193,7 +196,8 @@ def take_cameras(place: Path, archive: Path, limit_bytes: int) -> dict[Side, Cam
 
 
 def _top(folder: Path, holds: str | None = _MANIFEST) -> Path:
-    """The folder that holds the file `holds`: `folder`, or the only folder in it. None: the only folder where no file is beside it."""
+    """The folder that holds the file `holds`: `folder`, or the only folder in it. None: the only folder where no file
+    is beside it."""
     entries = [entry for entry in folder.iterdir() if entry.name != "__MACOSX"]
     inner = [entry for entry in entries if entry.is_dir()]
     here = (folder / holds).exists() if holds is not None else len(entries) > 1

@@ -19,8 +19,8 @@ LOOK_S = 1.0
 
 
 class QueueRunner:
-    """Looks at the queue in a thread of its own, from `start` to `close`. `ready`: False while stations are still made safe after a
-    crash, whose sessions go on first."""
+    """Looks at the queue in a thread of its own, from `start` to `close`. `ready`: False while stations are still made
+    safe after a crash, whose sessions go on first."""
 
     def __init__(self, store: Store, live: LiveSessions, ready: Callable[[], bool]) -> None:
         self._store, self._live, self._ready = store, live, ready

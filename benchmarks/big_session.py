@@ -1,8 +1,9 @@
-"""A whole session of two cameras of 1280 x 960, written as a recording set: what the fits' time and memory are measured on.
+"""A whole session of two cameras of 1280 x 960, written as a recording set: what the fits' time and memory are measured
+on.
 
-`python -m benchmarks.big_session FOLDER`. The mock bench with cameras of twice the pixels behind lenses of twice the focal length, so
-that its targets stand where they stood in the frame, and every sequence of a full calibration: some 190 frames of each camera.
-"""
+`python -m benchmarks.big_session FOLDER`. The mock bench with cameras of twice the pixels behind lenses of twice the
+focal length, so that its targets stand where they stood in the frame, and every sequence of a full calibration: some
+190 frames of each camera."""
 
 from __future__ import annotations
 

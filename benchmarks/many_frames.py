@@ -1,9 +1,9 @@
 """A recording set of many frames: what the memory and the time of a diagnosis are measured on.
 
-`python -m benchmarks.many_frames write FOLDER [SIDE_PX [REPEATS]]` writes it: one camera without a mosaic, darks of three
-exposures with `DARK_REPEATS` frames each and flats of ten levels with `FLAT_REPEATS` frames each (REPEATS: this share of
-them). `python -m benchmarks.many_frames diagnose FOLDER` diagnoses it in this process and prints CPU time and peak memory
-by step.
+`python -m benchmarks.many_frames write FOLDER [SIDE_PX [REPEATS]]` writes it: one camera without a mosaic, darks of
+three exposures with `DARK_REPEATS` frames each and flats of ten levels with `FLAT_REPEATS` frames each (REPEATS: this
+share of them). `python -m benchmarks.many_frames diagnose FOLDER` diagnoses it in this process and prints CPU time and
+peak memory by step.
 """
 
 from __future__ import annotations

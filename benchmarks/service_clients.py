@@ -1,8 +1,9 @@
-"""Clients of the service in one process: some that poll what the operator's page asks for, some that follow a session's events.
+"""Clients of the service in one process: some that poll what the operator's page asks for, some that follow a session's
+events.
 
-`python -m benchmarks.service_clients PORT SESSION POLLING STREAMING EVERY_S`, the key on standard input. It begins when it says `ready`, ends when its standard input does,
-and prints the time of every answer (ms) by what was asked, as JSON. Plain sockets: a client library would cost more than the service.
-"""
+`python -m benchmarks.service_clients PORT SESSION POLLING STREAMING EVERY_S`, the key on standard input. It begins when
+it says `ready`, ends when its standard input does, and prints the time of every answer (ms) by what was asked, as JSON.
+Plain sockets: a client library would cost more than the service."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Edges and kernels with known truth: bias, standard deviation and CPU time beside the peers', the original report's table, a photograph.
+"""Edges and kernels with known truth: bias, standard deviation and CPU time beside the peers', the original report's
+table, a photograph.
 
-Peers: the slanted edge as ISO 12233:2005 has it (`peers/iso12233.py`), the objective of Mosleh et al. (`peers/mosleh.py`); the
-Cramer-Rao bound of a free line spread of +-4 px, and of a free kernel. Prints the tables of docs/explanation/accuracy.md, "MTF" and "PSF".
-"""
+Peers: the slanted edge as ISO 12233:2005 has it (`peers/iso12233.py`), the objective of Mosleh et al.
+(`peers/mosleh.py`); the Cramer-Rao bound of a free line spread of +-4 px, and of a free kernel. Prints the tables of
+docs/explanation/accuracy.md, "MTF" and "PSF"."""
 
 from __future__ import annotations
 
@@ -87,7 +88,8 @@ def cramer_rao(mean: np.ndarray, sigma_px: float, half_px: float = 4.0, pitch_px
 
 def test_edges_beside_iso_12233() -> None:
     print(
-        "\n| sigma, px | bias % straight, bent by 2 px | sd % | CRB % | floor above Nyquist | ms | ISO: bias % straight, bent | sd % | ms |"
+        "\n| sigma, px | bias % straight, bent by 2 px | sd % | CRB % | floor above Nyquist | ms | ISO: bias % "
+        "straight, bent | sd % | ms |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     rng = np.random.default_rng(1)
@@ -116,7 +118,8 @@ def test_edges_beside_iso_12233() -> None:
         times = [1e3 * np.median([cpu(lambda f=f, w=w: w(f)) for f in frames[:10]]) for w in (edge_mtf, iso12233_mtf)]
         bound = 100 * cramer_rao(mean, sigma)
         print(
-            f"| {sigma} | {ours[0]:+.4f}, {ours[1]:+.4f} | {sd:.3f} | {bound:.3f} | {np.abs(excess).max():.4f} | {times[0]:.0f} "
+            f"| {sigma} | {ours[0]:+.4f}, {ours[1]:+.4f} | {sd:.3f} | {bound:.3f} | {np.abs(excess).max():.4f} | "
+            f"{times[0]:.0f} "
             f"| {theirs[0]:+.2f}, {theirs[1]:+.2f} | {sd_iso:.2f} | {times[1]:.0f} |"
         )
         assert max(map(abs, ours)) <= 0.02
@@ -145,7 +148,8 @@ def test_times_beside_their_limits() -> None:
 
 def test_kernels_beside_mosleh() -> None:
     print(
-        "\n| kernel (support) | ours, dB | Mosleh, dB | least squares, dB | CRB, dB | wanted, dB | relative L2 % | all zero, dB | s |"
+        "\n| kernel (support) | ours, dB | Mosleh, dB | least squares, dB | CRB, dB | wanted, dB | relative L2 % | "
+        "all zero, dB | s |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for name, (truth, goal) in KERNELS.items():
@@ -165,7 +169,8 @@ def test_kernels_beside_mosleh() -> None:
             bound.append(20 * np.log10(truth.max() / np.sqrt(1e-4 * np.trace(inverse) / support**2)))
         nothing = psnr_db(np.zeros_like(truth), truth)
         print(
-            f"| {name} ({support}) | {np.mean(ours):.1f} | {np.mean(theirs):.1f} | {np.mean(squares):.1f} | {np.mean(bound):.1f} "
+            f"| {name} ({support}) | {np.mean(ours):.1f} | {np.mean(theirs):.1f} | {np.mean(squares):.1f} | "
+            f"{np.mean(bound):.1f} "
             f"| {goal} | {np.mean(errors):.2f} | {nothing:.1f} | {np.median(times):.2f} |"
         )
         assert np.mean(ours) >= goal
@@ -174,7 +179,8 @@ def test_kernels_beside_mosleh() -> None:
 
 def test_corner_errors() -> None:
     print(
-        "\n| kernel | placed, dB | corners 0.3 px off: with refinement, dB | without, dB | cost, dB | cost to the CRB, dB | s |"
+        "\n| kernel | placed, dB | corners 0.3 px off: with refinement, dB | without, dB | cost, dB | cost to the "
+        "CRB, dB | s |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in ("Gauss 1", "Gauss 2.2 x 1.5", "disc 4.5", "Gauss 3"):
@@ -219,7 +225,8 @@ def both_db(estimate: np.ndarray, truth: np.ndarray) -> str:
 def test_the_original_reports_table() -> None:
     """Its kernels aren't stated beyond their kind: three Gaussians, two that aren't smooth."""
     print(
-        "\n| case | peak = maximum, dB | peak = 1, dB | Mosleh's objective here, peak = 1, dB | the report, dB |\n| --- | --- | --- | --- | --- |"
+        "\n| case | peak = maximum, dB | peak = 1, dB | Mosleh's objective here, peak = 1, dB | the report, dB |\n| "
+        "--- | --- | --- | --- | --- |"
     )
     figures = zip(
         ("Gauss 1", "Gauss 2.2 x 1.5", "Gauss 3", "disc 4.5", "ring 7"),
@@ -239,7 +246,8 @@ def test_the_original_reports_table() -> None:
             continue
         found = np.array([estimate_kernel(*blurred_target(t, seed=k), len(t)).kernel for k, t in enumerate(truths)])
         print(
-            f"| lens US 7,558,005, {place}: 450, 550, 600 nm as B, G, R, 1 % noise | {both_db(found, np.array(truths))} | | {reported} |"
+            f"| lens US 7,558,005, {place}: 450, 550, 600 nm as B, G, R, 1 % noise | "
+            f"{both_db(found, np.array(truths))} | | {reported} |"
         )
         assert psnr_db(found, np.array(truths)) > reported
     found, truth = simulated_camera()
@@ -248,7 +256,8 @@ def test_the_original_reports_table() -> None:
 
 
 def lens_kernels(field: int) -> list[np.ndarray] | None:
-    """Kernels on pixels of 1.4 um of the mobile lens at 450, 550 and 600 nm, pixel's square included; None without its file."""
+    """Kernels on pixels of 1.4 um of the mobile lens at 450, 550 and 600 nm, pixel's square included; None without its
+    file."""
     file = DATA / "lenses" / "7558005a.zmx"
     if not file.is_file():
         return None
@@ -270,7 +279,8 @@ def lens_kernels(field: int) -> list[np.ndarray] | None:
 
 
 def simulated_camera() -> tuple[np.ndarray, np.ndarray]:
-    """Kernel from white, black, checkerboard and Bernoulli frames of a camera with Gaussian optics and every noise, and the true one."""
+    """Kernel from white, black, checkerboard and Bernoulli frames of a camera with Gaussian optics and every noise, and
+    the true one."""
     at = (np.arange(61) - 30) * 0.5
     spread = np.exp(-0.5 * (at[:, None] ** 2 + at**2) / 3.0**2)
     imaging = MeasuredPsf(wavelength_nm=(550.0,), psf=((spread / spread.sum()).tolist(),), sample_pitch_um=0.5)
@@ -312,7 +322,8 @@ def simulated_camera() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_sub_pixel_kernels() -> None:
-    """Cells of a quarter pixel, a kernel on samples of a quarter pixel: the pattern on its own grid, every 4th sample seen."""
+    """Cells of a quarter pixel, a kernel on samples of a quarter pixel: the pattern on its own grid, every 4th sample
+    seen."""
     print("\n| sub-pixel kernel, x4 (support) | relative L2 % at 1 % noise | s |\n| --- | --- | --- |")
     rng = np.random.default_rng(3)
     for name, sigma in (("Gauss 2.4 cells = 0.6 px", 2.4), ("Gauss 4 cells = 1 px", 4.0)):
@@ -358,7 +369,8 @@ def test_a_real_photograph() -> None:
     photo = cv2.imread(str(folder / "img_example.pgm"), cv2.IMREAD_UNCHANGED).astype(float)
     pattern = (cv2.imread(str(folder / "pattern_noise.pgm"), cv2.IMREAD_UNCHANGED) > 127).astype(np.uint8)
     print(
-        "\n| Delbracio's photograph: samples a pixel | explained by the kernel, % | by homography and box, % | s |\n| --- | --- | --- | --- |"
+        "\n| Delbracio's photograph: samples a pixel | explained by the kernel, % | by homography and box, % | s |\n| "
+        "--- | --- | --- | --- |"
     )
     for oversample in (2, 4):
         start = time.process_time()

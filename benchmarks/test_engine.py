@@ -1,7 +1,8 @@
-"""What the engine itself takes of a stereo pair of 2 x 1280 x 960: plan, journal, documents, files, hashes. Wanted: 60 ms.
+"""What the engine itself takes of a stereo pair of 2 x 1280 x 960: plan, journal, documents, files, hashes. Wanted: 60
+ms.
 
-The cameras are objects of this process whose frames are ready, and nothing else moves: what is left is the engine's own time, the disk's fsyncs
-among it. The wall time holds where the machine is idle; the CPU time holds anywhere.
+The cameras are objects of this process whose frames are ready, and nothing else moves: what is left is the engine's own
+time, the disk's fsyncs among it. The wall time holds where the machine is idle; the CPU time holds anywhere.
 """
 
 from __future__ import annotations

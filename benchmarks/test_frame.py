@@ -1,4 +1,5 @@
-"""Whole frames, from light to codes: CPU time beside the limit that transforms, memory and random numbers set, and peak memory.
+"""Whole frames, from light to codes: CPU time beside the limit that transforms, memory and random numbers set, and peak
+memory.
 
 Prints the tables of docs/explanation/performance.md.
 """
@@ -150,7 +151,8 @@ def test_a_screen_through_a_traced_lens() -> None:
     moving = cpu(lambda: np.zeros(grid.shape, np.float32) + np.float32(1.0))
     ours = cpu(frame)
     show(
-        f"1280 x 960 Bayer frame of a random screen through {PRESCRIPTION.name}, f/{table.f_number:.2g}, pixels of {camera.pixel_pitch_um} um (asked for: 2 s)",
+        f"1280 x 960 Bayer frame of a random screen through {PRESCRIPTION.name}, f/{table.f_number:.2g}, pixels of "
+        f"{camera.pixel_pitch_um} um (asked for: 2 s)",
         [
             Row("the frame", ours, products, "CPU s", f"{size} x {size} samples a pixel times four kernels, by BLAS"),
             Row("of it, drawing the screen", drawing, moving, "CPU s", "writing that many samples"),
@@ -175,9 +177,9 @@ class Waves:
 
 
 def exact_region(table: LensTable, light: FloatArray, frame: ImageFrame, picture: Waves) -> FloatArray:
-    """The sum over all sources: each one's own function, in between the table's samples by cubic splines in height, row and column,
-    averaged over a full pixel by 5 x 5 Gauss nodes. Sources are 4 x 4 a pixel, which for such a picture and a lens that passes
-    less than 3.2 cy/px is the integral."""
+    """The sum over all sources: each one's own function, in between the table's samples by cubic splines in height, row
+    and column, averaged over a full pixel by 5 x 5 Gauss nodes. Sources are 4 x 4 a pixel, which for such a picture and
+    a lens that passes less than 3.2 cy/px is the integral."""
     n, pitch = table.psf.shape[-1], table.sample_pitch_um
     functions = np.einsum("fw,wfab->fab", light * table.relative_illumination.T, table.psf)
     at = (np.arange(n) - 0.5 * (n - 1)) * pitch
@@ -212,7 +214,8 @@ def exact_region(table: LensTable, light: FloatArray, frame: ImageFrame, picture
 
 @pytest.mark.skipif(not PRESCRIPTION.is_file(), reason="the lens prescriptions are not beside the repository")
 def test_accuracy_of_a_traced_frame() -> None:
-    """Regions of 8 x 8 px of the real lens, against the exact sum over their sources: 3e-3 of the contrast are asked for."""
+    """Regions of 8 x 8 px of the real lens, against the exact sum over their sources: 3e-3 of the contrast are asked
+    for."""
     camera = traced_camera()
     assert isinstance(camera.lens.imaging, TracedLens)
     table = camera.lens.imaging.table

@@ -151,7 +151,8 @@ def test_public_stereo_pairs() -> None:
                 grey = recordings.frame(capture).astype(np.uint8)
                 _, corners = cv2.findChessboardCorners(grey, (9, 6))
                 refined = cv2.cornerSubPix(grey, corners, (11, 11), (-1, -1), criteria)
-                # OpenCV begins at either end of the board, not always the same in both pictures of a pair; ours tell which
+                # OpenCV begins at either end of the board, not always the same in both pictures of a pair; ours tell
+                # which
                 first = next(view for view in fits[side == "right"].residuals if view.capture == capture.id)
                 begins = np.hypot(*(refined[0, 0] - [first.x_px[0], first.y_px[0]])) < 5
                 found[side].append(refined if begins else refined[::-1])

@@ -1,7 +1,8 @@
-"""Photon transfer beside EMVA 1288's reference implementation, on the same frames with known truth: accuracy and CPU time.
+"""Photon transfer beside EMVA 1288's reference implementation, on the same frames with known truth: accuracy and CPU
+time.
 
-The peer is measured in an environment of its own (`.venv-peers`), built on the first run; without it its column is empty.
-"""
+The peer is measured in an environment of its own (`.venv-peers`), built on the first run; without it its column is
+empty."""
 
 from __future__ import annotations
 
@@ -110,7 +111,8 @@ def peer_figures(python: Path, recordings: RecordingSet, folder: Path) -> dict[s
 
 
 def bound_percent() -> float:
-    """Cramer-Rao bound on K with a free curvature and dark variance: variances of two frames of N pixels are known to v sqrt(2 / N)."""
+    """Cramer-Rao bound on K with a free curvature and dark variance: variances of two frames of N pixels are known to v
+    sqrt(2 / N)."""
     x = GAIN * FULL * np.linspace(0.02, 1.05, LEVELS)
     x = x[x <= 0.9 * (4095.0 - BLACK)]
     floor = (GAIN * READ) ** 2 + 1.0 / 12.0
@@ -147,7 +149,8 @@ def test_gain_beside_the_reference(peer_python: Path | None, tmp_path: Path) -> 
         theirs_s = f"{np.median([one['cpu_s'] for one in theirs]):.2f}" if theirs else "-"
         rms = float(np.sqrt(np.mean(error**2)))
         print(
-            f"| {case} | {error.mean():+.3f}, {rms:.3f} | {stated:.3f} | {told} | {np.median(seconds):.2f} | {theirs_s} |"
+            f"| {case} | {error.mean():+.3f}, {rms:.3f} | {stated:.3f} | {told} | {np.median(seconds):.2f} | "
+            f"{theirs_s} |"
         )
         # An rms over n draws is itself known to 1 / sqrt(2 n); two of these.
         assert rms < 0.1 * (1.0 + 2.0 / np.sqrt(2.0 * DRAWS)), case
@@ -180,7 +183,8 @@ def test_gain_is_at_the_bound() -> None:
 
 
 def test_figures_beside_the_reference(peer_python: Path | None, tmp_path: Path) -> None:
-    """EMVA 1288's own figures, by the same definitions on the same frames: they agree far better than their uncertainties."""
+    """EMVA 1288's own figures, by the same definitions on the same frames: they agree far better than their
+    uncertainties."""
     if peer_python is None:
         pytest.skip(f"{PEER} can't be installed here")
     recordings = Bench(0.0, 0.0, 7).recordings()
@@ -217,7 +221,8 @@ def test_the_reference_set(peer_python: Path | None, tmp_path: Path) -> None:
     own = fit.emva1288["Y"]
     print(
         f"\nK {fit.conversion_gain_dn_per_e:.4f} (by the letter {own.system_gain_dn_per_e:.4f}, at zero signal "
-        f"{fit.conversion_gain_at_zero_dn_per_e:.4f} ± {fit.conversion_gain_at_zero_dn_per_e_std:.4f}) DN/e, dark noise "
+        f"{fit.conversion_gain_at_zero_dn_per_e:.4f} ± {fit.conversion_gain_at_zero_dn_per_e_std:.4f}) DN/e, dark "
+        "noise "
         f"{fit.read_noise_e:.2f} e, QE {fit.quantum_efficiency:.4f}, {seconds:.2f} s CPU"
     )
     if peer_python is not None:

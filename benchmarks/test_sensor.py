@@ -1,4 +1,5 @@
-"""One noisy 1280 x 960 frame from a known expectation: `make bench` prints its CPU time beside that of the bare random numbers."""
+"""One noisy 1280 x 960 frame from a known expectation: `make bench` prints its CPU time beside that of the bare random
+numbers."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ def test_a_noisy_frame() -> None:
     shape = camera.rows, camera.cols
     normal = _cpu_ms(lambda: rng.standard_normal(shape, dtype=np.float32))
     print(
-        "\none frame of 1280 x 960 px, all noise, CPU ms (limit: the bare random numbers, one Poisson and one normal a pixel)"
+        "\none frame of 1280 x 960 px, all noise, CPU ms (limit: the bare random numbers, one Poisson and one normal "
+        "a pixel)"
     )
     print(f"{'mean, e':>10} {'frame':>8} {'numpy poisson':>14} {'+ normal':>9} {'moments':>8}")
     levels = [

@@ -1,9 +1,10 @@
-"""The service while a session captures: 50 clients that poll and 10 that follow its events, in one run with and without them.
+"""The service while a session captures: 50 clients that poll and 10 that follow its events, in one run with and without
+them.
 
-Service and mock bench are processes of their own. The bench doesn't wait, so that a session is as fast as this machine can be: the worst case for
-its pace. The clients are a third process, whose own time is part of what is measured. Wanted on two cores: reads answered within 100 ms
-(99th percentile), the pace within 10 %. Sessions with and without clients are taken in turn, CALIBENCH_BENCH_ROUNDS (3) of each.
-"""
+Service and mock bench are processes of their own. The bench doesn't wait, so that a session is as fast as this machine
+can be: the worst case for its pace. The clients are a third process, whose own time is part of what is measured. Wanted
+on two cores: reads answered within 100 ms (99th percentile), the pace within 10 %. Sessions with and without clients
+are taken in turn, CALIBENCH_BENCH_ROUNDS (3) of each."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""All fits of a whole session and its diagnosis, as a user runs them: wall clock, CPU time and memory of `calibench fit` and `diagnose`.
+"""All fits of a whole session and its diagnosis, as a user runs them: wall clock, CPU time and memory of `calibench
+fit` and `diagnose`.
 
-Two cameras of 1280 x 960, some 190 frames of each (`benchmarks.big_session`, 1 GB, in a temporary folder), of which all are read and
-looked through. Wanted on two cores: 90 s for the fits, 240 s for the diagnosis with them. And the diagnosis of one
-camera of 600 frames of a megapixel (`benchmarks.many_frames`, 1.2 GB): 90 s.
+Two cameras of 1280 x 960, some 190 frames of each (`benchmarks.big_session`, 1 GB, in a temporary folder), of which all
+are read and looked through. Wanted on two cores: 90 s for the fits, 240 s for the diagnosis with them. And the
+diagnosis of one camera of 600 frames of a megapixel (`benchmarks.many_frames`, 1.2 GB): 90 s.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _most_held_bytes(command: list[str]) -> int:
-    """Run a command: the most that it and its processes held together, shared pages counted once, looked at twice a second."""
+    """Run a command: the most that it and its processes held together, shared pages counted once, looked at twice a
+    second."""
     most = 0
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
         while running.poll() is None:

@@ -1,8 +1,10 @@
-"""Sensitivities of measured cameras recovered from lights, beside division, the pseudo-inverse, plain Tikhonov, and the bound.
+"""Sensitivities of measured cameras recovered from lights, beside division, the pseudo-inverse, plain Tikhonov, and the
+bound.
 
-Twelve curves of four cameras, measured every 5 nm; between the samples, straight lines or a cubic spline. Relative RMS error over
-400..720 nm, of each curve over its draws: median and maximum are over curves. "Signal": noise of 0.2 % of each signal, as shot noise
-and radiometer give it; "peak": of the highest signal, at every wavelength.
+Twelve curves of four cameras, measured every 5 nm; between the samples, straight lines or a cubic spline. Relative RMS
+error over
+400..720 nm, of each curve over its draws: median and maximum are over curves. "Signal": noise of 0.2 % of each signal,
+as shot noise and radiometer give it; "peak": of the highest signal, at every wavelength.
 """
 
 from __future__ import annotations
@@ -38,8 +40,8 @@ def curves() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-#: Which curves figures are stated over. The red and blue ones of the two Canons, with a spline and noise of the peak, give division
-#: errors near those of "four measured Canon curves" that the targets were set beside.
+#: Which curves figures are stated over. The red and blue ones of the two Canons, with a spline and noise of the peak,
+#: give division errors near those of "four measured Canon curves" that the targets were set beside.
 GROUPS = {
     "all": lambda name: True,
     "Canon": lambda name: name.startswith("Canon"),
@@ -48,8 +50,8 @@ GROUPS = {
 
 
 def bound_percent(operator: np.ndarray, std: np.ndarray, truth: np.ndarray, inside: np.ndarray) -> float | None:
-    """Cramer-Rao: the least relative RMS that an unbiased estimate without a prior can have, the curve beyond the lights known.
-    None where the lights don't determine it (fewer lights than wavelengths)."""
+    """Cramer-Rao: the least relative RMS that an unbiased estimate without a prior can have, the curve beyond the
+    lights known. None where the lights don't determine it (fewer lights than wavelengths)."""
     scaled = operator[:, inside] / std[:, None]
     if scaled.shape[0] < scaled.shape[1]:
         return None
@@ -122,7 +124,7 @@ def test_measured_curves(grid_nm: float, between: str, width_nm: float, relative
     show(f"{width_nm:g} nm wide every {width_nm:g} nm, {100 * relative:g} % of the {noise}, {grid}", rows)
     median = {name: np.median(list(of.values())) for name, of in errors.items()}
     assert median["ours"] < median["division"]
-    # A spline is the curve of least second difference through its samples: what plain Tikhonov takes for granted, and smoother than
-    # a measured curve. There it is hardly to be beaten, and bands may be too wide.
+    # A spline is the curve of least second difference through its samples: what plain Tikhonov takes for granted, and
+    # smoother than a measured curve. There it is hardly to be beaten, and bands may be too wide.
     assert median["ours"] < (1.1 if between == "spline" else 1.0) * median["Tikhonov, GCV, S >= 0"]
     assert 0.93 <= np.mean(covered) <= (1.0 if between == "spline" else 0.985)

@@ -1,7 +1,8 @@
-"""Cameras that stream: 30 pairs a second of 1280 x 960 at 12 bits to numpy, what the computer has to do for it, and what gets lost.
+"""Cameras that stream: 30 pairs a second of 1280 x 960 at 12 bits to numpy, what the computer has to do for it, and
+what gets lost.
 
-From the mock U3V pair with frames that are ready, in a process of its own over USB/IP, and from pypylon's emulation, which draws its
-frames in this process: what it costs alone is measured beside. Wanted: less than one core.
+From the mock U3V pair with frames that are ready, in a process of its own over USB/IP, and from pypylon's emulation,
+which draws its frames in this process: what it costs alone is measured beside. Wanted: less than one core.
 """
 
 from __future__ import annotations
@@ -114,7 +115,8 @@ def _emulation_alone(cameras: Sequence[BaslerCamera]) -> float:
 
 @pytest.mark.parametrize("target", ["sphere", "screen"])
 def test_drawn_pair(target: str) -> None:
-    """Pairs that the mock bench draws, light, shot noise and read noise anew in each, from its cameras to numpy, all in this process."""
+    """Pairs that the mock bench draws, light, shot noise and read noise anew in each, from its cameras to numpy, all in
+    this process."""
     bench = Bench(seed=1, shape=(ROWS, COLS))
     bench.compile_loops()
     bench.place(target)

@@ -1,6 +1,7 @@
-"""Makes folders for `calibench import --from raw-folder` of what was published with bllanos/chromatic-aberration (a Flea3 before a
-ColorChecker behind band-pass filters, 2019-02-18): `python docs/convert_llanos.py DATA OUT` writes OUT/darks, the dark frames as they are, and
-OUT/white, the chart's white patch cut out of the frames behind every filter, and the same pixels of the dark frames."""
+"""Makes folders for `calibench import --from raw-folder` of what was published with bllanos/chromatic-aberration (a
+Flea3 before a ColorChecker behind band-pass filters, 2019-02-18): `python docs/convert_llanos.py DATA OUT` writes
+OUT/darks, the dark frames as they are, and OUT/white, the chart's white patch cut out of the frames behind every
+filter, and the same pixels of the dark frames."""
 
 from __future__ import annotations
 
@@ -13,8 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-#: What is known of the camera: Point Grey Flea3 with Sony's ICX655AQ, frames down-sampled Bayer-aware to 342 x 408 of 8 bit, so that a
-#: pixel's pitch and noise are no more those of the sensor's data sheet.
+#: What is known of the camera: Point Grey Flea3 with Sony's ICX655AQ, frames down-sampled Bayer-aware to 342 x 408 of 8
+#: bit, so that a pixel's pitch and noise are no more those of the sensor's data sheet.
 CAMERA = 'cfa = "GBRG"\nbit_depth = 8\n'
 #: Of the white patch (label 19), a margin of it left out; even, so that the mosaic starts as the frame's does.
 WHITE = np.s_[200:236, 54:92]
@@ -33,8 +34,8 @@ def darks(data: Path, out: Path) -> None:
 
 
 def white(data: Path, out: Path) -> None:
-    """The white patch behind every filter as narrowband light, with the filters' measured transmittance for its spectrum: of the lamp
-    nothing is known, so its level means nothing."""
+    """The white patch behind every filter as narrowband light, with the filters' measured transmittance for its
+    spectrum: of the lamp nothing is known, so its level means nothing."""
     out.mkdir(parents=True, exist_ok=True)
     lines = ["frame,kind,side,exposure_s,wavelength_nm,radiance"]
     for file in sorted((data / "dark").glob("d2_dark_*.tif")):

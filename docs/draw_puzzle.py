@@ -1,11 +1,12 @@
-"""Draw docs/puzzle.svg: MTF and spectral responsivity, measured, before and after the diagnosis named what the model left out.
+"""Draw docs/puzzle.svg: MTF and spectral responsivity, measured, before and after the diagnosis named what the model
+left out.
 
     .venv/bin/python docs/draw_puzzle.py        (a minute)
 
-A camera of the second image former (`mocks.former`, which shares no code with the models that the diagnosis fits) conceals an optical
-low-pass filter of 1.6 um and an infrared-cut filter at 645 nm. Its recordings are diagnosed, and the curves of the result are drawn: the
-measured ones with bars of two standard deviations, the baseline's prediction dashed, the improved model's solid. Open points are captures that the diagnosis
-held out.
+A camera of the second image former (`mocks.former`, which shares no code with the models that the diagnosis fits)
+conceals an optical low-pass filter of 1.6 um and an infrared-cut filter at 645 nm. Its recordings are diagnosed, and
+the curves of the result are drawn: the measured ones with bars of two standard deviations, the baseline's prediction
+dashed, the improved model's solid. Open points are captures that the diagnosis held out.
 """
 
 from __future__ import annotations
@@ -126,7 +127,7 @@ def points_of(
     return found
 
 
-# --- the picture ---------------------------------------------------------------------------------------------------------
+# --- the picture ------------------------------------------------------------------------------------------------------
 
 
 def drawing(result: DiagnosisResult, edges: Sequence[Points], sweep: Sequence[Points]) -> str:
@@ -144,7 +145,8 @@ def drawing(result: DiagnosisResult, edges: Sequence[Points], sweep: Sequence[Po
     parts = [
         (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" '
-            f'font-family="system-ui, -apple-system, \'Segoe UI\', \'DejaVu Sans\', sans-serif" font-size="13" fill="{INK}">'
+            "font-family=\"system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif\" font-size=\"13\" "
+            f'fill="{INK}">'
         ),
         f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#ffffff"/>',
     ]
@@ -208,7 +210,10 @@ def key(panel: Panel) -> list[str]:
         (f'<circle cx="{x}" cy="0" r="3.4" fill="{colour}"/>', "measured, bars ± 2 σ"),
         (f'<circle cx="{x}" cy="0" r="3.4" fill="#fff" stroke="{colour}" stroke-width="1.4"/>', "measured, held out"),
         (
-            f'<line x1="{x - 14}" x2="{x + 14}" y1="0" y2="0" stroke="{colour}" stroke-width="1.8" stroke-dasharray="6 4"/>',
+            (
+                f'<line x1="{x - 14}" x2="{x + 14}" y1="0" y2="0" stroke="{colour}" stroke-width="1.8" '
+                'stroke-dasharray="6 4"/>'
+            ),
             "baseline model",
         ),
         (f'<line x1="{x - 14}" x2="{x + 14}" y1="0" y2="0" stroke="{colour}" stroke-width="2"/>', "improved model"),

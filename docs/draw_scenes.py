@@ -1,7 +1,8 @@
-"""Draws docs/reference/scenes.png and prints the table of parameters in docs/reference/scenes.md: `python docs/draw_scenes.py docs/reference/scenes.png`.
+"""Draws docs/reference/scenes.png and prints the table of parameters in docs/reference/scenes.md: `python
+docs/draw_scenes.py docs/reference/scenes.png`.
 
-Every tile is the scene itself, without lens and noise, in the camera's pixels: the lights' luminances and colours by the CIE's
-observer of 1931, in sRGB.
+Every tile is the scene itself, without lens and noise, in the camera's pixels: the lights' luminances and colours by
+the CIE's observer of 1931, in sRGB.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Records a session of the worked examples as a recording set: `python docs/record_examples.py OUT PART`, PART `bench` or `puzzle`.
+"""Records a session of the worked examples as a recording set: `python docs/record_examples.py OUT PART`, PART `bench`
+or `puzzle`.
 
-`bench`: a quick session of the mock bench that `calibench run --quick` starts. `puzzle`: a camera of the second image former with the same two
-filters concealed, of which `tests/lab/diagnose/test_example.py` makes the same recordings.
+`bench`: a quick session of the mock bench that `calibench run --quick` starts. `puzzle`: a camera of the second image
+former with the same two filters concealed, of which `tests/lab/diagnose/test_example.py` makes the same recordings.
 """
 
 from __future__ import annotations

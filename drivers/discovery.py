@@ -1,6 +1,7 @@
 """What is connected to this computer, and which driver reaches it.
 
-USB devices are told by their identifiers; cameras by the libraries that enumerate them. What stands on a serial port says nothing by
+USB devices are told by their identifiers; cameras by the libraries that enumerate them. What stands on a serial port
+says nothing by
 itself: `probe` asks each serial driver to connect.
 """
 
@@ -27,7 +28,8 @@ _PROBE_TIMEOUT_S = 0.5
 
 @dataclass(frozen=True)
 class Found:
-    """Something connected: its address, what it says it is, and the driver's family and name; empty where none is known."""
+    """Something connected: its address, what it says it is, and the driver's family and name; empty where none is
+    known."""
 
     address: str
     what: str
@@ -42,7 +44,8 @@ class Found:
 
 
 def find_all(usbip: str = "") -> Iterator[Found]:
-    """Everything found: USB devices (and those that a USB/IP server `HOST[:PORT]` exports), cameras of installed libraries, serial ports."""
+    """Everything found: USB devices (and those that a USB/IP server `HOST[:PORT]` exports), cameras of installed
+    libraries, serial ports."""
     yield from usb_devices()
     if usbip:
         yield from usbip_devices(usbip)
@@ -118,10 +121,11 @@ def _enumerated(family: str, name: str) -> Iterator[Found]:
 
 
 def probe(address: str) -> Iterator[tuple[str, Identity | InstrumentError]]:
-    """Ask each driver of a serial instrument whether its instrument is at this address; the first that connects is the last yielded.
+    """Ask each driver of a serial instrument whether its instrument is at this address; the first that connects is the
+    last yielded.
 
-    Each writes its own greeting there: not for a port on which something moves that understands none of them. Raises `Disconnected` for a
-    port that can't be opened, `InUse` for one that another program holds.
+    Each writes its own greeting there: not for a port on which something moves that understands none of them. Raises
+    `Disconnected` for a port that can't be opened, `InUse` for one that another program holds.
     """
     port = Transport(address, "port")
     port.open()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 
 class InstrumentError(Exception):
-    """An instrument failed or can't be reached. The message is one line: which instrument, what happened, what to do."""
+    """An instrument failed or can't be reached. The message is one line: which instrument, what happened, what to
+    do."""
 
 
 class NoAnswer(InstrumentError):

@@ -1,7 +1,8 @@
-"""What an instrument was set to before it was changed, on disk until it is set so again: a process that is killed can't do that itself.
+"""What an instrument was set to before it was changed, on disk until it is set so again: a process that is killed can't
+do that itself.
 
-A file for each instrument, `instruments/NAME.json` in the data folder, from the first change to the last restoration. Whoever connects
-next finds it there, and restores what it says before anything else.
+A file for each instrument, `instruments/NAME.json` in the data folder, from the first change to the last restoration.
+Whoever connects next finds it there, and restores what it says before anything else.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ _lock = threading.Lock()
 
 
 class FoundSettings:
-    """The settings found on one instrument, by name, in the order in which they were changed. `who`: its name in messages.
+    """The settings found on one instrument, by name, in the order in which they were changed. `who`: its name in
+    messages.
 
     `name`: of the instrument, the same in every process that reaches it: its family and serial number, or its address.
     """
@@ -31,7 +33,8 @@ class FoundSettings:
 
     @classmethod
     def keep_in(cls, folder: Path | None) -> None:
-        """Keep the files in this folder from now on. None: in `instruments` of the data folder that CALIBENCH_DATA names, or `calibench-data`."""
+        """Keep the files in this folder from now on. None: in `instruments` of the data folder that CALIBENCH_DATA
+        names, or `calibench-data`."""
         cls._kept_in = folder
 
     def __init__(self, name: str, who: str) -> None:
@@ -85,6 +88,7 @@ class FoundSettings:
                 fresh.replace(self._file)
         except OSError as error:
             raise InstrumentError(
-                f"{self._who}: its settings can't be kept in {self._file} ({error.strerror}), to be restored later; make room, or set "
+                f"{self._who}: its settings can't be kept in {self._file} ({error.strerror}), to be restored later; "
+                "make room, or set "
                 "CALIBENCH_DATA to a folder of yours"
             ) from error

@@ -51,14 +51,15 @@ class Instrument(ABC):
 
     @abstractmethod
     def stop(self) -> None:
-        """Bring the instrument into its safe state now, from any thread: motion ends, shutters close, screens go dark."""
+        """Bring the instrument into its safe state now, from any thread: motion ends, shutters close, screens go
+        dark."""
 
     @abstractmethod
     def close(self) -> None:
         """Bring it into its safe state and close the connection, in any case; may be called twice.
 
-        Raises `InstrumentError` where light may get out still: a shutter that says it is open, or that was opened and doesn't answer.
-        """
+        Raises `InstrumentError` where light may get out still: a shutter that says it is open, or that was opened and
+        doesn't answer."""
 
     def __enter__(self) -> Self:
         self.connect()

@@ -32,7 +32,8 @@ def driver(family: str, name: str) -> Callable[..., Any]:
     if point is None:
         known = ", ".join(names(family)) or "none"
         raise InstrumentError(
-            f"{family}: no driver {name!r}; installed are {known}: correct `driver` in the station file or install its package"
+            f"{family}: no driver {name!r}; installed are {known}: correct `driver` in the station file or install "
+            "its package"
         )
     try:
         made: Callable[..., Any] = point.load()

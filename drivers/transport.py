@@ -80,7 +80,8 @@ class Transport:
                     "one port serves one instrument: close the other, or correct the address in the station file"
                 ) from error
             raise Disconnected(
-                f"{self.name}: can't be opened ({reason}); check the cable, the power and the address in the station file"
+                f"{self.name}: can't be opened ({reason}); check the cable, the power and the address in the station "
+                "file"
             ) from error
 
     def close(self) -> None:

@@ -1,8 +1,8 @@
 """USB over TCP: a pyusb backend that speaks USB/IP, so that a device on another computer (or on the mock bench) is used
 like one in a local port.
 
-`usb.core.find(backend=UsbIpBackend(host, port))`; `open_device("usbip://host:port/SERIAL")` finds one by its serial number
-or bus id. The remote side is any USB/IP server: Linux's `usbipd`, or `calibench bench`.
+`usb.core.find(backend=UsbIpBackend(host, port))`; `open_device("usbip://host:port/SERIAL")` finds one by its serial
+number or bus id. The remote side is any USB/IP server: Linux's `usbipd`, or `calibench bench`.
 
 Source: Linux kernel, Documentation/usb/usbip_protocol.rst (protocol version 1.1.1). All integers are big-endian; setup
 packets and descriptors are USB's own, little-endian.
@@ -558,7 +558,8 @@ def find(backend: IBackend | None, serial_number: str) -> usb.core.Device:
     absent = f"no USB device with serial number {serial_number}; there are: {there}"
     if in_use := getattr(backend, "in_use", 0):
         raise InUse(
-            f"{absent}, and {in_use} in use by another program or another instrument of the station: close that one, or correct the address"
+            f"{absent}, and {in_use} in use by another program or another instrument of the station: close that one, "
+            "or correct the address"
         )
     raise Disconnected(f"{absent}; plug it in and switch it on, or correct the address")
 

@@ -1,7 +1,7 @@
 """USBTMC: messages to an instrument on USB, and its answers, over pyusb.
 
-A bulk-out message carries the text; an answer is asked for by a bulk-out request and read from bulk-in. Source: USB-IF, USBTMC 1.0;
-USB488 1.0.
+A bulk-out message carries the text; an answer is asked for by a bulk-out request and read from bulk-in. Source: USB-IF,
+USBTMC 1.0; USB488 1.0.
 """
 
 from __future__ import annotations
@@ -111,7 +111,8 @@ class UsbTmc:
 
     def _strange(self, text: str, piece: bytes) -> Garbled:
         return Garbled(
-            f"{self.who}: answered {text!r} with {shown(piece[:24])}; check that the right instrument is at this address"
+            f"{self.who}: answered {text!r} with {shown(piece[:24])}; check that the right instrument is at this "
+            "address"
         )
 
     def close(self) -> None:

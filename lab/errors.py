@@ -1,4 +1,5 @@
-"""Errors that reach the user: one line that says what, where and how to mend it, and the exit code that goes with it."""
+"""Errors that reach the user: one line that says what, where and how to mend it, and the exit code that goes with
+it."""
 
 from __future__ import annotations
 
@@ -50,8 +51,8 @@ _OF_DATABASES = {
 
 
 def failure_of_environment(error: BaseException) -> str | None:
-    """A failure of the disk, of permissions, of the database or of the network as one line: where, what, remedy; None for anything else, which is
-    a defect."""
+    """A failure of the disk, of permissions, of the database or of the network as one line: where, what, remedy; None
+    for anything else, which is a defect."""
     if isinstance(error, socket.gaierror):
         return f"{one_line(error)}: a host's name isn't known; look after the network, or correct the address"
     if isinstance(error, OSError) and error.errno in _REMEDIES:
@@ -66,7 +67,8 @@ def failure_of_environment(error: BaseException) -> str | None:
 
 
 class NotDetermined(Exception):
-    """The recordings don't determine what a step computes: it is skipped, and `reason` says why and what would settle it."""
+    """The recordings don't determine what a step computes: it is skipped, and `reason` says why and what would settle
+    it."""
 
     def __init__(self, step: str, reason: str) -> None:
         super().__init__(f"{step}: {reason}")

@@ -1,10 +1,11 @@
-"""Long work as jobs: every goal of `lab.pipeline` and the work on challenges, in the background, with a row each in a table of the registry.
+"""Long work as jobs: every goal of `lab.pipeline` and the work on challenges, in the background, with a row each in a
+table of the registry.
 
-The table holds state, progress and error; results are kept under the job's id. A job that needs no instrument runs on Dask: in
-this process by default, or on a cluster whose address the settings give. A job that captures runs in a thread of this process,
-because the instruments are connected to this computer. A job is given references (the store's address, a session's id or a
-recording set's folder), never arrays. `cancel` sets a mark in the table; the job ends at its next progress.
-"""
+The table holds state, progress and error; results are kept under the job's id. A job that needs no instrument runs on
+Dask: in this process by default, or on a cluster whose address the settings give. A job that captures runs in a thread
+of this process, because the instruments are connected to this computer. A job is given references (the store's address,
+a session's id or a recording set's folder), never arrays. `cancel` sets a mark in the table; the job ends at its next
+progress."""
 
 from __future__ import annotations
 
@@ -75,7 +76,7 @@ class JobInfo(Frozen):
         return self.state in ("done", "failed", "cancelled")
 
 
-# --- the work ------------------------------------------------------------------------------------------------------------
+# --- the work ---------------------------------------------------------------------------------------------------------
 
 
 class _Reporter:
@@ -146,7 +147,8 @@ def run_job(
 
 
 def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: bool) -> PipelineRequest:
-    """What a job asks of the pipeline. A pipeline on a session captures what is left of it, and computes every step anew."""
+    """What a job asks of the pipeline. A pipeline on a session captures what is left of it, and computes every step
+    anew."""
     page = store.root / "reports" / f"{job_id}.html"
     if kind in ("capture", "pipeline") and store.has_session(source):
         capture = CaptureRequest(session=source)
@@ -181,8 +183,8 @@ def _over(store: Store, job_id: str, state: JobState, error: str | None) -> None
 
 
 def check_scheduler(address: str) -> None:
-    """Raises InputError for a scheduler that others could pose as: whoever is the scheduler runs code in this process. It is on
-    this computer, or speaks TLS with the certificates of Dask's own settings (`distributed.comm.tls`)."""
+    """Raises InputError for a scheduler that others could pose as: whoever is the scheduler runs code in this process.
+    It is on this computer, or speaks TLS with the certificates of Dask's own settings (`distributed.comm.tls`)."""
     scheme, _, place = address.rpartition("://")
     host = urlsplit(f"//{place}").hostname or ""
     with contextlib.suppress(ValueError):
@@ -190,19 +192,21 @@ def check_scheduler(address: str) -> None:
             return
     if scheme not in ("tls", "inproc") and host != "localhost":
         raise InputError(
-            f"Dask scheduler {address}: isn't on this computer and doesn't speak TLS; give tls://HOST:PORT, with the certificates in "
+            f"Dask scheduler {address}: isn't on this computer and doesn't speak TLS; give tls://HOST:PORT, with the "
+            "certificates in "
             "Dask's settings (distributed.comm.tls)"
         )
 
 
-# --- the runner ----------------------------------------------------------------------------------------------------------
+# --- the runner -------------------------------------------------------------------------------------------------------
 
 
 class JobRunner:
-    """Queues jobs and has them carried out. One per process; `close` it, or use it in `with`, so that no job is left running.
+    """Queues jobs and has them carried out. One per process; `close` it, or use it in `with`, so that no job is left
+    running.
 
-    A runner holds a lock as long as it lives. Jobs of a runner whose process ended are marked as failed by the next runner that starts.
-    """
+    A runner holds a lock as long as it lives. Jobs of a runner whose process ended are marked as failed by the next
+    runner that starts."""
 
     def __init__(
         self, store: Store, scheduler: str | None = None, workers: int = 1, connect_timeout_s: float = 10.0
@@ -280,10 +284,10 @@ class JobRunner:
     ) -> str:
         """Queue a job on a session's id, a recording set's folder, or a challenge's; returns the job's id.
 
-        `capturer`: how the job reaches the instruments; with one, the job runs in a thread of this process. `resolve`: of a
-        pipeline, take the captures that tell the remaining rivals apart. `camera_model`: id of one that stands in for the fitted
-        cameras of a validation or a diagnosis. Raises InputError for an unknown kind, and for `resolve` or `camera_model` where the job
-        can't take it.
+        `capturer`: how the job reaches the instruments; with one, the job runs in a thread of this process. `resolve`:
+        of a pipeline, take the captures that tell the remaining rivals apart. `camera_model`: id of one that stands in
+        for the fitted cameras of a validation or a diagnosis. Raises InputError for an unknown kind, and for `resolve`
+        or `camera_model` where the job can't take it.
         """
         if kind not in KINDS:
             raise InputError(f"job {kind!r}: no such work; choose from {', '.join(KINDS)}")
@@ -320,11 +324,14 @@ class JobRunner:
         return job_id
 
     def _left(self, job_id: str) -> None:
-        """Fail a job that no worker holds any more and that isn't over: its worker died (kill -9, out of memory). Dask may give it to
-        another worker, which refuses a job that had begun."""
+        """Fail a job that no worker holds any more and that isn't over: its worker died (kill -9, out of memory). Dask
+        may give it to another worker, which refuses a job that had begun."""
         with contextlib.suppress(InputError, sa.exc.SQLAlchemyError):
             if not self.job(job_id).is_over:
-                why = "the worker that did this job ended before it was done (kill -9, or memory was short); start the job again"
+                why = (
+                    "the worker that did this job ended before it was done (kill -9, or memory was short); start the "
+                    "job again"
+                )
                 _over(self.store, job_id, "failed", why)
 
     def job(self, job_id: str) -> JobInfo:

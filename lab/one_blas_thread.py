@@ -1,9 +1,9 @@
 """Linear algebra in one thread while the numerics run.
 
-Matrices here are small, a few hundred rows: more threads wait for each other longer than they compute (an estimated kernel takes 2.4 times as
-long with two), and both cameras are fitted at the same time. The number of threads belongs to the process, so that what else computes in it
-meanwhile has one thread, too; afterwards it is what it was. Within a `threadpool_limits` of another thread, that one's number holds.
-"""
+Matrices here are small, a few hundred rows: more threads wait for each other longer than they compute (an estimated
+kernel takes 2.4 times as long with two), and both cameras are fitted at the same time. The number of threads belongs to
+the process, so that what else computes in it meanwhile has one thread, too; afterwards it is what it was. Within a
+`threadpool_limits` of another thread, that one's number holds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ R = TypeVar("R")
 
 
 class _ThreadLimit:
-    """Reentrant context: BLAS uses one thread from the first entry until the last exit, whatever threads enter and in which order they leave."""
+    """Reentrant context: BLAS uses one thread from the first entry until the last exit, whatever threads enter and in
+    which order they leave."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -41,7 +42,8 @@ class _ThreadLimit:
             self._inside -= 1
             if self._inside == 0:
                 for library in self._libraries.lib_controllers:
-                    # Of OpenBLAS, only the thread that set the limit may lift it, unless it lets go: here that may be another one
+                    # Of OpenBLAS, only the thread that set the limit may lift it, unless it lets go: here that may be
+                    # another one
                     if (let_go := getattr(library, "clear_controlling_thread", None)) is not None:
                         let_go(force=True)
                 self._limiter.restore_original_limits()
@@ -51,7 +53,8 @@ _LIMIT = _ThreadLimit()
 
 
 def one_blas_thread(work: Callable[P, R]) -> Callable[P, R]:
-    """`work`, in which linear algebra (BLAS, LAPACK) has one thread. For the entries of the numerics; they may call each other."""
+    """`work`, in which linear algebra (BLAS, LAPACK) has one thread. For the entries of the numerics; they may call
+    each other."""
 
     @functools.wraps(work)
     def limited(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -1,11 +1,11 @@
 """The whole job as one verb: capture, fit, validate, diagnose, resolve, report.
 
-`run_pipeline` carries out a `PipelineRequest`. The command line, the jobs and the REST routes call it; none of them composes
-the steps itself. A step starts when the step before it has ended, and its result is kept before the next one starts.
+`run_pipeline` carries out a `PipelineRequest`. The command line, the jobs and the REST routes call it; none of them
+composes the steps itself. A step starts when the step before it has ended, and its result is kept before the next one
+starts.
 
-Instruments are reached through a `Capturer`, a function of the caller: the command line captures in its own thread, on a
-station or on a mock bench that it starts; the REST service captures through its live sessions.
-"""
+Instruments are reached through a `Capturer`, a function of the caller: the command line captures in its own thread, on
+a station or on a mock bench that it starts; the REST service captures through its live sessions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ STEPS: dict[Goal, tuple[Step, ...]] = {
     "report": ("fit", "validate", "diagnose", "report"),
     "pipeline": ("capture", "fit", "validate", "diagnose", "resolve", "report"),
 }
-#: Duration (s) of each step in a quick stereo session on the mock bench, two cores; their ratios give the share of the work that is done.
+#: Duration (s) of each step in a quick stereo session on the mock bench, two cores; their ratios give the share of the
+#: work that is done.
 TYPICAL_S: dict[Step, float] = {
     "capture": 36.0,
     "fit": 15.0,
@@ -58,7 +59,7 @@ TYPICAL_S: dict[Step, float] = {
 }
 
 
-# --- what is asked for ---------------------------------------------------------------------------------------------------
+# --- what is asked for ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -92,11 +93,12 @@ class PipelineRequest:
     source : the session or folder that the results belong to; empty: the session of `capture`, else none
     keep : keep the results of `source` in the registry
     job_id : the job for which the goal's result is kept
-    reuse : take the kept results of a finished session in place of computing the goal's inputs again. Without it a diagnosis is given
+    reuse : take the kept results of a finished session in place of computing the goal's inputs again. Without it a
+    diagnosis is given
         only the fits that it rests on, and these aren't kept
     fit, validation, diagnosis : results to rest on in place of new ones
-    improved : the cameras with the effects that `diagnosis` names, by side, for the report; where none are given, those that are kept with it
-    models : camera files that replace the fitted cameras, by side, in validation and diagnosis
+    improved : the cameras with the effects that `diagnosis` names, by side, for the report; where none are given, those
+    that are kept with it models : camera files that replace the fitted cameras, by side, in validation and diagnosis
     resolve : after the diagnosis, take the captures that tell the remaining rivals apart
     pictures : draw the residual pictures of the diagnosis
     bootstrap : healthy cameras that are drawn frame by frame for the threshold of the diagnosis
@@ -150,9 +152,11 @@ class PipelineProgress:
     remark: str | None = None
 
 
-#: Called at every piece of progress. It may raise `Cancelled`, which ends the pipeline; instruments are brought to a safe state first.
+#: Called at every piece of progress. It may raise `Cancelled`, which ends the pipeline; instruments are brought to a
+#: safe state first.
 Tell = Callable[[PipelineProgress], None]
-#: Captures a session to its end and returns its id; passes the session's progress on, and ends the session where that raises `Cancelled`.
+#: Captures a session to its end and returns its id; passes the session's progress on, and ends the session where that
+#: raises `Cancelled`.
 Capturer = Callable[[CaptureRequest, "Callable[[CaptureProgress], None]"], str]
 
 
@@ -169,7 +173,7 @@ class PipelineResult:
     report: Path | None = None
 
 
-# --- what is evaluated, and on what --------------------------------------------------------------------------------------
+# --- what is evaluated, and on what -----------------------------------------------------------------------------------
 
 
 def session_recordings(store: Store, session_id: str) -> RecordingSet:
@@ -187,7 +191,8 @@ def session_recordings(store: Store, session_id: str) -> RecordingSet:
 
 
 def source_recordings(source: str, open_store: Callable[[], Store | None]) -> RecordingSet:
-    """The recordings of `source`, a recording set's folder or a stored session's id. Raises InputError if it is neither.
+    """The recordings of `source`, a recording set's folder or a stored session's id. Raises InputError if it is
+    neither.
 
     The store is opened only where `source` isn't a path; `open_store` returns None where there is no data folder.
     """
@@ -199,7 +204,8 @@ def source_recordings(source: str, open_store: Callable[[], Store | None]) -> Re
     if store is None or not store.has_session(source):
         where = "there is no data folder" if store is None else f"no session in {store.root}"
         raise InputError(
-            f"{source}: no such folder, and {where}; give a recording set's folder or a session's id, and its data folder with --data or as CALIBENCH_DATA"
+            f"{source}: no such folder, and {where}; give a recording set's folder or a session's id, and its data "
+            "folder with --data or as CALIBENCH_DATA"
         )
     return session_recordings(store, source)
 
@@ -211,7 +217,8 @@ def capture_here(
     tell: Callable[[CaptureProgress], None],
     connect: Callable[[Station], Drivers] | None = None,
 ) -> str:
-    """Capture a session in this thread, on `station`; returns its id. `connect` makes the drivers, by default the station's.
+    """Capture a session in this thread, on `station`; returns its id. `connect` makes the drivers, by default the
+    station's.
 
     Raises what `CaptureSession.run` raises, and `Cancelled` if `tell` does: the session can then be resumed.
     """
@@ -251,7 +258,7 @@ def capture_here(
     return session.id
 
 
-# --- the pipeline --------------------------------------------------------------------------------------------------------
+# --- the pipeline -----------------------------------------------------------------------------------------------------
 
 
 def run_pipeline(
@@ -263,9 +270,8 @@ def run_pipeline(
 ) -> PipelineResult:
     """Take the steps of `request` and return what they found.
 
-    `store` keeps the results, under the request's source; without one nothing is kept. `capturer` is needed for a request that
-    captures or resolves. Raises InputError, DeviceError, NotDetermined, and what `tell` raises.
-    """
+    `store` keeps the results, under the request's source; without one nothing is kept. `capturer` is needed for a
+    request that captures or resolves. Raises InputError, DeviceError, NotDetermined, and what `tell` raises."""
     from lab.side_processes import kept_processes
 
     with kept_processes():
@@ -337,7 +343,7 @@ class _Pipeline:
         done = (sum(durations[:at]) + share * durations[at]) / sum(durations)
         self._tell(PipelineProgress(step, what, done, share, capture, remark))
 
-    # --- keeping ---------------------------------------------------------------------------------------------------------
+    # --- keeping ------------------------------------------------------------------------------------------------------
 
     def _known_session(self, source: str) -> str | None:
         return source if source and self.store is not None and self.store.has_session(source) else None
@@ -357,7 +363,8 @@ class _Pipeline:
             keep(self.store, self._results["diagnose"], examined.improved)
 
     def _kept(self, kind: Goal, model: type[M]) -> M | None:
-        """The newest kept result of a kind, where it may be reused: a folder, unlike a finished session, may have changed."""
+        """The newest kept result of a kind, where it may be reused: a folder, unlike a finished session, may have
+        changed."""
         if not self.request.reuse or kind == self.request.goal or self.store is None or self._session is None:
             return None
         if self.store.session(self._session).state != "finished":
@@ -368,7 +375,7 @@ class _Pipeline:
                 return model.model_validate(found.document)
         return None
 
-    # --- the steps -------------------------------------------------------------------------------------------------------
+    # --- the steps ----------------------------------------------------------------------------------------------------
 
     def _capture_step(self) -> None:
         assert self.request.capture is not None
@@ -463,8 +470,8 @@ class _Pipeline:
         return ", ".join(dict.fromkeys(one.name for one in self.request.models.values())) or None
 
     def _resolve_step(self) -> None:
-        """Take the best capture that a station can take by itself, and diagnose with it again, until no rivals are left or no
-        capture is worth taking."""
+        """Take the best capture that a station can take by itself, and diagnose with it again, until no rivals are left
+        or no capture is worth taking."""
         from lab.diagnose.policy import DecisionPolicy
         from lab.formats.results import Resolution
 
@@ -521,7 +528,8 @@ class _Pipeline:
         self._keep(self.request.goal, ReportFile(path=str(path), results=dict(self._results)))
 
     def _improved(self) -> Mapping[Side, CameraFile]:
-        """The cameras with the effects that the diagnosis names: those it made, that were given with it, or that are kept with it."""
+        """The cameras with the effects that the diagnosis names: those it made, that were given with it, or that are
+        kept with it."""
         if self._examined is not None or self.request.diagnosis is not None or self.store is None:
             return self._examined.improved if self._examined is not None else self.request.improved
         from lab.calibration import camera_models
@@ -582,5 +590,8 @@ class _Ties:
         capture = proposals[0].capture
         rivals = " from ".join(capture.rivals)
         if (capture.side, frozenset(capture.rivals)) in self._open:
-            return f"resolve: the captures that were taken didn't tell {rivals}, and no other that the station takes by itself would"
+            return (
+                f"resolve: the captures that were taken didn't tell {rivals}, and no other that the station takes by "
+                "itself would"
+            )
         return f"resolve: no capture that the station takes by itself would tell {rivals}"

@@ -1,9 +1,9 @@
 """The sides of a recording set at the same time, each in an OS process of its own, as Python computes in one thread at
 a time.
 
-A process is `python -m lab.side_processes`. It receives tasks on standard input, one after the other, and sends progress and
-findings as pickles on standard output. Unlike a pool's worker it needs nothing of the caller's main module, may be started by
-a pool's worker, and ends with the process that started it.
+A process is `python -m lab.side_processes`. It receives tasks on standard input, one after the other, and sends
+progress and findings as pickles on standard output. Unlike a pool's worker it needs nothing of the caller's main
+module, may be started by a pool's worker, and ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ _waiting: ContextVar[list[_Process] | None] = ContextVar("_waiting", default=Non
 
 @contextlib.contextmanager
 def kept_processes() -> Iterator[None]:
-    """Within it, and in its thread, a process that has carried out a task waits for the next one: a start takes about 1.5 s."""
+    """Within it, and in its thread, a process that has carried out a task waits for the next one: a start takes about
+    1.5 s."""
     waiting: list[_Process] = []
     before = _waiting.set(waiting)
     try:
@@ -64,11 +65,12 @@ def kept_processes() -> Iterator[None]:
 def in_processes(
     recordings: RecordingSet, tasks: Mapping[Side, Task[F]], report: Callable[[Side, Any], None], doing: str
 ) -> dict[Side, F]:
-    """The findings of every side. `tasks` are partials of functions that a module has by name; `recordings` are those that they read.
+    """The findings of every side. `tasks` are partials of functions that a module has by name; `recordings` are those
+    that they read.
 
-    `report` is called in the caller's thread with what a task tells. An exception in it, or in a process, ends all processes. `doing`:
-    the command, for messages. Raises InputError where a process was ended from outside, and what a task raises.
-    """
+    `report` is called in the caller's thread with what a task tells. An exception in it, or in a process, ends all
+    processes. `doing`: the command, for messages. Raises InputError where a process was ended from outside, and what a
+    task raises."""
     recordings.let_go()  # every process reads its own frames
     said: queue.SimpleQueue[tuple[Side, Any]] = queue.SimpleQueue()
     found: dict[Side, F] = {}
@@ -106,8 +108,9 @@ class _Process:
         )
 
     def carry_out(self, task: Task[Any], say: Callable[[Any], None]) -> None:
-        """Send the task, and pass on what the process says, its findings last. Raises EOFError, with how it ended, where the process
-        ends before. Does nothing after `end`: an interrupt may end the process while the thread that calls this is being started."""
+        """Send the task, and pass on what the process says, its findings last. Raises EOFError, with how it ended,
+        where the process ends before. Does nothing after `end`: an interrupt may end the process while the thread that
+        calls this is being started."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with self._in_use:
@@ -145,8 +148,8 @@ class _Process:
 
 
 class _Work:
-    """One side's task in a process, and a thread that reads what the process says. Leaving the context ends the process where it isn't
-    kept, and with it what the thread reads."""
+    """One side's task in a process, and a thread that reads what the process says. Leaving the context ends the process
+    where it isn't kept, and with it what the thread reads."""
 
     def __init__(self, side: Side, task: Task[Any], said: queue.SimpleQueue[tuple[Side, Any]], doing: str) -> None:
         self._side, self._task, self._said, self._doing = side, task, said, doing
@@ -181,16 +184,18 @@ class _Work:
             self._process.carry_out(self._task, lambda what: self._said.put((self._side, what)))
         except EOFError as ended:
             self._said.put((self._side, InputError(
-                f"{self._doing}: the process for the {self._side} side ended with {ended}; where memory was short, free about 1 GB a side "
+                f"{self._doing}: the process for the {self._side} side ended with {ended}; where memory was short, "
+                "free about 1 GB a side "
                 "and start again"
             )))  # fmt: skip
 
 
-# --- the process ---------------------------------------------------------------------------------------------------------
+# --- the process ------------------------------------------------------------------------------------------------------
 
 
 def serve() -> None:
-    """Read tasks from standard input until it ends, carry them out, and write progress and findings as pickles to standard output."""
+    """Read tasks from standard input until it ends, carry them out, and write progress and findings as pickles to
+    standard output."""
     with os.fdopen(os.dup(1), "wb") as to:
         os.dup2(2, 1)  # what a library prints goes to standard error
 

@@ -1,8 +1,9 @@
 """Where independent pieces of work are done: in this process, in processes of this computer, or on a Dask cluster.
 
-The cluster is the one of the service's jobs (`lab.jobs`), reached by its scheduler's address. Its workers are processes that have calibench
-installed and see the folders that the work names under the same paths. They do best with one thread each (`dask worker ADDRESS --nthreads 1`): Python
-computes in one at a time, and CPU time and memory are measured by the process.
+The cluster is the one of the service's jobs (`lab.jobs`), reached by its scheduler's address. Its workers are processes
+that have calibench installed and see the folders that the work names under the same paths. They do best with one thread
+each (`dask worker ADDRESS --nthreads 1`): Python computes in one at a time, and CPU time and memory are measured by the
+process.
 """
 
 from __future__ import annotations
@@ -29,14 +30,16 @@ def dask_client(scheduler: str, timeout_s: float) -> Any:
         return Client(scheduler, timeout=timeout_s, set_as_default=False)
     except (OSError, ValueError) as error:  # ValueError: the address isn't one
         raise InputError(
-            f"Dask scheduler {scheduler}: not reached ({error}); start it, or leave --scheduler and CALIBENCH_SCHEDULER out"
+            f"Dask scheduler {scheduler}: not reached ({error}); start it, or leave --scheduler and "
+            "CALIBENCH_SCHEDULER out"
         ) from error
 
 
 @dataclass(frozen=True)
 class Workers:
-    """`jobs` processes of this computer, 1: this one unless it is to be `apart`; or with `scheduler` the workers of a Dask cluster, however many
-    those are. `tick` is called every second while processes of this computer work; what it raises ends them at once."""
+    """`jobs` processes of this computer, 1: this one unless it is to be `apart`; or with `scheduler` the workers of a
+    Dask cluster, however many those are. `tick` is called every second while processes of this computer work; what it
+    raises ends them at once."""
 
     jobs: int = 1
     scheduler: str | None = None
@@ -46,8 +49,8 @@ class Workers:
     def done(self, work: Callable[..., R], items: Sequence[Any], *shared: Any) -> Iterator[tuple[int, R]]:
         """Number and result of `work(item, *shared)` of every item, as they get ready.
 
-        `shared` goes to each worker of a cluster once. An exception of the work ends the rest of it. Raises InputError where no scheduler answers.
-        """
+        `shared` goes to each worker of a cluster once. An exception of the work ends the rest of it. Raises InputError
+        where no scheduler answers."""
         if self.scheduler is not None and items:
             yield from self._on_cluster(self.scheduler, work, items, shared)
         elif not items or (not self.apart and (self.jobs == 1 or len(items) < 2)):

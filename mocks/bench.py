@@ -9,8 +9,8 @@ thread-safe, for each instrument answers in its own thread. Time is virtual: an 
 and takes none, unless `real_time_factor` asks for it.
 
 Frames are the forward model's (`sim.frame`), of the scenes of `mocks.targets`, so that any effect of the library can be
-concealed. Effects of lamp, monochromator, screen and room change the light that reaches the cameras and not what the radiometer
-says; effects of the radiometer (`mocks.conceal.OF_THE_RADIOMETER`) change what it says and not the light.
+concealed. Effects of lamp, monochromator, screen and room change the light that reaches the cameras and not what the
+radiometer says; effects of the radiometer (`mocks.conceal.OF_THE_RADIOMETER`) change what it says and not the light.
 
 What a lab would know of the bench (where a target's corners lie in the frame to within a pixel, what the data sheet
 says) is written to the station file by `station_targets()` and `station_cameras()`. What it wouldn't know, the hidden
@@ -77,7 +77,8 @@ class BenchError(Exception):
 
 
 class Clock:
-    """Seconds since the epoch that only `sleep` moves; `real_time_factor` of each sleep is really slept (0: none, 1: all)."""
+    """Seconds since the epoch that only `sleep` moves; `real_time_factor` of each sleep is really slept (0: none, 1:
+    all)."""
 
     def __init__(self, start_s: float = 1_780_000_000.0, real_time_factor: float = 0.0) -> None:
         self._now_s = start_s
@@ -110,11 +111,11 @@ class Clock:
 class Bench:
     """The light path, the stage and both cameras; see the module's docstring.
 
-    `seed` fixes the hidden truth and the noise; `concealed` replaces what the cameras conceal (default: `mocks.truth.CONCEALED`).
-    `shape` is that of the frames. `warm_up_c`: by how much the sensors get warmer after the bench was switched on.
-    `session_clock` (s) is the one that a session dates its frames with: effects of time follow it; None: the virtual clock.
-    Every public method may be called from any thread. Raises `mocks.conceal.ConcealError` for what it can't show.
-    """
+    `seed` fixes the hidden truth and the noise; `concealed` replaces what the cameras conceal (default:
+    `mocks.truth.CONCEALED`). `shape` is that of the frames. `warm_up_c`: by how much the sensors get warmer after the
+    bench was switched on. `session_clock` (s) is the one that a session dates its frames with: effects of time follow
+    it; None: the virtual clock. Every public method may be called from any thread. Raises `mocks.conceal.ConcealError`
+    for what it can't show."""
 
     def __init__(
         self,
@@ -184,7 +185,8 @@ class Bench:
         return 1.0 + 4e-4 * float(np.sin(2 * np.pi * (at_s - self._started_s) / 2400.0))
 
     def radiance(self) -> Spectrum:
-        """What a spectroradiometer aimed at the target measures (350..1000 nm by 1, W sr^-1 m^-2 nm^-1, with its noise).
+        """What a spectroradiometer aimed at the target measures (350..1000 nm by 1, W sr^-1 m^-2 nm^-1, with its
+        noise).
 
         Of the sphere's port; of a white diffuser beside the chart or board; of the lit half of a knife edge; of the
         screen's centre (a spot of 10 mm); dark under the cap. Noise: 0.15 % of the value and 2e-9 W sr^-1 m^-2 nm^-1.
@@ -229,7 +231,8 @@ class Bench:
             self._placed = name
 
     def show(self, pattern: UInt8Array | None, cell_px: int = 1) -> None:
-        """Show 0/1 cells on the screen (0 dark, anything else lit), each `cell_px` screen pixels square, the whole centred.
+        """Show 0/1 cells on the screen (0 dark, anything else lit), each `cell_px` screen pixels square, the whole
+        centred.
 
         The rest of the screen is dark. None: all dark. One value per screen pixel with `cell_px=1` is what a page that
         paints its canvas pixel by pixel amounts to. Raises `BenchError` if the pattern is larger than the screen.
@@ -242,7 +245,8 @@ class Bench:
             lit = (np.asarray(pattern) != 0).astype(np.uint8)
             if lit.ndim != 2 or lit.shape[0] * cell_px > SCREEN_ROWS or lit.shape[1] * cell_px > SCREEN_COLS:
                 raise BenchError(
-                    f"a pattern of {lit.shape} cells x {cell_px} px doesn't fit the screen of {SCREEN_ROWS} x {SCREEN_COLS} px"
+                    f"a pattern of {lit.shape} cells x {cell_px} px doesn't fit the screen of {SCREEN_ROWS} x "
+                    f"{SCREEN_COLS} px"
                 )
             self._shown = ShownCells(lit, int(cell_px), serial)
 
@@ -265,8 +269,8 @@ class Bench:
         return model.rows, model.cols, model.pixel_pitch_um
 
     def compile_loops(self) -> None:
-        """Those that patterns, charts, moved light and shot noise are drawn with: on a new installation that takes as long as a camera's driver waits
-        for its first frame. No frame changes by it."""
+        """Those that patterns, charts, moved light and shot noise are drawn with: on a new installation that takes as
+        long as a camera's driver waits for its first frame. No frame changes by it."""
         from sim.scene.displace import displace_drawing
 
         square = np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 1.0, 0.0])
@@ -323,7 +327,8 @@ class Bench:
             return max(at_s - self._first_exposure_s, 0.0)
 
     def _seen(self, side: Side) -> tuple[Scene, SceneLight]:
-        """What stands before a camera now, and the electrons a second that its light makes, kept for the scenes seen last."""
+        """What stands before a camera now, and the electrons a second that its light makes, kept for the scenes seen
+        last."""
         with self._lock:
             placed, light, shown = self._placed, self._light, self._shown
         camera = self._truth.cameras[side]

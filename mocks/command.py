@@ -59,7 +59,8 @@ WARMEST_C = 40.0
 
 
 def _mock(module: str, name: str, *identity: Any) -> Callable[[Place], Grammar]:
-    """Makes a mock of the class `name` in `mocks.MODULE`, which is imported only then: `calibench --help` names them all."""
+    """Makes a mock of the class `name` in `mocks.MODULE`, which is imported only then: `calibench --help` names them
+    all."""
     return lambda place: getattr(import_module(f"mocks.{module}"), name)(place, *identity)
 
 
@@ -216,7 +217,8 @@ def _lit(bench: Bench) -> Bench:
 
 
 def _serve_tethered(folder: Path, real_time: float, stop: threading.Event, faults: tuple[Fault, ...]) -> None:
-    """Write pictures into a folder until `stop`; says the driver's settings as lines of a station file, then `ready`."""
+    """Write pictures into a folder until `stop`; says the driver's settings as lines of a station file, then
+    `ready`."""
     from mocks.bench import Bench
     from mocks.tethered import TetheredCamera
 
@@ -283,7 +285,8 @@ def bench(
     conceal: Annotated[
         list[str] | None,
         typer.Option(
-            help="SIDE:EFFECT:PARAMETER=VALUE[,...], as in left:nonlinearity:quadratic_percent=2, in place of the bench's "
+            help="SIDE:EFFECT:PARAMETER=VALUE[,...], as in left:nonlinearity:quadratic_percent=2, in place of the "
+            "bench's "
             "default effects; may be repeated (or CALIBENCH_CONCEAL, with a ; between)."
         ),
     ] = None,

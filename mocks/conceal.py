@@ -3,8 +3,8 @@
     left:nonlinearity:quadratic_percent=2
     both:source_drift:drift_percent_per_min=0.5,settling_min=8
 
-Effects on the light (lamp, monochromator, radiometer, screen, room, pair) act on both sides, as both cameras stand at one rig.
-"""
+Effects on the light (lamp, monochromator, radiometer, screen, room, pair) act on both sides, as both cameras stand at
+one rig."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ class ConcealError(ValueError):
 
 
 def parse(specs: Iterable[str]) -> Concealed:
-    """Effects by side. Raises `ConcealError` that names the effect, the parameter or the limit, and what may be chosen."""
+    """Effects by side. Raises `ConcealError` that names the effect, the parameter or the limit, and what may be
+    chosen."""
     found: dict[Side, tuple[Effect, ...]] = {"left": (), "right": ()}
     for spec in specs:
         sides, effect = _parsed(spec.strip())
@@ -96,7 +97,10 @@ def _made(spec: str, kind: type[Effect], text: str) -> Effect:
         said = str(first["msg"]).removeprefix("Value error, ")
         if field in quantities and not said.startswith(quantities[field].meaning):
             unit = quantities[field].unit
-            said = f"{values[field]!r} is no number; give one{'' if unit == '1' else f', which is in {unit}'}, without a unit"
+            said = (
+                f"{values[field]!r} is no number; give one{'' if unit == '1' else f', which is in {unit}'}, without a "
+                "unit"
+            )
         raise ConcealError(f"--conceal {spec}: {kind.name} {field}: {said}") from None
     if effect == kind():
         raise ConcealError(f"--conceal {spec}: nothing of {kind.name} would be there; give a value of {known}")
@@ -118,7 +122,8 @@ def _is_one_value(annotation: Any) -> bool:
 
 
 def check(concealed: Concealed) -> None:
-    """Raises `ConcealError` for effects that the bench can't show, and for effects of the rig that differ from side to side."""
+    """Raises `ConcealError` for effects that the bench can't show, and for effects of the rig that differ from side to
+    side."""
     rig = {side: [effect for effect in concealed.get(side, ()) if "light" in effect.stages()] for side in SIDES}
     if rig["left"] != rig["right"]:
         names = sorted({effect.name for side in SIDES for effect in rig[side]})

@@ -1,8 +1,8 @@
 """A Cornerstone 260B on its RS-232 port, which differs from a Cornerstone 260 in what its clients trip over.
 
-The handshake byte comes on receipt, not on arrival; motions overlap, and queries are answered while they last; `IDLE?` tells whether one
-does; the echo may be off; a line ends with CR LF, an LF alone doesn't end it; no error 7. Source: Newport, MCS260B manual, p. 43-46, 62.
-"""
+The handshake byte comes on receipt, not on arrival; motions overlap, and queries are answered while they last; `IDLE?`
+tells whether one does; the echo may be off; a line ends with CR LF, an LF alone doesn't end it; no error 7. Source:
+Newport, MCS260B manual, p. 43-46, 62."""
 
 from __future__ import annotations
 

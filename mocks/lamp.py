@@ -1,4 +1,5 @@
-"""Light for a mock that stands alone, without a bench: a lamp that a radiometer can look at, and what the eye makes of it."""
+"""Light for a mock that stands alone, without a bench: a lamp that a radiometer can look at, and what the eye makes of
+it."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ class LampClock:
 
 
 class Lamp:
-    """A standing lamp (CIE illuminant A, 2856 K) on a white surface of `luminance_cd_m2`; it doesn't heed a monochromator."""
+    """A standing lamp (CIE illuminant A, 2856 K) on a white surface of `luminance_cd_m2`; it doesn't heed a
+    monochromator."""
 
     def __init__(self, luminance_cd_m2: float = 100.0, clock: MockClock | None = None) -> None:
         wavelength_nm = np.arange(340.0, 1100.5, 1.0)
@@ -83,7 +85,8 @@ def _colour_matching(first_nm: float, last_nm: float) -> FloatArray:
 
 
 def tristimulus(radiance: Spectrum) -> tuple[float, float, float]:
-    """X, Y, Z (CIE 1931, Y in cd/m2) of a spectral radiance in W sr^-1 m^-2 nm^-1: 683 x sum of L times each function."""
+    """X, Y, Z (CIE 1931, Y in cd/m2) of a spectral radiance in W sr^-1 m^-2 nm^-1: 683 x sum of L times each
+    function."""
     light = radiance.at(np.arange(360.0, 830.5, 1.0))
     x, y, z = (LUMINOUS_EFFICACY_LM_PER_W * float(np.sum(light * row)) for row in _colour_matching(360.0, 830.0))
     return x, y, z

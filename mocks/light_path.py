@@ -39,8 +39,8 @@ class LightSettings:
 def lamp_radiance(wavelength_nm: FloatArray, temperature_k: float = 3050.0) -> FloatArray:
     """Radiance (W sr^-1 m^-2 nm^-1) of the sphere's port in zero order with all filters out: a tungsten-halogen lamp.
 
-    Planck's law with the emissivity of tungsten falling from 0.47 to 0.33, behind glass that is opaque below 385 nm and a
-    heat filter that is opaque above 730 nm (half-way points), scaled to 0.03 at 560 nm.
+    Planck's law with the emissivity of tungsten falling from 0.47 to 0.33, behind glass that is opaque below 385 nm and
+    a heat filter that is opaque above 730 nm (half-way points), scaled to 0.03 at 560 nm.
     """
 
     def shape(w: FloatArray) -> FloatArray:
@@ -77,7 +77,8 @@ def filter_transmittance(place: int, wavelength_nm: FloatArray) -> FloatArray:
 
 
 def slit_function(wavelength_nm: FloatArray, centre_nm: float, fwhm_nm: float) -> FloatArray:
-    """Transmittance (1 at the centre) of equal entrance and exit slits: a triangle, rounded by aberrations to sigma 0.25 nm."""
+    """Transmittance (1 at the centre) of equal entrance and exit slits: a triangle, rounded by aberrations to sigma
+    0.25 nm."""
     w = np.asarray(wavelength_nm, float)
     offsets = np.linspace(-0.75, 0.75, 13)
     weights = np.exp(-0.5 * (offsets / 0.25) ** 2)

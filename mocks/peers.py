@@ -278,7 +278,8 @@ class EmulatedBasler(RealInstrument):
 
 
 class VikyCamera(RealInstrument):
-    """The first of the three cameras of GenICam's own GenTL producer, described as one that can be triggered (`viky.xml`).
+    """The first of the three cameras of GenICam's own GenTL producer, described as one that can be triggered
+    (`viky.xml`).
 
     The package `genicam` brings the producer. It can't be silenced or unplugged.
     """
@@ -295,7 +296,8 @@ class VikyCamera(RealInstrument):
 
 
 class AravisFakeCamera(Peer):
-    """The fake GigE camera of the package aravis-tools, a process of its own, on loopback; one at a time on this computer."""
+    """The fake GigE camera of the package aravis-tools, a process of its own, on loopback; one at a time on this
+    computer."""
 
     program = "arv-fake-gv-camera-0.8"
 

@@ -2,8 +2,8 @@
 
 Nothing is answered until the characters PHOTO have come, in whatever pieces and with whatever line end, or none; Q
 leaves remote mode at once. Commands end CR or LF, a pair of them counts once. Answers end CR LF and begin with a
-quality code, 00000 if all is well. Data codes as in the maker's table. Before a spectrum stand two lines, or by the manual (p. 127)
-one of five fields, with three-digit exponents: `dialect` chooses.
+quality code, 00000 if all is well. Data codes as in the maker's table. Before a spectrum stand two lines, or by the
+manual (p. 127) one of five fields, with three-digit exponents: `dialect` chooses.
 """
 
 from __future__ import annotations

@@ -55,7 +55,8 @@ class ReadyFrames:
             shapes = {frame.shape for frame in some}
             if len(shapes) > 1 or any(len(shape) != 2 or shape[0] % 2 or shape[1] % 2 for shape in shapes):
                 raise ValueError(
-                    f"frames of the {side} camera have the shapes {', '.join(map(str, sorted(shapes)))}; one even size is needed"
+                    f"frames of the {side} camera have the shapes {', '.join(map(str, sorted(shapes)))}; one even "
+                    "size is needed"
                 )
             if any(frame.dtype != np.uint16 or int(frame.max()) > 4095 for frame in some):
                 raise ValueError(f"frames of the {side} camera aren't uint16 of 12 bits; replay others")
@@ -65,7 +66,8 @@ class ReadyFrames:
 
     @classmethod
     def of_folder(cls, folder: Path, sides: Sequence[Side]) -> ReadyFrames:
-        """The frames `*-left.npy` and `*-right.npy` of a folder (a session's `frames`), by name. Raises ValueError, one line."""
+        """The frames `*-left.npy` and `*-right.npy` of a folder (a session's `frames`), by name. Raises ValueError, one
+        line."""
         found: dict[Side, list[UInt16Array]] = {}
         for side in sides:
             found[side] = []

@@ -1,7 +1,7 @@
 """The targets before the cameras, as scenes of the forward model; and where a lab would expect them in the frames.
 
-A target is flat and stands at a `Pose` in the rig's frame; each camera sees it in perspective and through its lens's distortion.
-"""
+A target is flat and stands at a `Pose` in the rig's frame; each camera sees it in perspective and through its lens's
+distortion."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ BLADE_REFLECTANCE, SCREEN_BLACK, BOARD_BLACK, BOARD_WHITE = 0.02, 0.0015, 0.04, 
 #: The ColorChecker: distance of neighbouring patches, and the share of it that is frame.
 CHART_PITCH_MM, CHART_GAP = 36.0, 0.13
 
-#: Knife-edge targets: nominal angle of the edge from the vertical; each has an edge in three places of the field, [rows, columns]
-#: from its centre in heights of the frame.
+#: Knife-edge targets: nominal angle of the edge from the vertical; each has an edge in three places of the field,
+#: [rows, columns] from its centre in heights of the frame.
 EDGE_ANGLES_DEG = {"edge-1": 5.2, "edge-2": 94.8, "edge-3": 41.0, "edge-4": -37.0}
 EDGE_PLACES = {"centre": (0.0, 0.0), "mid": (-110.0 / 480, -165.0 / 480), "corner": (158.0 / 480, 228.0 / 480)}
 EDGE_REGION_PX = 120
@@ -175,8 +175,8 @@ def _edges(name: str, camera: HiddenCamera) -> tuple[PlaneEdge, ...]:
 def scene(camera: HiddenCamera, placed: str, light: LightSettings, shown: ShownCells) -> Scene:
     """What one camera sees of a target: its light is what the lamp and the monochromator give when nothing is wrong.
 
-    First-order light is of the kind "narrowband" on every target: what goes wrong in a monochromator does so whatever it lights.
-    """
+    First-order light is of the kind "narrowband" on every target: what goes wrong in a monochromator does so whatever
+    it lights."""
     if placed == "cap":
         return Darkness()
     if placed == "screen":
@@ -226,12 +226,12 @@ def corners_px(warp: Warp, width: float, height: float) -> FloatArray:
     return np.stack([row, col], axis=1)
 
 
-# --- what a lab knows -----------------------------------------------------------------------------------------------------
+# --- what a lab knows -------------------------------------------------------------------------------------------------
 
 
 def station_targets(cameras: Mapping[Side, HiddenCamera]) -> dict[str, Any]:
-    """Nominal layout of the targets in the frames, for the station file's `[targets]`: as good as a hand that places them
-    and an eye that reads them off a first picture (corners to half a pixel, regions to the pixel). Keys by target:
+    """Nominal layout of the targets in the frames, for the station file's `[targets]`: as good as a hand that places
+    them and an eye that reads them off a first picture (corners to half a pixel, regions to the pixel). Keys by target:
 
     - all: `kind` ("cap" "sphere" "colorchecker" "slanted_edge" "screen" "charuco")
     - colorchecker: `chart`; `[targets.colorchecker.left]` `corners` (4 x [row, col], as in the recording set)

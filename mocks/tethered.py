@@ -39,7 +39,8 @@ def write_dng(file: Path, raw: UInt16Array, exposure_s: float) -> None:
 
 
 class TetheredCamera:
-    """The camera and its software, on a thread of its own from `start` to `close`; it begins with one picture in the folder."""
+    """The camera and its software, on a thread of its own from `start` to `close`; it begins with one picture in the
+    folder."""
 
     def __init__(self, folder: Path, bench: Bench | None = None, side: Side = "left") -> None:
         self.folder = folder
@@ -63,7 +64,8 @@ class TetheredCamera:
         self._thread.start()
 
     def fail(self, faults: tuple[Fault, ...]) -> None:
-        """Break the pictures to come, counted from the next one: `late`, `never`, `half`, `wrong`, or the folder gone (`unplug`)."""
+        """Break the pictures to come, counted from the next one: `late`, `never`, `half`, `wrong`, or the folder gone
+        (`unplug`)."""
         self._faults = deque(faults)
         self._pictures = 0
 

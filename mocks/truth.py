@@ -1,10 +1,10 @@
 """The hidden truth of the mock bench: what its cameras really are. Known to the bench and to tests, never on a wire.
 
-Each camera does what its data sheet says to within a smooth few per cent. By default the left one conceals two pieces of physics
-that a first model leaves out: a birefringent anti-alias filter and an infrared-cut filter; the right one conceals none. Beyond
-that there is a little of what no model of ours has (the filter's dispersion, pattern noise of neighbours that is a
-little alike), at levels that don't matter. A bench that is told what to conceal conceals that, and nothing else.
-"""
+Each camera does what its data sheet says to within a smooth few per cent. By default the left one conceals two pieces
+of physics that a first model leaves out: a birefringent anti-alias filter and an infrared-cut filter; the right one
+conceals none. Beyond that there is a little of what no model of ours has (the filter's dispersion, pattern noise of
+neighbours that is a little alike), at levels that don't matter. A bench that is told what to conceal conceals that, and
+nothing else."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ SELF_HEATING_C: dict[Side, float] = {"left": 8.0, "right": 7.8}
 
 
 class DispersingLowPassFilter(OpticalLowPassFilter):
-    """The anti-alias filter with quartz's dispersion: its displacement is as stated at 589 nm and 4 % more at 440 nm."""
+    """The anti-alias filter with quartz's dispersion: its displacement is as stated at 589 nm and 4 % more at 440
+    nm."""
 
     def on_image(self, image: Image) -> Image:
         split = image_of(image.camera, (OpticalLowPassFilter(**dict(self)),)).transfer
@@ -70,8 +71,8 @@ class RipplingInfraredCutFilter(InfraredCutFilter):
 class HiddenCamera:
     """One camera: model and concealed effects, its pixels' pattern, where it stands, and what its maker says.
 
-    A point X of the rig's frame (mm; origin amid the cameras, z forward) is `rotation` (X - `centre_mm`) in the camera's.
-    """
+    A point X of the rig's frame (mm; origin amid the cameras, z forward) is `rotation` (X - `centre_mm`) in the
+    camera's."""
 
     model: CameraModel
     effects: tuple[Effect, ...]
@@ -125,7 +126,8 @@ def _efficiency(w: FloatArray) -> dict[str, FloatArray]:
 
 
 def _true_efficiency(rng: np.random.Generator) -> dict[str, Spectrum]:
-    """The maker's curves, off by a scale of 2 %, a tilt of 1.5 % and a bend of 0.5 % (one sd each), on 1 nm up to 1000 nm."""
+    """The maker's curves, off by a scale of 2 %, a tilt of 1.5 % and a bend of 0.5 % (one sd each), on 1 nm up to 1000
+    nm."""
     w = np.arange(370.0, 1000.1, 1.0)
     x = (w - 560.0) / 180.0
     curves = {}
@@ -140,8 +142,8 @@ def _true_efficiency(rng: np.random.Generator) -> dict[str, Spectrum]:
 def _pattern(
     rng: np.random.Generator, shape: tuple[int, int], prnu_percent: float, dsnu_e: float, white: bool
 ) -> FixedPattern:
-    """Pattern noise with the stated standard deviations. White, as the data sheet's figures mean it, or with a tenth of the PRNU's
-    variance shared by neighbours and a fiftieth of the DSNU's by columns."""
+    """Pattern noise with the stated standard deviations. White, as the data sheet's figures mean it, or with a tenth of
+    the PRNU's variance shared by neighbours and a fiftieth of the DSNU's by columns."""
     own, shared = rng.standard_normal(shape), ndimage.gaussian_filter(rng.standard_normal(shape), 1.0, mode="wrap")
     dark, columns = rng.standard_normal(shape), rng.standard_normal((1, shape[1]))
     prnu = own if white else np.sqrt(0.9) * own + np.sqrt(0.1) * shared / shared.std()
@@ -257,8 +259,9 @@ CONCEALED: Concealed = {
 
 
 def hidden_truth(seed: int = 1, concealed: Concealed | None = None, shape: tuple[int, int] = (ROWS, COLS)) -> Truth:
-    """The truth of a seed. `concealed` None: `CONCEALED`, and structure in the pixels' patterns; else that alone, in cameras that are
-    otherwise the same. `shape`: rows and columns of the frames; the same lens before a smaller sensor sees less.
+    """The truth of a seed. `concealed` None: `CONCEALED`, and structure in the pixels' patterns; else that alone, in
+    cameras that are otherwise the same. `shape`: rows and columns of the frames; the same lens before a smaller sensor
+    sees less.
 
     Raises `mocks.conceal.ConcealError` for what the bench can't show.
     """

@@ -154,7 +154,8 @@ def _float_bits(value: float) -> int:
 
 
 class TriggerLine:
-    """The wire that runs from each camera's Line1 to the others' Line0; a pulse goes out where Line1 is told to follow the exposure."""
+    """The wire that runs from each camera's Line1 to the others' Line0; a pulse goes out where Line1 is told to follow
+    the exposure."""
 
     def __init__(self) -> None:
         self._devices: list[U3vDevice] = []
@@ -559,7 +560,8 @@ class U3vDevice(UsbDevice):
                     self._acquiring = False
 
     def _processed(self, raw: UInt16Array) -> UInt16Array:
-        """What the camera makes of the converter's codes: channel by channel times its white balance and its preset for the light."""
+        """What the camera makes of the converter's codes: channel by channel times its white balance and its preset for
+        the light."""
         if self._get(TEST_PATTERN):
             ramp = np.linspace(0.0, _MOST_CODE, raw.shape[1]).astype(np.uint16)
             return np.ascontiguousarray(np.broadcast_to(ramp, raw.shape))

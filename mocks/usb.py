@@ -2,8 +2,8 @@
 
 `backend("u3v")` is an `IBackend` with a camera plugged in, `"u3v-stereo"` one with two that trigger one another,
 `"cornerstone260b"` one with a monochromator, `"usb2000plus"` one with a spectrometer.
-`serve_usbip(devices, host, port)` exports the same device models by the real USB/IP protocol: to `drivers.usbip`, and to
-Linux's own `usbip attach` alike.
+`serve_usbip(devices, host, port)` exports the same device models by the real USB/IP protocol: to `drivers.usbip`, and
+to Linux's own `usbip attach` alike.
 
 Source: Linux kernel, Documentation/usb/usbip_protocol.rst (protocol version 1.1.1).
 """
@@ -61,7 +61,8 @@ def devices(name: str, bench: BeforeCameras | MeasuredLight | None = None) -> tu
 
 
 def backend(name: str, bench: Bench | None = None) -> InProcessBackend:
-    """A pyusb backend with that instrument plugged in (`u3v`, `u3v-stereo`, `cornerstone260b`, `usb2000plus`); `.plugged_in` are its device models."""
+    """A pyusb backend with that instrument plugged in (`u3v`, `u3v-stereo`, `cornerstone260b`, `usb2000plus`);
+    `.plugged_in` are its device models."""
     return InProcessBackend(devices(name, bench))
 
 
@@ -137,7 +138,8 @@ class _ReceivedUrb:
 
 
 class _Session:
-    """One imported device on one connection: a thread reads requests, one thread an endpoint works them off in order."""
+    """One imported device on one connection: a thread reads requests, one thread an endpoint works them off in
+    order."""
 
     def __init__(self, connection: socket.socket, device: UsbDevice) -> None:
         self._connection = connection
@@ -203,7 +205,8 @@ class _Session:
                 status = fault.status
             with self._lock:
                 self._pending.pop(urb.number, None)
-                # A request that ended before it could be cancelled is answered: what it took from the device would be lost.
+                # A request that ended before it could be cancelled is answered: what it took from the device would be
+                # lost.
                 if not abandoned:
                     count = len(came) if urb.data is None else len(urb.data) * (status == 0)
                     self._send(
@@ -348,5 +351,6 @@ class UsbIpServer:
 
 
 def serve_usbip(exported: Sequence[UsbDevice], host: str = "127.0.0.1", port: int = 0) -> UsbIpServer:
-    """Export devices over USB/IP; returns the running server (`.address`, `.url(serial_number)`, `.close()`). Port 0: any."""
+    """Export devices over USB/IP; returns the running server (`.address`, `.url(serial_number)`, `.close()`). Port 0:
+    any."""
     return UsbIpServer(exported, host, port)

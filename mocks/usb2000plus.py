@@ -1,11 +1,11 @@
 """An Ocean Optics USB2000+ on USB: a fibre spectrometer of 2048 pixels that gives raw counts, by the OOI commands.
 
-What it sees is the bench's radiance through a slit of 1.5 nm and its own response, with dark counts, noise, a full scale and
-a bend of the response; EEPROM slots hold what the maker measured of these. The response itself is in no slot: it is a
-calibration file's (`calibration_csv`), as it is for the instrument.
+What it sees is the bench's radiance through a slit of 1.5 nm and its own response, with dark counts, noise, a full
+scale and a bend of the response; EEPROM slots hold what the maker measured of these. The response itself is in no slot:
+it is a calibration file's (`calibration_csv`), as it is for the instrument.
 
-Source: Ocean Optics, USB2000+ data sheet (command list, EEPROM slots, status packet, spectrum packet with sync byte 0x69).
-"""
+Source: Ocean Optics, USB2000+ data sheet (command list, EEPROM slots, status packet, spectrum packet with sync byte
+0x69)."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def response(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
 def calibration_csv(departure_percent: float = 0.0) -> str:
     """The calibration that a laboratory would have sent with the instrument, as its driver reads it.
 
-    `departure_percent`: by how much it is off, smoothly over the spectrum; real ones are good to about 2 % (half of the expanded
-    uncertainty that calibration laboratories state for spectral radiance).
+    `departure_percent`: by how much it is off, smoothly over the spectrum; real ones are good to about 2 % (half of the
+    expanded uncertainty that calibration laboratories state for spectral radiance).
     """
     at = np.arange(350.0, 1001.0, 2.0)
     told = response(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 90.0))
@@ -104,7 +104,8 @@ class MockUsb2000Plus(UsbDevice):
         elif code == 0xFE:
             ready = len(self._queues[SPECTRUM_IN])
             status = struct.pack(
-                "<HIBBBBBBBBBB", PIXELS, self.integration_us, 0, self.trigger_mode, int(ready > 0), 8, 0, 8 * ready, 0, 0, 0x80, 0
+                "<HIBBBBBBBBBB", PIXELS, self.integration_us, 0, self.trigger_mode, int(ready > 0), 8, 0, 8 * ready, 0,
+                0, 0x80, 0
             )  # fmt: skip
             self._say(ANSWER_IN, status)
 

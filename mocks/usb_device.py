@@ -228,7 +228,8 @@ class UsbDevice:
     # --- faults -------------------------------------------------------------------------------------------------------
 
     def fail(self, faults: Iterable[Fault]) -> None:
-        """Break answers, which count from 1, as serial instruments' answers break; a camera's answers are its frames."""
+        """Break answers, which count from 1, as serial instruments' answers break; a camera's answers are its
+        frames."""
         self._line_faults = FaultPlan(faults)
         self.answers = 0
 

@@ -1,4 +1,5 @@
-"""What all mock instruments share: a grammar (bytes in, bytes out), faults on its answers, and the line it is served on.
+"""What all mock instruments share: a grammar (bytes in, bytes out), faults on its answers, and the line it is served
+on.
 
 A grammar is pure: it touches no file and no clock of its own. It says what an instrument answers at once (`receive`),
 and what it says by itself once time has passed (`wait_s`, `elapse`). `FaultyLine` lets it fail as instruments fail,
@@ -43,7 +44,8 @@ class MockClock(Protocol):
 
 
 class MeasuredLight(Protocol):
-    """What the optical instruments do to a light path, and see of it: `mocks.bench.Bench`, or `mocks.lamp.Lamp` alone."""
+    """What the optical instruments do to a light path, and see of it: `mocks.bench.Bench`, or `mocks.lamp.Lamp`
+    alone."""
 
     @property
     def clock(self) -> MockClock: ...
@@ -102,7 +104,8 @@ class Grammar(ABC):
 # --- faults ---------------------------------------------------------------------------------------------------------
 
 KINDS = ("late", "never", "half", "wrong", "error", "drop", "unplug")
-#: What only a camera's frames do: one comes torn, one comes twice, a trigger isn't heard. `never` is a frame that is dropped.
+#: What only a camera's frames do: one comes torn, one comes twice, a trigger isn't heard. `never` is a frame that is
+#: dropped.
 FRAME_KINDS = ("torn", "repeated", "missed")
 
 
@@ -114,8 +117,8 @@ class FaultSpecError(ValueError):
 class Fault:
     """One way to fail, at the N-th answer (`at`, from 1), or from there on (`onwards`).
 
-    `value`: real seconds for `late` (3 if not said) and `unplug` (1), the instrument's code for `error` (its usual one).
-    """
+    `value`: real seconds for `late` (3 if not said) and `unplug` (1), the instrument's code for `error` (its usual
+    one)."""
 
     kind: str
     at: int = 1
@@ -148,7 +151,8 @@ class FaultPlan:
 
 
 def parse_faults(spec: str, frames: bool = False) -> tuple[Fault, ...]:
-    """Faults from `KIND[=VALUE][@N[+]]`, several with commas: `half@3`, `late=5@2`, `error=120@1+`. `frames`: those of a camera, too.
+    """Faults from `KIND[=VALUE][@N[+]]`, several with commas: `half@3`, `late=5@2`, `error=120@1+`. `frames`: those of
+    a camera, too.
 
     Raises `FaultSpecError`.
     """
@@ -297,7 +301,8 @@ class Pty(Endpoint):
             except OSError as error:
                 self.close()
                 raise AddressError(
-                    f"--link {self.link}: can't become a link ({error.strerror}); give a path that isn't a file, in a folder that is there"
+                    f"--link {self.link}: can't become a link ({error.strerror}); give a path that isn't a file, in a "
+                    "folder that is there"
                 ) from error
 
     @property

@@ -1,7 +1,7 @@
 """Compile what a new installation would compile at first use, into the packages' `__pycache__`.
 
-The modules, and the loops of drawing, fitting and tracing. It takes a quarter of a minute; a first session, and processes that begin
-beside each other, find it done.
+The modules, and the loops of drawing, fitting and tracing. It takes a quarter of a minute; a first session, and
+processes that begin beside each other, find it done.
 """
 
 from __future__ import annotations

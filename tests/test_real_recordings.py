@@ -58,7 +58,8 @@ def _result(
     return SetResult(
         state="", cpu_s=cpu_s, memory_mb=400.0, verdict="explained", figures=(_figure(pull),), measurements=(measured,),
         names=tuple(
-            JudgedName(name=n, sides=("left",), probability=1.0, law="exact", is_right="contradicted", why="") for n in names
+            JudgedName(name=n, sides=("left",), probability=1.0, law="exact", is_right="contradicted",
+            why="") for n in names
         ),
         before=500.0, after=after, n=50,
     )  # fmt: skip
@@ -121,8 +122,12 @@ figures = [{ name = "green at 500 nm", at = "spectral.relative_sensitivity.Y.@50
 
 
 def test_a_named_folder_is_taken_through_once_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A flat sensor of which an independent look says so, and then something else: the second fails without running again."""
-    rows = [f"narrowband,{nm},10,0.1,{64 + 1000 * nm / 550:.3f},1,{1e-6 * 0.0005 * nm:.6g},{0.0005 * nm:g}" for nm in range(400, 701, 20)]  # fmt: skip
+    """A flat sensor of which an independent look says so, and then something else: the second fails without running
+    again."""
+    rows = [
+        f"narrowband,{nm},10,0.1,{64 + 1000 * nm / 550:.3f},1,{1e-6 * 0.0005 * nm:.6g},{0.0005 * nm:g}"
+        for nm in range(400, 701, 20)
+    ]
     one = tmp_path / "sets" / "mine"
     one.mkdir(parents=True)
     (one / "means.csv").write_text(SWEEP + "\n".join(rows) + "\n", encoding="utf-8")

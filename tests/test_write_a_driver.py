@@ -1,4 +1,5 @@
-"""docs/write-a-driver.md, followed to the letter: its files make a package whose own tests, the contract among them, pass."""
+"""docs/write-a-driver.md, followed to the letter: its files make a package whose own tests, the contract among them,
+pass."""
 
 from __future__ import annotations
 

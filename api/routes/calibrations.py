@@ -38,8 +38,8 @@ def list_calibrations(
 
 @router.get("/calibrations/{calibration_id}", dependencies=[READ], responses=answers(401, 404, 422))
 def get_calibration(service: Here, calibration_id: HexId) -> CalibrationRecord:
-    """One calibration. `judgements` of a candidate are by the limits of the data folder (`limits.toml`), where it has some; those of
-    another are as it was certified."""
+    """One calibration. `judgements` of a candidate are by the limits of the data folder (`limits.toml`), where it has
+    some; those of another are as it was certified."""
     found = _known(service, calibration_id)
     standing = standing_limits(service.store.root) if found.limits is None else None
     if standing is None:
@@ -55,8 +55,9 @@ def certify_calibration(
     asked: Certify,
     key: Annotated[StoredKey, Depends(Demand(Permission.CALIBRATE))],
 ) -> CalibrationRecord:
-    """Certify a candidate against limits, by the holder of the key; what the same cameras had before is superseded. 422, with a
-    reason for each, where figures are bad or missing, or in the warning band and that isn't accepted; 409 for what is no candidate."""
+    """Certify a candidate against limits, by the holder of the key; what the same cameras had before is superseded.
+    422, with a reason for each, where figures are bad or missing, or in the warning band and that isn't accepted; 409
+    for what is no candidate."""
     found = _known(service, calibration_id)
     if found.state != "candidate":
         raise Conflict(f"calibration {calibration_id} is {found.state}; only a candidate can be certified")
@@ -82,7 +83,8 @@ def figure_history(
     figure: Annotated[str, Query(max_length=200)],
     place: Annotated[str, Query(max_length=60, description="of a figure of several numbers: which")] = "",
 ) -> History:
-    """A figure of a camera over all its calibrations, oldest first: its band, and whether it drifted from the certified one before."""
+    """A figure of a camera over all its calibrations, oldest first: its band, and whether it drifted from the certified
+    one before."""
     limits = standing_limits(service.store.root)
     try:
         return life.history(service.store, camera, figure, place, limits)

@@ -28,7 +28,7 @@ from lab.report.compare import render_comparison
 router = APIRouter(tags=["calibrations"])
 
 
-# --- camera models -----------------------------------------------------------------------------------------------------
+# --- camera models ----------------------------------------------------------------------------------------------------
 
 
 def _fields(service: Service, record: CameraModelRecord) -> CameraModels:
@@ -53,8 +53,8 @@ def _whole(service: Service, model_id: str) -> CameraModels:
 def list_camera_models(
     service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
 ) -> list[CameraModels]:
-    """The camera models of fits (`fitted`), of diagnoses (`improved`: with the effects that were named), and those that were sent in (`sent`), the
-    newest first, in pages. `sides` is empty for results from before models were kept."""
+    """The camera models of fits (`fitted`), of diagnoses (`improved`: with the effects that were named), and those that
+    were sent in (`sent`), the newest first, in pages. `sides` is empty for results from before models were kept."""
     found = camera_models.records(service.store, after, limit)
     page_headers(request, response, camera_models.count(service.store), limit, [one.id for one in found])
     return [_fields(service, one) for one in found]
@@ -68,8 +68,9 @@ def list_camera_models(
     openapi_extra=BODY,
 )
 async def send_camera_model(service: Here, request: Request, response: Response) -> CameraModels:
-    """Send in camera files, left.toml or right.toml or both, with the arrays that they name beside them, as a .zip, .tar or .tar.gz. Each is read
-    completely before it is kept. A traced lens is sent as its table, for no lens is traced here."""
+    """Send in camera files, left.toml or right.toml or both, with the arrays that they name beside them, as a .zip,
+    .tar or .tar.gz. Each is read completely before it is kept. A traced lens is sent as its table, for no lens is
+    traced here."""
     async with arrived(service, request, service.limits.model_bytes) as came:
         found = await asyncio.to_thread(take_cameras, came.place, came.archive, service.limits.model_bytes)
         id = await asyncio.to_thread(camera_models.bring_in, service.store, found)
@@ -79,7 +80,8 @@ async def send_camera_model(service: Here, request: Request, response: Response)
 
 @router.get("/camera-models/{model_id}", dependencies=[READ], responses=answers(401, 404, 422))
 def get_camera_model(service: Here, model_id: HexId) -> CameraModels:
-    """One camera model: the parameters of each camera with unit and meaning, what is known of their uncertainty, and the effects that act."""
+    """One camera model: the parameters of each camera with unit and meaning, what is known of their uncertainty, and
+    the effects that act."""
     return _whole(service, model_id)
 
 
@@ -87,7 +89,8 @@ def get_camera_model(service: Here, model_id: HexId) -> CameraModels:
     "/camera-models/{model_id}", status_code=204, dependencies=[CALIBRATE], responses=answers(401, 403, 404, 409, 422)
 )
 def delete_camera_model(service: Here, model_id: HexId) -> None:
-    """Delete a camera model that was sent in, for ever. 409 for one that a fit or a diagnosis found: it is part of that result."""
+    """Delete a camera model that was sent in, for ever. 409 for one that a fit or a diagnosis found: it is part of that
+    result."""
     camera_model(service, model_id)
     try:
         camera_models.remove(service.store, model_id)
@@ -102,8 +105,8 @@ def delete_camera_model(service: Here, model_id: HexId) -> None:
     responses=answers(401, 404, 409, 422) | ARCHIVE,
 )
 def camera_model_archive(service: Here, model_id: HexId, form: Form) -> Response:
-    """Its camera files, SIDE.toml with the arrays beside them, as `calibench simulate --camera` and `--model` take them. 409 where none were
-    kept."""
+    """Its camera files, SIDE.toml with the arrays beside them, as `calibench simulate --camera` and `--model` take
+    them. 409 where none were kept."""
     record = camera_model(service, model_id)
     if not record.sides:
         raise Conflict(f"camera model {model_id}: no camera file was kept; fit again")
@@ -111,7 +114,7 @@ def camera_model_archive(service: Here, model_id: HexId, form: Form) -> Response
     return sent(packed(((file.name, file.read_bytes()) for file in files), form), f"camera-{model_id}", form)
 
 
-# --- comparisons -------------------------------------------------------------------------------------------------------
+# --- comparisons ------------------------------------------------------------------------------------------------------
 
 Source = Annotated[
     str,

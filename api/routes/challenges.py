@@ -1,4 +1,5 @@
-"""Challenges: recording sets of cameras that conceal something, made and scored by jobs. Their truths are sealed until they are scored."""
+"""Challenges: recording sets of cameras that conceal something, made and scored by jobs. Their truths are sealed until
+they are scored."""
 
 from __future__ import annotations
 
@@ -35,8 +36,8 @@ def _known(service: Service, challenge_id: str) -> KeptChallenge:
 
 @router.post("/challenges", status_code=202, dependencies=[CALIBRATE], responses=answers(401, 403, 422))
 def make_challenge(service: Here, start: ChallengeStart, response: Response) -> Job:
-    """Make a challenge, as `calibench challenge make` does, in processes of their own; the job's `challenge_id` is the challenge. Its seed is
-    drawn by the service, and sealed with the truths."""
+    """Make a challenge, as `calibench challenge make` does, in processes of their own; the job's `challenge_id` is the
+    challenge. Its seed is drawn by the service, and sealed with the truths."""
     id = service.challenges.begin(start.cases, start.size, start.cfa, start.name)
     return accepted(service, service.jobs.submit("make-challenge", str(service.challenges.folder(id))), response)
 
@@ -73,14 +74,15 @@ def delete_challenge(service: Here, challenge_id: HexId) -> None:
     responses=answers(401, 403, 404, 409, 422),
 )
 def start_challenge_job(service: Here, challenge_id: HexId, start: ChallengeJobStart, response: Response) -> Job:
-    """`make` goes on where a job was stopped. `score` diagnoses every case that has no diagnosis yet, then opens the seals and scores; 409 until
-    all cases are made, and while another job works on the challenge."""
+    """`make` goes on where a job was stopped. `score` diagnoses every case that has no diagnosis yet, then opens the
+    seals and scores; 409 until all cases are made, and while another job works on the challenge."""
     kept = _known(service, challenge_id)
     folder = str(service.challenges.folder(challenge_id))
     service.check_no_job(folder, f"challenge {challenge_id}")
     if start.kind == "score" and len(kept.seals) < kept.order.cases:
         raise Conflict(
-            f"challenge {challenge_id}: {len(kept.seals)} of {kept.order.cases} cases are made; start a job of the kind make"
+            f"challenge {challenge_id}: {len(kept.seals)} of {kept.order.cases} cases are made; start a job of the "
+            "kind make"
         )
     return accepted(service, service.jobs.submit(WORK[start.kind], folder), response)
 
@@ -92,7 +94,8 @@ def start_challenge_job(service: Here, challenge_id: HexId, start: ChallengeJobS
     responses=answers(401, 404, 409, 422) | ARCHIVE,
 )
 def challenge_case(service: Here, challenge_id: HexId, case: CaseName, form: Form) -> Response:
-    """The recordings of a case, a recording set as a .zip or .tar: for other programs, or for a diagnosis of one's own."""
+    """The recordings of a case, a recording set as a .zip or .tar: for other programs, or for a diagnosis of one's
+    own."""
     return challenge_folder(service, challenge_id, case).archive(form)
 
 
@@ -123,5 +126,6 @@ def challenge_score(service: Here, challenge_id: HexId) -> Response:
     responses=answers(401, 404, 409, 422),
 )
 def challenge_truths(service: Here, challenge_id: HexId) -> Response:
-    """The truths with their salts and the seed, from which the seals follow. 409 before it is scored: they are sealed until then."""
+    """The truths with their salts and the seed, from which the seals follow. 409 before it is scored: they are sealed
+    until then."""
     return _opened(service, challenge_id, "truths")

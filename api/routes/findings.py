@@ -34,8 +34,9 @@ def _newest(service: Service, source: str, what: str) -> DiagnosisFindings:
 
 @router.get("/sessions/{session_id}/findings", dependencies=[READ], responses=answers(401, 404, 409, 422))
 def session_findings(service: Here, session_id: SessionId) -> DiagnosisFindings:
-    """What the newest diagnosis of a session found, as the first screen of its report tells it: verdict, answers in sentences, the two
-    measurements that prove it before and after, and where in a frame the baseline is wrong. 409 before there is a diagnosis."""
+    """What the newest diagnosis of a session found, as the first screen of its report tells it: verdict, answers in
+    sentences, the two measurements that prove it before and after, and where in a frame the baseline is wrong. 409
+    before there is a diagnosis."""
     service.session(session_id)
     return _newest(service, session_id, f"session {session_id}")
 

@@ -42,7 +42,8 @@ def accepted(service: Service, job_id: str, response: Response) -> Job:
 
 
 def _submit(service: Service, start: JobStart, source: str) -> str:
-    """Queue a job that needs no instrument; its id. 404 for a camera model that isn't there, 409 for one without files."""
+    """Queue a job that needs no instrument; its id. 404 for a camera model that isn't there, 409 for one without
+    files."""
     if start.camera_model is not None and not camera_model(service, start.camera_model).sides:
         raise Conflict(f"camera model {start.camera_model}: no camera file was kept; fit again")
     return service.jobs.submit(start.kind, source, resolve=start.resolve, camera_model=start.camera_model)
@@ -58,9 +59,10 @@ def _submit(service: Service, start: JobStart, source: str) -> str:
 def start_session_job(
     service: Here, request: Request, session_id: SessionId, start: JobStart, response: Response
 ) -> Job:
-    """Start work on a session; `Location` says where to look. `validate`, `diagnose` and `report` rest on the newest results of a
-    finished session, and make those that are missing; 409 while the session isn't finished. `pipeline` captures what is left of the session, then makes all of them
-    anew; where it captures or resolves, the key's scope has to be `admin`."""
+    """Start work on a session; `Location` says where to look. `validate`, `diagnose` and `report` rest on the newest
+    results of a finished session, and make those that are missing; 409 while the session isn't finished. `pipeline`
+    captures what is left of the session, then makes all of them anew; where it captures or resolves, the key's scope
+    has to be `admin`."""
     info = service.session(session_id)
     if start.kind != "pipeline":
         if start.station is not None:
@@ -88,9 +90,9 @@ def start_session_job(
     responses=answers(401, 403, 404, 409, 422),
 )
 def start_pipeline(service: Here, start: PipelineStart, response: Response) -> Job:
-    """Start a session and the whole pipeline on it: capture, fit, validate, diagnose, resolve, report. The job's `session_id` is the
-    session, which can be followed, paused and aborted as any other. 409 while another runs on the same instruments. The key's
-    scope has to be `admin`, for this captures and computes."""
+    """Start a session and the whole pipeline on it: capture, fit, validate, diagnose, resolve, report. The job's
+    `session_id` is the session, which can be followed, paused and aborted as any other. 409 while another runs on the
+    same instruments. The key's scope has to be `admin`, for this captures and computes."""
     station = service.station(start.station)
     plan = start.plan(station)
     session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
@@ -142,8 +144,8 @@ def get_job(service: Here, job_id: HexId) -> Job:
     responses=answers(401, 403, 404, 422),
 )
 def cancel_job(service: Here, job_id: HexId) -> Job:
-    """Ask a job to end: at once if it is queued, else at its next progress; a session that it captures is aborted and can be
-    resumed. A finished job stays as it is."""
+    """Ask a job to end: at once if it is queued, else at its next progress; a session that it captures is aborted and
+    can be resumed. A finished job stays as it is."""
     service.job(job_id)
     return _job(service, service.jobs.cancel(job_id))
 

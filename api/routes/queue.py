@@ -35,15 +35,15 @@ def _told(service: Service) -> list[QueuedSession]:
 
 @router.get("/queue", dependencies=[READ], responses=answers(401))
 def list_queue(service: Here) -> list[QueuedSession]:
-    """The sessions that wait for their instruments, in their order. `held`: it doesn't start by itself, because the run before it on the
-    same instruments ended badly, or because of a halt."""
+    """The sessions that wait for their instruments, in their order. `held`: it doesn't start by itself, because the run
+    before it on the same instruments ended badly, or because of a halt."""
     return _told(service)
 
 
 @router.put("/sessions/{session_id}/queue", dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422))
 def queue_session(service: Here, session_id: SessionId, asked: QueuePlace) -> list[QueuedSession]:
-    """Let a session wait for its turn, move one that waits to another place or time, and release one that is held. The queue as it is then.
-    409 for a session that runs or is finished."""
+    """Let a session wait for its turn, move one that waits to another place or time, and release one that is held. The
+    queue as it is then. 409 for a session that runs or is finished."""
     info = service.session(session_id)
     state = service.state(info)
     if state not in OVER or state == "finished":
@@ -55,7 +55,8 @@ def queue_session(service: Here, session_id: SessionId, asked: QueuePlace) -> li
 
 @router.delete("/sessions/{session_id}/queue", dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422))
 def unqueue_session(service: Here, session_id: SessionId) -> list[QueuedSession]:
-    """Take a session out of the queue; it can be resumed by hand. The queue as it is then. 409 for a session that doesn't wait."""
+    """Take a session out of the queue; it can be resumed by hand. The queue as it is then. 409 for a session that
+    doesn't wait."""
     service.session(session_id)
     if service.live.find(session_id) is not None:
         raise Conflict(f"session {session_id} has begun; abort it")
@@ -81,9 +82,10 @@ def halt(
     key: Annotated[StoredKey, Depends(Demand(Permission.OPERATE, Permission.CALIBRATE))],
     asked: Halt | None = None,
 ) -> Halted:
-    """End every session that this service runs now, also one that is packed, or those on one station: shutters close, screens go dark, each can be
-    resumed. Stations on which nothing runs are made safe, too. What waits for the same instruments is held until somebody releases it. Answers
-    within 2 s; `stations` says whose shutter is closed, by its own answer, and whose isn't confirmed by then."""
+    """End every session that this service runs now, also one that is packed, or those on one station: shutters close,
+    screens go dark, each can be resumed. Stations on which nothing runs are made safe, too. What waits for the same
+    instruments is held until somebody releases it. Answers within 2 s; `stations` says whose shutter is closed, by its
+    own answer, and whose isn't confirmed by then."""
     station = service.station(asked.station) if asked is not None and asked.station is not None else None
     until_s, live, why = time.monotonic() + ANSWER_S, service.live, f"halted by {key.name}"
     ended = live.halt(station, why)  # first: nothing that the registry does delays it

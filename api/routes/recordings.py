@@ -77,9 +77,9 @@ def _foreign(asked: SentAs) -> Foreign | None:
 async def send_recordings(
     service: Here, request: Request, response: Response, asked: Annotated[SentAs, Query()]
 ) -> Recordings:
-    """Send in a recording set: its folder as a .zip, .tar or .tar.gz, as the body. It is checked completely before it is kept. With `format`, the
-    archive holds recordings as `calibench import` takes them, which become a recording set; the other parameters state what that format
-    doesn't."""
+    """Send in a recording set: its folder as a .zip, .tar or .tar.gz, as the body. It is checked completely before it
+    is kept. With `format`, the archive holds recordings as `calibench import` takes them, which become a recording set;
+    the other parameters state what that format doesn't."""
     foreign = _foreign(asked)
     limits = service.limits
     async with arrived(service, request, limits.upload_bytes) as sent:
@@ -124,7 +124,8 @@ def get_recordings(service: Here, recordings_id: HexId) -> Recordings:
     responses=answers(401, 404, 409, 422) | ARCHIVE,
 )
 def recordings_archive(service: Here, recordings_id: HexId, form: Form) -> Response:
-    """The recording set as a .zip or .tar, as `POST /recordings` takes it: sent while it is packed, without a stated length."""
+    """The recording set as a .zip or .tar, as `POST /recordings` takes it: sent while it is packed, without a stated
+    length."""
     return sent_set(service, recordings_id).archive(form)
 
 

@@ -43,7 +43,7 @@ router = APIRouter()
 FOR_EVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 
 
-# --- stations ----------------------------------------------------------------------------------------------------------
+# --- stations ---------------------------------------------------------------------------------------------------------
 
 
 def station_state(service: Service, name: str) -> StationState:
@@ -66,11 +66,12 @@ def station_state(service: Service, name: str) -> StationState:
 
 @router.get("/stations", tags=["stations"], dependencies=[READ], responses=answers(401))
 def list_stations(service: Here) -> list[StationState]:
-    """The station files in the folder `stations` of the data folder. They are written there, not sent: they name devices."""
+    """The station files in the folder `stations` of the data folder. They are written there, not sent: they name
+    devices."""
     return [station_state(service, name) for name in service.station_files()]
 
 
-# --- sessions ----------------------------------------------------------------------------------------------------------
+# --- sessions ---------------------------------------------------------------------------------------------------------
 
 
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
@@ -107,8 +108,8 @@ def list_sessions(
     responses=answers(401, 403, 404, 409, 422),
 )
 def start_session(service: Here, start: SessionStart, response: Response) -> StoredSession:
-    """Start a session, which runs in the background. 409 while another session runs on the same instruments; with `queue` it waits for its turn
-    instead."""
+    """Start a session, which runs in the background. 409 while another session runs on the same instruments; with
+    `queue` it waits for its turn instead."""
     station = service.station(start.station)
     plan = start.plan(station)
     if start.queue:
@@ -153,8 +154,8 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     responses=answers(401, 403, 404, 409, 422),
 )
 def delete_session(service: Here, session_id: SessionId) -> None:
-    """Delete a session for ever: its captures and its files. Results, reports and calibrations of it stay. 409 while it runs, while a job
-    works on it, and while a certified calibration rests on it. The key's scope has to be `admin`."""
+    """Delete a session for ever: its captures and its files. Results, reports and calibrations of it stay. 409 while it
+    runs, while a job works on it, and while a certified calibration rests on it. The key's scope has to be `admin`."""
     session_set(service, session_id).delete(service)
 
 
@@ -166,8 +167,8 @@ def delete_session(service: Here, session_id: SessionId) -> None:
     responses=answers(401, 404, 409, 422) | ARCHIVE,
 )
 def session_archive(service: Here, session_id: SessionId, form: Form) -> Response:
-    """The session as a recording set, a .zip or .tar as `POST /recordings` takes it: sent while it is packed, without a stated length. 409 while it
-    runs, because what it has is still changing, and where it has captured nothing."""
+    """The session as a recording set, a .zip or .tar as `POST /recordings` takes it: sent while it is packed, without a
+    stated length. 409 while it runs, because what it has is still changing, and where it has captured nothing."""
     return session_set(service, session_id).archive(form)
 
 
@@ -252,7 +253,7 @@ def session_events(service: Here, session_id: SessionId) -> EventSourceResponse:
     return stream(lambda stopping: _follow(service, session_id, stopping))
 
 
-# --- captures ----------------------------------------------------------------------------------------------------------
+# --- captures ---------------------------------------------------------------------------------------------------------
 
 
 def _capture(info: CaptureInfo) -> StoredCapture:
@@ -341,8 +342,8 @@ def preview_capture(
     width: Annotated[int, Query(ge=16, le=4096, description="px, at most")] = 480,
     stretch: Annotated[bool, Query(description="white is the frame's own brightest, not the data sheet's")] = False,
 ) -> Response:
-    """A small picture, .png or .webp (a tenth of its bytes): black subtracted, one value per colour and mosaic cell, gamma-encoded, without white
-    balance."""
+    """A small picture, .png or .webp (a tenth of its bytes): black subtracted, one value per colour and mosaic cell,
+    gamma-encoded, without white balance."""
     info = _known_capture(service, session_id, capture_id)
     tag = f'"{session_id}-{capture_id}-{width}-{int(stretch)}-{picture}"'
     headers = FOR_EVER | {"ETag": tag}
@@ -381,8 +382,8 @@ def capture_figures(service: Here, session_id: SessionId, capture_id: RegistryId
 
 @router.get("/sessions/{session_id}/curves", tags=["captures"], dependencies=[READ], responses=answers(401, 404, 422))
 def session_curves(service: Here, session_id: SessionId) -> Curves:
-    """Photon transfer, sensitivity and MTF as the captures so far show them: cheap estimates that grow while the session runs, computed in a
-    process of their own. A long session is looked at in several turns: ask again while `looked_at` is less than `captures`. The fit is what
-    counts."""
+    """Photon transfer, sensitivity and MTF as the captures so far show them: cheap estimates that grow while the
+    session runs, computed in a process of their own. A long session is looked at in several turns: ask again while
+    `looked_at` is less than `captures`. The fit is what counts."""
     service.session(session_id)
     return service.quick_look.curves(session_id)

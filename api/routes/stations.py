@@ -31,8 +31,8 @@ _LOOKING = threading.Lock()
 
 @router.get("/devices", dependencies=[OPERATE], responses=answers(401, 403, 503))
 def list_connected(service: Here) -> list[ConnectedDevice]:
-    """What is connected to the service's computer, and what drives it, as `calibench devices` lists it: USB instruments, cameras of installed
-    libraries, serial ports. Takes seconds where a network is searched for cameras."""
+    """What is connected to the service's computer, and what drives it, as `calibench devices` lists it: USB
+    instruments, cameras of installed libraries, serial ports. Takes seconds where a network is searched for cameras."""
     try:
         with _LOOKING:  # the libraries that list cameras aren't made for two at a time
             return [
@@ -76,7 +76,8 @@ def get_station(service: Here, name: StationName) -> StationState:
 
 @router.get("/stations/{name}/devices", dependencies=[READ], responses=answers(401, 404, 422))
 def list_devices(service: Here, name: StationName) -> list[DeviceState]:
-    """A station's instruments: where each is, what drives it, and how its latest self-test went. Nothing is asked of them."""
+    """A station's instruments: where each is, what drives it, and how its latest self-test went. Nothing is asked of
+    them."""
     station = service.station(name)
     return [_device(service, name, station, device) for device in station.devices]
 
@@ -102,8 +103,8 @@ def get_sequence(sequence: str) -> SequenceDescription:
 
 @router.post("/stations/{name}/estimate", dependencies=[READ], responses=answers(401, 404, 422))
 def estimate_session(service: Here, name: StationName, asked: PlanAsked) -> PlanEstimate:
-    """What a session would take on a station: each sequence with the values of its parameters, its captures and its time, learned from the
-    sessions that the station has finished. Nothing is started."""
+    """What a session would take on a station: each sequence with the values of its parameters, its captures and its
+    time, learned from the sessions that the station has finished. Nothing is started."""
     station = service.station(name)
     return estimate(asked.plan(station), station, step_times(service.store, station))
 
@@ -117,8 +118,9 @@ def estimate_session(service: Here, name: StationName, asked: PlanAsked) -> Plan
 def check_device(
     service: Here, name: StationName, device: DeviceName, response: Response, check: DeviceCheck | None = None
 ) -> DeviceState:
-    """Let a device work once, as `calibench devices check` does: connect, identify, safe state, what it is for, safe state. It runs in the
-    background, five minutes at most; `Location` says where to look. 409 while a session, or another check, has the station's instruments."""
+    """Let a device work once, as `calibench devices check` does: connect, identify, safe state, what it is for, safe
+    state. It runs in the background, five minutes at most; `Location` says where to look. 409 while a session, or
+    another check, has the station's instruments."""
     station = service.station(name)
     _device(service, name, station, device)
     service.checks.start(name, station, device, check is not None and check.transcript)

@@ -1,7 +1,7 @@
 """EMVA 1288's reference implementation on one set of frames, in an environment of its own: it needs numpy < 2.
 
-`python emva1288_reference.py PLAN.json` prints JSON. The plan: `{"temporal": {"EXPOSURE_NS": {"PHOTONS": [FILE.npy, FILE.npy]}},
-"spatial": ...}`, photons 0 for darks. Reading isn't in the time.
+`python emva1288_reference.py PLAN.json` prints JSON. The plan: `{"temporal": {"EXPOSURE_NS": {"PHOTONS": [FILE.npy,
+FILE.npy]}}, "spatial": ...}`, photons 0 for darks. Reading isn't in the time.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The slanted-edge method as ISO 12233:2005 (annex D) writes it down, word by word: for comparison, not for use.
 
-Every row's edge by the centroid of its windowed derivative, one straight line through them, all pixels projected along it into
-bins of a quarter pixel, derivative [-1/2, 0, 1/2], Hamming window, discrete Fourier transform, the derivative's own transfer taken
-out.
+Every row's edge by the centroid of its windowed derivative, one straight line through them, all pixels projected along
+it into bins of a quarter pixel, derivative [-1/2, 0, 1/2], Hamming window, discrete Fourier transform, the derivative's
+own transfer taken out.
 """
 
 from __future__ import annotations

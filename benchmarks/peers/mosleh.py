@@ -1,12 +1,12 @@
-"""The blur kernel by Mosleh et al., "Camera intrinsic blur kernel estimation: a reliable framework", CVPR 2015: kept so that
-the comparison with `lab.fit.psf` can be run. It is not what the fits use.
+"""The blur kernel by Mosleh et al., "Camera intrinsic blur kernel estimation: a reliable framework", CVPR 2015: kept so
+that the comparison with `lab.fit.psf` can be run. It is not what the fits use.
 
     min over k >= 0 of ||k * u - b||^2 + lambda ||k||^2 + mu ||grad k||^2 + gamma || |F(k)| - |F(k')| ||^2,
     |F(k')|^2 = |F(b)|^2 / |F(u)|^2
 
-u: the sharp target, b: the blurred one, F: the discrete Fourier transform. The kernel is normalised to a sum of 1 afterwards,
-as the paper does; that, and the last term, whose target is 4 to 10 % off wherever there is noise or a border, is what it loses
-by.
+u: the sharp target, b: the blurred one, F: the discrete Fourier transform. The kernel is normalised to a sum of 1
+afterwards, as the paper does; that, and the last term, whose target is 4 to 10 % off wherever there is noise or a
+border, is what it loses by.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def mosleh_kernel(
     spectrum: float = 1e-4,
 ) -> Array:
     """Kernel (support, support), >= 0, sum 1, of the objective above. `sharp`, `blurred`: (rows, cols) as for
-    `lab.fit.psf.estimate_kernel`; `ridge`, `smoothness`, `spectrum`: lambda, mu and gamma, in units of the Gram matrix' mean
-    diagonal. Minimised by L-BFGS-B from a flat kernel."""
+    `lab.fit.psf.estimate_kernel`; `ridge`, `smoothness`, `spectrum`: lambda, mu and gamma, in units of the Gram matrix'
+    mean diagonal. Minimised by L-BFGS-B from a flat kernel."""
     u, b = np.asarray(sharp, dtype=float), np.asarray(blurred, dtype=float)
     normal = normal_equations(u - u.mean(), b - b.mean(), support)
     scale = float(np.diag(normal.gram).mean())

@@ -1,4 +1,5 @@
-"""Sensitivities from lights as they are usually computed: division, the pseudo-inverse, plain Tikhonov: for comparison, not for use."""
+"""Sensitivities from lights as they are usually computed: division, the pseudo-inverse, plain Tikhonov: for comparison,
+not for use."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ Array = NDArray[np.float64]
 
 
 def divided(wavelength_nm: Array, operator: Array, signal: Array) -> Array:
-    """Signal over the light's integral at the light's centroid, linear between lights; (n, m) `operator` holds the weights."""
+    """Signal over the light's integral at the light's centroid, linear between lights; (n, m) `operator` holds the
+    weights."""
     total = operator.sum(axis=1)
     centroid = operator @ wavelength_nm / total
     order = np.argsort(centroid)

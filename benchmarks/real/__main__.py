@@ -33,7 +33,8 @@ def main(
     only: Annotated[list[str] | None, typer.Option("--only", metavar="SET", help="this set; may be repeated")] = None,
     accept: Annotated[bool, typer.Option("--accept", help="keep results that got worse")] = False,
 ) -> None:
-    """Take real recordings through import, fit and diagnose, and compare with the results that were kept. Goes on where it stopped."""
+    """Take real recordings through import, fit and diagnose, and compare with the results that were kept. Goes on where
+    it stopped."""
     page, json, folder, out = PAGE, JSON, data.resolve(), out.resolve()
     if more is not None:
         folder = more.resolve()

@@ -6,7 +6,8 @@ from benchmarks.real.judge import SetResult
 
 #: A figure fails whose pull exceeds the first, and the kept one by the factor.
 PULL, PULL_FACTOR = 2.0, 1.1
-#: Held-out chi2 over n, in total and of the worst measurement, may grow by this share and this much: what another compiler changes.
+#: Held-out chi2 over n, in total and of the worst measurement, may grow by this share and this much: what another
+#: compiler changes.
 CHI2_SHARE, CHI2_MORE = 0.1, 0.05
 #: CPU time and memory may grow by these factors, and by these few seconds and MB besides: what a busy computer changes.
 CPU_FACTOR, CPU_MORE_S = 1.5, 3.0

@@ -14,12 +14,14 @@ from lab.formats.results import DiagnosisResult, FitResult
 from sim.camera import Side
 from sim.parameters import Frozen
 
-#: Largest held-out chi2 over n of a measurement of which nothing more is told, and the quantile of chi2 that has to be passed as well.
+#: Largest held-out chi2 over n of a measurement of which nothing more is told, and the quantile of chi2 that has to be
+#: passed as well.
 EXPLAINED, QUANTILE = 1.5, 0.999
 
 
 class JudgedFigure(Frozen):
-    """A figure beside the independent one. `pull`: their difference over its standard uncertainty. None: not determined."""
+    """A figure beside the independent one. `pull`: their difference over its standard uncertainty. None: not
+    determined."""
 
     name: str
     unit: str
@@ -63,8 +65,8 @@ class JudgedMeasurement(Frozen):
 
 
 class SetResult(Frozen):
-    """A set's row. `made_up`: figures that its recordings can't determine; `missing`: names that had to be given. `before`, `after`, `n`:
-    held-out chi2 of all measurements. `summary`: the diagnosis in sentences."""
+    """A set's row. `made_up`: figures that its recordings can't determine; `missing`: names that had to be given.
+    `before`, `after`, `n`: held-out chi2 of all measurements. `summary`: the diagnosis in sentences."""
 
     state: str
     cpu_s: float
@@ -118,7 +120,8 @@ def judged(one: DeclaredSet, cost: Cost, fit: FitResult | None, diagnosis: Diagn
         )
         names.append(
             JudgedName(
-                name=effect.name, sides=effect.sides, probability=effect.probability, law=effect.law, is_right=is_right, why=why
+                name=effect.name, sides=effect.sides, probability=effect.probability, law=effect.law, is_right=is_right,
+                why=why
             )
         )  # fmt: skip
     told = {(u.side, u.measurement) for u in diagnosis.unexplained}
@@ -168,9 +171,9 @@ def _digits(value: float) -> float:
 def found_at(at: str, fit: FitResult, diagnosis: DiagnosisResult | None) -> tuple[float | None, float | None]:
     """The value at a place of the results and its standard deviation; None where they don't have one.
 
-    A place is a path with dots. It begins with `effect`, `stereo`, or a part of the left camera's fit; `right` before it takes the right
-    camera. Its steps are keys, numbers of a list's items, and `@NM`, the value at a wavelength. An effect is found by its name.
-    """
+    A place is a path with dots. It begins with `effect`, `stereo`, or a part of the left camera's fit; `right` before
+    it takes the right camera. Its steps are keys, numbers of a list's items, and `@NM`, the value at a wavelength. An
+    effect is found by its name."""
     steps = at.split(".")
     side: Side = "right" if steps[0] == "right" else "left"
     steps = steps[1:] if steps[0] == "right" else steps

@@ -15,26 +15,29 @@ from lab.diagnose.measurements.library import measurement_title
 
 HEAD = """# Real recordings
 
-`make real` takes every set of recordings that lies beside the checkout through import, fit and diagnose, and writes this page. Each figure
-stands beside one that was found by other means: another program, a few lines of numpy, a published value, or the truth of a simulated
-camera. A *pull* is their difference over its standard uncertainty; beyond 2 it is set in bold. What got worse since the last run fails
-the command.
+`make real` takes every set of recordings that lies beside the checkout through import, fit and diagnose, and writes
+this page. Each figure stands beside one that was found by other means: another program, a few lines of numpy, a
+published value, or the truth of a simulated camera. A *pull* is their difference over its standard uncertainty;
+beyond 2 it is set in bold. What got worse since the last run fails the command.
 
-Held-out chi2 is of captures that neither fit nor diagnosis has used. Over their number n it is 1 where the model predicts them within
-their noise. The worst measurement is the one in which it is largest after the diagnosis. CPU time and memory are those of the whole
-process, import to diagnosis, on one core; memory is the largest of any process.
+Held-out chi2 is of captures that neither fit nor diagnosis has used. Over their number n it is 1 where the model
+predicts them within their noise. The worst measurement is the one in which it is largest after the diagnosis. CPU
+time and memory are those of the whole process, import to diagnosis, on one core; memory is the largest of any
+process.
 """
 
 TAIL = """## What isn't taken through
 
-A photograph of a printed noise target (`delbracio_noise_target`) has no importer: `make bench` fits its kernel. Measured sensitivities,
-radiances of a chart and lens prescriptions hold no recordings: tests of the fits and of the lens read them.
+A photograph of a printed noise target (`delbracio_noise_target`) has no importer: `make bench` fits its kernel.
+Measured sensitivities, radiances of a chart and lens prescriptions hold no recordings: tests of the fits and of the
+lens read them.
 
 ## Sets of your own
 
-`make real ARGS="--more DIR"` takes the sets in the folders of DIR: recording sets, folders of frames with an index, and EMVA 1288 sessions. A
-file `independent.toml` beside the recordings states how else a set is brought in, and the independent figures, with the keys of
-`benchmarks/real/sets.toml`. Page and results go to `calibench-data/real/DIR`; the next run is compared with them.
+`make real ARGS="--more DIR"` takes the sets in the folders of DIR: recording sets, folders of frames with an index,
+and EMVA 1288 sessions. A file `independent.toml` beside the recordings states how else a set is brought in, and the
+independent figures, with the keys of `benchmarks/real/sets.toml`. Page and results go to `calibench-data/real/DIR`;
+the next run is compared with them.
 """
 
 #: Pages with findings of sets, each between marks that have the set's name.
@@ -86,13 +89,19 @@ def _wrong(sets: Mapping[str, tuple[DeclaredSet, SetResult]]) -> str:
             f"{f.name} isn't determined; independently {f.independent:g}" for f in result.figures if f.value is None
         ]
         said += [f"{at} is given, which these recordings can't determine" for at in result.made_up]
-        said += [f"the name `{name.name}` is contradicted: {name.why or 'it isn’t in the truth'}" for name in result.names if name.is_right == "contradicted"]  # fmt: skip
+        said += [
+            f"the name `{name.name}` is contradicted: {name.why or 'it isn’t in the truth'}"
+            for name in result.names
+            if name.is_right == "contradicted"
+        ]
         said += [f"the name `{name}` isn't given" for name in result.missing]
-        said += [f"{measurement_title(m.measurement)}: held-out chi2 over n is {m.after_over_n:.3g}, and nothing tells of it" for m in result.measurements if m.is_silent]  # fmt: skip
+        said += [f"{measurement_title(m.measurement)}: held-out chi2 over n is {m.after_over_n:.3g}, and nothing "
+            "tells of it" for m in result.measurements if m.is_silent]  # fmt: skip
         found += [f"- [{name}](#{name}): {words}" for words in said]
     lines = found or ["Nothing."]
     note = (
-        f"Wanted: pulls within 2, no name that is contradicted, and held-out chi2 over n of {EXPLAINED:g} at most where nothing more is told "
+        f"Wanted: pulls within 2, no name that is contradicted, and held-out chi2 over n of {EXPLAINED:g} at most "
+        "where nothing more is told "
         f"(or below the {QUANTILE:.1%} quantile of chi2, which few numbers exceed by chance)."
     )
     return "\n".join(["## What is wrong", "", note, "", *lines, ""])
@@ -102,17 +111,28 @@ def _overview(sets: Mapping[str, tuple[DeclaredSet, SetResult]]) -> str:
     lines = [
         "## All sets",
         "",
-        "| set | figures within 2 | worst pull | names | held-out chi2 / n, before | after | worst measurement after | CPU, s | memory, MB |",
+        (
+            "| set | figures within 2 | worst pull | names | held-out chi2 / n, before | after | worst measurement "
+            "after "
+            "| CPU, s | memory, MB |"
+        ),
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name, (_, result) in sets.items():
         judged = [f for f in result.figures if f.pull is not None]
         worst = max((abs(f.pull or 0.0) for f in judged), default=None)
         names = ", ".join(f"{n.name} ({n.is_right})" for n in result.names) or result.verdict.replace("_", " ") or "-"
-        before, after = ("-" if x is None or not result.n else f"{x / result.n:.3g}" for x in (result.before, result.after))  # fmt: skip
-        weak = "-" if result.worst is None else f"{measurement_title(result.worst.measurement)} {result.worst.after_over_n:.3g}"  # fmt: skip
+        before, after = (
+            "-" if x is None or not result.n else f"{x / result.n:.3g}" for x in (result.before, result.after)
+        )
+        weak = (
+            "-"
+            if result.worst is None
+            else f"{measurement_title(result.worst.measurement)} {result.worst.after_over_n:.3g}"
+        )
         lines.append(
-            f"| [{name}](#{name}) | {f'{len(judged) - len(_off(result))} of {len(result.figures)}' if result.figures else '-'} "
+            f"| [{name}](#{name}) | "
+            f"{f'{len(judged) - len(_off(result))} of {len(result.figures)}' if result.figures else '-'} "
             f"| {'-' if worst is None else f'{worst:.1f}'} | {result.failed or names} | {before} | {after} | {weak} "
             f"| {result.cpu_s:.0f} | {result.memory_mb:.0f} |"
         )
@@ -139,7 +159,8 @@ def _section(name: str, one: DeclaredSet, result: SetResult) -> str:
         said = {"agrees": "an independent look agrees", "contradicted": "an independent look contradicts it"}
         judged = said.get(found.is_right, "no independent look says whether it is right")
         why = f": {found.why}" if found.why else ""
-        parts.append(f"- `{found.name}` ({' and '.join(found.sides)}, probability {found.probability:.3g}): {judged}{why}.")  # fmt: skip
+        parts.append(f"- `{found.name}` ({' and '.join(found.sides)}, probability {found.probability:.3g}): "
+            f"{judged}{why}.")  # fmt: skip
     parts += [f"- `{missing}` isn't given: {one.agrees[missing]}." for missing in result.missing]
     if not result.names:
         parts.append(f"Verdict: {result.verdict.replace('_', ' ')}; no name is given.")
@@ -156,7 +177,15 @@ def _held_out(result: SetResult, most: int) -> str:
         "| --- | --- | --- | --- | --- |",
     ]
     ranked = sorted(result.measurements, key=lambda m: -max(m.before, m.after) / m.n)
-    rows = [(measurement_title(m.measurement) + (f", {m.side}" if len({o.side for o in ranked}) > 1 else ""), m.n, m.before, m.after) for m in ranked[:most]]  # fmt: skip
+    rows = [
+        (
+            measurement_title(m.measurement) + (f", {m.side}" if len({o.side for o in ranked}) > 1 else ""),
+            m.n,
+            m.before,
+            m.after,
+        )
+        for m in ranked[:most]
+    ]
     rows.append(("all", result.n, result.before, result.after))
     lines += [
         f"| {what} | {n} | {_chi2(before)} | {_chi2(after)} | {after / n:.3g} |" for what, n, before, after in rows

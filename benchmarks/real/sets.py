@@ -1,7 +1,8 @@
-"""What the benchmark of real recordings declares of each set: how it is brought in, and what was found in it by other means.
+"""What the benchmark of real recordings declares of each set: how it is brought in, and what was found in it by other
+means.
 
-`sets.toml` has a table a set of the shared data. A folder that is named may hold further sets: each in a folder of its own, with such a
-table as `independent.toml` beside the recordings where there is one.
+`sets.toml` has a table a set of the shared data. A folder that is named may hold further sets: each in a folder of its
+own, with such a table as `independent.toml` beside the recordings where there is one.
 """
 
 from __future__ import annotations
@@ -91,8 +92,8 @@ def declared_sets(file: Path = DECLARED) -> dict[str, DeclaredSet]:
 
 
 def sets_in(folder: Path) -> dict[str, DeclaredSet]:
-    """The sets in the folders of `folder`, by the folder's name: what `independent.toml` declares, else recording sets, folders of frames
-    with an index, and EMVA 1288 sessions."""
+    """The sets in the folders of `folder`, by the folder's name: what `independent.toml` declares, else recording sets,
+    folders of frames with an index, and EMVA 1288 sessions."""
     found = {}
     for inside in sorted(path for path in folder.iterdir() if path.is_dir()):
         beside = inside / BESIDE

@@ -1,7 +1,7 @@
 """One set through import, fit and diagnose, and what that takes.
 
-`python -m benchmarks.real.take_through FOLDER OUT` is the process of one set: FOLDER holds the recordings, OUT what is declared of them, and
-then `fit.json` and `diagnose.json`.
+`python -m benchmarks.real.take_through FOLDER OUT` is the process of one set: FOLDER holds the recordings, OUT what is
+declared of them, and then `fit.json` and `diagnose.json`.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ LONGEST_S = 1800
 
 
 class Cost(Frozen):
-    """What a set took, in CPU seconds of its process and of those that it started, and in the largest resident memory of one of them, MB
-    (2^20 bytes). `state`: of code and recordings. `failed`: the last line that it told, where it ended otherwise."""
+    """What a set took, in CPU seconds of its process and of those that it started, and in the largest resident memory
+    of one of them, MB (2^20 bytes). `state`: of code and recordings. `failed`: the last line that it told, where it
+    ended otherwise."""
 
     state: str
     cpu_s: float
@@ -78,7 +79,8 @@ def take_through(one: DeclaredSet, folder: Path, scratch: Path) -> tuple[FitResu
 
 
 def run_set(one: DeclaredSet, folder: Path, out: Path) -> Cost:
-    """Take a set through in a process of its own. Where `out` holds its results by this code and of these recordings, they stand."""
+    """Take a set through in a process of its own. Where `out` holds its results by this code and of these recordings,
+    they stand."""
     state = state_of(one, folder)
     if (out / COST).is_file() and (kept := load(Cost, out / COST)).state == state:
         return kept
@@ -103,7 +105,8 @@ def run_set(one: DeclaredSet, folder: Path, out: Path) -> Cost:
 
 
 def state_of(one: DeclaredSet, folder: Path) -> str:
-    """SHA-256, shortened, over the code that decides a set's results, how the set is brought in, and its files' names and sizes."""
+    """SHA-256, shortened, over the code that decides a set's results, how the set is brought in, and its files' names
+    and sizes."""
     found = hashlib.sha256(one.brought_in().encode())
     for part in ("sim", "lab"):
         for file in sorted((ROOT / part).rglob("*")):

@@ -1,8 +1,8 @@
 """GigE Vision and USB3 Vision cameras of any maker through Aravis (0.8), by GObject introspection.
 
-Aravis is a library of the distribution (Debian: `gir1.2-aravis-0.8`, `python3-gi`; `scripts/install-aravis` installs them). A virtual
-environment doesn't see the distribution's `gi`; it is loaded from there alone, if it was built for this version of Python.
-"""
+Aravis is a library of the distribution (Debian: `gir1.2-aravis-0.8`, `python3-gi`; `scripts/install-aravis` installs
+them). A virtual environment doesn't see the distribution's `gi`; it is loaded from there alone, if it was built for
+this version of Python."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ def _library() -> Any:
             from gi.repository import Aravis
     except (ImportError, ValueError) as error:
         raise InstrumentError(
-            f"GigE cameras: Aravis isn't installed for this Python ({' '.join(str(error).split())}); run scripts/install-aravis"
+            f"GigE cameras: Aravis isn't installed for this Python ({' '.join(str(error).split())}); run "
+            "scripts/install-aravis"
         ) from error
     return Aravis
 
@@ -162,7 +163,8 @@ class AravisCamera(GenicamCamera):
             self._camera = library.Camera.new(self.address)
         except _glib_error() as error:
             raise Disconnected(
-                f"camera {self.address}: Aravis finds no such camera ({getattr(error, 'message', error)}); check the cable, the power and the network"
+                f"camera {self.address}: Aravis finds no such camera ({getattr(error, 'message', error)}); check the "
+                "cable, the power and the network"
             ) from error
         nodes = _AravisFeatures(self._camera, f"camera {self.address}")
         device = self._camera.get_device()

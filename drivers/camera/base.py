@@ -22,7 +22,8 @@ TEMPERATURE_NS = 250_000_000
 
 @dataclass(frozen=True)
 class SensorInfo:
-    """What the camera reports of its sensor; None where it doesn't. `black_level` is in the camera's own unit, mostly codes.
+    """What the camera reports of its sensor; None where it doesn't. `black_level` is in the camera's own unit, mostly
+    codes.
 
     `exposure_s`: its shortest and longest exposure.
     """
@@ -42,8 +43,8 @@ class Frame:
     """One frame as it left the converter, (rows, cols) DN, with the settings that the camera reports.
 
     `exposure_s` and `gain_db` are the camera's rounded settings. `time` (UTC) is the start of the exposure. `frame_id`
-    counts the frames since acquisition started. `camera_time_ns`: start of the exposure on the camera's own clock, whose zero
-    is its own; None where it doesn't tell.
+    counts the frames since acquisition started. `camera_time_ns`: start of the exposure on the camera's own clock,
+    whose zero is its own; None where it doesn't tell.
     """
 
     raw: NDArray[np.uint16]
@@ -63,7 +64,8 @@ class Camera(Instrument):
     `capture` does all three; `capture_together` interleaves them for cameras wired to trigger one another.
     """
 
-    #: Longest time (s) beyond an exposure until its frame is there, or an error: whoever waits for `collect` waits as long.
+    #: Longest time (s) beyond an exposure until its frame is there, or an error: whoever waits for `collect` waits as
+    #: long.
     readout_s = 3.0
 
     @abstractmethod
@@ -72,14 +74,17 @@ class Camera(Instrument):
 
     @abstractmethod
     def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
-        """Set exposure (s) and gain (dB) of the frames to come. Raises `InstrumentError` outside the camera's limits."""
+        """Set exposure (s) and gain (dB) of the frames to come. Raises `InstrumentError` outside the camera's
+        limits."""
 
     def check(self, exposure_s: float, gain_db: float = 0.0) -> None:
-        """Raise `InstrumentError` for an exposure (s) or a gain (dB) that `configure` would refuse; nothing is exposed."""
+        """Raise `InstrumentError` for an exposure (s) or a gain (dB) that `configure` would refuse; nothing is
+        exposed."""
         self.configure(exposure_s, gain_db)
 
     def check_trigger(self, trigger: Trigger) -> None:
-        """Raise `InstrumentError` for a trigger that `arm` would refuse, as far as the driver knows; nothing is exposed."""
+        """Raise `InstrumentError` for a trigger that `arm` would refuse, as far as the driver knows; nothing is
+        exposed."""
         return
 
     @abstractmethod
@@ -98,7 +103,8 @@ class Camera(Instrument):
         """
 
     def follow(self) -> None:
-        """Called right after the camera that leads was triggered: a camera that isn't wired to it is triggered by software here."""
+        """Called right after the camera that leads was triggered: a camera that isn't wired to it is triggered by
+        software here."""
 
     def capture(self) -> Frame:
         """One frame on a software trigger."""
@@ -108,17 +114,19 @@ class Camera(Instrument):
 
 
 class StreamingCamera(Camera):
-    """A camera that keeps buffers queued from `arm` to `disarm`: it may be triggered again before a frame has been read.
+    """A camera that keeps buffers queued from `arm` to `disarm`: it may be triggered again before a frame has been
+    read.
 
-    `drivers.camera.stream.FrameStream` takes series with such cameras. A frame that fails ends nothing: the next one follows.
-    """
+    `drivers.camera.stream.FrameStream` takes series with such cameras. A frame that fails ends nothing: the next one
+    follows."""
 
     #: Whether the computer triggers it after the camera that leads, as it isn't wired; told by `arm`.
     follows_by_software = False
 
     @abstractmethod
     def next_frame(self) -> Frame:
-        """The frame of the oldest trigger whose frame wasn't read yet. Ends within exposure + time-out; the camera stays armed.
+        """The frame of the oldest trigger whose frame wasn't read yet. Ends within exposure + time-out; the camera
+        stays armed.
 
         Its temperature is at most `TEMPERATURE_NS` old on the camera's clock, read beside the stream. Raises
         `drivers.errors.Garbled` for a torn frame, `drivers.errors.Repeated` for one that came before, and `NoAnswer`.
@@ -130,7 +138,8 @@ class StreamingCamera(Camera):
 
 
 def capture_together(cameras: Sequence[Camera]) -> tuple[Frame, ...]:
-    """One frame of each camera, exposed at the same time: the first is triggered by software and pulses the others' line.
+    """One frame of each camera, exposed at the same time: the first is triggered by software and pulses the others'
+    line.
 
     Cameras that aren't wired follow milliseconds later (`follow`).
 

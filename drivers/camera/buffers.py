@@ -1,4 +1,5 @@
-"""A buffer as a camera filled it, before its codes are unpacked: what every camera's frames have in common on the way in."""
+"""A buffer as a camera filled it, before its codes are unpacked: what every camera's frames have in common on the way
+in."""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ from drivers.errors import Garbled
 class Grabbed:
     """The payload, its layout, and what is wrong with it; nothing if it is whole.
 
-    `camera_time_ns`: start of the exposure on the camera's own clock; None where it doesn't tell. `give_back`: called once the codes
-    are unpacked; the payload's memory may be filled again.
+    `camera_time_ns`: start of the exposure on the camera's own clock; None where it doesn't tell. `give_back`: called
+    once the codes are unpacked; the payload's memory may be filled again.
     """
 
     payload: Payload

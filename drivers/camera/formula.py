@@ -85,7 +85,8 @@ def _remainder(a: Number, b: Number) -> Number:
 
 
 def _power(a: Number, b: Number) -> Number:
-    """Integers stay integers while the result fits 64 bits; larger ones and negative powers are computed in floating point."""
+    """Integers stay integers while the result fits 64 bits; larger ones and negative powers are computed in floating
+    point."""
     if isinstance(a, int) and isinstance(b, int) and b >= 0 and b * abs(a).bit_length() <= 128:
         return int(a**b)
     return math.pow(a, b)

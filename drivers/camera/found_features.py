@@ -11,7 +11,8 @@ from drivers.instrument import Setting
 
 
 class RememberedFeatures:
-    """The features of a camera; `found` keeps what each was set to, by `Name` or, where a selector chooses, `Name[Entry]`."""
+    """The features of a camera; `found` keeps what each was set to, by `Name` or, where a selector chooses,
+    `Name[Entry]`."""
 
     def __init__(self, features: CameraFeatures, found: FoundSettings) -> None:
         self._features, self._found = features, found
@@ -40,8 +41,9 @@ class RememberedFeatures:
         self._features.execute(name)
 
     def restore(self) -> None:
-        """Set all as it was found, what was changed last first. What the camera refuses is tried once more when the rest is set, and stays
-        kept if it is refused then, too. Raises `NoAnswer` and `Disconnected`; what isn't restored stays kept."""
+        """Set all as it was found, what was changed last first. What the camera refuses is tried once more when the
+        rest is set, and stays kept if it is refused then, too. Raises `NoAnswer` and `Disconnected`; what isn't
+        restored stays kept."""
         for _ in range(2):
             for place, value in self._found.last_first():
                 if _was_set(self._features, place, value):

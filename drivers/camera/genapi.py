@@ -1,8 +1,8 @@
 """A reader of GenApi: the features that a GenICam camera's own XML describes, evaluated over its registers.
 
-The XML says at which addresses exposure time, gain and trigger lie and how to convert them. These node types are read: Integer, IntReg,
-MaskedIntReg, StructReg, Float, FloatReg, Boolean, Command, Enumeration, StringReg, SwissKnife, IntSwissKnife, Converter, IntConverter.
-Values are never cached, as a camera may change them by itself.
+The XML says at which addresses exposure time, gain and trigger lie and how to convert them. These node types are read:
+Integer, IntReg, MaskedIntReg, StructReg, Float, FloatReg, Boolean, Command, Enumeration, StringReg, SwissKnife,
+IntSwissKnife, Converter, IntConverter. Values are never cached, as a camera may change them by itself.
 
 Source: EMVA, GenICam Standard, section GenApi 2.1 (schema version 1.1), reimplemented from its description.
 """
@@ -74,8 +74,8 @@ def _integer(text: str) -> int:
 class NodeMap:
     """The features of a camera, by name: `get`, `set`, `execute`, `limits`, `entries`.
 
-    Raises `InstrumentError` for a feature the camera doesn't have, a value outside its limits, or XML that can't be read.
-    """
+    Raises `InstrumentError` for a feature the camera doesn't have, a value outside its limits, or XML that can't be
+    read."""
 
     def __init__(self, xml: bytes, port: Port) -> None:
         self._port = port

@@ -1,7 +1,8 @@
-"""What all GenICam cameras have in common, whatever reaches them: the project's own USB3 Vision (`drivers.camera.u3v`), or a library.
+"""What all GenICam cameras have in common, whatever reaches them: the project's own USB3 Vision (`drivers.camera.u3v`),
+or a library.
 
-What reaches the camera finds it, reads its XML and queues the buffers. What is asked of the camera, in which order, and what counts as
-a good frame is here.
+What reaches the camera finds it, reads its XML and queues the buffers. What is asked of the camera, in which order, and
+what counts as a good frame is here.
 """
 
 from __future__ import annotations
@@ -72,13 +73,15 @@ class _Transcribed:
 class GenicamCamera(StreamingCamera):
     """One camera at an `address` of whatever reaches it.
 
-    `pixel_format`: a format's name, or None for the deepest raw one of up to 14 bits (16 only if it has no other). `timeout_s`: longest
-    time beyond the exposure until a frame has arrived. `trigger_line`: the input wired to the camera that leads, None: Line0;
-    `Software`: none is wired, the computer triggers it right after the other, milliseconds apart. `output_line`: the output of the
-    camera that leads, on which `output_source` gives the pulses; None: it gives none.
+    `pixel_format`: a format's name, or None for the deepest raw one of up to 14 bits (16 only if it has no other).
+    `timeout_s`: longest time beyond the exposure until a frame has arrived. `trigger_line`: the input wired to the
+    camera that leads, None: Line0; `Software`: none is wired, the computer triggers it right after the other,
+    milliseconds apart. `output_line`: the output of the camera that leads, on which `output_source` gives the pulses;
+    None: it gives none.
     """
 
-    #: Whether the recorder is given the bytes on the wire; otherwise it is given the features that are read and written.
+    #: Whether the recorder is given the bytes on the wire; otherwise it is given the features that are read and
+    #: written.
     _records_bytes = False
 
     def __init__(
@@ -136,7 +139,8 @@ class GenicamCamera(StreamingCamera):
         """Let the camera go; may raise whatever the library raises."""
 
     def _await_trigger_ready(self) -> None:
-        """Return once a software trigger will be heard: from the start of acquisition, where the camera says no more."""
+        """Return once a software trigger will be heard: from the start of acquisition, where the camera says no
+        more."""
 
     def _give_trigger(self, features: CameraFeatures) -> None:
         """The software trigger."""
@@ -173,7 +177,8 @@ class GenicamCamera(StreamingCamera):
         set_if_there(features, "TriggerSelector", "FrameStart")
         if not features.has("TriggerMode"):
             raise InstrumentError(
-                f"{self._who}: it has no TriggerMode, so that it can't be told when to expose; use a camera that can be triggered"
+                f"{self._who}: it has no TriggerMode, so that it can't be told when to expose; use a camera that can "
+                "be triggered"
             )
         features.set("TriggerMode", "On")
         offered = features.entries("PixelFormat")
@@ -182,7 +187,8 @@ class GenicamCamera(StreamingCamera):
         chosen = next((name for name in names if name in offered and name in known), None)
         if chosen is None:
             raise InstrumentError(
-                f"{self._who}: pixel format {self._wanted_format or 'raw'} isn't offered or known; it offers {', '.join(offered)}"
+                f"{self._who}: pixel format {self._wanted_format or 'raw'} isn't offered or known; it offers "
+                f"{', '.join(offered)}"
             )
         features.set("PixelFormat", chosen)
         self._format = known[chosen]
@@ -374,7 +380,8 @@ class GenicamCamera(StreamingCamera):
                 if self._armed == "line" and not self.follows_by_software:
                     waited = f"; it waited for {self._wanted_line or 'Line0'}: the camera that leads needs output_line"
                 raise NoFrame(
-                    f"{self._who}: no frame within {self._timeout_s:g} s of its exposure of {exposure_s:g} s; check the cable and the power{waited}"
+                    f"{self._who}: no frame within {self._timeout_s:g} s of its exposure of {exposure_s:g} s; check "
+                    f"the cable and the power{waited}"
                 )
 
     def stop(self) -> None:

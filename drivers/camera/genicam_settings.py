@@ -1,7 +1,8 @@
-"""What every GenICam camera is told before it may measure: nothing automatic, nothing that bends its codes, and which lines trigger.
+"""What every GenICam camera is told before it may measure: nothing automatic, nothing that bends its codes, and which
+lines trigger.
 
-The names are those of EMVA's Standard Features Naming Convention (SFNC 2.7), and makers' own where they differ. The same settings
-serve every library that reaches such cameras: `drivers.camera.genapi`, pypylon, Aravis.
+The names are those of EMVA's Standard Features Naming Convention (SFNC 2.7), and makers' own where they differ. The
+same settings serve every library that reaches such cameras: `drivers.camera.genapi`, pypylon, Aravis.
 """
 
 from __future__ import annotations
@@ -45,10 +46,10 @@ class CameraFeatures(Features, Protocol):
 class Neutral:
     """A feature that changes exposure, gain or codes, and the value at which it leaves the converter's codes alone.
 
-    `selector`: the feature that chooses which of several is meant; all of its entries are set, or those that begin as one of `entries`.
-    `switch`: features that switch it off: where the camera has one, its own value doesn't matter. `must`: a camera on which it stays on is
-    refused, as its frames can't be compared, or aren't proportional to light; otherwise that is told, and belongs to its frames.
-    """
+    `selector`: the feature that chooses which of several is meant; all of its entries are set, or those that begin as
+    one of `entries`. `switch`: features that switch it off: where the camera has one, its own value doesn't matter.
+    `must`: a camera on which it stays on is refused, as its frames can't be compared, or aren't proportional to light;
+    otherwise that is told, and belongs to its frames."""
 
     name: str
     value: Setting
@@ -137,7 +138,8 @@ SELECTORS = {one.name: one.selector for one in NEUTRAL if one.selector} | {
     "LineSource": "LineSelector",
 }
 
-#: What else belongs to a frame: identity, sensor, region, exposure, trigger. `snapshot` reads these and all of `NEUTRAL`.
+#: What else belongs to a frame: identity, sensor, region, exposure, trigger. `snapshot` reads these and all of
+#: `NEUTRAL`.
 RECORDED = (
     "DeviceVendorName",
     "DeviceModelName",
@@ -180,7 +182,8 @@ RECORDED = (
 
 
 def set_if_there(features: Features, name: str, value: Setting) -> None:
-    """Set a feature that the camera has, an enumeration's entry that it offers; some can't be written, and have the value already."""
+    """Set a feature that the camera has, an enumeration's entry that it offers; some can't be written, and have the
+    value already."""
     if not features.has(name) or (isinstance(value, str) and value not in features.entries(name)):
         return
     try:
@@ -193,7 +196,8 @@ def set_if_there(features: Features, name: str, value: Setting) -> None:
 
 
 def make_neutral(features: Features, who: str) -> tuple[str, ...]:
-    """Switch off all that changes the converter's codes, and read it back. Returns what stays on, `Feature = value` each.
+    """Switch off all that changes the converter's codes, and read it back. Returns what stays on, `Feature = value`
+    each.
 
     Raises `InstrumentError` that names what stays on and must not: codes of such a camera aren't proportional to light.
     """
@@ -220,7 +224,8 @@ def _is_offered(features: Features, one: Neutral) -> bool:
 
 
 def _places(features: Features, one: Neutral) -> Iterator[str]:
-    """Each entry of the selector in turn, selected, as `[Entry]`; nothing where there is no selector. The one that was selected is so again."""
+    """Each entry of the selector in turn, selected, as `[Entry]`; nothing where there is no selector. The one that was
+    selected is so again."""
     if not one.selector or not features.has(one.selector):
         if one.entries == ("",):
             yield ""
@@ -298,13 +303,15 @@ def black_level(features: Features) -> float | None:
 
 
 def trigger_line(features: Features, who: str, wanted: str | None) -> str:
-    """The line that triggers exposures: `wanted`, else Line0. Raises `InstrumentError` that names those the camera has."""
+    """The line that triggers exposures: `wanted`, else Line0. Raises `InstrumentError` that names those the camera
+    has."""
     lines = [name for name in features.entries("TriggerSource") if name.startswith("Line")]
     name = wanted or "Line0"
     if name in lines:
         return name
     raise InstrumentError(
-        f"{who}: no trigger line {name}; it has {', '.join(lines) or 'none'}: name the one that is wired as trigger_line in the station file"
+        f"{who}: no trigger line {name}; it has {', '.join(lines) or 'none'}: name the one that is wired as "
+        "trigger_line in the station file"
     )
 
 
@@ -330,6 +337,7 @@ def give_pulses(features: Features, who: str, line: str, source: str) -> None:
     offered = features.entries("LineSource")
     if source not in offered:
         raise InstrumentError(
-            f"{who}: {line} can't follow {source}; it offers {', '.join(offered)}: correct output_source in the station file"
+            f"{who}: {line} can't follow {source}; it offers {', '.join(offered)}: correct output_source in the "
+            "station file"
         )
     features.set("LineSource", source)

@@ -1,8 +1,8 @@
 """Cameras of any maker through its GenTL producer (a `.cti` file), by harvesters: `calibench[gentl]`.
 
-Makers install their producers with their software, and name the folders in the environment variable GENICAM_GENTL64_PATH. A producer
-can be opened once in a process, and looking for cameras anew lets all of its cameras go: drivers share it, and it is closed with the
-last camera.
+Makers install their producers with their software, and name the folders in the environment variable
+GENICAM_GENTL64_PATH. A producer can be opened once in a process, and looking for cameras anew lets all of its cameras
+go: drivers share it, and it is closed with the last camera.
 
 Source: EMVA, GenICam GenTL 1.6; `harvesters` 1.4.
 """
@@ -219,8 +219,8 @@ def _producers(file: str | None) -> list[_Producer]:
 class GentlCamera(GenicamCamera):
     """The camera that a producer knows by the serial number, identifier or name `address`.
 
-    `producer`: its `.cti` file; None: all in the folders of GENICAM_GENTL64_PATH. `description`: a GenICam XML file to be taken instead
-    of the camera's own. `settings`: those of `GenicamCamera`.
+    `producer`: its `.cti` file; None: all in the folders of GENICAM_GENTL64_PATH. `description`: a GenICam XML file to
+    be taken instead of the camera's own. `settings`: those of `GenicamCamera`.
     """
 
     _producer: _Producer
@@ -247,12 +247,14 @@ class GentlCamera(GenicamCamera):
                 ElementTree.parse(self._description)
             except (OSError, ElementTree.ParseError) as error:
                 raise InstrumentError(
-                    f"camera {self.address}: its description {self._description} can't be read ({error}); correct it in the station file"
+                    f"camera {self.address}: its description {self._description} can't be read ({error}); correct it "
+                    "in the station file"
                 ) from error
         producers = _producers(self._producer_file)
         if not producers:
             raise InstrumentError(
-                f"camera {self.address}: no GenTL producer is installed; install the maker's software, which names it in {SEARCH_PATH}, or "
+                f"camera {self.address}: no GenTL producer is installed; install the maker's software, which names it "
+                f"in {SEARCH_PATH}, or "
                 "name its .cti file as producer in the station file"
             )
         self._acquirer = next((found for found in map(self._take_from, producers) if found is not None), None)
@@ -284,7 +286,8 @@ class GentlCamera(GenicamCamera):
             ) from error
         except (gentl.GenericException, genapi.GenericException) as error:
             raise Disconnected(
-                f"camera {self.address}: can't be opened ({_said(error)}); plug it in again, and close other programs that use it"
+                f"camera {self.address}: can't be opened ({_said(error)}); plug it in again, and close other programs "
+                "that use it"
             ) from error
 
     def _start(self) -> None:

@@ -1,4 +1,5 @@
-"""Single-channel pixel formats of GenICam's Pixel Format Naming Convention (PFNC): their codes, and how to unpack a payload."""
+"""Single-channel pixel formats of GenICam's Pixel Format Naming Convention (PFNC): their codes, and how to unpack a
+payload."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ class PixelFormat:
         return (pixels * self.bits + 7) // 8 if self.packed else pixels * (1 if self.bits == 8 else 2)
 
     def unpack(self, payload: Payload, rows: int, cols: int, padding: int = 0) -> NDArray[np.uint16]:
-        """(rows, cols) uint16 of a payload whose rows are followed by `padding` bytes. Raises ValueError if it is short."""
+        """(rows, cols) uint16 of a payload whose rows are followed by `padding` bytes. Raises ValueError if it is
+        short."""
         line = self.payload_bytes(cols) + padding
         if padding == 0:
             flat = self._unpack_flat(np.frombuffer(payload, np.uint8), rows * cols)
@@ -74,6 +76,6 @@ def _formats() -> dict[int, PixelFormat]:
 
 
 PIXEL_FORMATS = _formats()
-#: Order in which formats are preferred: the deepest first, plain before packed. 16 bits come last: most cameras only shift their 10
-#: or 12 bits up in it, and codes should be the converter's.
+#: Order in which formats are preferred: the deepest first, plain before packed. 16 bits come last: most cameras only
+#: shift their 10 or 12 bits up in it, and codes should be the converter's.
 PREFERENCE = sorted(PIXEL_FORMATS.values(), key=lambda item: (item.bits == 16, -item.bits, item.packed, item.name))

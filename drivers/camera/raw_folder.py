@@ -1,8 +1,9 @@
-"""A camera that is tethered by its own software: a folder into which that software writes raw files (CR2, NEF, ARW, DNG ...).
+"""A camera that is tethered by its own software: a folder into which that software writes raw files (CR2, NEF, ARW, DNG
+...).
 
-A frame is the next raw file that appears and is complete. What triggers it: a command (`gphoto2 --trigger-capture`), or a person. What
-sets the exposure: a command, or a person; either way the file's own exposure time is compared with the one asked for. Files are read by
-LibRaw, through `rawpy`: codes as they left the converter, without the covered margins.
+A frame is the next raw file that appears and is complete. What triggers it: a command (`gphoto2 --trigger-capture`), or
+a person. What sets the exposure: a command, or a person; either way the file's own exposure time is compared with the
+one asked for. Files are read by LibRaw, through `rawpy`: codes as they left the converter, without the covered margins.
 """
 
 from __future__ import annotations
@@ -60,9 +61,9 @@ class _Raw:
 class RawFolderCamera(Camera):
     """The folder `address`; it holds one raw file of the camera at least, which says what its frames are like.
 
-    `trigger_command`, `settings_command`: programs with their arguments, in which `{exposure_s}` and `{iso}` are replaced; None: a person
-    does it. `base_iso`: the camera's sensitivity at 0 dB. `timeout_s`: longest time from the trigger, beyond the exposure, until the file
-    is there. `settle_s`: a file that hasn't grown for so long is complete.
+    `trigger_command`, `settings_command`: programs with their arguments, in which `{exposure_s}` and `{iso}` are
+    replaced; None: a person does it. `base_iso`: the camera's sensitivity at 0 dB. `timeout_s`: longest time from the
+    trigger, beyond the exposure, until the file is there. `settle_s`: a file that hasn't grown for so long is complete.
     """
 
     def __init__(
@@ -96,7 +97,8 @@ class RawFolderCamera(Camera):
             files = self._files()
             if not files:
                 raise InstrumentError(
-                    f"{self._who}: no raw file in it; take one picture with the camera, so that its size and colour filters are known"
+                    f"{self._who}: no raw file in it; take one picture with the camera, so that its size and colour "
+                    "filters are known"
                 )
             self._sample = self._read(max(files, key=lambda file: file.stat().st_mtime))
 
@@ -153,13 +155,15 @@ class RawFolderCamera(Camera):
             found, sample = self._read(file), self._ready()
             if found.raw.shape != sample.raw.shape or found.cfa != sample.cfa:
                 raise Garbled(
-                    f"{self._who}: {file.name} has {found.raw.shape} pixels of {found.cfa}, the files before had {sample.raw.shape} of "
+                    f"{self._who}: {file.name} has {found.raw.shape} pixels of {found.cfa}, the files before had "
+                    f"{sample.raw.shape} of "
                     f"{sample.cfa}; keep the camera's picture size"
                 )
             exposure_s = found.exposure_s or self._exposure_s
             if abs(exposure_s - self._exposure_s) > TOLERANCE * self._exposure_s:
                 raise InstrumentError(
-                    f"{self._who}: {file.name} was exposed for {exposure_s:g} s, and {self._exposure_s:g} s were asked for: set the camera "
+                    f"{self._who}: {file.name} was exposed for {exposure_s:g} s, and {self._exposure_s:g} s were "
+                    "asked for: set the camera "
                     "to manual and to that time"
                 )
             self._frames += 1
@@ -218,7 +222,8 @@ class RawFolderCamera(Camera):
             )
 
     def _await_file(self, seen: frozenset[Path], exposure_s: float) -> Path:
-        """The file that wasn't there before, once it is complete. Raises `NoAnswer`, `Interrupted`, `Garbled` for two."""
+        """The file that wasn't there before, once it is complete. Raises `NoAnswer`, `Interrupted`, `Garbled` for
+        two."""
         until = time.monotonic() + exposure_s + self.timeout_s
         size, since = -1, time.monotonic()
         while True:
@@ -236,7 +241,8 @@ class RawFolderCamera(Camera):
                     return new[0]
             if time.monotonic() > until:
                 raise NoAnswer(
-                    f"{self._who}: no {'complete ' if new else ''}raw file within {self.timeout_s:g} s of the exposure; check that the "
+                    f"{self._who}: no {'complete ' if new else ''}raw file within {self.timeout_s:g} s of the "
+                    "exposure; check that the "
                     "camera's software writes into it"
                 )
             if self._stopped.wait(_LOOK_S):
@@ -257,5 +263,6 @@ class RawFolderCamera(Camera):
                 return _Raw(codes, cfa, bits, black, float(raw.other.shutter_speed), float(raw.other.iso_speed))
         except (rawpy.LibRawError, OSError, ValueError, TypeError) as error:
             raise Garbled(
-                f"{self._who}: {file.name} can't be read ({' '.join(str(error).split())}); let the camera write raw files, complete ones"
+                f"{self._who}: {file.name} can't be read ({' '.join(str(error).split())}); let the camera write raw "
+                "files, complete ones"
             ) from error

@@ -1,9 +1,10 @@
-"""Series of frames from cameras that stream: pairs of the same trigger, matched by the frames' numbers and the cameras' clocks.
+"""Series of frames from cameras that stream: pairs of the same trigger, matched by the frames' numbers and the cameras'
+clocks.
 
-A frame counts for a trigger, as the cameras number them from the start of the series. A number that was skipped is a frame that got lost
-on the way; a number that came before is a frame that came twice; a frame that is damaged is torn. What a camera didn't hear has no number: it
-shows in the clocks. Each trigger without a whole frame of every camera is given again, so that a series has all of its pairs.
-"""
+A frame counts for a trigger, as the cameras number them from the start of the series. A number that was skipped is a
+frame that got lost on the way; a number that came before is a frame that came twice; a frame that is damaged is torn.
+What a camera didn't hear has no number: it shows in the clocks. Each trigger without a whole frame of every camera is
+given again, so that a series has all of its pairs."""
 
 from __future__ import annotations
 
@@ -53,12 +54,14 @@ class _Side:
 
 
 class FrameStream:
-    """`count` frames of each camera, of one trigger each, exposed together: the first camera leads, as in `capture_together`.
+    """`count` frames of each camera, of one trigger each, exposed together: the first camera leads, as in
+    `capture_together`.
 
-    The cameras are configured and stay armed. `interval_s`: least time from one trigger to the next. `in_flight`: triggers that are given
-    before the frames of the first of them are there, which needs an interval that the cameras keep up with; the first of a series is
-    always given alone, as it sets the clocks against one another. `on_loss` is told of everything that got lost, in one line each. The
-    next trigger is given before a pair is handed out: while a pair is kept, the next one is exposed.
+    The cameras are configured and stay armed. `interval_s`: least time from one trigger to the next. `in_flight`:
+    triggers that are given before the frames of the first of them are there, which needs an interval that the cameras
+    keep up with; the first of a series is always given alone, as it sets the clocks against one another. `on_loss` is
+    told of everything that got lost, in one line each. The next trigger is given before a pair is handed out: while a
+    pair is kept, the next one is exposed.
 
     Raises ValueError for several triggers in flight without an interval.
     """
@@ -74,7 +77,8 @@ class FrameStream:
     ) -> None:
         if in_flight > 1 and interval_s <= 0.0:
             raise ValueError(
-                f"{in_flight} triggers in flight at an interval of {interval_s} s; give one that the cameras keep up with"
+                f"{in_flight} triggers in flight at an interval of {interval_s} s; give one that the cameras keep up "
+                "with"
             )
         self._sides = [
             _Side(camera, "camera " + (camera.identity().serial_number or str(n))) for n, camera in enumerate(cameras)
@@ -92,7 +96,8 @@ class FrameStream:
             yield self.next()
 
     def next(self) -> tuple[Frame, ...]:
-        """The next pair. Raises the failure of the last trigger after `MOST_LOST` lost ones in a row, and what no repetition mends."""
+        """The next pair. Raises the failure of the last trigger after `MOST_LOST` lost ones in a row, and what no
+        repetition mends."""
         try:
             while True:
                 with self._starting_anew():
@@ -127,7 +132,8 @@ class FrameStream:
     # --- triggers ---------------------------------------------------------------------------------------------------
 
     def _trigger(self, *, waiting: bool) -> None:
-        """Give triggers up to `in_flight`, as many as there are pairs wanted. `waiting`: at least one, when its time has come."""
+        """Give triggers up to `in_flight`, as many as there are pairs wanted. `waiting`: at least one, when its time
+        has come."""
         leader, *others = self._sides
         while len(self._given) < min(self.left, self._in_flight if self._clocks_known() else 1):
             wait_s = self._next_s - time.monotonic()
@@ -209,7 +215,8 @@ class FrameStream:
             self._count_on(side, skipped, f"{side.name}: {lost}; use another cable or port")
 
     def _count_on(self, side: _Side, triggers: int, why: str) -> None:
-        """A camera's frame belongs to a later trigger. Raises NoAnswer if none such was given: nobody knows what it shows then."""
+        """A camera's frame belongs to a later trigger. Raises NoAnswer if none such was given: nobody knows what it
+        shows then."""
         if side.trigger + triggers >= self._settled + len(self._given):
             raise NoAnswer(why)
         side.trigger += triggers
@@ -224,8 +231,8 @@ class FrameStream:
     def _missed(self) -> _Side | None:
         """A wired camera whose frame began half an interval later than the others': it belongs to another trigger.
 
-        The interval is the least one; without one, the time since the pair before, as then each trigger waits for a pair.
-        """
+        The interval is the least one; without one, the time since the pair before, as then each trigger waits for a
+        pair."""
         since = [
             (since_ns, side)
             for side in self._sides

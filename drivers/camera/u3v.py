@@ -1,7 +1,8 @@
 """USB3 Vision cameras, of any maker, over pyusb.
 
-The standard's own registers (ABRM, SBRM, SIRM), read over GenCP, say who the camera is and where its XML and its stream lie. Everything else
-(exposure, gain, trigger) is found through that XML, which is read from the camera at connect (`drivers.camera.genapi`).
+The standard's own registers (ABRM, SBRM, SIRM), read over GenCP, say who the camera is and where its XML and its stream
+lie. Everything else (exposure, gain, trigger) is found through that XML, which is read from the camera at connect
+(`drivers.camera.genapi`).
 
 Source: A3, USB3 Vision 1.1; bytes checked against `tests/drivers/camera/test_u3v.py`.
 """
@@ -67,7 +68,8 @@ class _Interfaces:
                 found.setdefault(interface.bInterfaceProtocol, interface)
         if 0 not in found or 2 not in found:
             raise InstrumentError(
-                f"{who}: this USB device is no USB3 Vision camera with a stream; correct the address in the station file"
+                f"{who}: this USB device is no USB3 Vision camera with a stream; correct the address in the station "
+                "file"
             )
 
         def endpoint(interface: usb.core.Interface, incoming: bool) -> int:

@@ -1,4 +1,5 @@
-"""The stream of a USB3 Vision camera: leader, payload and trailer put together to frames, by a thread that always has a transfer waiting.
+"""The stream of a USB3 Vision camera: leader, payload and trailer put together to frames, by a thread that always has a
+transfer waiting.
 
 A leader is looked for before every frame, so that a frame which comes in part costs itself alone.
 
@@ -32,7 +33,8 @@ TRAILER = struct.Struct("<IHHQHHQI")  # 32 bytes
 BUFFERS = 4
 #: How often (s) the thread looks whether it is to end, while nothing comes.
 _LOOK_S = 0.1
-#: Longest wait (s) for a transfer within a frame, after which it is looked whether the stream ends: shorter waits would fall into transfers more often.
+#: Longest wait (s) for a transfer within a frame, after which it is looked whether the stream ends: shorter waits would
+#: fall into transfers more often.
 _WAIT_S = 1.0
 
 
@@ -117,7 +119,8 @@ class U3vStream:
             self._came.put(error)
 
     def _next_leader(self) -> _Leader | None:
-        """The leader of the next frame; what comes before one belongs to a frame whose leader was lost. None if nothing comes."""
+        """The leader of the next frame; what comes before one belongs to a frame whose leader was lost. None if nothing
+        comes."""
         leader, self._leader = self._leader, None
         if leader is not None:
             return leader
@@ -171,8 +174,9 @@ class U3vStream:
         )
 
     def _fill(self, piece: array[int], deadline: float) -> int:
-        """Read a transfer until the deadline or the stream's end; the bytes that came. A long exposure is waited for in parts, so that a stop
-        needn't wait for its end: a wait that ends within the transfer is followed by another for the rest of it."""
+        """Read a transfer until the deadline or the stream's end; the bytes that came. A long exposure is waited for in
+        parts, so that a stop needn't wait for its end: a wait that ends within the transfer is followed by another for
+        the rest of it."""
         came = 0
         while True:
             began = time.monotonic()

@@ -1,7 +1,8 @@
-"""One contract for every driver: identify, limits, safe state, time-out, unplug, replug, stop in mid-motion, two at once.
+"""One contract for every driver: identify, limits, safe state, time-out, unplug, replug, stop in mid-motion, two at
+once.
 
-`check_driver` runs it over a driver and the peer at its other end. It is what `calibench devices contract` runs, and what the project's
-own tests run over every driver that has an entry point.
+`check_driver` runs it over a driver and the peer at its other end. It is what `calibench devices contract` runs, and
+what the project's own tests run over every driver that has an entry point.
 """
 
 from __future__ import annotations
@@ -57,7 +58,8 @@ class _Subject:
 
 
 def check_driver(family: str, name: str, peer: Peer) -> Iterator[Outcome]:
-    """Run the contract of a family over one driver, check by check. Raises `InstrumentError` for an unknown family or driver."""
+    """Run the contract of a family over one driver, check by check. Raises `InstrumentError` for an unknown family or
+    driver."""
     if family not in CONTRACTS:
         raise InstrumentError(f"{family}: no such family; there are {', '.join(CONTRACTS)}")
     subject = _Subject(family, name, peer)

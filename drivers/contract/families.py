@@ -1,4 +1,5 @@
-"""What each family's contract asks: an everyday call, a long one, the safe state, and settings within limits and refused beyond."""
+"""What each family's contract asks: an everyday call, a long one, the safe state, and settings within limits and
+refused beyond."""
 
 from __future__ import annotations
 

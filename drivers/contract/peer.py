@@ -1,7 +1,8 @@
-"""What stands at the other end while a driver is checked: a mock that can be silenced and unplugged, or a real instrument.
+"""What stands at the other end while a driver is checked: a mock that can be silenced and unplugged, or a real
+instrument.
 
-A package that has drivers offers the peers of their checks by entry points of the group `calibench.peers`, under the drivers' names
-(`family.name`): a callable without arguments that returns a running `Peer`.
+A package that has drivers offers the peers of their checks by entry points of the group `calibench.peers`, under the
+drivers' names (`family.name`): a callable without arguments that returns a running `Peer`.
 """
 
 from __future__ import annotations

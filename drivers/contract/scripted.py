@@ -1,4 +1,5 @@
-"""A peer that follows a golden transcript and knows nothing else: what a driver is tested against, apart from its mock."""
+"""A peer that follows a golden transcript and knows nothing else: what a driver is tested against, apart from its
+mock."""
 
 from __future__ import annotations
 
@@ -11,10 +12,11 @@ from drivers.transcript import parse
 
 
 class ScriptedPeer:
-    """Answers on a TCP port what a transcript of one conversation says to each request, in order; the last answer to a request is repeated.
+    """Answers on a TCP port what a transcript of one conversation says to each request, in order; the last answer to a
+    request is repeated.
 
-    `address`: what a driver opens. `requests`: what was asked that the transcript knows. `strange`: what it doesn't know.
-    """
+    `address`: what a driver opens. `requests`: what was asked that the transcript knows. `strange`: what it doesn't
+    know."""
 
     def __init__(self, transcript: str) -> None:
         self.answers: dict[bytes, list[bytes]] = {}

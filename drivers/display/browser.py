@@ -62,7 +62,8 @@ class BrowserDisplay(Display):
         self.host, self.port = host.strip("[]"), int(port)
         if not allow_remote and not _is_loopback(self.host):
             raise InstrumentError(
-                f"display at {address}: anyone on the network could open it; listen at 127.0.0.1 or set allow_remote = true"
+                f"display at {address}: anyone on the network could open it; listen at 127.0.0.1 or set allow_remote "
+                "= true"
             )
         self.timeout_s = timeout_s
         self.connect_timeout_s = connect_timeout_s
@@ -153,7 +154,8 @@ class BrowserDisplay(Display):
             )
         except OSError as error:
             raise Disconnected(
-                f"{self._name}: can't listen there ({error.strerror or error}); free the port or choose another in the station file"
+                f"{self._name}: can't listen there ({error.strerror or error}); free the port or choose another in "
+                "the station file"
             ) from error
         self.port = self._server.socket.getsockname()[1]
         threading.Thread(target=self._server.serve_forever, name=f"{self._name} server", daemon=True).start()
@@ -218,7 +220,8 @@ class BrowserDisplay(Display):
         canvas_px, screen_px = (_size(answer.get(key), self._name) for key in ("canvas_px", "screen_px"))
         if canvas_px != screen_px:
             raise Refused(
-                f"{self._name}: a canvas of {canvas_px[0]} x {canvas_px[1]} px on a screen of {screen_px[0]} x {screen_px[1]} px: "
+                f"{self._name}: a canvas of {canvas_px[0]} x {canvas_px[1]} px on a screen of {screen_px[0]} x "
+                f"{screen_px[1]} px: "
                 "one canvas pixel isn't one screen pixel; make the page full-screen at a zoom of 100 %",
                 _NOT_ONE_TO_ONE,
             )

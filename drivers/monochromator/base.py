@@ -1,4 +1,5 @@
-"""The monochromator abstraction: light of one wavelength, with a shutter, slits and a wheel of order-sorting filters."""
+"""The monochromator abstraction: light of one wavelength, with a shutter, slits and a wheel of order-sorting
+filters."""
 
 from __future__ import annotations
 
@@ -64,7 +65,8 @@ def order_sorting_filters(table: Sequence[object] | None) -> tuple[OrderSortingF
     for before, after in itertools.pairwise(rows):
         if after.from_nm < before.to_nm:
             raise InstrumentError(
-                f"monochromator: filters {before.place} and {after.place} both serve {after.from_nm} nm; give bands that don't overlap"
+                f"monochromator: filters {before.place} and {after.place} both serve {after.from_nm} nm; give bands "
+                "that don't overlap"
             )
     return tuple(rows)
 
@@ -88,7 +90,8 @@ class Monochromator(Instrument):
     _may_shine = False
 
     def _shut_for_good(self) -> InstrumentError | None:
-        """Close the shutter and read it back, a second time where that fails. Returns why it can't be said to be closed, or None."""
+        """Close the shutter and read it back, a second time where that fails. Returns why it can't be said to be
+        closed, or None."""
         failure: InstrumentError | None = None
         for _ in range(SHUT_ATTEMPTS):
             try:
@@ -109,8 +112,8 @@ class Monochromator(Instrument):
     def shut_at_once(self) -> bool:
         """Close the shutter before anything else is said: the first thing after a crash, and in a halt.
 
-        Returns whether the instrument answered that it is closed; False where it needs to be spoken to first. `connect` and
-        `stop` follow in any case. Raises `InstrumentError` where it isn't reached.
+        Returns whether the instrument answered that it is closed; False where it needs to be spoken to first. `connect`
+        and `stop` follow in any case. Raises `InstrumentError` where it isn't reached.
         """
         return False
 
@@ -119,11 +122,13 @@ class Monochromator(Instrument):
         """Go to a wavelength (nm; 0 is zero order, white light) with its order-sorting filter; returns on arrival."""
 
     def check_nm(self, wavelength_nm: float) -> None:
-        """Raise `InstrumentError` for a wavelength (nm) that `move_nm` would refuse, as far as the driver knows; nothing moves."""
+        """Raise `InstrumentError` for a wavelength (nm) that `move_nm` would refuse, as far as the driver knows;
+        nothing moves."""
         return
 
     def check_slit_um(self, width_um: float) -> None:
-        """Raise `InstrumentError` for a slit width (um) that `set_slit_um` would refuse, as far as the driver knows; nothing moves."""
+        """Raise `InstrumentError` for a slit width (um) that `set_slit_um` would refuse, as far as the driver knows;
+        nothing moves."""
         return
 
     @abstractmethod
@@ -160,7 +165,8 @@ class Monochromator(Instrument):
 
     @abstractmethod
     def bandwidth_nm(self) -> float:
-        """Full width at half maximum (nm) of the light: slit width x reciprocal linear dispersion of the grating in use.
+        """Full width at half maximum (nm) of the light: slit width x reciprocal linear dispersion of the grating in
+        use.
 
         0 where it isn't known, as the slits are set by hand and their width isn't stated; `departures` says so.
         """
@@ -180,7 +186,8 @@ def checked_slit_um(width_um: float) -> float:
     return width_um
 
 
-#: Reciprocal linear dispersion (nm/mm) of Cornerstone 260 and CS260B, times the grating's lines per mm: 1e6 nm/mm x cos(9.6 deg) / 260 mm.
+#: Reciprocal linear dispersion (nm/mm) of Cornerstone 260 and CS260B, times the grating's lines per mm: 1e6 nm/mm x
+#: cos(9.6 deg) / 260 mm.
 DISPERSION_NM = 1e6 / 260.0 * math.cos(math.radians(9.6))
 #: What the instruments say of slits that aren't motorised: no such accessory, or a statement that isn't known.
 NO_SLIT = {1, 6, -113, -241}
@@ -188,7 +195,8 @@ NO_SLIT = {1, 6, -113, -241}
 
 @dataclass(frozen=True)
 class HandSlits:
-    """Slits that a micrometer sets: what is known of them is the width (um) that the station file states, or nothing."""
+    """Slits that a micrometer sets: what is known of them is the width (um) that the station file states, or
+    nothing."""
 
     stated_um: float | None
 
@@ -196,7 +204,8 @@ class HandSlits:
         """Raise `InstrumentError` unless they have this width (um) already."""
         if self.stated_um is None or abs(self.stated_um - wanted_um) > 0.5:
             raise InstrumentError(
-                f"{who}: its slits are set by hand, and slit_um in its table of the station file says {self.stated_um}; turn them to "
+                f"{who}: its slits are set by hand, and slit_um in its table of the station file says "
+                f"{self.stated_um}; turn them to "
                 f"{wanted_um:g} um and state that there"
             )
 
@@ -208,14 +217,16 @@ class HandSlits:
 
 
 def lines_per_mm(told: str, who: str) -> float:
-    """Lines per mm of the grating in use, of the answer `1,1200,VIS` to GRAT?. Raises `InstrumentError` for another answer."""
+    """Lines per mm of the grating in use, of the answer `1,1200,VIS` to GRAT?. Raises `InstrumentError` for another
+    answer."""
     try:
         lines = float(told.split(",")[1])
     except (IndexError, ValueError):
         lines = 0.0
     if not lines > 0.0:
         raise InstrumentError(
-            f"{who}: says {told!r} of its grating, which has no lines per mm; state dispersion_nm_per_mm in the station file"
+            f"{who}: says {told!r} of its grating, which has no lines per mm; state dispersion_nm_per_mm in the "
+            "station file"
         )
     return lines
 

@@ -1,10 +1,10 @@
 """Oriel/Newport Cornerstone 260 on RS-232, and a CS260B / CS130B on its RS-232 port: 9600 8N1, replies end CR LF.
 
-The driver works in handshake mode, in which every statement is answered by the status byte: `00`, or `20` (hex) for an error whose
-number `ERROR?` tells. A Cornerstone 260 sends it when the motion is done, and echoes every character. A CS260B sends it on receipt:
-the driver asks `IDLE?` until nothing moves; its echo may be off. On closing, handshake and units are as they were found, by a process
-that was killed, too: the next program that talks to it expects its own. Sources: the manual's appendix on low level commands (p. 50-51); the MCS260B manual.
-"""
+The driver works in handshake mode, in which every statement is answered by the status byte: `00`, or `20` (hex) for an
+error whose number `ERROR?` tells. A Cornerstone 260 sends it when the motion is done, and echoes every character. A
+CS260B sends it on receipt: the driver asks `IDLE?` until nothing moves; its echo may be off. On closing, handshake and
+units are as they were found, by a process that was killed, too: the next program that talks to it expects its own.
+Sources: the manual's appendix on low level commands (p. 50-51); the MCS260B manual."""
 
 from __future__ import annotations
 
@@ -45,11 +45,13 @@ _FAILED = {"20", "32"}
 _NOT_UNDERSTOOD = 1
 #: Seconds between two looks at whether a motion has ended, where the instrument doesn't say so by itself.
 _LOOK_S = 0.1
-#: Lines that a slow instrument still sends after the statements of the first contact, echoes and status bytes, and the most of them.
+#: Lines that a slow instrument still sends after the statements of the first contact, echoes and status bytes, and the
+#: most of them.
 _LATE, _LATE_LINES = {"", "ABORT", *_DONE}, 6
 #: Most lines, echoes and status bytes among them, before an answer that tells where the instrument stands.
 _STALE_LINES = 24
-#: How often the shutter is asked before the first contact: a late answer to an earlier program is at most one of the answers.
+#: How often the shutter is asked before the first contact: a late answer to an earlier program is at most one of the
+#: answers.
 _ASKED = 2
 #: Longest time (s) that the status byte of HANDSHAKE itself is waited for.
 _HANDSHAKE_S = 1.0
@@ -59,8 +61,8 @@ class Cornerstone260(WireInstrument, Monochromator):
     """A Cornerstone 260.
 
     `filters`: the order-sorting filters (rows of `place`, `from_nm`, `to_nm`; None: the default table; an empty list:
-    no wheel). `grating`: which one to use, None: the one that stands. `dispersion_nm_per_mm`: None: by the lines of the grating in use.
-    `slit_um`: the width of slits that are set by hand. `move_timeout_s`: longest motion.
+    no wheel). `grating`: which one to use, None: the one that stands. `dispersion_nm_per_mm`: None: by the lines of the
+    grating in use. `slit_um`: the width of slits that are set by hand. `move_timeout_s`: longest motion.
     """
 
     def __init__(
@@ -235,7 +237,8 @@ class Cornerstone260(WireInstrument, Monochromator):
             self._do(f"GRAT {self.grating}")
 
     def _first_answer(self) -> tuple[str, bool]:
-        """The reply to INFO?, and whether handshake mode is on; by what comes with it also whether the instrument echoes.
+        """The reply to INFO?, and whether handshake mode is on; by what comes with it also whether the instrument
+        echoes.
 
         Late answers to what was sent before are skipped.
         """
@@ -278,7 +281,8 @@ class Cornerstone260(WireInstrument, Monochromator):
         self._do("SHUTTER C")
 
     def _gets_in_step(self) -> bool:
-        """End the motion and ask INFO?: answers come in the order of the statements, so what comes before its reply is stale."""
+        """End the motion and ask INFO?: answers come in the order of the statements, so what comes before its reply is
+        stale."""
         self._transport.write(b"\r\nABORT\r\nINFO?\r\n")
         for _ in range(_STALE_LINES):
             if self._line("INFO?") == self._info:
@@ -361,7 +365,8 @@ class Cornerstone260(WireInstrument, Monochromator):
     def _refused(self, statement: str, code: int) -> InstrumentError:
         meaning = ERRORS.get(code, "unknown error")
         return Refused(
-            f"{self._transport.name}: refused {statement!r}: error {code}, {meaning}; check the value against the instrument",
+            f"{self._transport.name}: refused {statement!r}: error {code}, {meaning}; check the value against the "
+            "instrument",
             code,
         )
 

@@ -1,7 +1,8 @@
-"""Newport Cornerstone 260B and 130B on USB: USBTMC, SCPI-like commands. Motions overlap; `idle?` says when all have ended.
+"""Newport Cornerstone 260B and 130B on USB: USBTMC, SCPI-like commands. Motions overlap; `idle?` says when all have
+ended.
 
-After each command the driver asks `system:error?`: the instrument says of no command that it wasn't obeyed. Source: Newport, MCS260B
-manual, p. 43-46, 62.
+After each command the driver asks `system:error?`: the instrument says of no command that it wasn't obeyed. Source:
+Newport, MCS260B manual, p. 43-46, 62.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ _LOOK_S = 0.05
 class Cornerstone260B(Monochromator):
     """A CS260B or CS130B at `usb://SERIAL` or `usbip://HOST:PORT/SERIAL` (or an already found pyusb `device`).
 
-    `filters`, `grating`, `dispersion_nm_per_mm`, `slit_um`, `upper_nm`, `tolerance_nm`: as of `cornerstone260`. `move_timeout_s`: longest motion;
-    a change of the grating takes 29 s.
+    `filters`, `grating`, `dispersion_nm_per_mm`, `slit_um`, `upper_nm`, `tolerance_nm`: as of `cornerstone260`.
+    `move_timeout_s`: longest motion; a change of the grating takes 29 s.
     """
 
     def __init__(
@@ -105,7 +106,8 @@ class Cornerstone260B(Monochromator):
             reached = self._number(wire, "wave?")
             if abs(reached - wanted) > self.tolerance_nm:
                 raise Garbled(
-                    f"{self._who}: stands at {reached:g} nm after a move to {wanted:g} nm; check its units and its calibration"
+                    f"{self._who}: stands at {reached:g} nm after a move to {wanted:g} nm; check its units and its "
+                    "calibration"
                 )
 
     def wavelength_nm(self) -> float:
@@ -142,7 +144,8 @@ class Cornerstone260B(Monochromator):
         return width_um
 
     def _slit_um(self) -> float | None:
-        """Width of the entrance slit, or what is stated of one that is set by hand: it doesn't answer the question then, and has an error."""
+        """Width of the entrance slit, or what is stated of one that is set by hand: it doesn't answer the question
+        then, and has an error."""
         with self._conversation() as wire:
             if not self._by_hand:
                 try:
@@ -218,7 +221,8 @@ class Cornerstone260B(Monochromator):
         device = self._given if self._given is not None else open_device(self.address)
         if device.idVendor != VENDOR or device.idProduct not in MODELS:
             raise InstrumentError(
-                f"{self._who}: USB device {device.idVendor:04x}:{device.idProduct:04x} is neither CS260B (1fde:0014) nor CS130B "
+                f"{self._who}: USB device {device.idVendor:04x}:{device.idProduct:04x} is neither CS260B (1fde:0014) "
+                "nor CS130B "
                 "(1fde:0006): correct the address in the station file"
             )
         self._open = UsbTmc(device, self._who, timeout_s=self.timeout_s, recorder=self._recorder)
@@ -252,7 +256,8 @@ class Cornerstone260B(Monochromator):
                     raise Interrupted(f"{self._who}: stopped while waiting for {command!r}; start again")
                 if time.monotonic() > until:
                     raise NoAnswer(
-                        f"{self._who}: still moving {self.move_timeout_s:g} s after {command!r}; listen whether its motors run"
+                        f"{self._who}: still moving {self.move_timeout_s:g} s after {command!r}; listen whether its "
+                        "motors run"
                     )
             if (error := self._error()) is not None:
                 code, text = error
@@ -286,7 +291,8 @@ class Cornerstone260B(Monochromator):
 
     def _strange(self, asked: str, answer: str) -> Garbled:
         return Garbled(
-            f"{self._who}: answered {asked!r} with {shown(answer.encode('latin-1'))}; check that a CS260B is at this address"
+            f"{self._who}: answered {asked!r} with {shown(answer.encode('latin-1'))}; check that a CS260B is at this "
+            "address"
         )
 
     def _drop(self) -> None:

@@ -1,4 +1,5 @@
-"""The reference photodiode: irradiance at the place of the sensor, as EMVA 1288 (release 4, section 6.1) has it measured."""
+"""The reference photodiode: irradiance at the place of the sensor, as EMVA 1288 (release 4, section 6.1) has it
+measured."""
 
 from __future__ import annotations
 
@@ -10,11 +11,11 @@ from drivers.instrument import Instrument
 
 @dataclass(frozen=True)
 class IrradianceMeasurement:
-    """Irradiance (W/m2) of light of one wavelength (nm), and what it was made of: current above dark (A) and its number of readings.
+    """Irradiance (W/m2) of light of one wavelength (nm), and what it was made of: current above dark (A) and its number
+    of readings.
 
-    `sd_irradiance_w_m2` holds the scatter of the readings and of the dark readings, and the calibration's own uncertainty;
-    `calibration_sd` is the latter, relative: all measurements with this photodiode have it in common.
-    """
+    `sd_irradiance_w_m2` holds the scatter of the readings and of the dark readings, and the calibration's own
+    uncertainty; `calibration_sd` is the latter, relative: all measurements with this photodiode have it in common."""
 
     irradiance_w_m2: float
     sd_irradiance_w_m2: float
@@ -32,9 +33,11 @@ class Photodiode(Instrument):
         """Current (A) without light, mean of the readings; later measurements are above it."""
 
     def check_nm(self, wavelength_nm: float) -> None:
-        """Raise `InstrumentError` for a wavelength (nm) that `measure` would refuse, as far as the driver knows; nothing is asked."""
+        """Raise `InstrumentError` for a wavelength (nm) that `measure` would refuse, as far as the driver knows;
+        nothing is asked."""
         return
 
     @abstractmethod
     def measure(self, wavelength_nm: float) -> IrradianceMeasurement:
-        """Irradiance of light of this wavelength. Raises `InstrumentError` outside the calibration, `Refused` for an overload."""
+        """Irradiance of light of this wavelength. Raises `InstrumentError` outside the calibration, `Refused` for an
+        overload."""

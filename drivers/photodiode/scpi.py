@@ -3,9 +3,9 @@
     E = (I - I_dark) / (R(wavelength) x A)
     sd(E)^2 = (s^2 / n + s_dark^2 / n_dark) / (R A)^2 + (u_R E)^2
 
-I: mean of n readings (A), s their standard deviation; R: responsivity (A/W) from the calibration file; A: area (m2) that the calibration
-holds for; u_R: its relative standard uncertainty. Source: EMVA 1288 release 4.0, section 6.1; Keithley 6485 and Keysight 34465A manuals
-for the commands.
+I: mean of n readings (A), s their standard deviation; R: responsivity (A/W) from the calibration file; A: area (m2)
+that the calibration holds for; u_R: its relative standard uncertainty. Source: EMVA 1288 release 4.0, section 6.1;
+Keithley 6485 and Keysight 34465A manuals for the commands.
 """
 
 from __future__ import annotations
@@ -40,12 +40,14 @@ _SETUP: tuple[tuple[str, tuple[str, ...]], ...] = (
 
 
 class ScpiPhotodiode(Photodiode):
-    """A photodiode whose meter has the VISA address `address` (`TCPIP0::host::5025::SOCKET`, `ASRL/dev/ttyUSB0::INSTR`, `USB0::...`).
+    """A photodiode whose meter has the VISA address `address` (`TCPIP0::host::5025::SOCKET`, `ASRL/dev/ttyUSB0::INSTR`,
+    `USB0::...`).
 
     `calibration`: CSV file of the columns `wavelength_nm,responsivity_a_per_w`. `area_mm2`: area that it holds for.
-    `calibration_sd_percent`: its relative standard uncertainty (half of the expanded one on the certificate). `readings`: of one
-    measurement, two at least, for their scatter is its uncertainty. `setup`: commands that set the meter to direct current, None: by its identity. `visa_library`: PyVISA's name of the
-    library, `@py` for the one in Python.
+    `calibration_sd_percent`: its relative standard uncertainty (half of the expanded one on the certificate).
+    `readings`: of one measurement, two at least, for their scatter is its uncertainty. `setup`: commands that set the
+    meter to direct current, None: by its identity. `visa_library`: PyVISA's name of the library, `@py` for the one in
+    Python.
     """
 
     def __init__(
@@ -101,7 +103,8 @@ class ScpiPhotodiode(Photodiode):
         low, high = self._responsivity.wavelength_nm[0], self._responsivity.wavelength_nm[-1]
         if not low <= wavelength_nm <= high:
             raise InstrumentError(
-                f"photodiode: {wavelength_nm} nm is outside its calibration's {low:g}..{high:g} nm; ask for a wavelength in it"
+                f"photodiode: {wavelength_nm} nm is outside its calibration's {low:g}..{high:g} nm; ask for a "
+                "wavelength in it"
             )
 
     def measure(self, wavelength_nm: float) -> IrradianceMeasurement:
@@ -143,7 +146,8 @@ class ScpiPhotodiode(Photodiode):
                 raise
 
     def _meet(self) -> None:
-        """Open the connection; twice if it was tried before, as a late answer to what was asked then may still arrive."""
+        """Open the connection; twice if it was tried before, as a late answer to what was asked then may still
+        arrive."""
         again, self._tried = self._tried, True
         try:
             self._establish()
@@ -225,7 +229,8 @@ class ScpiPhotodiode(Photodiode):
         return answer.decode("latin-1").strip()
 
     def _answer(self) -> bytes:
-        """The next line. The library reads on as long as anything comes: here it ends with the time-out, whatever comes."""
+        """The next line. The library reads on as long as anything comes: here it ends with the time-out, whatever
+        comes."""
         from pyvisa.constants import StatusCode
 
         until, line = time.monotonic() + self.timeout_s, bytearray()
@@ -237,7 +242,8 @@ class ScpiPhotodiode(Photodiode):
                 return bytes(line)
             if time.monotonic() > until:
                 raise Garbled(
-                    f"{self._who}: sends without end, {shown(bytes(line[:24]))} ...; check that a SCPI meter is at this address"
+                    f"{self._who}: sends without end, {shown(bytes(line[:24]))} ...; check that a SCPI meter is at "
+                    "this address"
                 )
 
     def _do(self, command: str, action: Any) -> Any:
@@ -261,7 +267,8 @@ class ScpiPhotodiode(Photodiode):
 
     def _strange(self, asked: str, answer: str) -> Garbled:
         return Garbled(
-            f"{self._who}: answered {asked!r} with {shown(answer.encode('latin-1', 'replace'))}; check that a SCPI meter is at this address"
+            f"{self._who}: answered {asked!r} with {shown(answer.encode('latin-1', 'replace'))}; check that a SCPI "
+            "meter is at this address"
         )
 
     def _drop(self) -> None:

@@ -1,7 +1,7 @@
 """Colorimetry Research CR-250 and CR-300 on the serial line: 115200 8N1, case-sensitive commands, answers end CR LF.
 
-An answer is `OK:0:COMMAND:TEXT` or `ER:CODE:MEANING:COMMAND`. A spectrum's step and number of values stand in its first line: a
-CR-300's is 1 nm for one public client and 2 nm for another, so no table of ours says it.
+An answer is `OK:0:COMMAND:TEXT` or `ER:CODE:MEANING:COMMAND`. A spectrum's step and number of values stand in its first
+line: a CR-300's is 1 nm for one public client and 2 nm for another, so no table of ours says it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""Ocean Optics spectrometers through `seabreeze` (its pure-Python backend): counts, made a radiance by a calibration file.
+"""Ocean Optics spectrometers through `seabreeze` (its pure-Python backend): counts, made a radiance by a calibration
+file.
 
-Every model on USB that the library knows; only the USB2000+ was tried, on its mock. The instruments have no radiometric calibration of their own. The file's two columns are
-`wavelength_nm,counts_per_s_per_w_sr_m2_nm`: counts a second above dark, corrected for the instrument's nonlinearity, for a
-radiance of 1 W sr^-1 m^-2 nm^-1 at the place where it is used (fibre, lens and distance included).
-"""
+Every model on USB that the library knows; only the USB2000+ was tried, on its mock. The instruments have no radiometric
+calibration of their own. The file's two columns are `wavelength_nm,counts_per_s_per_w_sr_m2_nm`: counts a second above
+dark, corrected for the instrument's nonlinearity, for a radiance of 1 W sr^-1 m^-2 nm^-1 at the place where it is used
+(fibre, lens and distance included)."""
 
 from __future__ import annotations
 
@@ -39,10 +40,10 @@ FloatArray = NDArray[np.float64]
 class OceanOptics(Spectroradiometer):
     """A spectrometer at `usb://SERIAL` or `usbip://HOST:PORT/SERIAL` (or an already found pyusb `device`).
 
-    `calibration`: the file described above. `max_integration_s`: longest integration time it may choose. `averages`: scans
-    that one measurement takes. `dark_counts`: counts without light, needed for models that have no covered pixels. The spectrum comes on whole nanometres from `from_nm` to `to_nm`, as far as the calibration
-    reaches. `recorder` is taken for the sake of the station file; `seabreeze` keeps the wire to itself.
-    """
+    `calibration`: the file described above. `max_integration_s`: longest integration time it may choose. `averages`:
+    scans that one measurement takes. `dark_counts`: counts without light, needed for models that have no covered
+    pixels. The spectrum comes on whole nanometres from `from_nm` to `to_nm`, as far as the calibration reaches.
+    `recorder` is taken for the sake of the station file; `seabreeze` keeps the wire to itself."""
 
     def __init__(
         self,
@@ -63,7 +64,8 @@ class OceanOptics(Spectroradiometer):
             )
         if not max_integration_s >= _SHORTEST_S:
             raise InstrumentError(
-                f"spectrometer: max_integration_s = {max_integration_s} s is below the limit of {_SHORTEST_S} s: allow it more"
+                f"spectrometer: max_integration_s = {max_integration_s} s is below the limit of {_SHORTEST_S} s: "
+                "allow it more"
             )
         self.address, self._given = address, device
         self._response = read_calibration(calibration, COLUMNS, "spectrometer")
@@ -71,7 +73,8 @@ class OceanOptics(Spectroradiometer):
         self._grid_nm = np.arange(max(from_nm, int(np.ceil(low))), min(to_nm, int(high)) + 1, dtype=float)
         if self._grid_nm.size < 2:
             raise InstrumentError(
-                f"spectrometer: {from_nm}..{to_nm} nm lies outside the calibration's {low:g}..{high:g} nm: ask for wavelengths inside"
+                f"spectrometer: {from_nm}..{to_nm} nm lies outside the calibration's {low:g}..{high:g} nm: ask for "
+                "wavelengths inside"
             )
         self.max_integration_s, self.averages, self.dark_counts = max_integration_s, averages, dark_counts
         self._lock = threading.RLock()
@@ -91,7 +94,8 @@ class OceanOptics(Spectroradiometer):
             self._model = USBTransport.vendor_product_ids.get((device.idVendor, device.idProduct), "")
             if not self._model:
                 raise InstrumentError(
-                    f"spectrometer {self.address}: USB device {device.idVendor:04x}:{device.idProduct:04x} is no spectrometer that "
+                    f"spectrometer {self.address}: USB device {device.idVendor:04x}:{device.idProduct:04x} is no "
+                    "spectrometer that "
                     "seabreeze knows: correct the address in the station file"
                 )
             try:
@@ -100,7 +104,8 @@ class OceanOptics(Spectroradiometer):
                 pixels = self._open.f.spectrometer
                 self._wavelength_nm = np.asarray(pixels.get_wavelengths(), float)
                 self._dark_pixels = np.array(pixels.get_electric_dark_pixel_indices())
-                # The library stretches counts so that saturation is at 65535; calibrations and the bend are in raw counts.
+                # The library stretches counts so that saturation is at 65535; calibrations and the bend are in raw
+                # counts.
                 self._stretch = float(pixels._normalization_value)
                 self._full_scale = float(pixels.get_maximum_intensity()) / self._stretch
                 self._bend = self._nonlinearity()
@@ -113,7 +118,8 @@ class OceanOptics(Spectroradiometer):
             if self._dark_pixels.size == 0 and self.dark_counts is None:
                 self._drop()
                 raise InstrumentError(
-                    f"spectrometer {self.address}: a {self._model} has no covered pixels: give dark_counts in the station file"
+                    f"spectrometer {self.address}: a {self._model} has no covered pixels: give dark_counts in the "
+                    "station file"
                 )
             if not (np.all(np.isfinite(self._wavelength_nm)) and np.all(np.diff(self._wavelength_nm) > 0)):
                 self._drop()
@@ -152,7 +158,8 @@ class OceanOptics(Spectroradiometer):
                 raise self._error(error, "measuring") from error
             signal = np.mean([self._signal(scan) for scan in scans], axis=0)
             rate = Spectrum.of(self._wavelength_nm, signal / integration_s)
-            # The mean over every nanometre, so that the pixels' noise averages and no light is lost between the samples.
+            # The mean over every nanometre, so that the pixels' noise averages and no light is lost between the
+            # samples.
             mean_rate = np.asarray(rate.resample(self._grid_nm).value)
             radiance = Spectrum.of(self._grid_nm, mean_rate / self._response.at(self._grid_nm))
             return RadianceMeasurement(radiance, integration_s, str(self._open.serial_number))
@@ -165,7 +172,7 @@ class OceanOptics(Spectroradiometer):
         with self._lock:
             self._drop()
 
-    # --- inside -----------------------------------------------------------------------------------------------------------
+    # --- inside -------------------------------------------------------------------------------------------------------
 
     def _connected(self) -> Any:
         if self._open is None:
@@ -198,7 +205,8 @@ class OceanOptics(Spectroradiometer):
             counts = np.asarray(pixels.get_intensities(), float) / self._stretch
         except ValueError as error:  # the library's, where bytes are missing
             raise Garbled(
-                f"spectrometer {self.address}: sent a spectrum that isn't whole ({' '.join(str(error).split())}); measure again"
+                f"spectrometer {self.address}: sent a spectrum that isn't whole ({' '.join(str(error).split())}); "
+                "measure again"
             ) from error
         if counts.shape != self._wavelength_nm.shape:
             raise Garbled(
@@ -207,7 +215,8 @@ class OceanOptics(Spectroradiometer):
         covered = counts[self._dark_pixels]
         if covered.size > 1 and np.ptp(covered) == 0 and covered[0] < SATURATED * self._full_scale:
             raise Garbled(
-                f"spectrometer {self.address}: sent {covered[0]:.0f} counts for each of its {covered.size} covered pixels, without any noise; "
+                f"spectrometer {self.address}: sent {covered[0]:.0f} counts for each of its {covered.size} covered "
+                "pixels, without any noise; "
                 "measure again"
             )
         return counts
@@ -226,7 +235,8 @@ class OceanOptics(Spectroradiometer):
             if np.max(counts) >= SATURATED * self._full_scale:
                 if seconds <= self._shortest_s:
                     raise InstrumentError(
-                        f"spectrometer {self.address}: over-exposed at its shortest time of {self._shortest_s:g} s: dim the light"
+                        f"spectrometer {self.address}: over-exposed at its shortest time of {self._shortest_s:g} s: "
+                        "dim the light"
                     )
                 seconds = max(seconds / 5.0, self._shortest_s)
             elif peak >= LEAST * room:
@@ -235,7 +245,8 @@ class OceanOptics(Spectroradiometer):
                 noise = float(np.std(counts[self._dark_pixels], ddof=1)) if self._dark_pixels.size > 1 else 0.0
                 if peak < _LEAST_OVER_NOISE * noise:
                     raise InstrumentError(
-                        f"spectrometer {self.address}: under-exposed, {peak:.0f} counts above dark at {seconds:g} s with a noise of "
+                        f"spectrometer {self.address}: under-exposed, {peak:.0f} counts above dark at {seconds:g} s "
+                        "with a noise of "
                         f"{noise:.0f}: give it more light or a longer `max_integration_s`"
                     )
                 return seconds

@@ -1,7 +1,8 @@
-"""Photo Research PR-655 and PR-670 on the serial line: remote mode, commands end CR, answers end CR LF and begin with a quality code.
+"""Photo Research PR-655 and PR-670 on the serial line: remote mode, commands end CR, answers end CR LF and begin with a
+quality code.
 
-Sources: PR-655 manual, p. 127; what public clients expect where it leaves room. A spectrum has one or two lines before its values
-(both are told in public), the wavelengths stand beside the values, so their step is the instrument's own.
+Sources: PR-655 manual, p. 127; what public clients expect where it leaves room. A spectrum has one or two lines before
+its values (both are told in public), the wavelengths stand beside the values, so their step is the instrument's own.
 """
 
 from __future__ import annotations
@@ -133,5 +134,6 @@ class Pr655(WireInstrument, Spectroradiometer):
 
     def _strange(self, asked: str, answer: bytes) -> Garbled:
         return Garbled(
-            f"{self._transport.name}: answered {asked!r} with {shown(answer)}; check that a PR-655 or PR-670 is at this address"
+            f"{self._transport.name}: answered {asked!r} with {shown(answer)}; check that a PR-655 or PR-670 is at "
+            "this address"
         )

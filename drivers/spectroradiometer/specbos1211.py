@@ -1,9 +1,10 @@
 """JETI specbos 1211 and 1201, spectraval 1501 and 1511 on their serial line: 8N1, no flow control, commands end CR.
 
-A setting is answered by ACK or NAK; after a NAK, `*stat:err?` tells why. A measurement (`*init`, a spectraval's `*meas:refer`) is
-answered by ACK, and by BEL once it is done; ENQ in between is passed over. Without flow control a spectrum can lose characters on its
-way: it is asked for again. A spectraval takes `*para:` where a specbos takes `*conf:`, tells its error as a bare number, chooses its
-integration time with `*para:tint 0`, and its spectrum on `*calc:sprad` ends with ETX
+A setting is answered by ACK or NAK; after a NAK, `*stat:err?` tells why. A measurement (`*init`, a spectraval's
+`*meas:refer`) is answered by ACK, and by BEL once it is done; ENQ in between is passed over. Without flow control a
+spectrum can lose characters on its
+way: it is asked for again. A spectraval takes `*para:` where a specbos takes `*conf:`, tells its error as a bare
+number, chooses its integration time with `*para:tint 0`, and its spectrum on `*calc:sprad` ends with ETX
 (unverified without the instrument: after the behaviour of a public client, ArgyllCMS).
 """
 
@@ -29,8 +30,9 @@ ERRORS = {
     141: ("outside the calibrated range", "ask for wavelengths within the instrument's calibration"),
 }
 OUT_OF_RANGE = 141
-#: Ranges (nm) that are tried, each within the one before, where a unit's own isn't calibrated to its ends: the usual calibrations, to 1000 nm, of visible light with its margins, and of 380 to 780 nm. Not from a manual: a unit whose own range
-#: differs takes `from_nm` and `to_nm` in the station file.
+#: Ranges (nm) that are tried, each within the one before, where a unit's own isn't calibrated to its ends: the usual
+#: calibrations, to 1000 nm, of visible light with its margins, and of 380 to 780 nm. Not from a manual: a unit whose
+#: own range differs takes `from_nm` and `to_nm` in the station file.
 NARROWER_NM = ((350, 1000), (350, 830), (380, 780))
 #: A fetch that broke off is asked for again, this often in all.
 FETCHES = 5
@@ -42,8 +44,8 @@ _HEADER_LINES = 2
 class Specbos1211(WireInstrument, Spectroradiometer):
     """A specbos or spectraval. Rates in `baudrates` are tried in turn; a TCP connection has none.
 
-    `from_nm`, `to_nm`: range asked for, in steps of 1 nm; None: as far as the unit is calibrated, by its own word, or less where it then
-    refuses to measure that (error 141). `max_integration_s`: longest
+    `from_nm`, `to_nm`: range asked for, in steps of 1 nm; None: as far as the unit is calibrated, by its own word, or
+    less where it then refuses to measure that (error 141). `max_integration_s`: longest
     integration time that the instrument may choose; one measurement ends within 5 times that and 10 s.
     """
 
@@ -165,7 +167,8 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         wanted += [high if self._wanted_nm[1] is None else self._wanted_nm[1]]
         if not low <= wanted[0] < wanted[1] <= high:
             raise InstrumentError(
-                f"{self._transport.name}: {wanted[0]}..{wanted[1]} nm isn't within the {low}..{high} nm for which it is calibrated; "
+                f"{self._transport.name}: {wanted[0]}..{wanted[1]} nm isn't within the {low}..{high} nm for which it "
+                "is calibrated; "
                 "correct from_nm and to_nm in the station file, or leave them out"
             )
         self.from_nm, self.to_nm = int(wanted[0]), int(wanted[1])
@@ -294,7 +297,8 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         rest = line.drain(quiet_s=AFTER_S)
         if rest.strip():
             raise Garbled(
-                f"{line.name}: sent {shown(rest.strip())} after {len(values)} values; check that nothing else talks to it"
+                f"{line.name}: sent {shown(rest.strip())} after {len(values)} values; check that nothing else talks "
+                "to it"
             )
         return Spectrum.of(wavelengths, values)
 

@@ -36,7 +36,8 @@ class OperatorStage(WireInstrument, Stage):
             answer = self._ask(f"PLACE {target}", self.place_timeout_s)
             if answer != f"OK {target}":
                 raise Garbled(
-                    f"{self._transport.name}: answered 'PLACE {target}' with {shown(answer.encode())}; check what stands there"
+                    f"{self._transport.name}: answered 'PLACE {target}' with {shown(answer.encode())}; check what "
+                    "stands there"
                 )
 
     def placed(self) -> str:
@@ -57,7 +58,8 @@ class OperatorStage(WireInstrument, Stage):
         answer = self._ask("PLACED?")
         if "PLACED?" in answer:  # an echo, or a complaint about it
             raise Garbled(
-                f"{self._transport.name}: answered 'PLACED?' with {shown(answer.encode())}; check that a stage is at this address"
+                f"{self._transport.name}: answered 'PLACED?' with {shown(answer.encode())}; check that a stage is at "
+                "this address"
             )
 
     def _make_safe(self) -> None:

@@ -33,7 +33,8 @@ class PromptStage(Stage):
     def connect(self) -> None:
         if self._ask is None and not (sys.stdin and sys.stdin.isatty()):
             raise InstrumentError(
-                "target stage: nobody can be asked, the input is no terminal; run it in one, or use the stage driver 'operator'"
+                "target stage: nobody can be asked, the input is no terminal; run it in one, or use the stage driver "
+                "'operator'"
             )
 
     def identity(self) -> Identity:

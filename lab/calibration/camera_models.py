@@ -1,8 +1,8 @@
 """The camera models of the registry, kept as camera files: `DATA/cameras/RESULT/SIDE.toml`.
 
-A fit's model is the baseline with what was fitted; a diagnosis' has the effects that it named, too. They stay when the session is
-deleted. What was kept before there were such files has none: fit again. A model that was sent in belongs to no session.
-"""
+A fit's model is the baseline with what was fitted; a diagnosis' has the effects that it named, too. They stay when the
+session is deleted. What was kept before there were such files has none: fit again. A model that was sent in belongs to
+no session."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ _ID = re.compile(r"[0-9a-f]{16}")
 
 
 class ModelParameter(Frozen):
-    """A parameter of a camera model as it is declared, with its value; `std`: one standard uncertainty, None where none is known."""
+    """A parameter of a camera model as it is declared, with its value; `std`: one standard uncertainty, None where none
+    is known."""
 
     name: str
     unit: str
@@ -69,7 +70,8 @@ class ModelOfCamera(Frozen):
 
 
 class CameraModelRecord(Frozen):
-    """The cameras of one result, by side. `source`: the session, or the folder of recordings; empty for what was sent in."""
+    """The cameras of one result, by side. `source`: the session, or the folder of recordings; empty for what was sent
+    in."""
 
     id: str
     kind: Kind
@@ -94,7 +96,8 @@ def keep(store: Store, result_id: str, cameras: Mapping[Side, CameraFile]) -> No
     partial.mkdir(parents=True)
     try:
         for side, content in cameras.items():
-            # The table of a traced lens goes beside the file: a prescription's path would only be good on this computer.
+            # The table of a traced lens goes beside the file: a prescription's path would only be good on this
+            # computer.
             write_camera(partial / f"{side}.toml", replace(content, prescription=None))
         partial.rename(folder)
     finally:
@@ -111,7 +114,8 @@ def bring_in(store: Store, cameras: Mapping[Side, CameraFile]) -> str:
 
 
 def remove(store: Store, model_id: str) -> None:
-    """Delete a model that was sent in, for ever. Raises InputError where there is none, and for one that a fit or a diagnosis found."""
+    """Delete a model that was sent in, for ever. Raises InputError where there is none, and for one that a fit or a
+    diagnosis found."""
     found = record(store, model_id)
     if found.kind != "sent":
         raise InputError(

@@ -1,7 +1,8 @@
-"""The figures of a calibration: every number of a fit that has a standard deviation, by the name that `compare` gives it.
+"""The figures of a calibration: every number of a fit that has a standard deviation, by the name that `compare` gives
+it.
 
-Curves and kernels are left out: they have no single value that a limit could bound. What is read off them (MTF50) is there.
-"""
+Curves and kernels are left out: they have no single value that a limit could bound. What is read off them (MTF50) is
+there."""
 
 from __future__ import annotations
 
@@ -14,8 +15,8 @@ from sim.parameters import Frozen
 
 
 class Figure(Frozen):
-    """One number of a calibration. `side` None: of the pair; `place`: which of several numbers under one name (`fx`), else empty.
-    `sensor`: of a dark current, at which temperature it was measured."""
+    """One number of a calibration. `side` None: of the pair; `place`: which of several numbers under one name (`fx`),
+    else empty. `sensor`: of a dark current, at which temperature it was measured."""
 
     name: str
     side: Side | None = None

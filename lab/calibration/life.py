@@ -1,8 +1,9 @@
-"""The registry of calibrations: what each is, who certified it against which limits, until when, and how its figures drift.
+"""The registry of calibrations: what each is, who certified it against which limits, until when, and how its figures
+drift.
 
-Every fit of a session is a calibration of the session's cameras, which are known by what they report: maker, model and serial
-number. It is a **candidate** until somebody certifies it against limits, **certified** then, **superseded** when a later one of the
-same cameras is certified, and **expired** when its time is over.
+Every fit of a session is a calibration of the session's cameras, which are known by what they report: maker, model and
+serial number. It is a **candidate** until somebody certifies it against limits, **certified** then, **superseded** when
+a later one of the same cameras is certified, and **expired** when its time is over.
 """
 
 from __future__ import annotations
@@ -54,8 +55,9 @@ class CalibrationRecord(Frozen):
 
 
 class HistoryPoint(Frozen):
-    """A figure in one calibration. `temperature_c`: of a dark current, the sensor's as it was measured. `mark`: by the limits, None without one. `significance_sigma`: of its difference from the
-    reference, the calibration before it that was certified last, or the first of all; `drifted`: beyond the limit of the false-alarm rate."""
+    """A figure in one calibration. `temperature_c`: of a dark current, the sensor's as it was measured. `mark`: by the
+    limits, None without one. `significance_sigma`: of its difference from the reference, the calibration before it that
+    was certified last, or the first of all; `drifted`: beyond the limit of the false-alarm rate."""
 
     calibration_id: str
     created: datetime
@@ -70,8 +72,8 @@ class HistoryPoint(Frozen):
 
 
 class History(Frozen):
-    """A figure of a camera over its calibrations, oldest first, one entry each. `title`, `unit`: as a lab reads them. `threshold_sigma`:
-    beyond it a change is called a drift."""
+    """A figure of a camera over its calibrations, oldest first, one entry each. `title`, `unit`: as a lab reads them.
+    `threshold_sigma`: beyond it a change is called a drift."""
 
     camera: str
     figure: str
@@ -84,12 +86,12 @@ class History(Frozen):
     points: tuple[HistoryPoint, ...]
 
 
-# --- cameras -------------------------------------------------------------------------------------------------------------
+# --- cameras ----------------------------------------------------------------------------------------------------------
 
 
 def cameras_of(instruments: Mapping[str, Mapping[str, str]], station: Station) -> dict[Side, str]:
-    """Name of each camera of a run: maker, model and serial number as it reports them. Without a serial number it is known by its
-    station and side."""
+    """Name of each camera of a run: maker, model and serial number as it reports them. Without a serial number it is
+    known by its station and side."""
     found: dict[Side, str] = {}
     for side in station.sides:
         identity = instruments.get(f"camera {side}", {})
@@ -119,25 +121,28 @@ def check_certified(store: Store, cameras: Mapping[Side, str]) -> None:
         else f"{len(found)} calibrations of it are known, none is certified"
     )
     raise InputError(
-        f"cameras {', '.join(cameras.values())}: the session demands a certified calibration, and {why}; certify one with "
+        f"cameras {', '.join(cameras.values())}: the session demands a certified calibration, and {why}; certify one "
+        "with "
         "`calibench calibrations certify ID`, or start without --certified"
     )
 
 
 def check_nothing_rests_on(store: Store, session_id: str) -> None:
-    """Raises InputError where a calibration that is certified now rests on the session; enters the others, which stay without it."""
+    """Raises InputError where a calibration that is certified now rests on the session; enters the others, which stay
+    without it."""
     register(store)
     with store.reading() as db:
         found = [_calibration(*row) for row in db.execute(_asked().where(CalibrationRow.session_id == session_id))]
     for one in found:
         if one.state == "certified":
             raise InputError(
-                f"session {session_id}: the certified calibration {one.id} rests on it; its captures are kept until that is "
+                f"session {session_id}: the certified calibration {one.id} rests on it; its captures are kept until "
+                "that is "
                 "superseded or expired"
             )
 
 
-# --- registering ---------------------------------------------------------------------------------------------------------
+# --- registering ------------------------------------------------------------------------------------------------------
 
 
 def register(store: Store) -> None:
@@ -198,7 +203,7 @@ def _entry(
     return row, figures
 
 
-# --- reading -------------------------------------------------------------------------------------------------------------
+# --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def _aware(at: datetime | None) -> datetime | None:
@@ -292,7 +297,7 @@ def figure_names(store: Store) -> list[tuple[str, str, str]]:
         return [(camera, name, place) for camera, name, place in sorted(db.execute(asked))]
 
 
-# --- certifying ----------------------------------------------------------------------------------------------------------
+# --- certifying -------------------------------------------------------------------------------------------------------
 
 
 def certify(
@@ -336,7 +341,10 @@ def certify(
 def _refusal(id: str, one: Judgement) -> str:
     where = " ".join(part for part in (one.side, one.figure, one.place) if part)
     if one.value is None:
-        return f"calibration {id}: {where}: the calibration doesn't have it; capture what determines it, or take the limit out"
+        return (
+            f"calibration {id}: {where}: the calibration doesn't have it; capture what determines it, or take the "
+            "limit out"
+        )
     return (
         f"calibration {id}: {where} = {one.value:.6g} +- {one.std:.2g} is {one.mark}, good is {one.limit.good_text}; "
         + (
@@ -347,7 +355,7 @@ def _refusal(id: str, one: Judgement) -> str:
     )
 
 
-# --- history -------------------------------------------------------------------------------------------------------------
+# --- history ----------------------------------------------------------------------------------------------------------
 
 
 def history(
@@ -358,14 +366,14 @@ def history(
     limits: CalibrationLimits | None = None,
     false_alarm_rate: float = FALSE_ALARM_RATE,
 ) -> History:
-    """A figure of a camera over its calibrations. A session that was fitted again with the same outcome is entered once: by its newest fit, or
-    by that which was certified.
+    """A figure of a camera over its calibrations. A session that was fitted again with the same outcome is entered
+    once: by its newest fit, or by that which was certified.
 
-    Each is compared with its reference as `compare` does, by the standard deviation of the difference, dark currents at the sensor
-    temperature of the reference. The threshold is that at which
-    an unchanged camera has any drift called in its whole history with the probability `false_alarm_rate` (Sidak). `limits`: by
-    default those of the camera's newest certificate. Raises InputError where the camera or the figure isn't known.
-    """
+    Each is compared with its reference as `compare` does, by the standard deviation of the difference, dark currents at
+    the sensor temperature of the reference. The threshold is that at which
+    an unchanged camera has any drift called in its whole history with the probability `false_alarm_rate` (Sidak).
+    `limits`: by default those of the camera's newest certificate. Raises InputError where the camera or the figure
+    isn't known."""
     register(store)
     of_figure = (FigureRow.camera == camera, FigureRow.name == figure, FigureRow.place == place)
     life = (CalibrationRow.created, CalibrationRow.certified, CalibrationRow.superseded, CalibrationRow.expires)
@@ -411,7 +419,8 @@ def _once_a_session(rows: Sequence[Any]) -> list[Any]:
 
 
 def _points(rows: Sequence[Any], limit: Limit | None, threshold_sigma: float) -> Iterator[HistoryPoint]:
-    """A point for each row, oldest first. The reference is the last one before that was ever certified, else the first."""
+    """A point for each row, oldest first. The reference is the last one before that was ever certified, else the
+    first."""
     at = now()
     reference = None
     for row in rows:

@@ -1,8 +1,9 @@
 """Limits that a laboratory sets on figures of a calibration: a good and a warning band each.
 
-A figure is judged by its value and its uncertainty, as ISO 14253-1 decides conformity: `good` where the whole interval of value
-+- 2 standard deviations lies in the good band, `warn` where it lies in the warning band, else `bad`. A figure without a stated
-uncertainty is judged by its value alone. A limit whose figure the calibration doesn't have is `missing`.
+A figure is judged by its value and its uncertainty, as ISO 14253-1 decides conformity: `good` where the whole interval
+of value
++- 2 standard deviations lies in the good band, `warn` where it lies in the warning band, else `bad`. A figure without a
+stated uncertainty is judged by its value alone. A limit whose figure the calibration doesn't have is `missing`.
 
     valid_days = 90
     [[limit]]
@@ -34,7 +35,8 @@ COVERAGE_FACTOR = 2.0
 
 
 class Limit(Frozen):
-    """The bands of one figure. `place`: of a figure of several numbers (`fx`), which; empty: all. None as an end: no limit there."""
+    """The bands of one figure. `place`: of a figure of several numbers (`fx`), which; empty: all. None as an end: no
+    limit there."""
 
     figure: str = Field(min_length=1, max_length=200)
     side: Side | None = None
@@ -85,14 +87,16 @@ def _ends(band: tuple[float | None, float | None]) -> tuple[float, float]:
 
 
 class CalibrationLimits(Frozen):
-    """Limits of a laboratory. `valid_days`: how long a calibration that was certified against them may be used; None: until it is superseded."""
+    """Limits of a laboratory. `valid_days`: how long a calibration that was certified against them may be used; None:
+    until it is superseded."""
 
     valid_days: float | None = Field(default=None, gt=0.0, le=36_500.0)
     limit: tuple[Limit, ...] = Field(min_length=1, max_length=500)
 
 
 class Judgement(Frozen):
-    """One figure against one limit. `value` None: the calibration doesn't have it. `title`, `unit`: as a lab reads them."""
+    """One figure against one limit. `value` None: the calibration doesn't have it. `title`, `unit`: as a lab reads
+    them."""
 
     figure: str
     title: str = ""
@@ -142,7 +146,8 @@ def judged(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judg
 
 
 def standing_limits(folder: Path) -> CalibrationLimits | None:
-    """The limits of a data folder, `limits.toml`; None where it has none. Raises InputError where they can't be used."""
+    """The limits of a data folder, `limits.toml`; None where it has none. Raises InputError where they can't be
+    used."""
     file = folder / "limits.toml"
     return read_limits(file) if file.exists() else None
 

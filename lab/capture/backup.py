@@ -1,8 +1,8 @@
 """A backup of a data folder while it is in use: a folder that is itself a data folder.
 
-Files of sessions never change once they are linked, so a backup copies only those that it hasn't yet. The registry is copied at one
-moment, by SQLite itself, before the files. A session that is packed meanwhile moves its frames into one file: the copy is then
-checked against the registry's copy, and both are taken again.
+Files of sessions never change once they are linked, so a backup copies only those that it hasn't yet. The registry is
+copied at one moment, by SQLite itself, before the files. A session that is packed meanwhile moves its frames into one
+file: the copy is then checked against the registry's copy, and both are taken again.
 """
 
 from __future__ import annotations
@@ -39,14 +39,15 @@ class BackupCount:
 def back_up(store: Store, folder: Path) -> BackupCount:
     """Bring the backup in `folder` up to date, or make it.
 
-    Files that were deleted from the data folder stay in the backup, except frames that were packed. Raises InputError where the
-    registry isn't SQLite, where `folder` lies in the data folder or holds anything but a backup of it, where files can't be written,
-    and where files that the registry names are missing or damaged.
+    Files that were deleted from the data folder stay in the backup, except frames that were packed. Raises InputError
+    where the registry isn't SQLite, where `folder` lies in the data folder or holds anything but a backup of it, where
+    files can't be written, and where files that the registry names are missing or damaged.
     """
     target = folder.resolve()
     if store.count_sessions() == 0 and any((store.root / "sessions").glob("*/*")):
         raise InputError(
-            f"{store.root}: its registry names no session, and there are folders of sessions; where the registry is a database server's, set "
+            f"{store.root}: its registry names no session, and there are folders of sessions; where the registry is a "
+            "database server's, set "
             "CALIBENCH_DATABASE_URL as the service has it, and dump it by its own means (pg_dump)"
         )
     if store.settings.database_url is not None:
@@ -95,7 +96,8 @@ def _taken(store: Store, target: Path) -> BackupCount:
             _drop_packed(store.root, target)
             return BackupCount(sessions, number, copied, copied_bytes)
     raise InputError(
-        f"backup: {len(lacking)} files that the registry names are missing or damaged in the data folder, such as {lacking[0]}; the backup "
+        f"backup: {len(lacking)} files that the registry names are missing or damaged in the data folder, such as "
+        f"{lacking[0]}; the backup "
         "of before is kept"
     )
 
@@ -118,8 +120,8 @@ def _files(root: Path) -> Iterator[Path]:
 
 
 def _copied(source: Path, made: Path) -> int | None:
-    """Copy a file, unless the backup has one of the same size and time. Returns the bytes copied; None if nothing was, also where the
-    file vanished meanwhile (deleted or packed)."""
+    """Copy a file, unless the backup has one of the same size and time. Returns the bytes copied; None if nothing was,
+    also where the file vanished meanwhile (deleted or packed)."""
     try:
         there = source.stat()
         if made.exists() and (made.stat().st_size, made.stat().st_mtime_ns) == (there.st_size, there.st_mtime_ns):
@@ -136,8 +138,8 @@ def _copied(source: Path, made: Path) -> int | None:
 def _checked(registry: Path, target: Path) -> tuple[int, int, list[str]]:
     """Number of sessions and of linked files in a copied registry, and the files that the backup lacks.
 
-    A file must exist with the registered size, one of at most `_COMPARED_BYTES` also with the registered SHA-256. Of packed frames only
-    the pack must exist: their SHA-256 is checked whenever one is read.
+    A file must exist with the registered size, one of at most `_COMPARED_BYTES` also with the registered SHA-256. Of
+    packed frames only the pack must exist: their SHA-256 is checked whenever one is read.
     """
     asked = "SELECT session_id, path, sha256, bytes, pack_index FROM files"
     with contextlib.closing(sqlite3.connect(registry)) as copy:

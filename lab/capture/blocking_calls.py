@@ -1,4 +1,5 @@
-"""An instrument's blocking calls in threads of their own, each with a time-out: a driver that never returns can't hang a session."""
+"""An instrument's blocking calls in threads of their own, each with a time-out: a driver that never returns can't hang
+a session."""
 
 from __future__ import annotations
 
@@ -21,13 +22,15 @@ T = TypeVar("T")
 STOP_S = 15.0
 
 
-#: How long (s) a thread without work is kept: starting one takes milliseconds where the cores are busy, and a step takes five.
+#: How long (s) a thread without work is kept: starting one takes milliseconds where the cores are busy, and a step
+#: takes five.
 IDLE_S = 1.0
 _Work = tuple[Callable[[], Any], "Future[Any]"]
 
 
 class _Threads:
-    """Daemon threads that carry out one call after the other. One whose call never returns is replaced, and doesn't keep the process alive."""
+    """Daemon threads that carry out one call after the other. One whose call never returns is replaced, and doesn't
+    keep the process alive."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -1,9 +1,9 @@
 """The sequences as a catalogue, and what a plan takes on a station: captures and time.
 
-The time is learned from the sessions that the station has finished: a step takes a + b t, t being its fixed exposure. a is the mean of what
-the steps of the same sequence and the same work took, b the slope over all fixed exposures, as a stage, a search for an exposure or a
-person at a prompt are as fast as they are. Where a station has no such session, typical times of the instruments stand in.
-"""
+The time is learned from the sessions that the station has finished: a step takes a + b t, t being its fixed exposure. a
+is the mean of what the steps of the same sequence and the same work took, b the slope over all fixed exposures, as a
+stage, a search for an exposure or a person at a prompt are as fast as they are. Where a station has no such session,
+typical times of the instruments stand in."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ from lab.capture_kinds.base import CAPTURES, SEQUENCES, FindExposure, FixedExpos
 from lab.errors import InputError
 from sim.parameters import Frozen, read_quantities
 
-#: What a step does, in seconds where a station hasn't shown it yet: a search takes some six test frames and a change of the light, a
-#: spectroradiometer 3 to 12 s at the levels of a monochromator, a pair of frames its read-out and its files.
+#: What a step does, in seconds where a station hasn't shown it yet: a search takes some six test frames and a change of
+#: the light, a spectroradiometer 3 to 12 s at the levels of a monochromator, a pair of frames its read-out and its
+#: files.
 TYPICAL_S = {"search": 5.0, "measurement": 6.0, "frame": 0.5}
 #: Sessions of a station that its times are learned from, of so many that are looked at, the newest ones.
 LEARNED_FROM, LOOKED_AT = 3, 40
@@ -124,7 +125,7 @@ def parse_parameters(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
     return dict(found)
 
 
-# --- the time ------------------------------------------------------------------------------------------------------------
+# --- the time ---------------------------------------------------------------------------------------------------------
 
 #: A step's sequence, and what it does.
 Work = tuple[str, tuple[str, ...]]
@@ -145,7 +146,8 @@ def _exposure_s(step: Step) -> float:
 
 @dataclass(frozen=True)
 class StepTimes:
-    """How long the steps of a station take: `mean_s` of each work, and `per_exposure` s more for a second of fixed exposure."""
+    """How long the steps of a station take: `mean_s` of each work, and `per_exposure` s more for a second of fixed
+    exposure."""
 
     mean_s: Mapping[Work, float]
     per_exposure: float = 1.0

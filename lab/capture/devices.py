@@ -1,7 +1,7 @@
 """A station's instruments as bluesky's devices: plain classes with the methods of `bluesky.protocols`.
 
-A driver's calls block. Each runs in a thread of its own and is represented by a `Status` with a time-out. On pause and stop, bluesky
-calls the devices' `pause` and `stop`, which close the shutter and darken the screen.
+A driver's calls block. Each runs in a thread of its own and is represented by a `Status` with a time-out. On pause and
+stop, bluesky calls the devices' `pause` and `stop`, which close the shutter and darken the screen.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from sim.spectrum import Spectrum
 WriteFrame = Callable[[str, Side, NDArray[np.uint16]], StoredFile]
 WriteSpectrum = Callable[[str, Spectrum], StoredFile]
 
-#: Time-outs (s) of a move, of placing a target (a person may do it), of a measurement of light, and of what a camera does beside the
-#: exposures and the readouts, whose own time-outs (`Camera.readout_s`) come on top: the drivers' messages say more.
+#: Time-outs (s) of a move, of placing a target (a person may do it), of a measurement of light, and of what a camera
+#: does beside the exposures and the readouts, whose own time-outs (`Camera.readout_s`) come on top: the drivers'
+#: messages say more.
 MOVE_S, PLACE_S, MEASURE_S, READOUT_S = 90.0, 660.0, 180.0, 30.0
 
 
@@ -151,8 +152,8 @@ class ShutterDevice(Device):
         return Status("monochromator", move, MOVE_S)
 
     def bar(self) -> None:
-        """Close the shutter now, whatever the monochromator does, and open it no more. Raises InstrumentError where it doesn't say that it is
-        closed."""
+        """Close the shutter now, whatever the monochromator does, and open it no more. Raises InstrumentError where it
+        doesn't say that it is closed."""
         self._barred = True
         self.monochromator.stop()
         with self._moving:  # one that was about to open it has done so, or was refused
@@ -176,9 +177,9 @@ class ShutterDevice(Device):
 def shut(monochromator: Monochromator) -> None:
     """Stop a monochromator and ask for its shutter. Raises InstrumentError where it says that it is open still.
 
-    One that isn't connected yet ignores a stop: it is connected then, and told to close. A stop by another thread, which closes the shutter as well,
-    ends the question: it is asked again within `STOP_S`, without another stop, which would end the question of that thread in turn.
-    """
+    One that isn't connected yet ignores a stop: it is connected then, and told to close. A stop by another thread,
+    which closes the shutter as well, ends the question: it is asked again within `STOP_S`, without another stop, which
+    would end the question of that thread in turn."""
     until = time.monotonic() + STOP_S
     monochromator.stop()
     while True:
@@ -198,7 +199,8 @@ def shut(monochromator: Monochromator) -> None:
 
 @dataclass(frozen=True)
 class ShownPattern:
-    """The pattern on the screen, by its path in the session (None: the screen is dark), and its screen pixels per cell."""
+    """The pattern on the screen, by its path in the session (None: the screen is dark), and its screen pixels per
+    cell."""
 
     path: str | None = None
     cell_px: int = 1
@@ -265,7 +267,8 @@ class RadiometerDevice(Device):
 
 
 class PhotodiodeDevice(Device):
-    """The reference photodiode: prepared with the wavelength (nm) of the light, triggered to measure its irradiance (W m^-2).
+    """The reference photodiode: prepared with the wavelength (nm) of the light, triggered to measure its irradiance (W
+    m^-2).
 
     Prepared with None, it measures its dark current (A).
     """
@@ -302,10 +305,11 @@ class PhotodiodeDevice(Device):
 
 @dataclass(frozen=True)
 class Shot:
-    """One trigger of all cameras: exposures (s), gain (dB), and paths of the frames; the frame of a side without a path isn't kept.
+    """One trigger of all cameras: exposures (s), gain (dB), and paths of the frames; the frame of a side without a path
+    isn't kept.
 
-    `repeats`: number of following shots with the same exposures and gain, with nothing moved in between; cameras that stream take them
-    as one series.
+    `repeats`: number of following shots with the same exposures and gain, with nothing moved in between; cameras that
+    stream take them as one series.
     """
 
     exposure_s: Mapping[Side, float]
@@ -319,11 +323,12 @@ class Shot:
 
 
 def level_of(frame: NDArray[np.uint16], sheet: DataSheet) -> float:
-    """Level of a frame (rows, cols), a share of its range: (p - black level) / range, where p is the brightest channel's 99.5th percentile.
+    """Level of a frame (rows, cols), a share of its range: (p - black level) / range, where p is the brightest
+    channel's 99.5th percentile.
 
-    The range (DN) goes from the black level to the code of saturation, or to the data sheet's full well where that is lower. A
-    percentile, because a hot pixel must not set the exposure; channel by channel, because a chart's white patch is a few percent of
-    the frame.
+    The range (DN) goes from the black level to the code of saturation, or to the data sheet's full well where that is
+    lower. A percentile, because a hot pixel must not set the exposure; channel by channel, because a chart's white
+    patch is a few percent of the frame.
     """
     black = sheet.black_level_dn or 0.0
     top = sheet.saturation_dn
@@ -376,7 +381,8 @@ class CamerasDevice(Device):
         return max(camera.readout_s for camera in self.cameras.values())
 
     def _expose(self, shot: Shot) -> Sequence[Frame]:
-        """A frame of each camera, the next of the series under way if there is one. A lost or incomplete frame is taken again."""
+        """A frame of each camera, the next of the series under way if there is one. A lost or incomplete frame is taken
+        again."""
         if self._stream is None and shot.repeats:
             streaming = [camera for camera in self.cameras.values() if isinstance(camera, StreamingCamera)]
             if len(streaming) == len(self.cameras):
@@ -417,8 +423,10 @@ class CamerasDevice(Device):
                 sheet = self.sheets[side]
                 if frame.raw.shape != (sheet.rows, sheet.cols):
                     raise InstrumentError(
-                        f"camera {side}: a frame of {frame.raw.shape[0]} x {frame.raw.shape[1]} pixels came, the data sheet in "
-                        f"the station file says {sheet.rows} x {sheet.cols}; correct rows and cols there, or the camera's region"
+                        f"camera {side}: a frame of {frame.raw.shape[0]} x {frame.raw.shape[1]} pixels came, the data "
+                        "sheet in "
+                        f"the station file says {sheet.rows} x {sheet.cols}; correct rows and cols there, or the "
+                        "camera's region"
                     )
             self._keep(frames, shot)
             self.frames = frames
@@ -428,7 +436,8 @@ class CamerasDevice(Device):
         return Status("cameras", take, (1 + MOST_LOST) * once_s + READOUT_S)
 
     def _keep(self, frames: Mapping[Side, Frame], shot: Shot) -> None:
-        """Levels of the frames, and the files of those that are kept, all sides at once: hashing and the disk wait for nobody."""
+        """Levels of the frames, and the files of those that are kept, all sides at once: hashing and the disk wait for
+        nobody."""
 
         def kept(side: Side) -> tuple[float, StoredFile | None]:
             raw, path = frames[side].raw, shot.paths.get(side)

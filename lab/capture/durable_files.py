@@ -19,7 +19,8 @@ def npy_bytes(array: NDArray[Any]) -> bytes:
 
 
 def write_durably(path: Path, content: bytes) -> None:
-    """Write a file completely or not at all, and flush it to the disk: temporary name, fsync, rename, fsync of the folder."""
+    """Write a file completely or not at all, and flush it to the disk: temporary name, fsync, rename, fsync of the
+    folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
     with partial.open("wb") as file:

@@ -1,4 +1,5 @@
-"""Locks between processes, on files: they end with their process. The standard library alone, as the first thing of a start needs them."""
+"""Locks between processes, on files: they end with their process. The standard library alone, as the first thing of a
+start needs them."""
 
 from __future__ import annotations
 
@@ -9,14 +10,16 @@ from pathlib import Path
 
 
 class Lock:
-    """A lock on a file, held by one process at a time. The system releases it when that process ends, even by kill -9."""
+    """A lock on a file, held by one process at a time. The system releases it when that process ends, even by kill
+    -9."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file: int | None = None
 
     def acquire(self, patience_s: float = 0.2) -> bool:
-        """Try to take the lock for `patience_s`; whether it succeeded. It has to try, as `is_held` holds the lock for a moment."""
+        """Try to take the lock for `patience_s`; whether it succeeded. It has to try, as `is_held` holds the lock for a
+        moment."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
         until = time.monotonic() + patience_s

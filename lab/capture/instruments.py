@@ -52,8 +52,9 @@ Shutter = Literal["closed", "unknown", "none"]
 
 
 class SafeState(Frozen):
-    """How a station's instruments were brought into their safe state. `shutter`: `closed` by the monochromator's own answer, `unknown` where it didn't give
-    one, `none` where the station has no monochromator; `complaints`: a line for each instrument that failed to stop; `at`: when (UTC)."""
+    """How a station's instruments were brought into their safe state. `shutter`: `closed` by the monochromator's own
+    answer, `unknown` where it didn't give one, `none` where the station has no monochromator; `complaints`: a line for
+    each instrument that failed to stop; `at`: when (UTC)."""
 
     shutter: Shutter
     complaints: tuple[str, ...] = ()
@@ -108,8 +109,8 @@ class Instruments:
 
         `go_on` is called before each; what it raises ends the connecting.
 
-        Raises DeviceError where an instrument doesn't answer, and where a camera's pixels or colour filters contradict its data sheet.
-        """
+        Raises DeviceError where an instrument doesn't answer, and where a camera's pixels or colour filters contradict
+        its data sheet."""
         found: dict[str, Identity] = {}
         for name, driver in self.drivers.all.items():
             go_on()
@@ -125,10 +126,11 @@ class Instruments:
         return found
 
     def check(self, steps: Sequence[Step]) -> None:
-        """Raise DeviceError for what these steps need and an instrument can't do; nothing moves, and nothing is exposed.
+        """Raise DeviceError for what these steps need and an instrument can't do; nothing moves, and nothing is
+        exposed.
 
-        That is a wavelength, a slit width, an exposure, a gain, the line that triggers a camera, and a screen of another size.
-        """
+        That is a wavelength, a slit width, an exposure, a gain, the line that triggers a camera, and a screen of
+        another size."""
         for asks, whence in self._demands(steps):
             try:
                 asks()
@@ -171,7 +173,8 @@ class Instruments:
                 yield partial(camera.check, exposure_s, limits.gain_db), whence
 
     def _check_screen(self, target: str) -> None:
-        """Raise DeviceError where the display's screen isn't as large as the station file has it: something scales its pixels."""
+        """Raise DeviceError where the display's screen isn't as large as the station file has it: something scales its
+        pixels."""
         wanted = self.station.targets[target].screen_px if target in self.station.targets else None
         if self.screen is None or wanted is None:
             return
@@ -181,8 +184,10 @@ class Instruments:
             raise DeviceError(named_complaint("display", error)) from error
         if found != wanted:
             raise DeviceError(
-                f"display: its screen has {found[0]} x {found[1]} px, [targets.{target}] in the station file says {wanted[0]} x {wanted[1]}: "
-                "the system scales its pixels, or it is another screen; set its scaling to 100 %, or correct rows and cols there"
+                f"display: its screen has {found[0]} x {found[1]} px, [targets.{target}] in the station file says "
+                f"{wanted[0]} x {wanted[1]}: "
+                "the system scales its pixels, or it is another screen; set its scaling to 100 %, or correct rows and "
+                "cols there"
             )
 
     def make_safe(self) -> SafeState:
@@ -203,8 +208,8 @@ class Instruments:
 def made_safe(
     drivers: Drivers, first: Callable[[Instrument], None], on_shut: Callable[[], None] = lambda: None
 ) -> SafeState:
-    """Stop every instrument of a station, all at once, within `STOP_S`, after `first` was called with it. `on_shut` is called as soon as the
-    monochromator has answered that its shutter is closed."""
+    """Stop every instrument of a station, all at once, within `STOP_S`, after `first` was called with it. `on_shut` is
+    called as soon as the monochromator has answered that its shutter is closed."""
 
     def stopped(driver: Instrument) -> None:
         first(driver)
@@ -221,7 +226,8 @@ def made_safe(
 
 
 def _complaints(stopping: Mapping[str, Future[None]]) -> dict[str, str]:
-    """Wait for instruments that are being stopped, `STOP_S` for all together. Returns a line for each that failed to stop, by its name."""
+    """Wait for instruments that are being stopped, `STOP_S` for all together. Returns a line for each that failed to
+    stop, by its name."""
     complaints, until = {}, time.monotonic() + STOP_S
     for name, future in stopping.items():
         try:
@@ -238,14 +244,16 @@ def contradiction(side: str, sensor: SensorInfo, sheet: DataSheet) -> str | None
     where = "its data sheet in the station file says"
     if (sensor.rows, sensor.cols) != (sheet.rows, sheet.cols):
         return (
-            f"camera {side}: has {sensor.rows} x {sensor.cols} pixels, {where} {sheet.rows} x {sheet.cols}; correct rows and cols "
+            f"camera {side}: has {sensor.rows} x {sensor.cols} pixels, {where} {sheet.rows} x {sheet.cols}; correct "
+            "rows and cols "
             "there, or the camera's region"
         )
     if sensor.cfa not in (None, sheet.cfa):
         return f"camera {side}: says its colour filters are {sensor.cfa}, {where} {sheet.cfa}; correct cfa there"
     if sensor.bit_depth not in (None, sheet.bit_depth):
         return (
-            f"camera {side}: its codes have {sensor.bit_depth} bits, {where} {sheet.bit_depth}; correct bit_depth there, or give the "
+            f"camera {side}: its codes have {sensor.bit_depth} bits, {where} {sheet.bit_depth}; correct bit_depth "
+            "there, or give the "
             "camera a pixel_format"
         )
     return None

@@ -31,7 +31,8 @@ def migrate(engine: sa.Engine, folder: Path) -> None:
                 return
             if found is not None and found not in known:
                 raise InputError(
-                    f"{folder}: its registry has the revision {found}, written by a newer calibench; install that version, or restore "
+                    f"{folder}: its registry has the revision {found}, written by a newer calibench; install that "
+                    "version, or restore "
                     "the backup of before the upgrade"
                 )
             config.attributes["connection"] = connection

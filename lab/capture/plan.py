@@ -35,7 +35,8 @@ class CapturePlan:
         for step in made:
             if (there := times[name_of(step.id)]) > 1:
                 raise InputError(
-                    f"sequences: the step {step.id} is there {there} times; take each sequence once, and give every value once"
+                    f"sequences: the step {step.id} is there {there} times; take each sequence once, and give every "
+                    "value once"
                 )
         return made
 
@@ -56,9 +57,9 @@ def full_plan(
 ) -> CapturePlan:
     """Every sequence whose instruments and targets the station has. `quick` takes fewer frames of each.
 
-    `only`: names of the sequences to take. `parameters`: values in place of those that a full session has. Raises InputError where the
-    station can't take one of the sequences, and for a parameter that none of them has or that is out of its bounds.
-    """
+    `only`: names of the sequences to take. `parameters`: values in place of those that a full session has. Raises
+    InputError where the station can't take one of the sequences, and for a parameter that none of them has or that is
+    out of its bounds."""
     possible = [planned for kind in SEQUENCES.values() if (planned := kind.planned(station, quick)) is not None]
     taken = possible if only is None else _only(possible, only)
     wanted = parameters or {}

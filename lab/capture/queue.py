@@ -1,8 +1,10 @@
-"""The queue of sessions that wait for their instruments. It is kept in the registry, so it survives a restart of the service.
+"""The queue of sessions that wait for their instruments. It is kept in the registry, so it survives a restart of the
+service.
 
-A queued session starts when its turn has come, its instruments are free and its time (`not_before`) is reached. A run that was aborted, failed or
-was killed holds the queued sessions that need one of its instruments: no shutter that somebody just closed opens by itself. They start after
-somebody releases them, or after the run that held them is resumed and finishes.
+A queued session starts when its turn has come, its instruments are free and its time (`not_before`) is reached. A run
+that was aborted, failed or was killed holds the queued sessions that need one of its instruments: no shutter that
+somebody just closed opens by itself. They start after somebody releases them, or after the run that held them is
+resumed and finishes.
 """
 
 from __future__ import annotations
@@ -59,8 +61,8 @@ def put_into_queue(
 ) -> None:
     """Queue a session, or move a queued one to `place` (1 is first; None: last, or its present place).
 
-    It is held for the reason `held`, or released where that is None. Raises InputError for a session that is unknown, runs or is finished.
-    """
+    It is held for the reason `held`, or released where that is None. Raises InputError for a session that is unknown,
+    runs or is finished."""
     with store.transaction() as db:
         row = db.get(SessionRow, session_id)
         if row is None or row.state not in STARTABLE:
@@ -86,7 +88,8 @@ def leave_queue(store: Store, session_id: str) -> None:
 
 
 def hold_queue(db: Session, why: str, station: dict[str, Any] | None = None) -> None:
-    """Hold the queued sessions that need an instrument of `station` (as the registry has it); None: all queued sessions."""
+    """Hold the queued sessions that need an instrument of `station` (as the registry has it); None: all queued
+    sessions."""
     addresses = None if station is None else Station.model_validate(station).addresses
     for row in _waiting(db):
         if addresses is None or addresses & Station.model_validate(row.station).addresses:

@@ -60,7 +60,8 @@ class ResultInfo(_Record):
 
 
 class RunRecord(Frozen):
-    """Provenance of one run of a session: when, after how many finished steps, with which instruments and which versions."""
+    """Provenance of one run of a session: when, after how many finished steps, with which instruments and which
+    versions."""
 
     started: datetime
     steps_done: int = 0

@@ -1,8 +1,8 @@
 """Recovery of sessions whose process died: kill -9, a power cut, a crash.
 
-Such a session may have left the shutter open. Its station is made safe (shutter closed, screen dark, motion stopped), the reason
-is recorded, and the session is resumed where its station says so (`resume_automatically`) or where only packing is left.
-"""
+Such a session may have left the shutter open. Its station is made safe (shutter closed, screen dark, motion stopped),
+the reason is recorded, and the session is resumed where its station says so (`resume_automatically`) or where only
+packing is left."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from lab.capture.store import Store
 from lab.errors import DeviceError, InputError
 
 log = logging.getLogger(__name__)
-#: Interval (s) between searches of the registry for sessions whose process died, and longest interval between attempts to reach
-#: instruments that didn't answer.
+#: Interval (s) between searches of the registry for sessions whose process died, and longest interval between attempts
+#: to reach instruments that didn't answer.
 LOOK_S, LONGEST_PAUSE_S = 5.0, 60.0
 
 
 def make_station_safe(
     station: Station, connect: Callable[[Station], Drivers] = drivers_of, on_shut: Callable[[], None] = lambda: None
 ) -> SafeState:
-    """Connect to every instrument of a station and stop it, all at once: shutter closed, screen dark, motion stopped. A person at a prompt isn't asked.
+    """Connect to every instrument of a station and stop it, all at once: shutter closed, screen dark, motion stopped. A
+    person at a prompt isn't asked.
 
     An instrument that isn't reached, or doesn't stop within `STOP_S`, has its complaint. `on_shut` is called as soon as
     the shutter has answered that it is closed: where it can be asked at once, long before the instrument's identity
@@ -64,11 +65,12 @@ def ended_without_progress_twice(store: Store, session_id: str) -> bool:
 
 
 class Recovery:
-    """Looks for sessions whose process died, makes their stations safe, and resumes those that may be resumed automatically.
+    """Looks for sessions whose process died, makes their stations safe, and resumes those that may be resumed
+    automatically.
 
-    It works in a thread from `start` to `close`. `connect` makes a station's drivers. An instrument that doesn't answer is tried
-    again until it does; meanwhile the session's `error` says so. `made_safe`: sessions whose stations are safe already, with their
-    locks, which are held since.
+    It works in a thread from `start` to `close`. `connect` makes a station's drivers. An instrument that doesn't answer
+    is tried again until it does; meanwhile the session's `error` says so. `made_safe`: sessions whose stations are safe
+    already, with their locks, which are held since.
     """
 
     def __init__(
@@ -123,7 +125,8 @@ class Recovery:
             self._wake.clear()
 
     def look(self) -> None:
-        """Make the stations of all sessions safe whose process died, and resume those that may be resumed automatically."""
+        """Make the stations of all sessions safe whose process died, and resume those that may be resumed
+        automatically."""
         for session_id in self._store.under_way():
             at, _ = self._next_try_s.get(session_id, (0.0, 0.0))
             if self._clock() >= at and not self._ended.is_set():
@@ -152,7 +155,10 @@ class Recovery:
                 _, pause_s = self._next_try_s.get(session_id, (0.0, LOOK_S / 2))
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
                 self._next_try_s[session_id] = (self._clock() + pause_s, pause_s)
-                said = f"{began}; not brought into a safe state: {'; '.join(complaints)}; look after them, they are tried again"
+                said = (
+                    f"{began}; not brought into a safe state: {'; '.join(complaints)}; look after them, they are "
+                    "tried again"
+                )
                 self._store.set_state(session_id, "running", error=said)  # so that the next look finds it
                 log.error("session %s: %s", session_id, said)
                 return
@@ -174,7 +180,11 @@ class Recovery:
             return "resume it when the bench is ready", False
         if ended_without_progress_twice(self._store, session_id):
             return (
-                "its last two runs finished no step, so it isn't resumed by itself: look after the bench, then resume it",
+                (
+                    "its last two runs finished no step, so it isn't resumed by itself: look after the bench, then "
+                    "resume "
+                    "it"
+                ),
                 False,
             )
         return "it goes on by itself, as its station says", True

@@ -1,8 +1,9 @@
 """The first step of a start: make the stations safe whose session ended by a crash.
 
-The shutter comes first. Closing it needs the standard library and the monochromator's driver alone, less than a tenth of a second of CPU. Then the other
-instruments are stopped, whose drivers need half a second of it. The command line's and the registry's own libraries take as long again, and the service two
-seconds more: on a busy computer that is many seconds of light. `lab.capture.recovery` then records what happened, and looks after what wasn't reached here. A
+The shutter comes first. Closing it needs the standard library and the monochromator's driver alone, less than a tenth
+of a second of CPU. Then the other instruments are stopped, whose drivers need half a second of it. The command line's
+and the registry's own libraries take as long again, and the service two seconds more: on a busy computer that is many
+seconds of light. `lab.capture.recovery` then records what happened, and looks after what wasn't reached here. A
 registry that isn't SQLite is left to it.
 """
 
@@ -59,7 +60,8 @@ class _Station:
         self.shutter_asked.set()
 
     def stop_others(self) -> None:
-        """Stop the other instruments. Their drivers are loaded here, one after the other: threads that import the same modules can disturb each other."""
+        """Stop the other instruments. Their drivers are loaded here, one after the other: threads that import the same
+        modules can disturb each other."""
         for family, entry in self._entries(*_OTHERS):
             try:
                 instrument = driver(family, entry["driver"])(entry["address"], **_settings(entry))
@@ -119,10 +121,11 @@ class _Station:
 
 
 class Rescue:
-    """The stations of all sessions that are recorded as under way and that no process runs, being made safe: motion ends, shutters close, screens go dark.
+    """The stations of all sessions that are recorded as under way and that no process runs, being made safe: motion
+    ends, shutters close, screens go dark.
 
-    Raises nothing: what doesn't succeed here is tried again, and told, by the recovery. `tell`: called with a line where a shutter is closed, and
-    where a whole station is safe.
+    Raises nothing: what doesn't succeed here is tried again, and told, by the recovery. `tell`: called with a line
+    where a shutter is closed, and where a whole station is safe.
     """
 
     def __init__(self, data: Path, tell: Callable[[str], None] = lambda _: None) -> None:
@@ -147,7 +150,8 @@ class Rescue:
             station.close_shutter()
 
     def stop_others(self, patience_s: float) -> None:
-        """Wait, for `patience_s` at most, until every shutter was asked to close, then have all other instruments stopped."""
+        """Wait, for `patience_s` at most, until every shutter was asked to close, then have all other instruments
+        stopped."""
         until_s = time.monotonic() + patience_s
         for station in self._stations:
             station.shutter_asked.wait(max(0.0, until_s - time.monotonic()))
@@ -155,8 +159,9 @@ class Rescue:
             station.stop_others()
 
     def made_safe(self, patience_s: float) -> dict[str, Lock]:
-        """Wait, for `patience_s` at most, for the instruments. The sessions whose stations are safe, with their locks, which are held; those of
-        the others are released, as the recovery takes them while an instrument that doesn't answer is still waited for here."""
+        """Wait, for `patience_s` at most, for the instruments. The sessions whose stations are safe, with their locks,
+        which are held; those of the others are released, as the recovery takes them while an instrument that doesn't
+        answer is still waited for here."""
         until_s = time.monotonic() + patience_s
         safe: dict[str, Lock] = {}
         for station in self._stations:
@@ -172,8 +177,9 @@ _at_start: list[Rescue] = []
 
 
 def make_safe_at_start(arguments: Sequence[str]) -> None:
-    """What `calibench serve ARGUMENTS` does first: have the stations of its data folder's sessions that ended by a crash made safe, and say when they
-    are. While the instruments answer, the service may be loaded; `made_safe_at_start` waits for them."""
+    """What `calibench serve ARGUMENTS` does first: have the stations of its data folder's sessions that ended by a
+    crash made safe, and say when they are. While the instruments answer, the service may be loaded;
+    `made_safe_at_start` waits for them."""
     if "CALIBENCH_DATABASE_URL" in os.environ:
         return
     data = os.environ.get("CALIBENCH_DATA", "calibench-data")
@@ -190,8 +196,8 @@ def _say(line: str) -> None:
 
 
 def made_safe_at_start() -> dict[str, Lock]:
-    """The sessions whose stations `make_safe_at_start` made safe, with their locks, which are held. To be called before somebody else speaks to
-    the same instruments."""
+    """The sessions whose stations `make_safe_at_start` made safe, with their locks, which are held. To be called before
+    somebody else speaks to the same instruments."""
     return {name: lock for rescue in _at_start for name, lock in rescue.made_safe(INSTRUMENTS_S).items()}
 
 

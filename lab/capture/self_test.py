@@ -29,8 +29,8 @@ MOST_EXPOSURE_S = 10.0
 
 @dataclass(frozen=True)
 class SelfTest:
-    """Result of one instrument's self-test: its name in the station, its identity (maker, model, serial number, firmware), whether it works,
-    and the finding in words."""
+    """Result of one instrument's self-test: its name in the station, its identity (maker, model, serial number,
+    firmware), whether it works, and the finding in words."""
 
     name: str
     identity: str
@@ -39,7 +39,8 @@ class SelfTest:
 
 
 def self_tests(drivers: Drivers, sheets: Mapping[str, DataSheet] = MappingProxyType({})) -> Iterator[SelfTest]:
-    """Connect to each instrument, bring it into its safe state, use it once for its purpose, check that it is safe, and disconnect.
+    """Connect to each instrument, bring it into its safe state, use it once for its purpose, check that it is safe, and
+    disconnect.
 
     `sheets`: the cameras' data sheets by side, held against what the cameras say.
     """
@@ -48,7 +49,8 @@ def self_tests(drivers: Drivers, sheets: Mapping[str, DataSheet] = MappingProxyT
 
 
 def self_test(station: Station, name: str, connect: Callable[[Station], Drivers] = drivers_of) -> SelfTest:
-    """The self-test of one instrument (`monochromator`, `cameras.left`, ...). Raises InputError if the station hasn't got it."""
+    """The self-test of one instrument (`monochromator`, `cameras.left`, ...). Raises InputError if the station hasn't
+    got it."""
     _entry(station, name)
     side = _said(name).partition(" ")[2]
     return _self_test(_said(name), connect(station).all[_said(name)], _sheets(station).get(side))
@@ -104,7 +106,8 @@ def _self_test(name: str, instrument: Instrument, sheet: DataSheet | None = None
 
 
 def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
-    """A self-test of one instrument (`monochromator`, `cameras.left`, ...), with a transcript of its messages in a file.
+    """A self-test of one instrument (`monochromator`, `cameras.left`, ...), with a transcript of its messages in a
+    file.
 
     Raises InputError if the station has no such instrument or the file can't be written.
     """
@@ -132,10 +135,14 @@ def check_station(station: Station) -> list[SelfTest]:
 
 
 def station_text(found: Iterable[Found]) -> str:
-    """A station file (TOML) of the instruments that are connected. Cameras are asked for their pixels, colour filters and bit depth; what
-    they don't tell becomes a comment. Raises DeviceError where there is no camera or one doesn't answer."""
+    """A station file (TOML) of the instruments that are connected. Cameras are asked for their pixels, colour filters
+    and bit depth; what they don't tell becomes a comment. Raises DeviceError where there is no camera or one doesn't
+    answer."""
     lines = [
-        "# Written by `calibench station init` from what is connected. Data sheets hold what the makers say: complete them."
+        (
+            "# Written by `calibench station init` from what is connected. Data sheets hold what the makers say: complete "  # noqa: E501
+            "them."
+        )
     ]
     sides = iter(("left", "right"))
     cameras = 0
@@ -158,7 +165,8 @@ def station_text(found: Iterable[Found]) -> str:
             lines += ["", f"# also connected: {one.what} at {one.address}"]
     if not cameras:
         raise DeviceError(
-            "no camera is connected that a driver here reaches: plug it in, give --usbip HOST:PORT, or install its library "
+            "no camera is connected that a driver here reaches: plug it in, give --usbip HOST:PORT, or install its "
+            "library "
             "(calibench[basler], Aravis); `calibench devices` shows what is"
         )
     if exposures:

@@ -1,8 +1,8 @@
 """Run a session on a station: every step exactly once, through interruptions.
 
-bluesky's RunEngine runs the plan; the journal in the registry says which steps are done. A run that ended early (Ctrl-C, an
-instrument that failed, kill -9, a power cut) is resumed by running the session again: finished steps are not taken again, and
-the others are taken whole.
+bluesky's RunEngine runs the plan; the journal in the registry says which steps are done. A run that ended early
+(Ctrl-C, an instrument that failed, kill -9, a power cut) is resumed by running the session again: finished steps are
+not taken again, and the others are taken whole.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ PACKAGES = ("calibench", "numpy", "bluesky", "pyserial", "pyusb", "h5py")
 
 
 class Progress(Frozen):
-    """Progress of a session: `done` of `total` steps are finished, `what` is the current one; times in s. `bench`: state of the instruments
-    after the previous step."""
+    """Progress of a session: `done` of `total` steps are finished, `what` is the current one; times in s. `bench`:
+    state of the instruments after the previous step."""
 
     session: str
     state: Literal["connecting", "running", "paused", "packing", "interrupted", "failed", "finished"]
@@ -93,8 +93,8 @@ class _Pace:
 class _Writes:
     """Allows writes until the run is over.
 
-    An abort doesn't end the threads that wait for instruments. A thread that returns late must not write into the next run's files.
-    """
+    An abort doesn't end the threads that wait for instruments. A thread that returns late must not write into the next
+    run's files."""
 
     def __init__(self) -> None:
         self._change = threading.Condition()
@@ -128,9 +128,8 @@ class _Ended(Exception):
 class CaptureSession:
     """One session on its station. `run` blocks; `pause`, `resume` and `abort` may be called from other threads.
 
-    `station`: None for the station of its last run, or that it was registered with; another one where instruments have new addresses.
-    `on_progress` is called from a thread of the run. An exception that it raises ends the run.
-    """
+    `station`: None for the station of its last run, or that it was registered with; another one where instruments have
+    new addresses. `on_progress` is called from a thread of the run. An exception that it raises ends the run."""
 
     def __init__(
         self,
@@ -192,7 +191,7 @@ class CaptureSession:
         )
         return cls(store, session_id, on_progress=on_progress, connect=connect)
 
-    # --- from other threads ------------------------------------------------------------------------------------------------
+    # --- from other threads -------------------------------------------------------------------------------------------
 
     def pause(self) -> None:
         """Pause after the current step: the shutter closes, the screen goes dark, all connections stay open."""
@@ -211,10 +210,9 @@ class CaptureSession:
     def shut(self, reason: str) -> Literal["closed", "none"] | None:
         """Close the shutter now, without waiting for the step under way, and open it no more in this run.
 
-        `abort` then ends the run, for the same `reason`. Returns `closed` by the monochromator's own answer, `none` where
-        the station has no monochromator, and None where the run holds no instruments, and takes none up from now on.
-        Raises InstrumentError where the monochromator doesn't say that its shutter is closed.
-        """
+        `abort` then ends the run, for the same `reason`. Returns `closed` by the monochromator's own answer, `none`
+        where the station has no monochromator, and None where the run holds no instruments, and takes none up from now
+        on. Raises InstrumentError where the monochromator doesn't say that its shutter is closed."""
         with self._control:
             self._ended_by = self._ended_by or reason
         with self._held:
@@ -226,7 +224,8 @@ class CaptureSession:
             return "closed"
 
     def abort(self, reason: str = "aborted") -> None:
-        """End the run now. The current step is dropped, finished ones stay, and `run` continues from there: also while the session is packed."""
+        """End the run now. The current step is dropped, finished ones stay, and `run` continues from there: also while
+        the session is packed."""
         with self._control:
             if self._ended_by is None:
                 self._ended_by = reason
@@ -236,14 +235,14 @@ class CaptureSession:
             with contextlib.suppress(TransitionError):
                 engine.abort(reason)
 
-    # --- the run -----------------------------------------------------------------------------------------------------------
+    # --- the run ------------------------------------------------------------------------------------------------------
 
     def run(self) -> SessionInfo:
         """Take every step that isn't in the journal yet, and pack the session.
 
         Raises DeviceError if an instrument fails (what was finished is kept, the shutter closed), InputError if another
-        process runs the session or the disk is full, and KeyboardInterrupt on Ctrl-C, after everything is safe. A run that
-        `abort` ended returns with the state "interrupted".
+        process runs the session or the disk is full, and KeyboardInterrupt on Ctrl-C, after everything is safe. A run
+        that `abort` ended returns with the state "interrupted".
         """
         lock = self.store.lock(self.id)
         if not lock.acquire():
@@ -254,7 +253,8 @@ class CaptureSession:
             if interrupted.is_set():
                 raise KeyboardInterrupt
         finally:
-            self._entries.clear()  # what a run held lives on in cycles of its exception and engine, until Python looks for these
+            # what a run held lives on in cycles of its exception and engine, until Python looks for these
+            self._entries.clear()
             lock.release()
         return self.store.session(self.id)
 
@@ -339,13 +339,15 @@ class CaptureSession:
             raise DeviceError(f"{self._ended_by or 'at its end'}; {UNSAFE}: {'; '.join(self.safe.complaints)}")
 
     def _check_identities(self, identities: dict[str, Identity]) -> None:
-        """Check that the session's instruments are the same. Raises InputError if one was exchanged since the previous run."""
+        """Check that the session's instruments are the same. Raises InputError if one was exchanged since the previous
+        run."""
         for run in self.store.runs(self.id)[-1:]:
             for name, identity in identities.items():
                 before = run.instruments.get(name, {}).get("serial_number", "")
                 if before and identity.serial_number and before != identity.serial_number:
                     raise InputError(
-                        f"session {self.id}: {name} has the serial number {identity.serial_number}, the session began with "
+                        f"session {self.id}: {name} has the serial number {identity.serial_number}, the session began "
+                        "with "
                         f"{before}; connect that one again or start a new session"
                     )
 
@@ -486,8 +488,8 @@ class CaptureSession:
 class _Wakeful(DuringTask):  # type: ignore[misc]  # the library has no types
     """Waits for the end of a plan and wakes every `WAKE_S`.
 
-    Python runs signal handlers in the main thread only. A signal that the kernel delivers to another thread doesn't wake the main
-    thread from an unlimited wait.
+    Python runs signal handlers in the main thread only. A signal that the kernel delivers to another thread doesn't
+    wake the main thread from an unlimited wait.
     """
 
     def block(self, blocking_event: threading.Event) -> None:
@@ -496,7 +498,8 @@ class _Wakeful(DuringTask):  # type: ignore[misc]  # the library has no types
 
 
 def _has_exposure(result: Mapping[str, Any]) -> bool:
-    """Whether later steps ask for a step's result: for the exposure that it found. Others aren't kept: a session may take a day."""
+    """Whether later steps ask for a step's result: for the exposure that it found. Others aren't kept: a session may
+    take a day."""
     return "exposure_s" in result
 
 
@@ -511,7 +514,8 @@ def _append(file: Path, name: str, document: dict[str, Any]) -> None:
 
 
 def _plain(error: BaseException, complaints: Sequence[str]) -> BaseException:
-    """The error as an InputError or a DeviceError where its kind is known, with the instruments that didn't reach their safe state."""
+    """The error as an InputError or a DeviceError where its kind is known, with the instruments that didn't reach their
+    safe state."""
     while isinstance(error, FailedStatus) and error.__cause__ is not None:
         error = error.__cause__
     unsafe = [line for line in complaints if line not in str(error)]

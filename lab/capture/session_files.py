@@ -32,7 +32,8 @@ class StoredPlace:
 
 
 class SessionFiles:
-    """Frames, spectra and targets of a session, packed or not. It holds paths only, so it can be sent to another process."""
+    """Frames, spectra and targets of a session, packed or not. It holds paths only, so it can be sent to another
+    process."""
 
     def __init__(self, folder: Path, places: Mapping[str, StoredPlace], pack: Path | None = None) -> None:
         self.folder, self.places = folder, dict(places)

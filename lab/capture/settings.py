@@ -8,7 +8,8 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
 class Settings(BaseSettings):
-    """Where data are kept and where jobs run: the environment's `CALIBENCH_DATA`, `CALIBENCH_DATABASE_URL`, `CALIBENCH_SCHEDULER`."""
+    """Where data are kept and where jobs run: the environment's `CALIBENCH_DATA`, `CALIBENCH_DATABASE_URL`,
+    `CALIBENCH_SCHEDULER`."""
 
     model_config = SettingsConfigDict(env_prefix="CALIBENCH_")
 

@@ -1,8 +1,8 @@
 """The station: the instruments and their addresses, the cameras' data sheets, and the targets at hand.
 
 A station file is TOML; `calibench bench --station FILE` writes one for the mock bench. It holds what the lab knows
-beforehand: addresses, data sheets, nominal layouts. Nothing in it is measured. The kinds of target are in `lab.capture_kinds`.
-"""
+beforehand: addresses, data sheets, nominal layouts. Nothing in it is measured. The kinds of target are in
+`lab.capture_kinds`."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ class Address(BaseModel):
 class StationCamera(Address):
     """One camera: its address and its data sheet.
 
-    `datasheet` has the recording set's keys. Its `quantum_efficiency`, inline curves or paths of CSV files beside the station
-    file, is moved to `quantum_efficiency` here.
+    `datasheet` has the recording set's keys. Its `quantum_efficiency`, inline curves or paths of CSV files beside the
+    station file, is moved to `quantum_efficiency` here.
     """
 
     datasheet: DataSheet
@@ -112,19 +112,22 @@ class Station(Frozen):
             other = taken.setdefault(port, table)
             if other != table:
                 raise ValueError(
-                    f"[{other}] and [{table}] both have the address {port}; one port serves one instrument: correct one of them"
+                    f"[{other}] and [{table}] both have the address {port}; one port serves one instrument: correct "
+                    "one of them"
                 )
         return self
 
     @property
     def addresses(self) -> frozenset[str]:
-        """The addresses of its instruments, without those that have none (a person at a prompt) and so can't be shared."""
+        """The addresses of its instruments, without those that have none (a person at a prompt) and so can't be
+        shared."""
         entries = [*(getattr(self, family) for family in _FAMILIES), *self.cameras.values()]
         return frozenset(entry.address for entry in entries if entry is not None and entry.address)
 
     @property
     def machines(self) -> Station:
-        """The station without those instruments that have no address (a person at a prompt), whom nothing reaches or stops."""
+        """The station without those instruments that have no address (a person at a prompt), whom nothing reaches or
+        stops."""
         people = [family for family in _FAMILIES if (entry := getattr(self, family)) is not None and not entry.address]
         return self.model_copy(update=dict.fromkeys(people))
 

@@ -7,9 +7,9 @@
                      documents.jsonl  bluesky's documents
                      session.nxs      the whole session, packed when it closes (NeXus layout, gzip and shuffle)
 
-A file is written under a temporary name, flushed to the disk and renamed. Then one transaction links all files of a step and
-marks the step done. A crash may leave a file without a link, which is removed when the session resumes; it never leaves a
-link without its file. A frame's SHA-256 is checked whenever it is read.
+A file is written under a temporary name, flushed to the disk and renamed. Then one transaction links all files of a
+step and marks the step done. A crash may leave a file without a link, which is removed when the session resumes; it
+never leaves a link without its file. A frame's SHA-256 is checked whenever it is read.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Store:
         with self._write.begin() as session:
             yield session
 
-    # --- sessions --------------------------------------------------------------------------------------------------------
+    # --- sessions -----------------------------------------------------------------------------------------------------
 
     def folder(self, session_id: str) -> Path:
         """Where a session's files lie."""
@@ -128,8 +128,8 @@ class Store:
         notes: str = "",
         demands_certified: bool = False,
     ) -> str:
-        """Register a session with all its steps; nothing is captured yet. Returns its id. `demands_certified`: it runs only with
-        cameras that have a certified calibration."""
+        """Register a session with all its steps; nothing is captured yet. Returns its id. `demands_certified`: it runs
+        only with cameras that have a certified calibration."""
         created = now()
         session_id = f"{created:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
         files: list[StoredFile] = []
@@ -176,7 +176,8 @@ class Store:
         return row
 
     def _infos(self, db: Session, rows: Sequence[SessionRow]) -> list[SessionInfo]:
-        """The sessions of these rows. Of one that is packed, all steps are done; those of the others are counted in one query."""
+        """The sessions of these rows. Of one that is packed, all steps are done; those of the others are counted in one
+        query."""
         counted = sa.select(StepRow.session_id, sa.func.count(StepRow.finished)).group_by(StepRow.session_id)
         open_ones = [row.id for row in rows if not row.packed]
         asked = db.execute(counted.where(StepRow.session_id.in_(open_ones))) if open_ones else ()
@@ -204,8 +205,8 @@ class Store:
     def _now(self, read: SessionInfo) -> SessionInfo:
         """The state as it is now.
 
-        A session that was read as running, but whose lock is free, is read again: its process may have ended in between. It is
-        "interrupted" if that process didn't record how it ended.
+        A session that was read as running, but whose lock is free, is read again: its process may have ended in
+        between. It is "interrupted" if that process didn't record how it ended.
         """
         if read.state not in ("running", "paused") or self.lock(read.id).is_held():
             return read
@@ -278,7 +279,8 @@ class Store:
         run: RunRecord | None = None,
         station: Station | None = None,
     ) -> None:
-        """Record the state of a session and take it out of the queue. `run` is added to its provenance; `station`: where it runs now.
+        """Record the state of a session and take it out of the queue. `run` is added to its provenance; `station`:
+        where it runs now.
 
         A session that is interrupted or failed holds the queued sessions that need one of its instruments.
         """
@@ -296,7 +298,8 @@ class Store:
                 row.station = station.model_dump(mode="json")
 
     def delete_session(self, session_id: str) -> None:
-        """Delete a session for ever: its captures, its journal, its files. Results of it stay. Raises InputError while a process runs it."""
+        """Delete a session for ever: its captures, its journal, its files. Results of it stay. Raises InputError while
+        a process runs it."""
         lock = self.lock(session_id)
         with self.reading() as db:
             self._row(db, session_id)
@@ -311,7 +314,7 @@ class Store:
             lock.release()
         shutil.rmtree(self.folder(session_id), ignore_errors=True)
 
-    # --- the journal -----------------------------------------------------------------------------------------------------
+    # --- the journal --------------------------------------------------------------------------------------------------
 
     def journal(self, session_id: str) -> list[JournalEntry]:
         """All steps of a session in order, done or to do."""
@@ -332,7 +335,8 @@ class Store:
         files: Sequence[StoredFile] = (),
         captures: Sequence[Capture] = (),
     ) -> bool:
-        """Link all files and captures of a step and mark it done, in one transaction. False, and no change, if it was done before."""
+        """Link all files and captures of a step and mark it done, in one transaction. False, and no change, if it was
+        done before."""
         with self.transaction() as db:
             row = db.scalars(
                 sa.select(StepRow).where(StepRow.session_id == session_id, StepRow.step_id == step_id).with_for_update()
@@ -358,7 +362,8 @@ class Store:
         return True
 
     def sweep(self, session_id: str) -> list[str]:
-        """Remove the files that no finished step links, as a crash leaves them; their paths. Needs the session's lock."""
+        """Remove the files that no finished step links, as a crash leaves them; their paths. Needs the session's
+        lock."""
         with self.reading() as db:
             linked = set(db.scalars(sa.select(FileRow.path).where(FileRow.session_id == session_id)))
         folder = self.folder(session_id)
@@ -372,7 +377,7 @@ class Store:
             (folder / path).unlink()
         return swept
 
-    # --- files -----------------------------------------------------------------------------------------------------------
+    # --- files --------------------------------------------------------------------------------------------------------
 
     def _put(self, session_id: str, role: Role, path: str, content: bytes, side: Side | None = None) -> StoredFile:
         write_durably(self.folder(session_id) / path, content)
@@ -396,7 +401,7 @@ class Store:
             rows = db.scalars(sa.select(FileRow).where(FileRow.session_id == session_id).order_by(FileRow.id))
             return [StoredFile(row.role, row.path, row.sha256, row.bytes, row.side) for row in rows]  # type: ignore[arg-type]
 
-    # --- captures --------------------------------------------------------------------------------------------------------
+    # --- captures -----------------------------------------------------------------------------------------------------
 
     def captures(
         self,
@@ -408,8 +413,8 @@ class Store:
         newest_first: bool = False,
         limit: int | None = None,
     ) -> list[CaptureInfo]:
-        """The captures of a session in the order in which they were taken, or the newest first: of one kind and side, or all;
-        `limit` at most, those that follow the capture of the id `after` in this order."""
+        """The captures of a session in the order in which they were taken, or the newest first: of one kind and side,
+        or all; `limit` at most, those that follow the capture of the id `after` in this order."""
         asked = _captures_of(sa.select(CaptureRow), session_id, kind, side)
         if after is not None:
             asked = asked.where(CaptureRow.id < after if newest_first else CaptureRow.id > after)
@@ -451,20 +456,21 @@ class Store:
             manifest = Manifest(
                 name=row.name or session_id,
                 notes=row.notes,
-                cameras={side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()},  # type: ignore[misc]
+                cameras={side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()},
+                # type: ignore[misc]
                 captures=tuple(_capture(session_id, one) for one in db.scalars(asked.order_by(CaptureRow.id))),
             )
             where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in db.execute(files)}
         return RecordingSet(manifest, source=session_id, files=SessionFiles(self.folder(session_id), where))
 
-    # --- closing ---------------------------------------------------------------------------------------------------------
+    # --- closing ------------------------------------------------------------------------------------------------------
 
     def close_session(self, session_id: str, progress: Callable[[str, float], None] | None = None) -> Path:
         """Pack a session whose steps are all done into one NeXus-layout file, and remove the files of its frames.
 
-        The packed frames are read back and compared by their SHA-256 before anything is removed. A second call changes nothing.
-        Raises InputError while steps are still to do. What `progress` raises ends the packing, which a later call begins anew.
-        """
+        The packed frames are read back and compared by their SHA-256 before anything is removed. A second call changes
+        nothing. Raises InputError while steps are still to do. What `progress` raises ends the packing, which a later
+        call begins anew."""
         info = self.session(session_id)
         if info.steps_done < info.steps:
             raise InputError(
@@ -506,7 +512,7 @@ class Store:
         shutil.rmtree(folder / "frames", ignore_errors=True)
         return pack
 
-    # --- results ---------------------------------------------------------------------------------------------------------
+    # --- results ------------------------------------------------------------------------------------------------------
 
     def add_result(self, kind: str, source: str, document: Mapping[str, Any], job_id: str | None = None) -> str:
         """Store a result; returns its id."""
@@ -542,10 +548,11 @@ class Store:
         with self.reading() as db:
             return [ResultInfo.model_validate(row) for row in db.scalars(asked)]
 
-    # --- keys ------------------------------------------------------------------------------------------------------------
+    # --- keys ---------------------------------------------------------------------------------------------------------
 
     def keys(self, anew: bool = True) -> list[tuple[str, str, str]]:
-        """(name, scope, SHA-256) of every API key; unless `anew`, as another process may have left them `KEYS_S` ago."""
+        """(name, scope, SHA-256) of every API key; unless `anew`, as another process may have left them `KEYS_S`
+        ago."""
         if anew or not self.knows_keys():
             with self.reading() as db:
                 rows = db.scalars(sa.select(KeyRow).order_by(KeyRow.name))

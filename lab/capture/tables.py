@@ -116,8 +116,8 @@ class ResultRow(Base):
 
 
 class CalibrationRow(Base):
-    """A calibration: a session's fit, from candidate to superseded. `id`: of the fit's result. `rig`: its cameras, by side. `certified`: when;
-    None for a candidate."""
+    """A calibration: a session's fit, from candidate to superseded. `id`: of the fit's result. `rig`: its cameras, by
+    side. `certified`: when; None for a candidate."""
 
     __tablename__ = "calibrations"
 
@@ -136,8 +136,9 @@ class CalibrationRow(Base):
 
 
 class FigureRow(Base):
-    """A figure of a calibration, in a table of its own so that a history reads no documents. `camera`: its name, or the rig for a figure of
-    the pair. `temperature_c`, `doubling_c`: of a dark current, the sensor's temperature and by how much a rise doubles it."""
+    """A figure of a calibration, in a table of its own so that a history reads no documents. `camera`: its name, or the
+    rig for a figure of the pair. `temperature_c`, `doubling_c`: of a dark current, the sensor's temperature and by how
+    much a rise doubles it."""
 
     __tablename__ = "figures"
     __table_args__ = (
@@ -182,7 +183,7 @@ class IdempotentRow(Base):
     body: Mapped[str | None] = mapped_column(sa.Text)
 
 
-# --- the database ------------------------------------------------------------------------------------------------------
+# --- the database -----------------------------------------------------------------------------------------------------
 
 
 def open_engine(url: str) -> sa.Engine:

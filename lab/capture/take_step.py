@@ -1,7 +1,7 @@
 """The plan that takes one step: set the bench, measure the light, find the exposure, expose.
 
-It yields bluesky's messages itself: each of the library's plan stubs formats the whole call stack, for a warning that is never needed here.
-"""
+It yields bluesky's messages itself: each of the library's plan stubs formats the whole call stack, for a warning that
+is never needed here."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from sim.camera import Side
 T = TypeVar("T")
 Plan = Generator[Msg, Any, T]
 
-#: A level above SATURATED or below UNLIT (shares of the range) tells only the direction of the search. SATURATED is 10 % below the
-#: data sheet's full well, because a sensor may saturate below its data sheet.
+#: A level above SATURATED or below UNLIT (shares of the range) tells only the direction of the search. SATURATED is 10
+#: % below the data sheet's full well, because a sensor may saturate below its data sheet.
 SATURATED, UNLIT = 0.9, 0.01
 TRIES = 14  # test exposures at most
 
-#: Frames that are read and not kept before a capture in new light or after a test exposure. In a camera with image lag q (the share
-#: of a frame's signal that is added to the next), earlier light then adds the share q^3 to the capture.
+#: Frames that are read and not kept before a capture in new light or after a test exposure. In a camera with image lag
+#: q (the share of a frame's signal that is added to the next), earlier light then adds the share q^3 to the capture.
 DUMMY_FRAMES = 2
 
 
@@ -49,7 +49,8 @@ def arrange(step: Step, instruments: Instruments) -> Plan[None]:
     if setting.target is not None:
         if instruments.target is None:
             raise InputError(
-                f"station: step {step.id!r} needs target {setting.target!r} and there is no [stage]; add one (driver 'prompt' asks you)"
+                f"station: step {step.id!r} needs target {setting.target!r} and there is no [stage]; add one (driver "
+                "'prompt' asks you)"
             )
         moves.append((instruments.target, setting.target))
     if light is not None and instruments.shutter is not None:
@@ -85,11 +86,12 @@ def _shoot(instruments: Instruments, shot: Shot) -> Plan[None]:
 def find_exposure(
     wanted: FindExposure, instruments: Instruments, start_s: Mapping[Side, float]
 ) -> Plan[tuple[dict[Side, float], dict[Side, float]]]:
-    """Search each camera's exposure (s) for the wanted level, with at most `TRIES` test frames that aren't kept. Returns exposures and levels.
+    """Search each camera's exposure (s) for the wanted level, with at most `TRIES` test frames that aren't kept.
+    Returns exposures and levels.
 
-    After a saturated or unlit frame, the exposure is divided by 5 or multiplied by 10; after any other, it is multiplied by wanted level
-    / level. Exposures stay within the station's limits. The last exposures are returned also where a camera missed the level.
-    """
+    After a saturated or unlit frame, the exposure is divided by 5 or multiplied by 10; after any other, it is
+    multiplied by wanted level / level. Exposures stay within the station's limits. The last exposures are returned also
+    where a camera missed the level."""
     limits = instruments.limits
 
     def bounded(exposure_s: float) -> float:
@@ -154,12 +156,12 @@ def _repeats(step: Step, other: Step) -> bool:
 def take(
     step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]], repeats: int = 0
 ) -> Plan[Taken]:
-    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id; `repeats`: its number
-    in `repeats_ahead`.
+    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by
+    id; `repeats`: its number in `repeats_ahead`.
 
-    If the spectroradiometer refuses to measure the light (too dark, too bright), a step with captures is skipped, with the reason in its
-    result; in a step without captures this raises DeviceError, as later steps need the spectrum. Raises InputError for a missing instrument.
-    """
+    If the spectroradiometer refuses to measure the light (too dark, too bright), a step with captures is skipped, with
+    the reason in its result; in a step without captures this raises DeviceError, as later steps need the spectrum.
+    Raises InputError for a missing instrument."""
     wavelength_nm = step.setting.wavelength_nm or 0.0
     photodiode = _irradiance_meter(step, instruments)
     if photodiode is not None and photodiode.dark_a is None:

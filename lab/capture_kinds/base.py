@@ -6,8 +6,8 @@ The file of a kind declares, where the kind needs its own:
 - a `Target`: the station file's description of the object before the cameras;
 - a `Sequence`: the steps in which a station takes such captures.
 
-`register` makes them known. Everything else (formats, store, sessions, service, command line, reports) reads `CAPTURES`,
-`TARGETS` and `SEQUENCES` and names no kind, unless an estimator needs that very kind.
+`register` makes them known. Everything else (formats, store, sessions, service, command line, reports) reads
+`CAPTURES`, `TARGETS` and `SEQUENCES` and names no kind, unless an estimator needs that very kind.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Cells = NDArray[np.uint8]
 #: Longest exposure of a plan, and of a capture that was exposed in seconds.
 LONGEST_EXPOSURE_S = 3600.0
 
-# --- the manifest's entry ----------------------------------------------------------------------------------------------
+# --- the manifest's entry ---------------------------------------------------------------------------------------------
 
 
 class Open(BaseModel):
@@ -67,7 +67,8 @@ PoseName = Annotated[str, Names.POSE]
 
 @dataclass(frozen=True)
 class Reading:
-    """Marks a capture's key whose value is read from an instrument when the frame is taken; `key`: in `Device.readings`."""
+    """Marks a capture's key whose value is read from an instrument when the frame is taken; `key`: in
+    `Device.readings`."""
 
     key: str
 
@@ -104,7 +105,10 @@ class Capture(Open):
     def remarks(self) -> Iterator[str]:
         """Warnings about the keys, with a remedy. The capture is used nevertheless."""
         if (self.exposure_s or 0.0) > LONGEST_EXPOSURE_S:
-            yield f"exposure_s is above {LONGEST_EXPOSURE_S:g} s: state it in seconds, not in milliseconds or microseconds"
+            yield (
+                f"exposure_s is above {LONGEST_EXPOSURE_S:g} s: state it in seconds, not in milliseconds or "
+                "microseconds"
+            )
 
     def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
         """The scene for the forward model; None where the manifest doesn't determine it.
@@ -146,7 +150,7 @@ def in_folder(item: O, folder: str) -> O:
 CAPTURES: ByKind[Capture] = ByKind("capture")
 AnyCapture = Annotated[Capture, CAPTURES]
 
-# --- the station's targets ---------------------------------------------------------------------------------------------
+# --- the station's targets --------------------------------------------------------------------------------------------
 
 
 class Target(Frozen):
@@ -169,7 +173,7 @@ TargetT = TypeVar("TargetT", bound=Target)
 TARGETS: ByKind[Target] = ByKind("target")
 AnyTarget = Annotated[Target, TARGETS]
 
-# --- the sequence of steps ---------------------------------------------------------------------------------------------
+# --- the sequence of steps --------------------------------------------------------------------------------------------
 
 
 class CaptureLimits(Frozen):
@@ -188,7 +192,8 @@ class CaptureLimits(Frozen):
     def _ordered(self) -> Self:
         if self.exposure_min_s > self.exposure_max_s:
             raise ValueError(
-                f"exposure_min_s: {self.exposure_min_s:g} s is above exposure_max_s, {self.exposure_max_s:g} s; exchange them"
+                f"exposure_min_s: {self.exposure_min_s:g} s is above exposure_max_s, {self.exposure_max_s:g} s; "
+                "exchange them"
             )
         return self
 
@@ -208,9 +213,9 @@ class Equipment(Protocol):
 class Setting(Frozen):
     """The bench's setting for a step. `target`, `slit_um` None: left as it is.
 
-    `wavelength_nm`: of the monochromator; 0 is zero order (white light), None keeps its shutter closed. `pattern`: path in
-    the session of what the screen shows; None leaves the screen dark. `cell_px`: screen pixels per cell of the pattern.
-    """
+    `wavelength_nm`: of the monochromator; 0 is zero order (white light), None keeps its shutter closed. `pattern`: path
+    in the session of what the screen shows; None leaves the screen dark. `cell_px`: screen pixels per cell of the
+    pattern."""
 
     target: str | None
     wavelength_nm: float | None = None
@@ -248,9 +253,9 @@ class FindExposure(Frozen):
 class Step(Frozen):
     """The unit of the journal: all its files are kept, or none. Its `id` is stable, so that a session can be resumed.
 
-    `radiance`: path of the spectrum that the spectroradiometer measures in the step; None: no measurement. `captures`: the captures of
-    one trigger of all cameras, without the keys that are known only then (exposure, gain, temperature, time).
-    """
+    `radiance`: path of the spectrum that the spectroradiometer measures in the step; None: no measurement. `captures`:
+    the captures of one trigger of all cameras, without the keys that are known only then (exposure, gain, temperature,
+    time)."""
 
     id: str
     what: str
@@ -283,8 +288,8 @@ Level = Annotated[
 
 
 class Sequence(Frozen):
-    """What is captured to determine something. Its fields are its parameters, those with a `Quantity` an operator's to set; its steps
-    follow from them."""
+    """What is captured to determine something. Its fields are its parameters, those with a `Quantity` an operator's to
+    set; its steps follow from them."""
 
     name: ClassVar[str]
     purpose: ClassVar[str]  # what is determined with it, in words
@@ -299,7 +304,8 @@ class Sequence(Frozen):
     @classmethod
     @abstractmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        """The sequence in a full calibration on this station; `quick`: with fewer frames. None where the station can't take it."""
+        """The sequence in a full calibration on this station; `quick`: with fewer frames. None where the station can't
+        take it."""
 
     @abstractmethod
     def steps(self, station: Equipment) -> tuple[Step, ...]:
@@ -353,8 +359,8 @@ def planned_keys(step_id: str, side: Side) -> dict[str, Any]:
 
 
 def exposure_step(stem: str, what: str, setting: Setting, level: float, *, measures_light: bool = True) -> Step:
-    """The step `STEM/exposure`: with `measures_light` it measures the radiance (at `spectrum_path` of its id), then finds the exposure for
-    `level`."""
+    """The step `STEM/exposure`: with `measures_light` it measures the radiance (at `spectrum_path` of its id), then
+    finds the exposure for `level`."""
     id = f"{stem}/exposure"
     return Step(
         id=id,
@@ -365,7 +371,7 @@ def exposure_step(stem: str, what: str, setting: Setting, level: float, *, measu
     )
 
 
-# --- the registry ------------------------------------------------------------------------------------------------------
+# --- the registry -----------------------------------------------------------------------------------------------------
 
 
 def register(kind: type[Capture]) -> None:

@@ -29,7 +29,8 @@ KNOWN_CHART = "ColorChecker24"
 
 
 class ChartLayout(Frozen):
-    """Nominal place of the patch grid in one camera's frame: [row, col] (px) of its corners dark skin, bluish green, black, white."""
+    """Nominal place of the patch grid in one camera's frame: [row, col] (px) of its corners dark skin, bluish green,
+    black, white."""
 
     corners: Corners
 

@@ -95,7 +95,8 @@ class CharucoCapture(Capture):
     kind: Literal["charuco"]
     # An imported photograph may not say how long it was exposed; the geometry doesn't need it.
     exposure_s: float | None = Field(ge=0)  # type: ignore[assignment]
-    # OpenCV's name; "none": a plain checkerboard of `squares`, without markers; "dots": a grid of (rows - 1) x (cols - 1) dots
+    # OpenCV's name; "none": a plain checkerboard of `squares`, without markers; "dots": a grid of (rows - 1) x (cols -
+    # 1) dots
     dictionary: str
     squares: tuple[int, int]  # rows, cols
     square_mm: float = Field(gt=0)

@@ -40,8 +40,8 @@ class CapTarget(Target):
 class DarkSequence(Sequence):
     """`frames` dark frames at each exposure time `exposures_s`.
 
-    The series of exposures is taken upwards and downwards in turn, so that a linear drift of the temperature doesn't bias the dark current.
-    """
+    The series of exposures is taken upwards and downwards in turn, so that a linear drift of the temperature doesn't
+    bias the dark current."""
 
     name: ClassVar[str] = "dark"
     purpose: ClassVar[str] = "black level, read noise, DSNU, dark current"

@@ -26,8 +26,8 @@ from sim.parameters import Quantity
 from sim.scene.scenes import Scene, UniformField
 from sim.spectrum import Spectrum
 
-#: Levels, shares of the brightest channel's saturation: dense where the photon transfer curve bends, and beyond 1 so that the frame's
-#: corners and the darker channels saturate, too.
+#: Levels, shares of the brightest channel's saturation: dense where the photon transfer curve bends, and beyond 1 so
+#: that the frame's corners and the darker channels saturate, too.
 LEVELS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.15, 1.4, 1.8, 2.3)
 QUICK_LEVELS = (0.03, 0.1, 0.25, 0.4, 0.55, 0.7, 0.87, 1.2, 1.6)
 
@@ -45,10 +45,10 @@ class SphereTarget(Target):
 class FlatSequence(Sequence):
     """`frames` flats at each of `levels`, shares of the exposure at which the brightest channel saturates.
 
-    Each camera has exposures of its own, scaled from that found for `level_found`. The series of levels is taken upwards and downwards in
-    turn. The radiance is measured before each turn, so that a drift of the lamp shows as a difference between turns. `wavelength_nm`: of the
-    light, 0 is white; with one wavelength a photodiode measures the irradiance before each frame (EMVA 1288).
-    """
+    Each camera has exposures of its own, scaled from that found for `level_found`. The series of levels is taken
+    upwards and downwards in turn. The radiance is measured before each turn, so that a drift of the lamp shows as a
+    difference between turns. `wavelength_nm`: of the light, 0 is white; with one wavelength a photodiode measures the
+    irradiance before each frame (EMVA 1288)."""
 
     name: ClassVar[str] = "flat"
     purpose: ClassVar[str] = "conversion gain, PRNU, full well, linearity (photon transfer)"
@@ -110,8 +110,8 @@ class FlatSequence(Sequence):
 
 
 class FlatCapture(IrradianceCapture):
-    """Uniform light: `radiance` (CSV, W sr^-1 m^-2 nm^-1), or `photons_per_pixel` in this exposure at `wavelength_nm`, or `irradiance_w_m2`
-    with its standard uncertainties, of light of this wavelength where the sensor is."""
+    """Uniform light: `radiance` (CSV, W sr^-1 m^-2 nm^-1), or `photons_per_pixel` in this exposure at `wavelength_nm`,
+    or `irradiance_w_m2` with its standard uncertainties, of light of this wavelength where the sensor is."""
 
     shows: ClassVar[str] = "uniform diffuse light filling the field"
     sequence: ClassVar[type[Sequence] | None] = FlatSequence

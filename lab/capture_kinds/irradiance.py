@@ -12,11 +12,12 @@ from lab.capture_kinds.base import Capture, Reading, Step
 
 
 class IrradianceCapture(Capture):
-    """Light of one wavelength whose irradiance a reference photodiode measured at its own place, where the station has one.
+    """Light of one wavelength whose irradiance a reference photodiode measured at its own place, where the station has
+    one.
 
-    `sd_irradiance_w_m2`: standard uncertainty of the irradiance, by the readings' scatter and by the calibration together;
-    `irradiance_calibration_sd_percent`: the calibration's part, which all captures with this photodiode have in common.
-    """
+    `sd_irradiance_w_m2`: standard uncertainty of the irradiance, by the readings' scatter and by the calibration
+    together; `irradiance_calibration_sd_percent`: the calibration's part, which all captures with this photodiode have
+    in common."""
 
     wavelength_nm: float | None = Field(default=None, gt=0)
     irradiance_w_m2: Annotated[float | None, Reading("irradiance_w_m2")] = None
@@ -27,7 +28,8 @@ class IrradianceCapture(Capture):
 
     @property
     def photon_irradiance_per_m2_s(self) -> float | None:
-        """Photons a second and square metre where the photodiode is, E wavelength / (h c) (EMVA 1288 release 4.0, eq. 3); None without one."""
+        """Photons a second and square metre where the photodiode is, E wavelength / (h c) (EMVA 1288 release 4.0, eq.
+        3); None without one."""
         if self.irradiance_w_m2 is None or self.wavelength_nm is None:
             return None
         return self.irradiance_w_m2 * self.wavelength_nm * 1e-9 / (constants.h * constants.c)
@@ -47,7 +49,7 @@ class IrradianceCapture(Capture):
 
 
 def irradiance_nm(step: Step) -> float | None:
-    """Wavelength (nm) at which a photodiode measures the irradiance beside a step's captures; None: it has one responsivity, and
-    measures in light of one wavelength alone."""
+    """Wavelength (nm) at which a photodiode measures the irradiance beside a step's captures; None: it has one
+    responsivity, and measures in light of one wavelength alone."""
     lit = step.setting.wavelength_nm or 0.0
     return lit if lit > 0.0 and any(isinstance(one, IrradianceCapture) for one in step.captures) else None

@@ -30,7 +30,8 @@ from sim.spectrum import Spectrum
 
 
 class NarrowbandSequence(Sequence):
-    """Wavelengths from `from_nm` to `to_nm` by `step_nm` in `passes` passes, up and down in turn. The light is measured at every visit.
+    """Wavelengths from `from_nm` to `to_nm` by `step_nm` in `passes` passes, up and down in turn. The light is measured
+    at every visit.
 
     Up and down together cancel a linear drift of the lamp. The exposures are found in the first pass and kept.
     """
@@ -95,8 +96,9 @@ class NarrowbandSequence(Sequence):
 
 
 class NarrowbandCapture(IrradianceCapture):
-    """Uniform light of one wavelength: `wavelength_nm` and `bandwidth_nm` (FWHM) as set, `radiance` as measured; `irradiance_w_m2` and its
-    standard uncertainties as a reference photodiode measured them at its place, where the station has one."""
+    """Uniform light of one wavelength: `wavelength_nm` and `bandwidth_nm` (FWHM) as set, `radiance` as measured;
+    `irradiance_w_m2` and its standard uncertainties as a reference photodiode measured them at its place, where the
+    station has one."""
 
     shows: ClassVar[str] = "uniform diffuse light from the monochromator, filling the field"
     sequence: ClassVar[type[Sequence] | None] = NarrowbandSequence

@@ -16,8 +16,8 @@ LONGEST_NAME = 20
 class ByKind(Generic[M]):
     """The models of one family, by the value of their field `kind`.
 
-    As an annotation, `Annotated[Base, family]`, it validates a document by the model that its `kind` names. The family may
-    grow after the annotated model was built.
+    As an annotation, `Annotated[Base, family]`, it validates a document by the model that its `kind` names. The family
+    may grow after the annotated model was built.
     """
 
     def __init__(self, what: str) -> None:
@@ -30,7 +30,8 @@ class ByKind(Generic[M]):
         return tuple(self.models)
 
     def add(self, model: type[M]) -> None:
-        """Add a model. Its field `kind` is a `Literal` of one name. Raises ValueError where that name is taken or too long."""
+        """Add a model. Its field `kind` is a `Literal` of one name. Raises ValueError where that name is taken or too
+        long."""
         names = get_args(model.model_fields["kind"].annotation)
         if len(names) != 1 or not isinstance(names[0], str) or not 0 < len(names[0]) <= LONGEST_NAME:
             raise ValueError(

@@ -39,7 +39,8 @@ SQUARE_CELLS = 8
 
 
 class ScreenLayout(Frozen):
-    """Nominal view of the screen by one camera; `visible`: rectangle (row0, col0, row1, col1) in screen px that lies inside the frame."""
+    """Nominal view of the screen by one camera; `visible`: rectangle (row0, col0, row1, col1) in screen px that lies
+    inside the frame."""
 
     camera_px_per_screen_px: float = Field(gt=0)
     visible: tuple[int, int, int, int]
@@ -75,8 +76,8 @@ class CellGrid(Frozen):
 class ScreenSequence(Sequence):
     """`frames` of every pattern on the screen, with nothing moved in between.
 
-    The side of a cell is a whole number of screen pixels, about `cell_camera_px` camera pixels. The pattern is centred on the screen
-    and lies inside what all cameras see. `seed`: of random patterns.
+    The side of a cell is a whole number of screen pixels, about `cell_camera_px` camera pixels. The pattern is centred
+    on the screen and lies inside what all cameras see. `seed`: of random patterns.
     """
 
     name: ClassVar[str] = "screen"
@@ -102,8 +103,8 @@ class ScreenSequence(Sequence):
         return {name: kind for name, kind in CAPTURES.models.items() if issubclass(kind, ScreenCapture)}
 
     def grid(self, station: Equipment) -> CellGrid:
-        """The largest grid of whole checkerboard squares that all cameras see. Raises InputError if that is less than 2 x 2 squares, and
-        where no camera's view of the screen is given."""
+        """The largest grid of whole checkerboard squares that all cameras see. Raises InputError if that is less than 2
+        x 2 squares, and where no camera's view of the screen is given."""
         name = station.one(ScreenTarget)
         screen = station.list_targets(ScreenTarget)[name]
         layouts = [layout for side in station.sides if (layout := getattr(screen, side)) is not None]
@@ -119,7 +120,8 @@ class ScreenSequence(Sequence):
         rows, cols = (int(2 * half / cell_px) // SQUARE_CELLS * SQUARE_CELLS for half in (half_rows, half_cols))
         if min(rows, cols) < 2 * SQUARE_CELLS:
             raise InputError(
-                f"station: only {max(0, rows)} x {max(0, cols)} cells of {cell_px} screen px fit what both cameras see of {name!r}; "
+                f"station: only {max(0, rows)} x {max(0, cols)} cells of {cell_px} screen px fit what both cameras "
+                f"see of {name!r}; "
                 "give a larger visible rectangle or smaller cells"
             )
         return CellGrid(rows=rows, cols=cols, cell_px=cell_px)

@@ -23,8 +23,8 @@ from sim.parameters import Frozen, Quantity
 
 
 class EdgeLayout(Frozen):
-    """Nominal place of one edge in a frame: `region` (row0, col0, row1, col1) in px, end excluded; `angle_deg` from the vertical; `field_mm`:
-    [row, col] of its centre from the optical axis, at the sensor."""
+    """Nominal place of one edge in a frame: `region` (row0, col0, row1, col1) in px, end excluded; `angle_deg` from the
+    vertical; `field_mm`: [row, col] of its centre from the optical axis, at the sensor."""
 
     name: str
     region: tuple[int, int, int, int]
@@ -52,7 +52,8 @@ class EdgeTarget(Target):
 
 
 class EdgeSequence(Sequence):
-    """`frames` of every knife edge of the station. A frame shows the edge in several regions; each region is a capture of its own."""
+    """`frames` of every knife edge of the station. A frame shows the edge in several regions; each region is a capture
+    of its own."""
 
     name: ClassVar[str] = "edge"
     purpose: ClassVar[str] = "MTF over the field and over orientations"

@@ -70,12 +70,13 @@ def comparison(default: ChallengeScore, changed: ChallengeScore) -> str:
     return "\n".join(lines)
 
 
-# --- each rule in turn ---------------------------------------------------------------------------------------------------
+# --- each rule in turn ------------------------------------------------------------------------------------------------
 
 
 class Answer(Frozen):
-    """What the diagnosis of one case says under one policy. `named`: effects, or families in place of an effect, most significant first;
-    `mismatch`: whether anything is told at all; `cpu_s`: of deciding, the measurements made before."""
+    """What the diagnosis of one case says under one policy. `named`: effects, or families in place of an effect, most
+    significant first; `mismatch`: whether anything is told at all; `cpu_s`: of deciding, the measurements made
+    before."""
 
     named: tuple[str, ...]
     mismatch: bool
@@ -83,7 +84,8 @@ class Answer(Frozen):
 
 
 def policies_without() -> dict[str, DecisionPolicy]:
-    """The default policy, and by the name of each rule without a derivation, the policy in which that rule doesn't act."""
+    """The default policy, and by the name of each rule without a derivation, the policy in which that rule doesn't
+    act."""
     rules = DecisionPolicy.rules()
     changed = {name: DecisionPolicy.model_validate({name: r.off}) for name, r in rules.items() if r.off is not None}
     return {DEFAULT: DecisionPolicy(), **changed}
@@ -91,7 +93,8 @@ def policies_without() -> dict[str, DecisionPolicy]:
 
 @one_blas_thread
 def answers(folder: Path, policies: Mapping[str, DecisionPolicy]) -> dict[str, Answer]:
-    """What each policy says of one recording set, whose measurements are made once. Without a fit, as a challenge is diagnosed."""
+    """What each policy says of one recording set, whose measurements are made once. Without a fit, as a challenge is
+    diagnosed."""
     recordings = recording_set.read(folder)
     models = [measurement_model(recordings, side, None)[0] for side in recordings.sides]
     found: dict[str, Answer] = {}
@@ -117,8 +120,9 @@ def _family(name: str) -> str:
 
 
 class Tally(Frozen):
-    """Of all cases under one policy: concealed listed effects that are named, by their effect or their family; names of a family that isn't
-    concealed; healthy cameras of which anything is told; cases answered otherwise than by default; CPU time (s)."""
+    """Of all cases under one policy: concealed listed effects that are named, by their effect or their family; names of
+    a family that isn't concealed; healthy cameras of which anything is told; cases answered otherwise than by default;
+    CPU time (s)."""
 
     effects: int
     families: int
@@ -147,7 +151,8 @@ def tally(truths: Mapping[str, CaseTruth], by_case: Mapping[str, Mapping[str, An
         differ += (one.named, one.mismatch) != (default.named, default.mismatch)
     cpu_s = sum(answered[policy].cpu_s for answered in by_case.values())
     return Tally(
-        effects=effects, families=families, concealed=concealed, wrong=wrong, alarms=alarms, healthy=healthy, differ=differ, cpu_s=cpu_s
+        effects=effects, families=families, concealed=concealed, wrong=wrong, alarms=alarms, healthy=healthy,
+        differ=differ, cpu_s=cpu_s
     )  # fmt: skip
 
 
@@ -155,14 +160,19 @@ def rule_table(truths: Mapping[str, CaseTruth], by_case: Mapping[str, Mapping[st
     """One row of Markdown for the default policy, and one for each rule that is taken out."""
     rules, default = DecisionPolicy.rules(), DecisionPolicy()
     lines = [
-        "| without | at | in place of | effects named | families | wrong names | alarms, healthy | cases that differ | CPU, s |",
+        (
+            "| without | at | in place of | effects named | families | wrong names | alarms, healthy | cases that "
+            "differ "
+            "| CPU, s |"
+        ),
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for policy in policies_without():
         one = tally(truths, by_case, policy)
         changed = ("", "") if policy == DEFAULT else (f"{rules[policy].off:g}", f"{getattr(default, policy):g}")
         lines.append(
-            f"| {'' if policy == DEFAULT else f'`{policy}`'} | {changed[0]} | {changed[1]} | {one.effects} of {one.concealed} | {one.families} "
+            f"| {'' if policy == DEFAULT else f'`{policy}`'} | {changed[0]} | {changed[1]} | {one.effects} of "
+            f"{one.concealed} | {one.families} "
             f"| {one.wrong} | {one.alarms} of {one.healthy} | {one.differ} of {len(by_case)} | {one.cpu_s:.0f} |"
         )
     return "\n".join(lines)

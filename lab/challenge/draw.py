@@ -1,4 +1,5 @@
-"""The cases of a challenge: drawn cameras, the laws that they conceal, at which strength, and faults of metadata or rig."""
+"""The cases of a challenge: drawn cameras, the laws that they conceal, at which strength, and faults of metadata or
+rig."""
 
 from __future__ import annotations
 
@@ -50,10 +51,11 @@ class DrawnFrame:
 
     @staticmethod
     def drawn(rng: np.random.Generator) -> DrawnFrame:
-        """A frame unlike those of tuning: 24 to 384 rows, 8 to 16 bit, screen cells of 2 to 6 px, rotated by 0 to 2 degrees.
+        """A frame unlike those of tuning: 24 to 384 rows, 8 to 16 bit, screen cells of 2 to 6 px, rotated by 0 to 2
+        degrees.
 
-        In a third of the cases cells are a whole number of pixels and aren't rotated, as a careful laboratory sets a screen up.
-        """
+        In a third of the cases cells are a whole number of pixels and aren't rotated, as a careful laboratory sets a
+        screen up."""
         rows, cols = FOREIGN_FRAMES[int(rng.choice(len(FOREIGN_FRAMES), p=FOREIGN_SHARES))]
         aligned = rng.random() < 1.0 / 3.0
         return DrawnFrame(
@@ -66,15 +68,17 @@ class DrawnFrame:
 
 
 def draw(
-    seed: int, index: int, size: str = "medium", *, cfa: str | None = None, kind: Kind | None = None, law: type[Law] | None = None, sizing: Sizing = "aimed"
+    seed: int, index: int, size: str = "medium", *, cfa: str | None = None, kind: Kind | None = None,
+    law: type[Law] | None = None, sizing: Sizing = "aimed"
 ) -> Case:  # fmt: skip
     """Case number `index` of a challenge; the same arguments give the same case.
 
     cfa, kind, law    None: drawn
-    sizing            "aimed": laws get the strength that gives a drawn non-centrality. "strong": the same of one draw of the noise, far
+    sizing            "aimed": laws get the strength that gives a drawn non-centrality. "strong": the same of one draw
+    of the noise, far
                       above what is needed to see them. "nominal": they have their nominal strength, and the
-                      non-centrality is taken from one draw of the noise, which is quick and too high. "unmeasured": they have their
-                      nominal strength, and 0 stands for the non-centrality
+                      non-centrality is taken from one draw of the noise, which is quick and too high. "unmeasured":
+                      they have their nominal strength, and 0 stands for the non-centrality
     """
     rng = np.random.default_rng([seed, index])
     what = kind or kind_of(seed, index)
@@ -130,13 +134,15 @@ def draw(
     concealed = tuple(
         Concealed(
             name=one.name, effect=one.listed_effect, variant=one.variant, strength=one.strength, unit=one.unit,
-            parameters=one.library_parameters(), noncentrality=size, conditional=fair.conditional, separability=fair.separability,
+            parameters=one.library_parameters(), noncentrality=size, conditional=fair.conditional,
+            separability=fair.separability,
             nearest_rival=fair.rival,
         )
         for one, size, fair in zip(found.laws, found.noncentrality, found.fair, strict=True)
     )  # fmt: skip
     truth = CaseTruth(
-        kind=what, concealed=concealed, fault=fault.name if fault else None, accepts=tuple(sorted(accepted)), oracle_share=found.oracle_share, cfa=healthy.cfa, f_number=healthy.f_number,
+        kind=what, concealed=concealed, fault=fault.name if fault else None, accepts=tuple(sorted(accepted)),
+        oracle_share=found.oracle_share, cfa=healthy.cfa, f_number=healthy.f_number,
         frames=len(session.manifest["captures"]), rows=rows, cols=cols,
     )  # fmt: skip
     return Case(recording_set(session), truth)
@@ -198,8 +204,8 @@ def _sized(
 ) -> _Sized:
     """Laws at strengths near the target non-centralities; of two laws, near target conditional non-centralities.
 
-    `take`: draws the session with given laws and a number of the draw of the noise; `draws`: the two numbers. `against`: names that are
-    no rivals, and the oracle's random numbers; None: only the non-centralities are measured.
+    `take`: draws the session with given laws and a number of the draw of the noise; `draws`: the two numbers.
+    `against`: names that are no rivals, and the oracle's random numbers; None: only the non-centralities are measured.
     """
     if not laws:
         return _Sized([], [], [], None)

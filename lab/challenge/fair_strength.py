@@ -1,14 +1,15 @@
 """How well the concealed laws of one case can be identified at best: a linear Gaussian problem.
 
-All vectors are changes of the summaries (the measured numbers), (n,), whitened: noise has unit variance, and nuisance parameters are
-marginalised. P[J] is the projection orthogonal to directions J, and d the change by the concealed law i:
+All vectors are changes of the summaries (the measured numbers), (n,), whitened: noise has unit variance, and nuisance
+parameters are marginalised. P[J] is the projection orthogonal to directions J, and d the change by the concealed law i:
 
-    conditional non-centrality   lambda(i | j) = |P[J_j] d|^2               the part that the other concealed law can't imitate
-    separability                 min over rivals k of |P[J_j, J_k] d|^2     the part that no rival beside it can imitate, either
+    conditional non-centrality   lambda(i | j) = |P[J_j] d|^2               the part that the other concealed law can't
+    imitate separability                 min over rivals k of |P[J_j, J_k] d|^2     the part that no rival beside it can
+    imitate, either
 
-They are the minimal detectable and the minimal identifiable bias of geodesy (Baarda 1968; Teunissen 2018, J Geod 92:59). The oracle
-knows all directions and only has to choose among them. Its share of right answers, found by Monte Carlo, is the best that a method can
-reach on these summaries, except for the information in the signs of parameters.
+They are the minimal detectable and the minimal identifiable bias of geodesy (Baarda 1968; Teunissen 2018, J Geod
+92:59). The oracle knows all directions and only has to choose among them. Its share of right answers, found by Monte
+Carlo, is the best that a method can reach on these summaries, except for the information in the signs of parameters.
 """
 
 from __future__ import annotations
@@ -22,16 +23,18 @@ from scipy.stats import chi2
 
 from sim.spectrum import FloatArray
 
-#: Ratio to the largest singular value below which a direction isn't counted: two instances of one effect differ by curvature.
+#: Ratio to the largest singular value below which a direction isn't counted: two instances of one effect differ by
+#: curvature.
 DISTINCT = 0.1
-#: The oracle's rate of false alarms on healthy cameras, and the draws of the noise that set its thresholds: the rate is known to
-#: 1 / sqrt(FALSE_ALARMS * NOISE_DRAWS) = 10 %.
+#: The oracle's rate of false alarms on healthy cameras, and the draws of the noise that set its thresholds: the rate is
+#: known to 1 / sqrt(FALSE_ALARMS * NOISE_DRAWS) = 10 %.
 FALSE_ALARMS, NOISE_DRAWS = 0.01, 10000
 
 
 @dataclass(frozen=True)
 class Directions:
-    """Orthonormal basis (n, m) of the changes that an effect can make. A name may have several, of which one applies."""
+    """Orthonormal basis (n, m) of the changes that an effect can make. A name may have several, of which one
+    applies."""
 
     name: str
     basis: FloatArray
@@ -55,8 +58,8 @@ def joined(*bases: FloatArray) -> FloatArray:
 
 
 def with_direction(basis: FloatArray, change: FloatArray) -> FloatArray:
-    """The basis (n, m) of an effect whose concealed law changes the summaries by `change` (n,): its direction nearest to that of `change`
-    is replaced by that of `change`."""
+    """The basis (n, m) of an effect whose concealed law changes the summaries by `change` (n,): its direction nearest
+    to that of `change` is replaced by that of `change`."""
     unit = change[:, None] / max(float(np.linalg.norm(change)), 1e-300)
     if not basis.shape[1]:
         return unit
@@ -65,15 +68,16 @@ def with_direction(basis: FloatArray, change: FloatArray) -> FloatArray:
 
 
 def beyond(first: FloatArray, second: FloatArray, basis: FloatArray) -> float:
-    """d1' P d2, at least 0: squared length of a change's part orthogonal to `basis` (n, m). d1 and d2 (n,) are measured with two draws of
-    the noise."""
+    """d1' P d2, at least 0: squared length of a change's part orthogonal to `basis` (n, m). d1 and d2 (n,) are measured
+    with two draws of the noise."""
     return max(float(first @ second - (first @ basis) @ (second @ basis)), 0.0)
 
 
 def separability(
     first: FloatArray, second: FloatArray, beside: FloatArray, rivals: Sequence[Directions]
 ) -> tuple[float, str | None]:
-    """The least squared length of a change orthogonal to `beside` and to any one rival, and that rival; without rivals None.
+    """The least squared length of a change orthogonal to `beside` and to any one rival, and that rival; without rivals
+    None.
 
     `beside` (n, m): the directions of the other concealed laws.
     """
@@ -84,11 +88,12 @@ def separability(
 def oracle_share(
     mean: FloatArray, candidates: Sequence[Directions], truth: Sequence[str], rng: np.random.Generator, draws: int = 400
 ) -> float:
-    """Share of draws of the noise in which the oracle is right: one true name comes first; of two, exactly both are named.
+    """Share of draws of the noise in which the oracle is right: one true name comes first; of two, exactly both are
+    named.
 
-    `mean` (n,): change by all concealed laws together. The oracle names none, one or two candidates, those with the largest gain in chi2
-    less a threshold for each (`_prices`). Raises ValueError for more than two true names, and where one of them isn't a candidate.
-    """
+    `mean` (n,): change by all concealed laws together. The oracle names none, one or two candidates, those with the
+    largest gain in chi2 less a threshold for each (`_prices`). Raises ValueError for more than two true names, and
+    where one of them isn't a candidate."""
     if not 1 <= len(truth) <= 2 or not {c.name for c in candidates} >= set(truth):
         raise ValueError(f"{', '.join(truth)}: the oracle tells one or two of its candidates")
     whole = joined(*(c.basis for c in candidates), mean[:, None] / max(float(np.linalg.norm(mean)), 1e-300))
@@ -115,10 +120,11 @@ def oracle_share(
 
 
 def _prices(bases: Sequence[FloatArray], rng: np.random.Generator) -> list[float]:
-    """The chi2 that each candidate has to gain: a quantile of chi2 with as many degrees of freedom as the candidate has directions.
+    """The chi2 that each candidate has to gain: a quantile of chi2 with as many degrees of freedom as the candidate has
+    directions.
 
-    The quantile is the same for all, such that pure noise exceeds the threshold of any candidate in `FALSE_ALARMS` of the draws.
-    """
+    The quantile is the same for all, such that pure noise exceeds the threshold of any candidate in `FALSE_ALARMS` of
+    the draws."""
     noise = rng.standard_normal((NOISE_DRAWS, len(bases[0])))
     freedom = [basis.shape[1] for basis in bases]
     most = {m: np.zeros(NOISE_DRAWS) for m in freedom}

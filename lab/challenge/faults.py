@@ -16,7 +16,8 @@ Spoil = Callable[[dict[str, Any], dict[str, Any], dict[str, Any], np.random.Gene
 
 @dataclass(frozen=True)
 class CaseFault:
-    """One fault. `spoil` changes manifest, frames and spectra in place; `accepts`: effects whose name is right for it."""
+    """One fault. `spoil` changes manifest, frames and spectra in place; `accepts`: effects whose name is right for
+    it."""
 
     name: str
     spoil: Spoil

@@ -50,7 +50,8 @@ class ChallengeOrder(Frozen):
 
 
 class KeptChallenge(Frozen):
-    """A challenge as it stands: `seals` of the cases that are made, SHA-256 of a salt and the truth; `scored`: when, None before that."""
+    """A challenge as it stands: `seals` of the cases that are made, SHA-256 of a salt and the truth; `scored`: when,
+    None before that."""
 
     order: ChallengeOrder
     seals: dict[str, str]
@@ -144,7 +145,8 @@ def carry_out(work: ChallengeWork, folder: Path, progress: Progress) -> None:
 
 
 def _workers(tick: Callable[[], None]) -> Workers:
-    """Processes of their own, so that no capture of this process is slowed; one core is left. A worker of a cluster may start none."""
+    """Processes of their own, so that no capture of this process is slowed; one core is left. A worker of a cluster may
+    start none."""
     if multiprocessing.current_process().daemon:
         return Workers(1)
     return Workers(max(1, (os.cpu_count() or 1) - 1), apart=True, tick=tick)
@@ -171,7 +173,8 @@ def _score(order: ChallengeOrder, folder: Path, workers: Workers, progress: Prog
     seals = load(Seals, folder / "set" / "seals.json")
     if len(seals.seals) < order.cases:
         raise InputError(
-            f"challenge {order.id}: {len(seals.seals)} of {order.cases} cases are made; start a job that makes the others"
+            f"challenge {order.id}: {len(seals.seals)} of {order.cases} cases are made; start a job that makes the "
+            "others"
         )
     runs = run_all(folder / "set", tuple(sorted(seals.seals)), workers, progress)
     truths = load(Truths, folder / "truths.json")  # only now that all diagnoses are written

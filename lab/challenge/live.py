@@ -1,8 +1,8 @@
 """The live proof: mock benches that conceal effects, a whole session over the wire, and its diagnosis.
 
-`python -m lab.challenge.live --out DIR`. Every case starts `calibench bench` as an OS process, captures a quick session from its
-station file, fits and diagnoses it, and leaves DIR/results/CASE.json; a case whose result is there is not run again.
-"""
+`python -m lab.challenge.live --out DIR`. Every case starts `calibench bench` as an OS process, captures a quick session
+from its station file, fits and diagnoses it, and leaves DIR/results/CASE.json; a case whose result is there is not run
+again."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from sim.parameters import Frozen
 
 Outcome = Literal["named", "among rivals", "not named", "wrong name", "healthy", "failed"]
 
-#: Sizes of effects at which a quick session shows them, on the left camera or on the rig. Effects that aren't here are concealed at
-#: `sim.effects.library.typical`.
+#: Sizes of effects at which a quick session shows them, on the left camera or on the rig. Effects that aren't here are
+#: concealed at `sim.effects.library.typical`.
 SIZES: dict[str, str] = {
     "adc_nonlinearity": "left:error_dn=4",
     "adc_step": "left:step_dn=3,code_dn=1500",
@@ -115,8 +115,8 @@ FIRST_SESSION = ("dark", "flat", "screen")
 #: By how much the sensors get warmer (C) where the effect needs that.
 WARM_UP_C = {"dark_current_temperature": 6.0}
 
-#: Effects that a diagnosis doesn't look for, and the names that are right for them, besides no name: those of effects or families that
-#: change recordings alike. The model discrepancy's typical instance is an isotropic loss of contrast.
+#: Effects that a diagnosis doesn't look for, and the names that are right for them, besides no name: those of effects
+#: or families that change recordings alike. The model discrepancy's typical instance is an isotropic loss of contrast.
 NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
     "cover_glass": frozenset({"spherical_aberration"}),
     "empirical_law": frozenset(),
@@ -127,7 +127,8 @@ NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
 #: Effects that the mock bench can't show, and refuses to conceal.
 NOT_SHOWN_BY_BENCH = frozenset({"second_order_light", "stereo_time_offset"})
 
-#: Effects that one session can't show: distortion is fitted to its boards, so that only an earlier calibration shows a change.
+#: Effects that one session can't show: distortion is fitted to its boards, so that only an earlier calibration shows a
+#: change.
 NOT_IN_ONE_SESSION = frozenset({"distortion", "decentre"})
 
 
@@ -148,7 +149,8 @@ class LiveCase(Frozen):
 
 
 class FoundParameter(Frozen):
-    """A parameter of a concealed effect that was named: true and estimated value, with standard deviation or 95 % interval."""
+    """A parameter of a concealed effect that was named: true and estimated value, with standard deviation or 95 %
+    interval."""
 
     effect: str
     parameter: str
@@ -160,8 +162,8 @@ class FoundParameter(Frozen):
 
 
 class LiveRun(Frozen):
-    """The outcome of a case. `named`: effects with their sides; `first_named`, `first_rivals`: names and rivals before `--resolve` took
-    its `captures`. `commit`: of the code, abbreviated; empty outside a checkout."""
+    """The outcome of a case. `named`: effects with their sides; `first_named`, `first_rivals`: names and rivals before
+    `--resolve` took its `captures`. `commit`: of the code, abbreviated; empty outside a checkout."""
 
     case: LiveCase
     outcome: Outcome
@@ -214,8 +216,8 @@ def every_case() -> dict[str, LiveCase]:
 
 
 def drawn(seed: int, count: int = 3) -> tuple[LiveCase, ...]:
-    """Random cases of single effects, for everyday tests. Of the session, only darks, flats, and the sequences that can show the effect
-    are captured."""
+    """Random cases of single effects, for everyday tests. Of the session, only darks, flats, and the sequences that can
+    show the effect are captured."""
     single = [case for name, case in every_case().items() if name in library() and name not in NOT_IN_ONE_SESSION]
     return tuple(
         case.model_copy(update={"only": _showing(case.effects[0])})
@@ -255,7 +257,8 @@ def run_case(case: LiveCase, folder: Path) -> LiveRun:
 
 
 def session_of(options: Sequence[str], folder: Path) -> DiagnosisResult:
-    """Capture a quick session of a mock bench over the wire, started with these options, and diagnose it. It lies in `folder`."""
+    """Capture a quick session of a mock bench over the wire, started with these options, and diagnose it. It lies in
+    `folder`."""
     shutil.rmtree(folder, ignore_errors=True)
     with mock_bench((), options) as station:
         _command("capture", "--quick", "--station", str(station), "--out", str(folder))
@@ -349,7 +352,8 @@ def _reaches(name: str, sides: tuple[Side, ...], wanted: dict[str, frozenset[Sid
 
 
 def commit() -> str:
-    """Abbreviated hash of the checkout's commit, with `+` where files differ from it; empty where there is no checkout."""
+    """Abbreviated hash of the checkout's commit, with `+` where files differ from it; empty where there is no
+    checkout."""
     command = ["git", "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty=+"]
     done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
     return done.stdout.strip()

@@ -54,7 +54,10 @@ def summary(runs: Mapping[str, LiveRun]) -> str:
 def table(runs: Mapping[str, LiveRun]) -> str:
     """Markdown table with a row for each case."""
     lines = [
-        "| concealed | outcome | named (sides) | rivals | parameter: found, concealed | held-out chi2 / n, before | after |",
+        (
+            "| concealed | outcome | named (sides) | rivals | parameter: found, concealed | held-out chi2 / n, before | "  # noqa: E501
+            "after |"
+        ),
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name, run in runs.items():
@@ -83,7 +86,8 @@ def _words(parameter: FoundParameter) -> str:
 
 
 def drawing(runs: Mapping[str, LiveRun]) -> str:
-    """SVG: the parameters of singles and pairs, found over concealed, with two standard deviations; grey or red where it wasn't named."""
+    """SVG: the parameters of singles and pairs, found over concealed, with two standard deviations; grey or red where
+    it wasn't named."""
     rows: list[tuple[str, str, FoundParameter | None]] = []
     for run in runs.values():
         if run.case.resolve or not run.case.concealed:
@@ -94,7 +98,10 @@ def drawing(runs: Mapping[str, LiveRun]) -> str:
         rows += [(f"{words}: {p.parameter.replace('_', ' ')}", colour, p) for p in sized] or [(words, colour, None)]
     width, height = LABEL_PX + PLOT_PX + 30, HEAD_PX + ROW_PX * len(rows) + 30
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif" font-size="11">',
+        (
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif" '
+            'font-size="11">'
+        ),
         f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
         f'<text x="{LABEL_PX}" y="16" fill="#222">found / concealed, two standard deviations</text>',
     ]

@@ -54,7 +54,8 @@ def make(
         there = load(Truths, truths_file)
         if (there.seed, there.size, there.cases) != (seed, size, cases):
             raise InputError(
-                f"{truths_file}: holds a challenge of {there.cases} cases of size {there.size}, of another seed, size or number than asked for; give another file, or remove it"
+                f"{truths_file}: holds a challenge of {there.cases} cases of size {there.size}, of another seed, size "
+                "or number than asked for; give another file, or remove it"
             )
         held = there
     elif out.exists() and any(out.iterdir()):

@@ -2,12 +2,15 @@
 
 `python -m lab.challenge.names --out DIR`. Four classes of cameras, each with seeds of its own:
 
-- `bench`: quick sessions of the default mock bench over the wire, with another pair of cameras each. Its two filters and the column
+- `bench`: quick sessions of the default mock bench over the wire, with another pair of cameras each. Its two filters
+  and the column
   offsets of both cameras are there, and nothing else.
 - `healthy`: cameras of the second image former that do what their data sheet says.
-- `strong`: cameras of the former with one strong effect, its law varied, and nothing else. What the nearest law of the library lacks
+- `strong`: cameras of the former with one strong effect, its law varied, and nothing else. What the nearest law of the
+  library lacks
   beside it is no second effect.
-- `blur`: cameras of the former with a low-pass filter of 0.4 to 1.0 px, charge diffusion, or a smaller aperture: is it an anti-alias
+- `blur`: cameras of the former with a low-pass filter of 0.4 to 1.0 px, charge diffusion, or a smaller aperture: is it
+  an anti-alias
   filter?
 
 Each case leaves DIR/results/CASE.json; a case whose result is there is not run again.
@@ -40,7 +43,8 @@ from sim.parameters import Frozen
 Kind = Literal["bench", "healthy", "strong", "blur"]
 #: Non-centrality from which on a concealed effect has to be named.
 LEAST_VISIBLE = 1000.0
-#: How many cases of each class there are, and the most of them that may have a false name; the fewest right names of `blur`.
+#: How many cases of each class there are, and the most of them that may have a false name; the fewest right names of
+#: `blur`.
 COUNTS: dict[Kind, int] = {"bench": 60, "healthy": 150, "strong": 150, "blur": 60}
 MOST_FALSE: dict[Kind, int] = {"bench": 0, "healthy": 1, "strong": 1, "blur": 0}
 LEAST_RIGHT_BLUR = 0.95
@@ -61,8 +65,9 @@ BLUR_ROWS, BLUR_COLS = 192, 256
 
 
 class NameRun(Frozen):
-    """The names of one case. `false`: names, with the side, that nothing concealed gives; `missing`: what is concealed and has no name;
-    `noncentrality`: of what is concealed, where it was measured (some laws can't be made strong enough for a small frame)."""
+    """The names of one case. `false`: names, with the side, that nothing concealed gives; `missing`: what is concealed
+    and has no name; `noncentrality`: of what is concealed, where it was measured (some laws can't be made strong enough
+    for a small frame)."""
 
     case: str
     concealed: tuple[str, ...] = ()
@@ -100,8 +105,8 @@ def case_name(kind: Kind, number: int) -> str:
 def _judged(
     found: DiagnosisResult, wanted: frozenset[tuple[str, str]], right_besides: dict[str, frozenset[str]]
 ) -> NameRun:
-    """Judge a diagnosis. `wanted`: (name, side) of what is concealed; `right_besides`: by such a name, others that are right in its place:
-    families, and effects that describe it as well."""
+    """Judge a diagnosis. `wanted`: (name, side) of what is concealed; `right_besides`: by such a name, others that are
+    right in its place: families, and effects that describe it as well."""
     named = {(e.name, side) for e in found.effects for side in e.sides}
     sides = {side for _, side in wanted} or {"left"}
     stands_for = {
@@ -121,8 +126,8 @@ def _judged(
 
 @dataclass(frozen=True)
 class Made:
-    """A drawn camera's recordings. `wanted` and `right_besides`: as of `_judged`; `noncentrality`: of what is concealed, where it was
-    measured."""
+    """A drawn camera's recordings. `wanted` and `right_besides`: as of `_judged`; `noncentrality`: of what is
+    concealed, where it was measured."""
 
     recordings: RecordingSet
     wanted: frozenset[tuple[str, str]] = frozenset()
@@ -228,7 +233,8 @@ def main(
     ] = None,
     most: Annotated[int | None, typer.Option("--most", metavar="N", min=1, help="cases of each class at most")] = None,
 ) -> None:
-    """Count false names on cameras of four classes. Continues where an earlier run stopped; ends with 4 where there are too many."""
+    """Count false names on cameras of four classes. Continues where an earlier run stopped; ends with 4 where there are
+    too many."""
     unknown = sorted(set(only or ()) - set(get_args(Kind)))
     if unknown:
         raise InputError(f"--only {unknown[0]}: no such class; there are {', '.join(get_args(Kind))}")

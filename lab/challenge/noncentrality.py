@@ -1,9 +1,10 @@
-"""The strength of a concealed law: the non-centrality of its change of the summaries, and how well it can be identified.
+"""The strength of a concealed law: the non-centrality of its change of the summaries, and how well it can be
+identified.
 
-Summaries are the measured numbers of a diagnosis. Recordings with and without the law are of the same camera with the same noise, so
-that their difference is the law's change. Its covariance is that of the recordings with the law, nuisance parameters marginalised. The
-library of effects has no part in the non-centrality. It enters as rivals, by its effects' changes of the healthy camera
-(`lab.challenge.fair_strength`).
+Summaries are the measured numbers of a diagnosis. Recordings with and without the law are of the same camera with the
+same noise, so that their difference is the law's change. Its covariance is that of the recordings with the law,
+nuisance parameters marginalised. The library of effects has no part in the non-centrality. It enters as rivals, by its
+effects' changes of the healthy camera (`lab.challenge.fair_strength`).
 """
 
 from __future__ import annotations
@@ -63,9 +64,9 @@ def _change(present: MeasurementModel, absent: MeasurementModel) -> dict[Hashabl
 def noncentrality(pairs: Sequence[tuple[MeasurementModel | None, MeasurementModel | None]]) -> float:
     """d1' C^-1 d2, at least 0, of two pairs (with the law, without it), each with its own draw of the noise.
 
-    d is the change of the summaries, C their covariance under the baseline, from the first recordings with the law. A law that moves an
-    edge changes the noise under it, too. That part is independent in d1 and d2 and cancels on average; |d|^2 of one pair would be biased by
-    it.
+    d is the change of the summaries, C their covariance under the baseline, from the first recordings with the law. A
+    law that moves an edge changes the noise under it, too. That part is independent in d1 and d2 and cancels on
+    average; |d|^2 of one pair would be biased by it.
     """
     (present, absent), (again, without) = pairs
     if present is None or absent is None or again is None or without is None:
@@ -119,11 +120,12 @@ def fair_strengths(
     accepts: Collection[str],
     rng: np.random.Generator,
 ) -> tuple[list[FairStrength], float | None]:
-    """Conditional non-centrality and separability of each concealed law, and the oracle's share of right answers on the case.
+    """Conditional non-centrality and separability of each concealed law, and the oracle's share of right answers on the
+    case.
 
-    `whole`: summaries with all laws; `without`: without each law in turn; `effects`: the laws' names in the library, None outside it;
-    `accepts`: names that are no rivals. Of a concealed effect, the law's measured change replaces one direction. The share is None where a
-    law isn't in the library, or its effect changes no summary.
+    `whole`: summaries with all laws; `without`: without each law in turn; `effects`: the laws' names in the library,
+    None outside it; `accepts`: names that are no rivals. Of a concealed effect, the law's measured change replaces one
+    direction. The share is None where a law isn't in the library, or its effect changes no summary.
     """
     present, again = whole
     absent = [(one, other) for one, other in without if one is not None and other is not None]

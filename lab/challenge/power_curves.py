@@ -1,4 +1,5 @@
-"""Power curves of the proof as a picture: share of right answers against separability, of the diagnosis and of the oracle."""
+"""Power curves of the proof as a picture: share of right answers against separability, of the diagnosis and of the
+oracle."""
 
 from __future__ import annotations
 
@@ -15,11 +16,15 @@ MEASURED, ORACLE = "#1f5fa8", "#8a8f98"
 
 
 def power_curves(found: ChallengeScore) -> str:
-    """SVG with single effects at the left and compounds at the right. For each class of separability, at its geometric mean: the share of
-    right diagnoses with its 95 % interval and the number of cases, and the mean share of the oracle on the same cases."""
+    """SVG with single effects at the left and compounds at the right. For each class of separability, at its geometric
+    mean: the share of right diagnoses with its 95 % interval and the number of cases, and the mean share of the oracle
+    on the same cases."""
     width, height = LEFT_PX + 2 * WIDTH_PX + GAP_PX + 24, TOP_PX + HEIGHT_PX + 92
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" font-family="sans-serif" font-size="12">',
+        (
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" font-family="sans-serif" '  # noqa: E501
+            'font-size="12">'
+        ),
         f'<rect width="{width:.0f}" height="{height:.0f}" fill="#ffffff"/>',
     ]
     for column, (kind, title) in enumerate(
@@ -50,13 +55,15 @@ def _panel(left: float, title: str, cases: Sequence[CaseScore]) -> list[str]:
     ]
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         parts.append(
-            f'<path d="M{left:.0f} {up(share):.1f}h{WIDTH_PX:.0f}" stroke="#d5d8dd"/><text x="{left - 8:.0f}" y="{up(share) + 4:.1f}" '
+            f'<path d="M{left:.0f} {up(share):.1f}h{WIDTH_PX:.0f}" stroke="#d5d8dd"/><text x="{left - 8:.0f}" '
+            f'y="{up(share) + 4:.1f}" '
             f'text-anchor="end" fill="#222">{100 * share:.0f} %</text>'
         )
     for strength in (1, 5, 10, 25, 50, 100, 300, 2000):
         x = across(strength)
         parts.append(
-            f'<path d="M{x:.1f} {up(0):.1f}v5" stroke="#222"/><text x="{x:.1f}" y="{up(0) + 18:.1f}" text-anchor="middle" fill="#222">{strength}</text>'
+            f'<path d="M{x:.1f} {up(0):.1f}v5" stroke="#222"/><text x="{x:.1f}" y="{up(0) + 18:.1f}" '
+            f'text-anchor="middle" fill="#222">{strength}</text>'
         )
     parts.append(
         f'<text x="{left + WIDTH_PX / 2:.0f}" y="{up(0) + 38:.1f}" text-anchor="middle" fill="#222">separability</text>'
@@ -82,8 +89,10 @@ def _panel(left: float, title: str, cases: Sequence[CaseScore]) -> list[str]:
     for x, rate in zip(places, rates, strict=True):
         y, low, high = (up(share or 0.0) for share in (rate.share, rate.low, rate.high))
         parts.append(
-            f'<path d="M{x:.1f} {low:.1f}V{high:.1f}" stroke="{MEASURED}" stroke-opacity="0.5"/><circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" '
-            f'fill="{MEASURED}"/><text x="{x + 5:.1f}" y="{y - 6:.1f}" fill="{MEASURED}" font-size="10">{rate.of}</text>'
+            f'<path d="M{x:.1f} {low:.1f}V{high:.1f}" stroke="{MEASURED}" stroke-opacity="0.5"/><circle cx="{x:.1f}" '
+            f'cy="{y:.1f}" r="3.5" '
+            f'fill="{MEASURED}"/><text x="{x + 5:.1f}" y="{y - 6:.1f}" fill="{MEASURED}" '
+            f'font-size="10">{rate.of}</text>'
         )
     return parts
 

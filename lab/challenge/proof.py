@@ -73,13 +73,15 @@ def table(found: ChallengeScore) -> str:
             lines.append(f"| {what} | {100 * share:.1f} % |")
     if found.cpu_median_s is not None and found.memory_max_mib is not None:
         lines.append(
-            f"| CPU time of a case, median; memory, largest | {found.cpu_median_s:.1f} s; {found.memory_max_mib:.0f} MiB |"
+            f"| CPU time of a case, median; memory, largest | {found.cpu_median_s:.1f} s; {found.memory_max_mib:.0f} "
+            "MiB |"
         )
     lines += ["", "| concealed alone | right | right above 50 | else |", "| --- | --- | --- | --- |"]
     for e in found.effects:
         instead = ", ".join(f"{name} {n}" for name, n in e.instead.items()) or "-"
         lines.append(
-            f"| {e.effect} | {e.top_1.count} of {e.top_1.of} | {e.strong_top_1.count} of {e.strong_top_1.of} | {instead} |"
+            f"| {e.effect} | {e.top_1.count} of {e.top_1.of} | {e.strong_top_1.count} of {e.strong_top_1.of} | "
+            f"{instead} |"
         )
     lines += ["", "| outside the library, named | as |", "| --- | --- |"]
     wrong = [s for s in found.case_scores if s.kind == "outside" and not s.right]
@@ -96,7 +98,8 @@ def write_page(found: ChallengeScore, page: Path) -> None:
     text = page.read_text(encoding="utf-8") if page.is_file() else "# Proof\n"
     picture = page.with_name(f"{page.stem}-{found.purpose}.svg")
     section = (
-        f"Seed {found.seed}, {found.cases} cases, {found.size} frames; SHA-256 over all seals `{found.seals_sha256}`.\n\n"
+        f"Seed {found.seed}, {found.cases} cases, {found.size} frames; SHA-256 over all seals "
+        f"`{found.seals_sha256}`.\n\n"
         f"{table(found)}\n\n![What was said of what was concealed]({picture.name})"
     )
     if any(s.oracle_share is not None for s in found.case_scores):
@@ -109,7 +112,10 @@ def write_page(found: ChallengeScore, page: Path) -> None:
     if row not in text:
         begin = text.find("<!-- seeds:end -->")
         if begin < 0:
-            text += "\n## Seeds\n\n| for | seed | cases | frames | seals |\n| --- | --- | --- | --- | --- |\n<!-- seeds:end -->\n"
+            text += (
+                "\n## Seeds\n\n| for | seed | cases | frames | seals |\n| --- | --- | --- | --- | --- |\n<!-- "
+                "seeds:end -->\n"
+            )
             begin = text.find("<!-- seeds:end -->")
         text = f"{text[:begin]}{row}\n{text[begin:]}"
     page.parent.mkdir(parents=True, exist_ok=True)
@@ -126,7 +132,7 @@ def placed(text: str, name: str, section: str) -> str:
     return f"{head}{begin}\n{section}\n{end}{rest.split(end, 1)[1]}"
 
 
-# --- the picture -----------------------------------------------------------------------------------------------------------
+# --- the picture ------------------------------------------------------------------------------------------------------
 
 
 def _row(case: CaseScore) -> str:
@@ -136,8 +142,8 @@ def _row(case: CaseScore) -> str:
 
 
 def confusion(found: ChallengeScore) -> str:
-    """Confusion matrix as SVG: numbers of cases by what was concealed (rows: single effects of non-centrality above 50, healthy, outside
-    the library) and by the first name or the verdict (columns)."""
+    """Confusion matrix as SVG: numbers of cases by what was concealed (rows: single effects of non-centrality above 50,
+    healthy, outside the library) and by the first name or the verdict (columns)."""
     shown = [
         s
         for s in found.case_scores
@@ -150,14 +156,18 @@ def confusion(found: ChallengeScore) -> str:
     columns = [*sorted(said - set(SAID_NOTHING)), *(c for c in SAID_NOTHING if c in said)]
     width, height = LABEL_PX + CELL_PX * len(columns) + 130, HEAD_PX + CELL_PX * len(rows) + 50
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif" font-size="12">',
+        (
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif" '
+            'font-size="12">'
+        ),
         f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
     ]
     for j, column in enumerate(columns):
         x = LABEL_PX + CELL_PX * (j + 0.5)
         words = escape(effect_title(column))
         parts.append(
-            f'<text x="{x + 4:.0f}" y="{HEAD_PX - 6}" transform="rotate(-55 {x + 4:.0f} {HEAD_PX - 6})" fill="#222">{words}</text>'
+            f'<text x="{x + 4:.0f}" y="{HEAD_PX - 6}" transform="rotate(-55 {x + 4:.0f} {HEAD_PX - 6})" '
+            f'fill="#222">{words}</text>'
         )
     for i, row in enumerate(rows):
         y = HEAD_PX + CELL_PX * i
@@ -170,7 +180,8 @@ def confusion(found: ChallengeScore) -> str:
             colour = RIGHT if right else ABSTAINED if column in SAID_NOTHING else WRONG
             shade = 0.25 + 0.75 * n / total if n else 0.0
             parts.append(
-                f'<rect x="{x}" y="{y}" width="{CELL_PX}" height="{CELL_PX}" fill="{colour}" fill-opacity="{shade:.2f}" stroke="#d5d8dd"/>'
+                f'<rect x="{x}" y="{y}" width="{CELL_PX}" height="{CELL_PX}" fill="{colour}" '
+                f'fill-opacity="{shade:.2f}" stroke="#d5d8dd"/>'
             )
             if n:
                 ink = "#fff" if shade > 0.55 else "#111"
@@ -181,6 +192,7 @@ def confusion(found: ChallengeScore) -> str:
     for k, (colour, words) in enumerate(((RIGHT, "right"), (ABSTAINED, "nothing named"), (WRONG, "a wrong name"))):
         x = LABEL_PX + 130 * k - 150
         parts.append(
-            f'<rect x="{x}" y="{y - 11}" width="12" height="12" fill="{colour}"/><text x="{x + 18}" y="{y}" fill="#222">{words}</text>'
+            f'<rect x="{x}" y="{y - 11}" width="12" height="12" fill="{colour}"/><text x="{x + 18}" y="{y}" '
+            f'fill="#222">{words}</text>'
         )
     return "\n".join([*parts, "</svg>\n"])

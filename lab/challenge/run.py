@@ -18,7 +18,8 @@ from sim.parameters import Frozen
 
 
 class CaseRun(Frozen):
-    """The diagnosis of one case, without its curves, and its cost; `error`: why there is none. `memory_mib`: peak of the process."""
+    """The diagnosis of one case, without its curves, and its cost; `error`: why there is none. `memory_mib`: peak of
+    the process."""
 
     case: str
     wall_s: float
@@ -37,7 +38,8 @@ def _peak_mib() -> float:
 
 
 def run_case(folder: Path, policy: DecisionPolicy | None = None) -> CaseRun:
-    """Diagnose the recording set in `folder`. `policy`: the rules of decision; None: the default ones. An exception becomes `error`."""
+    """Diagnose the recording set in `folder`. `policy`: the rules of decision; None: the default ones. An exception
+    becomes `error`."""
     from lab.diagnose import examine
     from lab.formats import recording_set as recording
 
@@ -52,7 +54,8 @@ def run_case(folder: Path, policy: DecisionPolicy | None = None) -> CaseRun:
         at = traceback.extract_tb(caught.__traceback__)[-1]
         error = f"{type(caught).__name__}: {' '.join(str(caught).split())} ({Path(at.filename).name}:{at.lineno})"
     return CaseRun(
-        case=folder.name, wall_s=time.perf_counter() - wall, cpu_s=time.process_time() - cpu, memory_mib=_peak_mib(), error=error, diagnosis=found
+        case=folder.name, wall_s=time.perf_counter() - wall, cpu_s=time.process_time() - cpu, memory_mib=_peak_mib(),
+        error=error, diagnosis=found
     )  # fmt: skip
 
 

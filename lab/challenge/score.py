@@ -95,7 +95,8 @@ class CaseScore(Frozen):
 
 
 class SinglesScore(Frozen):
-    """Single effects of one class of non-centrality: rates of the right first name, of only that name, and of no name."""
+    """Single effects of one class of non-centrality: rates of the right first name, of only that name, and of no
+    name."""
 
     noncentrality: str
     top_1: Rate
@@ -114,7 +115,8 @@ class FairScore(Frozen):
 
 
 class FamiliesScore(Frozen):
-    """Names of effects and families, as rates of cases whose concealed laws have a family and a non-centrality above 25."""
+    """Names of effects and families, as rates of cases whose concealed laws have a family and a non-centrality above
+    25."""
 
     right_effects: Rate  # of cases of listed effects: every effect is named
     right_families: Rate  # every concealed law is named by its effect or its family
@@ -282,19 +284,25 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
         _limit("memory of a case", memory, MEMORY_GOAL_MIB, " MiB"),
     )
     return ChallengeScore(
-        purpose=truths.purpose, seed=truths.seed, size=truths.size, cases=len(cases), seals_sha256=seals_sha256(seals), broken_seals=tuple(broken),
-        failed={case: run.error for case, _, run in cases if run.error is not None}, singles=classes, fair=fair, families=families, effects=_by_effect(singles),
-        compounds_both_named=both, compounds_one_named=one, compounds_strong_both_named=both_strong, rival_sets_cover=cover,
+        purpose=truths.purpose, seed=truths.seed, size=truths.size, cases=len(cases), seals_sha256=seals_sha256(seals),
+        broken_seals=tuple(broken),
+        failed={case: run.error for case, _, run in cases if run.error is not None}, singles=classes, fair=fair,
+        families=families, effects=_by_effect(singles),
+        compounds_both_named=both, compounds_one_named=one, compounds_strong_both_named=both_strong,
+        rival_sets_cover=cover,
         rival_set_mean_size=size, model_sets_hold=Rate.over(bool(s.set_holds) for s in weighed),
-        model_sets_mean_size=fmean(model_sizes) if model_sizes else None, false_alarms=alarms, false_names=names, outside_not_named=abstained, outside_located=located,
-        parameters_covered=covered, excess_removed=mean_removed, excess_removed_median=median(removed) if removed else None,
+        model_sets_mean_size=fmean(model_sizes) if model_sizes else None, false_alarms=alarms, false_names=names,
+        outside_not_named=abstained, outside_located=located,
+        parameters_covered=covered, excess_removed=mean_removed,
+        excess_removed_median=median(removed) if removed else None,
         outside_excess_removed_median=median(outside_removed) if outside_removed else None,
-        wall_median_s=median(r.wall_s for r in ran) if ran else None, cpu_median_s=median(r.cpu_s for r in ran) if ran else None,
+        wall_median_s=median(r.wall_s for r in ran) if ran else None,
+        cpu_median_s=median(r.cpu_s for r in ran) if ran else None,
         cpu_max_s=cpu, memory_max_mib=memory, goals=goals, case_scores=tuple(scored),
     )  # fmt: skip
 
 
-# --- one case ------------------------------------------------------------------------------------------------------------
+# --- one case ---------------------------------------------------------------------------------------------------------
 
 
 def _case_score(case: str, truth: CaseTruth, run: CaseRun) -> CaseScore:
@@ -312,13 +320,15 @@ def _case_score(case: str, truth: CaseTruth, run: CaseRun) -> CaseScore:
         "outside": found is not None and set(named) <= set(truth.accepts),
     }[truth.kind]
     return CaseScore(
-        case=case, kind=truth.kind, truth=tuple(c.name for c in truth.concealed), variants=tuple(c.variant for c in truth.concealed),
+        case=case, kind=truth.kind, truth=tuple(c.name for c in truth.concealed),
+        variants=tuple(c.variant for c in truth.concealed),
         noncentrality=tuple(c.noncentrality for c in truth.concealed), separability=_least_separability(truth),
         oracle_share=truth.oracle_share, fault=truth.fault,
         verdict=found.verdict if found is not None else "failed", named=named, rivals=rivals,
         unexplained=tuple(u.measurement for u in found.unexplained) if found is not None else (), right=right,
         effects=truth.names, true_families=tuple(tuple(sorted(one)) for one in true), families=tuple(told),
-        right_family=bool(true) and all(set(told) & one for one in true), wrong_family=not set(told) <= accepted.union(*true),
+        right_family=bool(true) and all(set(told) & one for one in true),
+        wrong_family=not set(told) <= accepted.union(*true),
         set_holds=frozenset(truth.names) in _model_sets(found) if _is_listed(truth) else None,
         excess_removed=_removed(truth, found), cpu_s=run.cpu_s, memory_mib=run.memory_mib,
     )  # fmt: skip
@@ -343,7 +353,8 @@ def _least_separability(truth: CaseTruth) -> float | None:
 
 
 def families_of(concealed: Concealed) -> frozenset[str]:
-    """Families that are right for a concealed law: its effect's, or those that the second former declares; empty where no family has it."""
+    """Families that are right for a concealed law: its effect's, or those that the second former declares; empty where
+    no family has it."""
     if concealed.effect is not None:
         return frozenset({library()[concealed.effect].family.value})
     return next((law.families for law in OUTSIDE if law.name == concealed.name), frozenset())
@@ -362,7 +373,8 @@ def _removed(truth: CaseTruth, found: DiagnosisResult | None) -> float | None:
 
 
 def _covered(truth: CaseTruth, found: DiagnosisResult | None) -> Iterable[bool]:
-    """Of every parameter that has the same meaning in the library: whether its 95 % interval contains the true value."""
+    """Of every parameter that has the same meaning in the library: whether its 95 % interval contains the true
+    value."""
     named = {e.name: e for e in found.effects} if found is not None else {}
     for hidden in truth.concealed:
         effect = named.get(hidden.effect or "")
@@ -375,7 +387,7 @@ def _covered(truth: CaseTruth, found: DiagnosisResult | None) -> Iterable[bool]:
                 yield abs(away) <= INTERVAL_SIGMAS * said.std
 
 
-# --- sums ----------------------------------------------------------------------------------------------------------------
+# --- sums -------------------------------------------------------------------------------------------------------------
 
 
 def _singles(what: str, cases: Sequence[CaseScore]) -> SinglesScore:
@@ -397,7 +409,8 @@ def _fair(kind: Literal["single", "compound"], what: str, cases: Sequence[CaseSc
     asked = [s for s in cases if s.oracle_share is not None and s.separability is not None]
     right, oracle = Rate.over(s.right for s in asked), _oracle(asked)
     return FairScore(
-        kind=kind, separability=what, right=right, oracle=oracle, of_oracle=right.share / oracle if right.share is not None and oracle else None
+        kind=kind, separability=what, right=right, oracle=oracle,
+        of_oracle=right.share / oracle if right.share is not None and oracle else None
     )  # fmt: skip
 
 

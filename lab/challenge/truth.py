@@ -18,7 +18,8 @@ from sim.parameters import Frozen
 #: Seeds below are for tuning, from here on for proofs; those of the everyday tests lie above both.
 FIRST_PROOF_SEED = 1_000_000
 FIRST_FRESH_SEED = 1 << 32
-#: (rows, cols) of frames by the name of their size; None: each case has a frame of its own, see `lab.challenge.draw.DrawnFrame.drawn`.
+#: (rows, cols) of frames by the name of their size; None: each case has a frame of its own, see
+#: `lab.challenge.draw.DrawnFrame.drawn`.
 SIZES: dict[str, tuple[int, int] | None] = {
     "small": (96, 128),
     "medium": (192, 256),
@@ -96,8 +97,8 @@ class Seals(Frozen):
 
 
 def canonical(truth: CaseTruth) -> str:
-    """JSON with sorted keys and no blanks, the same text for the same truth. Measures of strength that are None are left out, so that
-    seals of older challenges, which had none, still hold."""
+    """JSON with sorted keys and no blanks, the same text for the same truth. Measures of strength that are None are
+    left out, so that seals of older challenges, which had none, still hold."""
     content = truth.model_dump(mode="json")
     for part in (content, *content["concealed"]):
         for name in ("oracle_share", "conditional", "separability", "nearest_rival"):

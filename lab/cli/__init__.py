@@ -10,7 +10,8 @@ from __future__ import annotations
 import os
 import sys
 
-# Both cameras are fitted at the same time; libraries that start threads of their own under these take four times as long.
+# Both cameras are fitted at the same time; libraries that start threads of their own under these take four times as
+# long.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 

@@ -21,8 +21,8 @@ BENCH_START_S, BENCH_END_S = 60.0, 10.0
 def mock_bench(conceal: Sequence[str], options: Sequence[str] = ()) -> Iterator[Path]:
     """Start `calibench bench` and give its station file; the bench ends with the block, or with this process.
 
-    `conceal`: what the bench's option of that name takes, one item an effect; `options`: others of its options. Raises InputError with the bench's own line where
-    it refuses an option, DeviceError where it doesn't start.
+    `conceal`: what the bench's option of that name takes, one item an effect; `options`: others of its options. Raises
+    InputError with the bench's own line where it refuses an option, DeviceError where it doesn't start.
     """
     with tempfile.TemporaryDirectory(prefix="calibench-bench-") as folder:
         file = Path(folder) / "station.toml"

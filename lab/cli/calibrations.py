@@ -133,7 +133,8 @@ def history(
     json: Json = None,
     data: StoreFolder = None,
 ) -> None:
-    """A figure of a camera over all its calibrations: bands and drift. Exit code 4 where the newest is bad or drifted."""
+    """A figure of a camera over all its calibrations: bands and drift. Exit code 4 where the newest is bad or
+    drifted."""
     from lab.calibration.life import figure_names
     from lab.calibration.life import history as looked_up
     from lab.formats.results.figure_names import plain_name, unit_of

@@ -148,7 +148,8 @@ def sequences(
     json: Json = None,
     data: StoreFolder = None,
 ) -> None:
-    """The sequences: what each is for, its parameters with unit and bounds; with a station file, their values, captures and time there."""
+    """The sequences: what each is for, its parameters with unit and bounds; with a station file, their values, captures
+    and time there."""
     from lab.capture.catalogue import catalogue, estimate, parse_parameters, step_times
     from lab.capture.plan import full_plan
     from lab.capture.station import read_station
@@ -169,8 +170,8 @@ def sequences(
 
 
 def _capturer(store: Store, station_file: Path | None, conceal: list[str] | None, verb: list[str]) -> Capturer:
-    """Captures in this thread: on the station of a file, or on a mock bench that is started for each session. `verb`: the words of the command that
-    does, which goes on with an interrupted session."""
+    """Captures in this thread: on the station of a file, or on a mock bench that is started for each session. `verb`:
+    the words of the command that does, which goes on with an interrupted session."""
     if station_file is not None and conceal:
         raise InputError("--conceal: only the mock bench conceals effects; leave --station out")
 

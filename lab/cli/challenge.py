@@ -79,7 +79,8 @@ def make_command(
         )
     if not proof and purpose_of(seed) == "proof":
         raise InputError(
-            f"seed {seed}: seeds from {FIRST_PROOF_SEED} to {FIRST_FRESH_SEED - 1} are for proofs; give one below to tune, or --proof"
+            f"seed {seed}: seeds from {FIRST_PROOF_SEED} to {FIRST_FRESH_SEED - 1} are for proofs; give one below to "
+            "tune, or --proof"
         )
     if proof:
         refuse_scored(seed, PROOF_PAGE)

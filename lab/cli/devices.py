@@ -70,7 +70,8 @@ def listed(
             )
     else:
         out.print(
-            "nothing is connected that is known here; serial ports of USB adapters, USB instruments and cameras are looked for"
+            "nothing is connected that is known here; serial ports of USB adapters, USB instruments and cameras are "
+            "looked for"
         )
 
 
@@ -118,8 +119,8 @@ def contract(
 ) -> None:
     """Check that drivers keep their family's contract. Exit code 4 if one doesn't.
 
-    FILE has a table [[instrument]] a driver: `driver` ("family.name"), and either `peer` ("module:callable", a mock) or `address` and
-    the driver's settings (a real instrument).
+    FILE has a table [[instrument]] a driver: `driver` ("family.name"), and either `peer` ("module:callable", a mock) or
+    `address` and the driver's settings (a real instrument).
     """
     from drivers.contract.checks import check_driver
     from drivers.errors import InstrumentError
@@ -149,7 +150,8 @@ def init(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="the station file to write")],
     usbip: UsbIp = "",
 ) -> None:
-    """Write a station file of the connected instruments: cameras with pixels, colour filters and bit depth, others with their addresses."""
+    """Write a station file of the connected instruments: cameras with pixels, colour filters and bit depth, others with
+    their addresses."""
     from drivers import discovery
     from drivers.errors import InstrumentError
     from lab.capture.self_test import station_text

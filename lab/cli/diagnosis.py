@@ -28,7 +28,8 @@ from lab.cli.tables import print_diagnosis, print_validation
 from lab.errors import InputError
 from lab.pipeline import PipelineRequest, PipelineResult
 
-#: The fewest drawn cameras for a threshold: of ten draws, the standard deviation is known to 1 / sqrt(2 (10 - 1)) = 24 %.
+#: The fewest drawn cameras for a threshold: of ten draws, the standard deviation is known to 1 / sqrt(2 (10 - 1)) = 24
+#: %.
 FEWEST_DRAWS = 10
 
 commands = typer.Typer()
@@ -68,16 +69,19 @@ def diagnose(
         int,
         typer.Option(
             metavar="N",
-            help=f"simulate N healthy cameras (at least {FEWEST_DRAWS}) frame by frame for the threshold of a false alarm",
+            help=f"simulate N healthy cameras (at least {FEWEST_DRAWS}) frame by frame for the threshold of a false "
+            "alarm",
         ),
     ] = 0,
     scheduler: Scheduler = None,
     data: StoreFolder = None,
 ) -> None:
-    """Name the physics that the camera model lacks and the recordings show. Exit code 2 if they determine no measurement."""
+    """Name the physics that the camera model lacks and the recordings show. Exit code 2 if they determine no
+    measurement."""
     if 0 < bootstrap < FEWEST_DRAWS or bootstrap < 0:
         raise InputError(
-            f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, or 0"
+            f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, "
+            "or 0"
         )
     if scheduler is not None and not bootstrap:
         raise InputError(f"--scheduler {scheduler}: only the draws of --bootstrap are spread; give both, or neither")
@@ -148,7 +152,8 @@ def report(
     ] = False,
     data: StoreFolder = None,
 ) -> None:
-    """Fit, validate, diagnose, and write one page with pictures. What is given, or with --stored is stored, isn't computed again."""
+    """Fit, validate, diagnose, and write one page with pictures. What is given, or with --stored is stored, isn't
+    computed again."""
     from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 
     check_writable(out_file)
@@ -181,7 +186,8 @@ def report(
     kept = [kind for kind, file in given.items() if file is None and store is not None and store.results(source, kind)]
     if kept and not stored:
         err.print(
-            f"calibench: {escape(source)} has stored results ({', '.join(kept)}), computed again now; --stored takes them"
+            f"calibench: {escape(source)} has stored results ({', '.join(kept)}), computed again now; --stored takes "
+            "them"
         )
     if stored and not kept:
         err.print(

@@ -22,7 +22,8 @@ def effects(
     name: Annotated[str, typer.Argument(metavar="[NAME]", help="only this effect")] = "",
     json: Json = None,
 ) -> None:
-    """The library of effects: its families, where each effect acts, its parameters, which measurements can show it, and its rivals."""
+    """The library of effects: its families, where each effect acts, its parameters, which measurements can show it, and
+    its rivals."""
     from lab.diagnose.effect_list import EffectList, effect_description, effect_list
 
     check_writable(json)
@@ -56,7 +57,8 @@ def _print_effect(effect: EffectDescription) -> None:
     for choice in effect.choices:
         values = f" ({', '.join(choice.values)})" if choice.values else ""
         out.print(
-            f"  {choice.name}, not fitted: {escape(choice.meaning)}{escape(values)}; {escape(choice.default)} if not given"
+            f"  {choice.name}, not fitted: {escape(choice.meaning)}{escape(values)}; {escape(choice.default)} if not "
+            "given"
         )
     for heading, items in (
         ("family", (effect.family,)),

@@ -35,7 +35,8 @@ app.add_typer(devices.station)
 
 
 def attach_service_and_mocks() -> None:
-    """Add the commands of `api` and `mocks`. Only this function imports them, and only when a command line is parsed."""
+    """Add the commands of `api` and `mocks`. Only this function imports them, and only when a command line is
+    parsed."""
     from api.command import commands as service
     from mocks.command import commands as mocks
 

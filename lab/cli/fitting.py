@@ -34,7 +34,8 @@ def fit(
         typer.Option(
             "--maps",
             metavar="DIR",
-            help="write every pixel's offset, dark current and gain, and which are defective, into DIR/SIDE (.npy and .png)",
+            help="write every pixel's offset, dark current and gain, and which are defective, into DIR/SIDE (.npy and "
+            ".png)",
         ),
     ] = None,
     data: StoreFolder = None,

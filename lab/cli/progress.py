@@ -26,7 +26,8 @@ def progress_bar(what: str) -> Iterator[Callable[[str, float], None]]:
 
 @contextlib.contextmanager
 def pipeline_bar() -> Iterator[Callable[[PipelineProgress], None]]:
-    """A bar for the step of a pipeline that is under way; yields what the pipeline calls. Remarks are printed as they come.
+    """A bar for the step of a pipeline that is under way; yields what the pipeline calls. Remarks are printed as they
+    come.
 
     Where stderr is no terminal, each sequence of a capture is a line on stdout, for a log.
     """

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from lab.formats.importers.import_options import ImportOptions
 
 commands = typer.Typer()
-#: `--from` these: a CSV of channel means and variances by level, or of channel means by wavelength, which becomes a fit.
+#: `--from` these: a CSV of channel means and variances by level, or of channel means by wavelength, which becomes a
+#: fit.
 LEVEL_TABLE, MEAN_TABLE = "photon-transfer-table", "spectral-table"
 
 
@@ -32,7 +33,8 @@ def import_(
         typer.Option(
             "--from",
             metavar="KIND",
-            help="emva1288, raw-folder, fits, slanted-edge, colorchecker, dot-grid, checkerboard, photon-transfer-table or spectral-table",
+            help="emva1288, raw-folder, fits, slanted-edge, colorchecker, dot-grid, checkerboard, "
+            "photon-transfer-table or spectral-table",
         ),
     ],
     out_folder: Annotated[
@@ -159,7 +161,8 @@ def backup(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="the backup: new, or one of this data folder")],
     data: StoreFolder = None,
 ) -> None:
-    """Copy the data folder while it is in use. The copy is a data folder itself: to restore, use it in place of the other."""
+    """Copy the data folder while it is in use. The copy is a data folder itself: to restore, use it in place of the
+    other."""
     from lab.capture.backup import back_up
 
     made = back_up(store_to_read(data), folder)

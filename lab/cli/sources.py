@@ -37,7 +37,8 @@ Scheduler = Annotated[
         "--scheduler",
         metavar="ADDRESS",
         envvar="CALIBENCH_SCHEDULER",
-        help="a Dask scheduler (tcp://HOST:PORT) whose workers do the parallel work in place of this computer; they have to see its files under the same path",
+        help="a Dask scheduler (tcp://HOST:PORT) whose workers do the parallel work in place of this computer; they "
+        "have to see its files under the same path",
     ),
 ]
 FitFile = Annotated[Path | None, typer.Option("--fit", metavar="FILE", help="a fit's JSON, in place of fitting again")]
@@ -62,14 +63,16 @@ def existing_store(folder: Path | None = None) -> Store | None:
 
 
 def store_to_read(folder: Path | None = None) -> Store:
-    """The store of the data folder, for a command that only reads or changes what is there. Raises InputError where there is none."""
+    """The store of the data folder, for a command that only reads or changes what is there. Raises InputError where
+    there is none."""
     from lab.capture.settings import Settings
 
     store = existing_store(folder)
     if store is None:
         at = folder or Settings().data
         raise InputError(
-            f"{at}: holds no registry; name the data folder by --data, or, where its registry is a database server's, set "
+            f"{at}: holds no registry; name the data folder by --data, or, where its registry is a database server's, "
+            "set "
             "CALIBENCH_DATABASE_URL as the service has it"
         )
     return store
@@ -89,7 +92,8 @@ def run_here(request: PipelineRequest, store: Store | None = None, capturer: Cap
 
 
 def read_given(model: type[M], file: Path | None) -> M | None:
-    """The result of an option `--fit FILE`, `--validation FILE` or `--diagnosis FILE`; None without it: the pipeline computes one then."""
+    """The result of an option `--fit FILE`, `--validation FILE` or `--diagnosis FILE`; None without it: the pipeline
+    computes one then."""
     if file is None:
         return None
     from lab.formats.result_file import read_result
@@ -98,8 +102,8 @@ def read_given(model: type[M], file: Path | None) -> M | None:
 
 
 def camera_path(recordings: RecordingSet, side: Side, path: Path) -> Path:
-    """The camera file of a side: `path` if it names a .toml file, else SIDE.toml in the folder `path`. Raises InputError for
-    one file and two cameras."""
+    """The camera file of a side: `path` if it names a .toml file, else SIDE.toml in the folder `path`. Raises
+    InputError for one file and two cameras."""
     if path.suffix != ".toml":
         return path / f"{side}.toml"
     if len(recordings.sides) > 1:

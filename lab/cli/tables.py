@@ -165,14 +165,17 @@ def print_comparison(comparison: ComparisonResult, every: bool) -> None:
     for item in comparison.projection:
         turn = ", ".join(f"{value:.3f}" for value in item.implied_turn_mrad)
         out.print(
-            f"projection ({item.side}): {item.difference_px:.4f} px rms apart once the implied motion is taken out, {item.expected_px:.4f} "
-            f"px by the uncertainties, {item.significance_sigma:.1f} sigma: {'changed' if item.changed else 'unchanged'} (as stated "
+            f"projection ({item.side}): {item.difference_px:.4f} px rms apart once the implied motion is taken out, "
+            f"{item.expected_px:.4f} "
+            f"px by the uncertainties, {item.significance_sigma:.1f} sigma: "
+            f"{'changed' if item.changed else 'unchanged'} (as stated "
             f"{item.as_stated_px:.4f} px; implied turn {turn} mrad)"
         )
     number = sum(row.changed for row in comparison.changes) + sum(item.changed for item in comparison.projection)
     total = len(comparison.changes) + len(comparison.projection)
     out.print(
-        f"{number or 'none'} of {total} numbers and curves changed beyond {comparison.threshold_sigma:.1f} sigma, which an unchanged rig "
+        f"{number or 'none'} of {total} numbers and curves changed beyond {comparison.threshold_sigma:.1f} sigma, "
+        "which an unchanged rig "
         f"passes in {100 * comparison.false_alarm_rate:g} % of all comparisons"
     )
     print_skipped(comparison.skipped)

@@ -42,7 +42,8 @@ def predict(
     light_std_percent: Annotated[float, typer.Option(help="standard deviation of the light to come, per cent")] = 0.3,
     data: StoreFolder = None,
 ) -> None:
-    """Predict the measured numbers of a session that hasn't been captured, with their covariance, and seal them by hash."""
+    """Predict the measured numbers of a session that hasn't been captured, with their covariance, and seal them by
+    hash."""
     from lab.twin.changes import parse_changes
     from lab.twin.predict import predict as predicted
     from lab.twin.sealed import seal
@@ -126,7 +127,8 @@ def budget(
     use: Annotated[str, typer.Option("--use", metavar="USE,...", help="MTF50, patches, variance, dark mean")],
     json: Json = None,
 ) -> None:
-    """Which effects and parameters, at their present uncertainty, matter for a use, and how much each adds to its variance."""
+    """Which effects and parameters, at their present uncertainty, matter for a use, and how much each adds to its
+    variance."""
     from lab.formats.camera_file import read_camera
     from lab.twin.budget import budget as budgeted
     from lab.twin.budget import parse_uses

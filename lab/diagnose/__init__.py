@@ -1,5 +1,5 @@
-"""Diagnosis: where recordings depart from the baseline camera, which effect the baseline lacks, and how much better the camera with that
-effect predicts.
+"""Diagnosis: where recordings depart from the baseline camera, which effect the baseline lacks, and how much better the
+camera with that effect predicts.
 
 policy.py       every number by which a diagnosis decides
 metadata/       statements about camera and captures that the recordings contradict
@@ -36,7 +36,8 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The result, the improved model of every side that could be judged, and proposals for the next capture, best first."""
+    """The result, the improved model of every side that could be judged, and proposals for the next capture, best
+    first."""
 
     result: DiagnosisResult
     improved: dict[Side, CameraFile]
@@ -67,13 +68,14 @@ def examine(
     workers: Workers | None = None,
     policy: DecisionPolicy | None = None,
 ) -> Diagnosis:
-    """Diagnose every side of the recordings. Measurements that they don't determine are listed in the result's `skipped`.
+    """Diagnose every side of the recordings. Measurements that they don't determine are listed in the result's
+    `skipped`.
 
-    fit         the fit of the recordings: geometry and sensitivity of the baseline camera. None: as the data sheet states them.
-    progress    called in the caller's thread with the current step and the share of the work that is done.
+    fit         the fit of the recordings: geometry and sensitivity of the baseline camera. None: as the data sheet
+    states them. progress    called in the caller's thread with the current step and the share of the work that is done.
     baseline    camera files by side, effects included, in place of data sheet and fit.
-    at_once     diagnose several sides at the same time, each in a process of its own; else one after the other in this one.
-    pictures    draw residual pictures, for the report.
+    at_once     diagnose several sides at the same time, each in a process of its own; else one after the other in this
+    one. pictures    draw residual pictures, for the report.
     bootstrap   number of healthy cameras, drawn frame by frame, whose scores may raise the threshold.
     workers     where these are drawn; None: in the side's process.
     policy      the rules of decision; None: `DecisionPolicy()`.

@@ -1,4 +1,5 @@
-"""Discover laws that no effect of the library has: tables by code, row or column that predict what they weren't taken from.
+"""Discover laws that no effect of the library has: tables by code, row or column that predict what they weren't taken
+from.
 
 A profile holds what the baseline and the named effects leave along one index: the counts of codes in uniform light
 about a smooth curve, the means of rows and columns of flats over a running polynomial, and those of darks. Tables that
@@ -41,7 +42,8 @@ LEAST_REPEATS = 6  # of a period over the index
 REACH, DEGREE = 24, 2
 ROBUST = 1.4826  # median absolute departure -> standard deviation of a normal distribution
 LEAST_WIDTH = 0.02  # of a code: a missing code's
-#: Share of what the chosen table takes off chi2 that a shorter one takes off, too, from which on that one is told first.
+#: Share of what the chosen table takes off chi2 that a shorter one takes off, too, from which on that one is told
+#: first.
 SHORTER_SHARE = 0.9
 
 #: What a table may come from, by stage and index: suspects, not names.

@@ -88,8 +88,8 @@ def _literals(annotation: Any) -> tuple[Any, ...]:
 class EffectDescription(Frozen):
     """An effect of the library.
 
-    family : the physics that it is one law of; named in its place where no law holds exactly, or several fit equally well
-    stages : the stages of the forward model in which it acts, in the order of the light
+    family : the physics that it is one law of; named in its place where no law holds exactly, or several fit equally
+    well stages : the stages of the forward model in which it acts, in the order of the light
     sentence : the physics that a model without it lacks
     reference : source of its law
     choices : its fields that no fit changes

@@ -4,10 +4,10 @@ from.
 Odds are natural logarithms throughout ("log odds"): 2.3 is ten to one, 4.6 is a hundred to one. A score is the gain in
 chi2 that an effect's signature promises: twice its log odds.
 
-Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge, and each states a value at which
-it doesn't act (`Rule.off`). `calibench challenge calibrate --each` takes them out one by one and counts right and false
-names of tuning cases; `--rule NAME=VALUE` scores the cases under any other value. docs/reference/decision-policy.md is generated
-from this module by docs/write_tables.py.
+Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge, and each states a value at
+which it doesn't act (`Rule.off`). `calibench challenge calibrate --each` takes them out one by one and counts right and
+false names of tuning cases; `--rule NAME=VALUE` scores the cases under any other value.
+docs/reference/decision-policy.md is generated from this module by docs/write_tables.py.
 """
 
 from __future__ import annotations
@@ -36,14 +36,15 @@ class Rule:
 class DecisionPolicy(Frozen):
     """All rules of decision. An instance is passed to `lab.diagnose.examine` and stored in its result."""
 
-    # --- significance ----------------------------------------------------------------------------------------------------
+    # --- significance -------------------------------------------------------------------------------------------------
     false_alarm_rate: Annotated[
         float,
         Rule(
             "significance",
             "1",
             "share of healthy cameras whose best score exceeds the threshold",
-            "chosen; checked by `calibench challenge score` on healthy cases, and per camera by `calibench diagnose --bootstrap`",
+            "chosen; checked by `calibench challenge score` on healthy cases, and per camera by `calibench diagnose "
+            "--bootstrap`",
         ),
     ] = 0.01
     threshold_draws: Annotated[
@@ -52,7 +53,8 @@ class DecisionPolicy(Frozen):
             "significance",
             "1",
             "draws of noise behind the threshold",
-            "4 of 400 draws lie above the 99 % quantile, so that its rate is known to 50 % and the threshold to 2 ln 1.5 = 0.8 of about 15",
+            "4 of 400 draws lie above the 99 % quantile, so that its rate is known to 50 % and the threshold to 2 ln "
+            "1.5 = 0.8 of about 15",
         ),
     ] = 400
     slice_false_alarm_rate: Annotated[
@@ -115,8 +117,10 @@ class DecisionPolicy(Frozen):
         Rule(
             "significance",
             "px",
-            "standard deviation of a corner's coordinate beyond noise, up to which boards are taken as flat and as printed",
-            "twice the 0.11 px that plain boards of public stereo pairs leave beside Brown's distortion (docs/explanation/accuracy.md)",
+            "standard deviation of a corner's coordinate beyond noise, up to which boards are taken as flat and as "
+            "printed",
+            "twice the 0.11 px that plain boards of public stereo pairs leave beside Brown's distortion "
+            "(docs/explanation/accuracy.md)",
         ),
     ] = 0.2
     lone_score_margin: Annotated[
@@ -124,13 +128,13 @@ class DecisionPolicy(Frozen):
         Rule(
             "significance",
             "score",
-            "excess of the best score over the threshold that is a mismatch where neither a slice nor a refit shows one",
+            "excess of the best score over the threshold that is a mismatch where neither a slice nor a refit shows one",  # noqa: E501
             TUNED,
             off=0.0,
         ),
     ] = 10.0
 
-    # --- cost of a model -------------------------------------------------------------------------------------------------
+    # --- cost of a model ----------------------------------------------------------------------------------------------
     parameter_log_odds: Annotated[
         float,
         Rule(
@@ -164,7 +168,8 @@ class DecisionPolicy(Frozen):
             "cost of a model",
             "log odds",
             "gain that a model discrepancy has to earn",
-            "logarithm of the number of kernels that differ: 20 amplitudes x 3 lengths x 4 groupings = 240 are tried, of which neighbouring amplitudes are nearly alike: about 150",
+            "logarithm of the number of kernels that differ: 20 amplitudes x 3 lengths x 4 groupings = 240 are tried, "
+            "of which neighbouring amplitudes are nearly alike: about 150",
         ),
     ] = 5.0
     exchange_log_odds: Annotated[
@@ -182,7 +187,8 @@ class DecisionPolicy(Frozen):
             "cost of a model",
             "1",
             "least share of the laws' form tolerances by which sets of effects are compared, each by its likeliest",
-            "a tenth of a declared tolerance is below the noise up to changes of 200 standard deviations (5 %); 1 takes the declared ones as they are",
+            "a tenth of a declared tolerance is below the noise up to changes of 200 standard deviations (5 %); 1 "
+            "takes the declared ones as they are",
         ),
     ] = 0.1
     beside_tolerance: Annotated[
@@ -213,15 +219,17 @@ class DecisionPolicy(Frozen):
         ),
     ] = 30.0
 
-    # --- name ------------------------------------------------------------------------------------------------------------
+    # --- name ---------------------------------------------------------------------------------------------------------
     least_probability: Annotated[float, Rule("name", "1", "least probability of a name", "likelier than not")] = 0.5
     least_inclusion_probability: Annotated[
         float,
         Rule(
             "name",
             "1",
-            "least probability that a named effect is there, against the same set without it and with `included_log_odds` as its prior",
-            "odds of 9 to 1; with `parameter_log_odds`, one parameter has to gain 17 in chi2, which noise reaches in one of 27 000 effects that are tried",
+            "least probability that a named effect is there, against the same set without it and with "
+            "`included_log_odds` as its prior",
+            "odds of 9 to 1; with `parameter_log_odds`, one parameter has to gain 17 in chi2, which noise reaches in "
+            "one of 27 000 effects that are tried",
         ),
     ] = 0.9
     least_size_sigma: Annotated[
@@ -238,8 +246,10 @@ class DecisionPolicy(Frozen):
         Rule(
             "name",
             "log odds",
-            "least gain in log-likelihood, in the numbers that aren't variances, of an effect that changes variances by changing the mean response",
-            "ln(1 / `false_alarm_rate`): without the effect, a likelihood ratio exceeds 1 / p with a probability of p at most (Markov)",
+            "least gain in log-likelihood, in the numbers that aren't variances, of an effect that changes variances "
+            "by changing the mean response",
+            "ln(1 / `false_alarm_rate`): without the effect, a likelihood ratio exceeds 1 / p with a probability of p "
+            "at most (Markov)",
         ),
     ] = 4.6
     family_probability: Annotated[
@@ -247,7 +257,8 @@ class DecisionPolicy(Frozen):
         Rule(
             "name",
             "1",
-            "least probability that a family's members hold together, if the cause is a listed effect; and below which its likeliest member isn't named beside others of the family that fit",
+            "least probability that a family's members hold together, if the cause is a listed effect; and below "
+            "which its likeliest member isn't named beside others of the family that fit",
             "odds of 4 to 1, chosen",
         ),
     ] = 0.8
@@ -256,8 +267,10 @@ class DecisionPolicy(Frozen):
         Rule(
             "name",
             "1",
-            "least share of the excess chi2, in the measurements that its nearest law acts on, that a family of which no law holds explains",
-            "a straight line explains three quarters of a step, so that a difference between taps would be uneven light by less",
+            "least share of the excess chi2, in the measurements that its nearest law acts on, that a family of which "
+            "no law holds explains",
+            "a straight line explains three quarters of a step, so that a difference between taps would be uneven "
+            "light by less",
         ),
     ] = 0.76
     least_explained_share: Annotated[
@@ -276,8 +289,8 @@ class DecisionPolicy(Frozen):
             "name",
             "1",
             "the same where what is left exceeds noise and form tolerances",
-            "a filter beside a ripple without a law is no vibration of 96 % (`tests/lab/diagnose/inference/test_decide.py`); "
-            + TUNED,
+            "a filter beside a ripple without a law is no vibration of 96 % "
+            "(`tests/lab/diagnose/inference/test_decide.py`); " + TUNED,
             off=0.8,
         ),
     ] = 0.98
@@ -307,7 +320,8 @@ class DecisionPolicy(Frozen):
         Rule(
             "name",
             "1",
-            "gain of a discrepancy in the measurement that shows a name most, over the name's gain, above which both count as one unknown cause",
+            "gain of a discrepancy in the measurement that shows a name most, over the name's gain, above which both "
+            "count as one unknown cause",
             "chosen: 2 % may be left",
         ),
     ] = 0.02
@@ -321,7 +335,7 @@ class DecisionPolicy(Frozen):
         ),
     ] = 2.0
 
-    # --- budget of the search --------------------------------------------------------------------------------------------
+    # --- budget of the search -----------------------------------------------------------------------------------------
     most_effects: Annotated[
         int, Rule("budget of the search", "1", "effects in one set", "chosen: twice what the proof's compounds have")
     ] = 4
@@ -348,7 +362,8 @@ class DecisionPolicy(Frozen):
         Rule(
             "budget of the search",
             "1",
-            "share of a name's gain that an effect promises in closed form, from which on it is fitted in its place; and of the best score beside a set, from which on an effect is added",
+            "share of a name's gain that an effect promises in closed form, from which on it is fitted in its place; "
+            "and of the best score beside a set, from which on an effect is added",
             "a refit of a large effect may gain two and a half times what its small signature promises; " + TUNED,
             off=0.0,
         ),
@@ -390,7 +405,7 @@ class DecisionPolicy(Frozen):
             "a probability of exp(-30) changes no decision",
         ),
     ] = 30.0
-    # --- model discrepancy -----------------------------------------------------------------------------------------------
+    # --- model discrepancy --------------------------------------------------------------------------------------------
     left_out_parts: Annotated[
         int,
         Rule(
@@ -419,7 +434,7 @@ class DecisionPolicy(Frozen):
         ),
     ] = 0.1
 
-    # --- report ----------------------------------------------------------------------------------------------------------
+    # --- report -------------------------------------------------------------------------------------------------------
     shown_chi2: Annotated[
         float,
         Rule(
@@ -478,7 +493,8 @@ class DecisionPolicy(Frozen):
             "report",
             "1",
             "predicted probability that the captures taken leave a tie open, below which no more are taken",
-            "a tenth of `false_alarm_rate`: a tie that stays open all the same contradicts the predictions of its captures",
+            "a tenth of `false_alarm_rate`: a tie that stays open all the same contradicts the predictions of its "
+            "captures",
         ),
     ] = 0.001
 

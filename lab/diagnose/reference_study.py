@@ -45,7 +45,18 @@ EDGE_SIDE_PX, EDGE_PLACES = (
 )  # side of a region; its middle (row, column), as shares of the frame
 DARK_SIDE, SCREEN_BLACK = 0.08, 0.0035  # radiance of an edge's dark side, and of the dark screen, over the lit one
 CELL_PX = 4.0  # side of a screen's cells
-TILTS_DEG = ((0, 0, 0), (30, 0, 3), (-30, 0, -4), (0, 30, 5), (0, -30, 2), (20, 20, -6), (-20, 20, 4), (20, -20, 8), (-20, -20, -3), (8, -12, 20))  # fmt: skip
+TILTS_DEG = (
+    (0, 0, 0),
+    (30, 0, 3),
+    (-30, 0, -4),
+    (0, 30, 5),
+    (0, -30, 2),
+    (20, 20, -6),
+    (-20, 20, 4),
+    (20, -20, 8),
+    (-20, -20, -3),
+    (8, -12, 20),
+)
 
 
 def reference_study(seed: int = 1) -> RecordingSet:
@@ -82,10 +93,13 @@ def _rig() -> StereoRig:
     focal_px = FOCAL_LENGTH_MM * 1000.0 / PITCH_UM
     matrix = ((focal_px, 0.0, 0.5 * (COLS - 1)), (0.0, focal_px, 0.5 * (ROWS - 1)), (0.0, 0.0, 1.0))
     camera = CameraModel(
-        rows=ROWS, cols=COLS, pixel_pitch_um=PITCH_UM, fill_factor=0.9, cfa="RGGB", bit_depth=12, black_level_dn=64.0, white_level_dn=4095.0,
-        conversion_gain_dn_per_e=0.38, full_well_e=10500.0, read_noise_e=2.4, dark_current_e_per_s=5.0, dark_current_reference_c=25.0,
+        rows=ROWS, cols=COLS, pixel_pitch_um=PITCH_UM, fill_factor=0.9, cfa="RGGB", bit_depth=12, black_level_dn=64.0,
+        white_level_dn=4095.0,
+        conversion_gain_dn_per_e=0.38, full_well_e=10500.0, read_noise_e=2.4, dark_current_e_per_s=5.0,
+        dark_current_reference_c=25.0,
         dark_current_doubling_c=7.0, dsnu_e=0.8, prnu_percent=0.6,
-        quantum_efficiency={"R": curve(0.48, 605.0, 45.0), "G": curve(0.58, 530.0, 38.0), "B": curve(0.52, 455.0, 33.0)},
+        quantum_efficiency={"R": curve(0.48, 605.0, 45.0), "G": curve(0.58, 530.0, 38.0), "B": curve(0.52, 455.0,
+        33.0)},
         lens=Lens(f_number=4.0, focal_length_mm=FOCAL_LENGTH_MM), geometry=Geometry(camera_matrix=matrix),
     )  # fmt: skip
     straight = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -159,12 +173,23 @@ class _SideSession:
         }
         exposure_s = min(self.exposure_for(light, 0.8) for light in lines.values())
         for w, light in lines.items():
-            self.take("narrowband", UniformField(light, "narrowband"), exposure_s, 1, wavelength_nm=w, bandwidth_nm=10.0, radiance=self.noted(light))  # fmt: skip
+            self.take(
+                "narrowband",
+                UniformField(light, "narrowband"),
+                exposure_s,
+                1,
+                wavelength_nm=w,
+                bandwidth_nm=10.0,
+                radiance=self.noted(light),
+            )
 
     def edges(self) -> None:
         """White light in the middle and off the axis, narrowband light, and a quarter of the exposure, at four angles
         each."""
-        line = {w: Spectrum.of(WAVELENGTH_NM, 0.05 * np.exp(-0.5 * ((WAVELENGTH_NM - w) / 4.2466) ** 2)) for w in (460.0, 640.0)}  # fmt: skip
+        line = {
+            w: Spectrum.of(WAVELENGTH_NM, 0.05 * np.exp(-0.5 * ((WAVELENGTH_NM - w) / 4.2466) ** 2))
+            for w in (460.0, 640.0)
+        }
         lights = [
             (self.lamp, EDGE_PLACES[0]),
             (self.lamp, EDGE_PLACES[1]),
@@ -178,7 +203,16 @@ class _SideSession:
             path, exposure_s = self.noted(light), self.exposure_for(light, 0.7)
             for angle in ANGLES_DEG:
                 scene = KnifeEdge((EdgeRegion(region, angle),), light.scale(DARK_SIDE), light)
-                self.take("slanted_edge", scene, exposure_s, 2, region=region, angle_deg=angle, light_radiance=path, field_mm=place)  # fmt: skip
+                self.take(
+                    "slanted_edge",
+                    scene,
+                    exposure_s,
+                    2,
+                    region=region,
+                    angle_deg=angle,
+                    light_radiance=path,
+                    field_mm=place,
+                )
 
     def screen(self, targets: dict[str, Any]) -> None:
         """White, black, checkerboard and Bernoulli patterns, pixel rows along the camera's."""
@@ -192,7 +226,13 @@ class _SideSession:
         exposure_s = self.exposure_for(light, 0.7)
         for kind, pattern in shown.items():
             high, wide = pattern.shape
-            to_camera = Warp.of(((CELL_PX, 0, 0.5 * (COLS - 1 - wide * CELL_PX)), (0, CELL_PX, 0.5 * (ROWS - 1 - high * CELL_PX)), (0, 0, 1)))  # fmt: skip
+            to_camera = Warp.of(
+                (
+                    (CELL_PX, 0, 0.5 * (COLS - 1 - wide * CELL_PX)),
+                    (0, CELL_PX, 0.5 * (ROWS - 1 - high * CELL_PX)),
+                    (0, 0, 1),
+                )
+            )
             scene = ScreenPattern(pattern, to_camera, light.scale(SCREEN_BLACK), light, kind)
             more: dict[str, Any] = {"target": files[kind]} if kind in files else {}
             self.take(kind, scene, exposure_s, 3, **where, **more)
@@ -215,7 +255,8 @@ class _SideSession:
                 texture, 0.5, _matrix(turn), _vector(corner), self.camera.geometry, light.scale(0.05), light, 1.0
             )
             scene = target.pose_for_rig(self.rig)[self.side == "right"]
-            self.take("charuco", scene, self.exposure_for(light, 0.6), 1, dictionary="DICT_4X4_50", squares=(6, 8), square_mm=9.0,
+            self.take("charuco", scene, self.exposure_for(light, 0.6), 1, dictionary="DICT_4X4_50", squares=(6, 8),
+            square_mm=9.0,
                       marker_mm=6.0, pose=f"b{k}")  # fmt: skip
 
     def take(
@@ -233,7 +274,8 @@ class _SideSession:
             )  # fmt: skip
             self.captures.append(
                 {"id": f"{self.side}-{k:04d}", "kind": kind, "side": self.side, "frame": path, "exposure_s": exposure_s,
-                 "temperature_c": temperature_c, "time": (BEGIN + timedelta(seconds=self.elapsed_s)).isoformat(), **more}
+                 "temperature_c": temperature_c, "time": (BEGIN + timedelta(seconds=self.elapsed_s)).isoformat(),
+                 **more}
             )  # fmt: skip
             self.elapsed_s += BOARD_STEP_S if kind == "charuco" else STEP_S
 

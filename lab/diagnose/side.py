@@ -1,4 +1,5 @@
-"""The diagnosis of one side: its metadata, its measurement model, the decision (`inference/decide.py`), and the findings.
+"""The diagnosis of one side: its metadata, its measurement model, the decision (`inference/decide.py`), and the
+findings.
 
 `SideFindings` can be sent between processes; a measurement model, which holds functions, can't.
 """
@@ -109,8 +110,8 @@ def diagnose_side(
     bootstrap: int = 0,
     workers: Workers | None = None,
 ) -> SideFindings:
-    """Diagnose one side; arguments as of `lab.diagnose.examine`. Residual pictures take some seconds. Each draw of the bootstrap takes as
-    long as summarising the recordings."""
+    """Diagnose one side; arguments as of `lab.diagnose.examine`. Residual pictures take some seconds. Each draw of the
+    bootstrap takes as long as summarising the recordings."""
     policy = policy or DecisionPolicy()
     report("checking what is stated")
     stated = recordings.camera(side)

@@ -1,5 +1,5 @@
-"""A camera in a TOML file: every parameter of the camera model under its own name, which ends in its unit. The comments are
-the parameters' declarations.
+"""A camera in a TOML file: every parameter of the camera model under its own name, which ends in its unit. The comments
+are the parameters' declarations.
 
     rows = 960  # px: rows of the frame (1 ..)
     [quantum_efficiency]      # a table of samples each, or the name of a CSV file
@@ -46,7 +46,10 @@ from sim.parameters import Quantity, read_quantities
 from sim.spectrum import Spectrum
 
 FORMAT, VERSION = "calibench-camera", 1
-HEADER = "# A camera for calibench: each key is a parameter, and ends in its unit. docs/reference/camera-file.md says what they do."
+HEADER = (
+    "# A camera for calibench: each key is a parameter, and ends in its unit. docs/reference/camera-file.md says what "
+    "they do."
+)
 #: Keys of the file that don't belong to the camera model.
 OWN_KEYS = ("format", "version", "name", "effects", "posterior")
 CURVES = ("quantum_efficiency", "quantum_efficiency_std")
@@ -54,8 +57,8 @@ CURVES = ("quantum_efficiency", "quantum_efficiency_std")
 
 @dataclass(frozen=True)
 class CameraFile:
-    """The content of a camera file: the model, the effects that act in it, the prescription of a traced lens, and how well its parameters are
-    known together (None: nobody says)."""
+    """The content of a camera file: the model, the effects that act in it, the prescription of a traced lens, and how
+    well its parameters are known together (None: nobody says)."""
 
     name: str
     camera: CameraModel
@@ -64,7 +67,7 @@ class CameraFile:
     posterior: ModelPosterior | None = None
 
 
-# --- reading -----------------------------------------------------------------------------------------------------------
+# --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def read_camera(
@@ -74,8 +77,8 @@ def read_camera(
     *,
     sent: bool = False,
 ) -> CameraFile:
-    """Read a camera file. `cache`: folder of traced lenses' tables (None: `lens_cache`). `sent`: it came from elsewhere, so that the files it
-    names are looked for in its folder alone, and no lens is traced.
+    """Read a camera file. `cache`: folder of traced lenses' tables (None: `lens_cache`). `sent`: it came from
+    elsewhere, so that the files it names are looked for in its folder alone, and no lens is traced.
 
     Raises InputError, in one line, that names file, key, value, limit and remedy.
     """
@@ -87,7 +90,8 @@ def read_camera(
         raise InputError(f"{file}: isn't TOML ({error}); correct it") from error
     if content.get("format") != FORMAT or content.get("version") != VERSION:
         raise InputError(
-            f'{file}: format {content.get("format")!r} version {content.get("version")!r} is not {FORMAT!r} {VERSION}; write format = "{FORMAT}" and version = {VERSION}'
+            f"{file}: format {content.get('format')!r} version {content.get('version')!r} is not {FORMAT!r} "
+            f'{VERSION}; write format = "{FORMAT}" and version = {VERSION}'
         )
     values = {key: value for key, value in content.items() if key not in OWN_KEYS}
     for curves in CURVES:
@@ -156,7 +160,8 @@ def _imaging(
         named = {k: values[k] for k in ("prescription", "table") if k in values}
         if len(named) != 1 or not isinstance(next(iter(named.values())), str) or set(values) - {"kind", *named}:
             raise InputError(
-                f'{file}: {key} of a traced lens has the keys {", ".join(values)}; give kind and either prescription = "FILE.zmx" or table = "FILE.npz"'
+                f"{file}: {key} of a traced lens has the keys {', '.join(values)}; give kind and either prescription "
+                '= "FILE.zmx" or table = "FILE.npz"'
             )
         which, path = next(iter(named.items()))
         if sent and which == "prescription":
@@ -225,7 +230,10 @@ def _validated(file: Path, at: str, model: type[BaseModel], values: Mapping[str,
         where = [str(part) for part in problem["loc"]]
         key = ".".join([*([at] if at else []), *where])
         if problem["type"] == "extra_forbidden":
-            what = f"{key} isn't a key of a camera file; leave it out, or take one of {', '.join(_known(model, where[:-1]))}"
+            what = (
+                f"{key} isn't a key of a camera file; leave it out, or take one of "
+                f"{', '.join(_known(model, where[:-1]))}"
+            )
         elif problem["type"] == "missing":
             meant = read_quantities(model).get(where[-1])
             what = f"{key} is missing; add it" + (f" ({meant.unit}: {meant.meaning})" if meant else "")
@@ -261,21 +269,25 @@ def _check_levels(file: Path, camera: CameraModel) -> None:
     highest = 2**camera.bit_depth - 1
     if camera.white_level_dn > highest:
         raise InputError(
-            f"{file}: white_level_dn is {camera.white_level_dn:g} DN, above the limit of {highest} DN of {camera.bit_depth} bit; correct one of them"
+            f"{file}: white_level_dn is {camera.white_level_dn:g} DN, above the limit of {highest} DN of "
+            f"{camera.bit_depth} bit; correct one of them"
         )
     if camera.black_level_dn >= camera.white_level_dn:
         raise InputError(
-            f"{file}: black_level_dn is {camera.black_level_dn:g} DN, not below the limit of white_level_dn, {camera.white_level_dn:g} DN; correct one of them"
+            f"{file}: black_level_dn is {camera.black_level_dn:g} DN, not below the limit of white_level_dn, "
+            f"{camera.white_level_dn:g} DN; correct one of them"
         )
     if set(camera.quantum_efficiency) != set(camera.channels):
         raise InputError(
-            f"{file}: quantum_efficiency has the channels {', '.join(camera.quantum_efficiency)}; a {camera.cfa} camera's are {', '.join(camera.channels)}, give those"
+            f"{file}: quantum_efficiency has the channels {', '.join(camera.quantum_efficiency)}; a {camera.cfa} "
+            f"camera's are {', '.join(camera.channels)}, give those"
         )
     for channel, curve in camera.quantum_efficiency.items():
         low, high = min(curve.value), max(curve.value)
         if low < 0 or high > 1:
             raise InputError(
-                f"{file}: quantum_efficiency.{channel} runs from {low:g} to {high:g}, beyond the limits of 0 and 1 electron a photon; scale it"
+                f"{file}: quantum_efficiency.{channel} runs from {low:g} to {high:g}, beyond the limits of 0 and 1 "
+                "electron a photon; scale it"
             )
 
 
@@ -287,14 +299,14 @@ def _first(error: Exception) -> str:
     return " ".join(text.split())
 
 
-# --- writing -----------------------------------------------------------------------------------------------------------
+# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 def write_camera(file: Path, content: CameraFile) -> None:
     """Write a camera file that `read_camera` reads back to exactly the same camera.
 
-    Measured point-spread and transfer functions go into an .npz file beside it; so does the table of a traced lens without a
-    prescription.
+    Measured point-spread and transfer functions go into an .npz file beside it; so does the table of a traced lens
+    without a prescription.
     """
     text = "\n".join(_lines(file, content)) + "\n"
     with replacing(file) as partial:
@@ -329,10 +341,16 @@ def _lines(file: Path, content: CameraFile) -> Iterator[str]:
     yield "[lens]"
     yield from _parameters(camera.lens, skip=("imaging", "illumination"))
     yield ""
-    yield "[lens.imaging]  # how a point is imaged: diffraction_limited, zernike_pupil, measured_psf, measured_otf, traced_lens"
+    yield (
+        "[lens.imaging]  # how a point is imaged: diffraction_limited, zernike_pupil, measured_psf, measured_otf, "
+        "traced_lens"
+    )
     yield from _imaging_lines(file, content)
     yield ""
-    yield "[lens.illumination]  # how the light falls off: cosine_fourth, radial (a maker's curve), measured (a flat's map)"
+    yield (
+        "[lens.illumination]  # how the light falls off: cosine_fourth, radial (a maker's curve), measured (a flat's "
+        "map)"
+    )
     yield from _parameters(camera.lens.illumination)
     if camera.geometry is not None:
         yield ""
@@ -376,7 +394,8 @@ def _imaging_lines(file: Path, content: CameraFile) -> Iterator[str]:
 
 
 def _parameters(model: BaseModel, skip: Sequence[str] = ()) -> Iterator[str]:
-    """One line for each field: key, value, and its declaration as a comment. A field that isn't set is a comment as a whole."""
+    """One line for each field: key, value, and its declaration as a comment. A field that isn't set is a comment as a
+    whole."""
     known = read_quantities(type(model))
     for key in type(model).model_fields:
         if key in skip:
@@ -407,7 +426,8 @@ def _text(value: Any) -> str:
 
 
 def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> CameraFile:
-    """The camera that a fit found (`lab.predict.camera_model.camera_model`), with the fit's uncertainties, to be written as a file."""
+    """The camera that a fit found (`lab.predict.camera_model.camera_model`), with the fit's uncertainties, to be
+    written as a file."""
     model = camera_model(recordings, side, fit)
     std = {}
     for key in read_quantities(CameraModel) if fit.noise is not None else ():
@@ -417,14 +437,14 @@ def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> Camer
     return CameraFile(f"{recordings.manifest.name} {side}", model.model_copy(update={"std": std}))
 
 
-# --- the camera without a file -----------------------------------------------------------------------------------------
+# --- the camera without a file ----------------------------------------------------------------------------------------
 
 
 def default_camera() -> CameraFile:
     """A plausible RGB machine-vision camera: 1280 x 960 px of 3.45 um, 12 bit, global shutter, f/4, 8 mm.
 
-    Its values are like those of data sheets of 1/3 inch sensors. Its curves, with an infrared-cut filter at 650 nm, have typical
-    shapes and are of no particular maker.
+    Its values are like those of data sheets of 1/3 inch sensors. Its curves, with an infrared-cut filter at 650 nm,
+    have typical shapes and are of no particular maker.
     """
     wavelength_nm = np.arange(380.0, 721.0, 10.0)
 

@@ -1,7 +1,7 @@
 """How well the parameters of a camera model are known together: a JSON file beside the camera file.
 
-A parameter is a nuisance parameter of the diagnosis (`gain`, `curve:G:0`), a parameter of an effect (`veiling_glare.share_percent`), or the
-reflectance of a chart's patch in one channel (`patch:white:G`).
+A parameter is a nuisance parameter of the diagnosis (`gain`, `curve:G:0`), a parameter of an effect
+(`veiling_glare.share_percent`), or the reflectance of a chart's patch in one channel (`patch:white:G`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ PATCH = "patch:"
 
 
 class FirstEstimates(Frozen):
-    """The figures about which a session's predictions were linear, and the scatter of its levels from repeat to repeat."""
+    """The figures about which a session's predictions were linear, and the scatter of its levels from repeat to
+    repeat."""
 
     dark_temperature_c: float | None  # that the camera's dark current holds for; None: not known
     read_noise_dn: float  # as recorded, rounding included
@@ -32,9 +33,9 @@ class FirstEstimates(Frozen):
 class ModelPosterior(Frozen):
     """Posterior mean (k,) and covariance (k, k) of a camera model's parameters.
 
-    A nuisance parameter is in prior standard deviations of the diagnosis from what the camera file states. An effect's parameter is in its
-    coordinate (`Quantity.linear_power`, `logarithmic`) from what the file states, a reflectance relative to the published one.
-    """
+    A nuisance parameter is in prior standard deviations of the diagnosis from what the camera file states. An effect's
+    parameter is in its coordinate (`Quantity.linear_power`, `logarithmic`) from what the file states, a reflectance
+    relative to the published one."""
 
     format: Literal["calibench-posterior"] = "calibench-posterior"
     version: Literal[1] = 1
@@ -59,7 +60,8 @@ class ModelPosterior(Frozen):
         )
 
     def taken(self, names: list[str]) -> tuple[FloatArray, FloatArray]:
-        """Mean (n,) and covariance (n, n) of the parameters `names`. One that isn't known here has its prior: mean 0, variance 1."""
+        """Mean (n,) and covariance (n, n) of the parameters `names`. One that isn't known here has its prior: mean 0,
+        variance 1."""
         known = {name: i for i, name in enumerate(self.names)}
         mean, covariance = np.zeros(len(names)), np.eye(len(names))
         at = [i for i, name in enumerate(names) if name in known]

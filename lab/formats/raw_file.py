@@ -1,8 +1,9 @@
-"""Raw frames as .npy, 16-bit TIFF or DNG files. A file is written completely or not at all; an existing one is replaced at the end.
+"""Raw frames as .npy, 16-bit TIFF or DNG files. A file is written completely or not at all; an existing one is replaced
+at the end.
 
-A DNG holds the codes as they are, uncompressed, with mosaic, black and white level, and a colour matrix from the camera's own
-quantum efficiency; a MONO frame is its `LinearRaw` of one sample. (Adobe, Digital Negative Specification 1.7.1.)
-"""
+A DNG holds the codes as they are, uncompressed, with mosaic, black and white level, and a colour matrix from the
+camera's own quantum efficiency; a MONO frame is its `LinearRaw` of one sample. (Adobe, Digital Negative Specification
+1.7.1.)"""
 
 from __future__ import annotations
 
@@ -81,12 +82,14 @@ def write_raw(file: Path, frame: Frame, camera: CameraModel, metadata: RawMetada
     writer = writer_of(file)
     if frame.dtype != np.uint16 or frame.shape != (camera.rows, camera.cols):
         raise InputError(
-            f"{file}: the frame is {frame.dtype} {frame.shape}, this camera's are uint16 {(camera.rows, camera.cols)}; give its own frame"
+            f"{file}: the frame is {frame.dtype} {frame.shape}, this camera's are uint16 "
+            f"{(camera.rows, camera.cols)}; give its own frame"
         )
     highest = int(frame.max(initial=0))
     if highest > camera.white_level_dn:
         raise InputError(
-            f"{file}: the frame holds {highest} DN, above the limit of the white level {camera.white_level_dn:g} DN; give the camera's own white level"
+            f"{file}: the frame holds {highest} DN, above the limit of the white level {camera.white_level_dn:g} DN; "
+            "give the camera's own white level"
         )
     with replacing(file) as partial:
         writer(partial, np.ascontiguousarray(frame), camera, metadata)
@@ -200,14 +203,15 @@ def _tag(code: int, kind: int, value: Any) -> tuple[int, int, int, Any]:
     return code, kind, len(value), tuple(value)
 
 
-# --- colour ------------------------------------------------------------------------------------------------------------
+# --- colour -----------------------------------------------------------------------------------------------------------
 
 
 def colour_matrix(camera: CameraModel) -> FloatArray:
-    """From CIE XYZ to this camera's R, G, B under D65 (3, 3), as DNG's ColorMatrix1 wants it: white has a greatest code of 1.
+    """From CIE XYZ to this camera's R, G, B under D65 (3, 3), as DNG's ColorMatrix1 wants it: white has a greatest code
+    of 1.
 
-    Least squares over the 24 patches of the ColorChecker. A camera channel is the electrons from the patch over those from white. Raises ValueError for a MONO camera, which has no colours.
-    """
+    Least squares over the 24 patches of the ColorChecker. A camera channel is the electrons from the patch over those
+    from white. Raises ValueError for a MONO camera, which has no colours."""
     if camera.cfa == "MONO":
         raise ValueError("a MONO camera has no colour matrix: ask for one of a camera with R, G and B")
     key = tuple(camera.quantum_efficiency[channel] for channel in "RGB")

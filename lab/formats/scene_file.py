@@ -51,8 +51,8 @@ MOST_SAMPLES = 2**29
 def read_light(file: Path, luminance_cd_m2: float | None = None) -> Spectrum:
     """Radiance (W sr^-1 m^-2 nm^-1) of a measured light.
 
-    The CSV's header is `wavelength_nm,` and one of `radiance_w_sr_m2_nm`, `photons_s_sr_m2_nm` (s^-1 sr^-1 m^-2 nm^-1), which
-    are taken as they are unless a luminance is asked for, and `relative`, which needs one.
+    The CSV's header is `wavelength_nm,` and one of `radiance_w_sr_m2_nm`, `photons_s_sr_m2_nm` (s^-1 sr^-1 m^-2 nm^-1),
+    which are taken as they are unless a luminance is asked for, and `relative`, which needs one.
     """
     with _about(file):
         try:
@@ -63,7 +63,8 @@ def read_light(file: Path, luminance_cd_m2: float | None = None) -> Spectrum:
     lowest = int(np.argmin(curve.value))
     if curve.value[lowest] < 0:
         raise InputError(
-            f"{file}: {column} is {curve.value[lowest]:g} at {curve.wavelength_nm[lowest]:g} nm, below the limit of 0; subtract the dark reading, and set what stays below 0 to 0"
+            f"{file}: {column} is {curve.value[lowest]:g} at {curve.wavelength_nm[lowest]:g} nm, below the limit of "
+            "0; subtract the dark reading, and set what stays below 0 to 0"
         )
     if len(curve.value) < 2:
         raise InputError(f"{file}: one sample is a light of no width; give two or more")
@@ -78,7 +79,8 @@ def read_light(file: Path, luminance_cd_m2: float | None = None) -> Spectrum:
 
 
 def light(name: str, luminance_cd_m2: float | None = None) -> Spectrum:
-    """Radiance of a perfect white diffuser under an illuminant: a name (D65, A, FL2, ...), at 100 cd/m^2 unless told, or a CSV."""
+    """Radiance of a perfect white diffuser under an illuminant: a name (D65, A, FL2, ...), at 100 cd/m^2 unless told,
+    or a CSV."""
     if name.lower().endswith(".csv") or Path(name).is_file():
         return read_light(Path(name), luminance_cd_m2)
     try:
@@ -88,8 +90,8 @@ def light(name: str, luminance_cd_m2: float | None = None) -> Spectrum:
 
 
 def read_picture(file: Path) -> NDArray[np.uint8]:
-    """8-bit codes (rows, cols, 3), red green blue, of a PNG, TIFF, JPEG or BMP. Grey becomes three equal codes, 16 bit is
-    rounded to 8; transparency is refused, as the background isn't known."""
+    """8-bit codes (rows, cols, 3), red green blue, of a PNG, TIFF, JPEG or BMP. Grey becomes three equal codes, 16 bit
+    is rounded to 8; transparency is refused, as the background isn't known."""
     if not file.is_file():
         raise InputError(f"{file}: no such file; give one of {' '.join(PICTURES)}")
     with _about(file):
@@ -112,9 +114,10 @@ def read_picture(file: Path) -> NDArray[np.uint8]:
 def read_cube(file: Path, white: Spectrum | None = None) -> SpectralImage:
     """A spectral image from an .npz or an ENVI header (.hdr) with its data file beside it.
 
-    .npz: `wavelength_nm` (bands,) and one of `radiance_w_sr_m2_nm`, `photons_s_sr_m2_nm`, `reflectance`, (rows, cols, bands).
-    ENVI: `wavelength` in `wavelength units` nanometers or micrometers, and `data units` as in `ENVI_UNITS`. A reflectance is
-    taken under `white`, the radiance of a perfect diffuser.
+    .npz: `wavelength_nm` (bands,) and one of `radiance_w_sr_m2_nm`, `photons_s_sr_m2_nm`, `reflectance`, (rows, cols,
+    bands).
+    ENVI: `wavelength` in `wavelength units` nanometers or micrometers, and `data units` as in `ENVI_UNITS`. A
+    reflectance is taken under `white`, the radiance of a perfect diffuser.
     """
     suffix = file.suffix.lower()
     if suffix not in CUBES:
@@ -133,7 +136,8 @@ def read_cube(file: Path, white: Spectrum | None = None) -> SpectralImage:
                 raise InputError("holds reflectances; say the illuminant that falls on them")
             if values.ndim != 3 or values.shape[2] != len(wavelengths):
                 raise InputError(
-                    f"reflectance of shape {values.shape} has to be (rows, cols, {len(wavelengths)} bands); move the bands to the last axis"
+                    f"reflectance of shape {values.shape} has to be (rows, cols, {len(wavelengths)} bands); move the "
+                    "bands to the last axis"
                 )
             values = values * white.at(wavelengths).astype(values.dtype)
         return SpectralImage(wavelengths, values)
@@ -149,8 +153,8 @@ def scene(
 ) -> Scene:
     """A scene before a camera: one of `sim.scene.catalogue.SCENES` by its name, or a picture or a cube by its file.
 
-    `white`: radiance of a perfect white diffuser there. A picture's screen takes its luminance for its own white; a cube of
-    radiance has its own light. Raises InputError for anything else.
+    `white`: radiance of a perfect white diffuser there. A picture's screen takes its luminance for its own white; a
+    cube of radiance has its own light. Raises InputError for anything else.
     """
     try:
         if name in SCENES:
@@ -169,7 +173,8 @@ def scene(
         with _about(file):
             return Cube.choose(parameters).show(image, view)
     raise InputError(
-        f"scene {name!r} is not known: name one of {', '.join(SCENES)}, a picture ({' '.join(PICTURES)}) or a cube ({' '.join(CUBES)})"
+        f"scene {name!r} is not known: name one of {', '.join(SCENES)}, a picture ({' '.join(PICTURES)}) or a cube "
+        f"({' '.join(CUBES)})"
     )
 
 
@@ -254,7 +259,8 @@ def _envi_samples(file: Path) -> tuple[dict[str, Any], NDArray[Any]]:
     wanted = opened.offset + int(np.prod(shape)) * np.dtype(opened.dtype).itemsize
     if data.stat().st_size < wanted:
         raise InputError(
-            f"{data.name} has {data.stat().st_size} bytes where the header asks for {wanted}; copy it again, or correct the header"
+            f"{data.name} has {data.stat().st_size} bytes where the header asks for {wanted}; copy it again, or "
+            "correct the header"
         )
     try:
         values = np.array(opened.open_memmap(interleave="bip", writable=False))

@@ -1,4 +1,5 @@
-"""Lines through the means of levels: dark signal against exposure, saturation, and a response that outliers don't move."""
+"""Lines through the means of levels: dark signal against exposure, saturation, and a response that outliers don't
+move."""
 
 from __future__ import annotations
 
@@ -115,8 +116,10 @@ def refuse_light_darks(recorded: RecordedLevels, dark: DarkSignal) -> None:
             if short > max(DARKER_SHARE * (recorded.white_dn - expected), 1.0):
                 raise NotDetermined(
                     "noise",
-                    f"a flat of {level.exposure_s:g} s has {level.plane[name].mean:.0f} DN and is darker than darks of as long, {expected:.0f} DN: "
-                    "darks and flats may be stated for each other: exchange them, or capture the darks again, with the cap on and at the flats' "
+                    f"a flat of {level.exposure_s:g} s has {level.plane[name].mean:.0f} DN and is darker than darks "
+                    f"of as long, {expected:.0f} DN: "
+                    "darks and flats may be stated for each other: exchange them, or capture the darks again, with "
+                    "the cap on and at the flats' "
                     "settings",
                 )
 
@@ -282,8 +285,9 @@ def _light_at(u: FloatArray, solution: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _LightLaw:
-    """A law of the light over n levels, linear in its coefficients: log(light / u) = basis @ coefficients. `basis` (n, 1 + p), the offset first; `value` (n,) is
-    log(light / u); `noise` (n,) is the relative standard deviation of the signal."""
+    """A law of the light over n levels, linear in its coefficients: log(light / u) = basis @ coefficients. `basis` (n,
+    1 + p), the offset first; `value` (n,) is log(light / u); `noise` (n,) is the relative standard deviation of the
+    signal."""
 
     basis: FloatArray
     value: FloatArray

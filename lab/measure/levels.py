@@ -1,7 +1,7 @@
 """Statistics of the repeats of one level: means, temporal and spatial variances, defective pixels, shading.
 
-One level is all frames of one exposure, light and temperature. Its frames are read once, and no more than one level is held in memory.
-"""
+One level is all frames of one exposure, light and temperature. Its frames are read once, and no more than one level is
+held in memory."""
 
 from __future__ import annotations
 
@@ -245,8 +245,8 @@ def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa) -> BoolArray:
 #
 # Repeats are read one after the other and not kept. Each frame is compared with the mean of those before it, plane by
 # plane, after the difference of the means of the two planes has been subtracted (Welford's recursion). A lamp that
-# drifts between repeats is then no temporal noise. This costs one of the N degrees of freedom of a plane for each frame,
-# as in EMVA 1288 with two frames.
+# drifts between repeats is then no temporal noise. This costs one of the N degrees of freedom of a plane for each
+# frame, as in EMVA 1288 with two frames.
 
 
 @dataclass(frozen=True)
@@ -374,9 +374,9 @@ class PlaneStatistics:
 class MeasuredLevel:
     """One level of light (0: dark): its setting, and the statistics of its planes by name.
 
-    `light` is proportional to the photons among the levels of the same `lamp`. `captures`: ids of the frames. `light_std`,
-    `light_calibration_std`: relative standard uncertainties of `light`, of its own, and common to all levels of the lamp.
-    `temperature_c`: to a degree where it groups darks; `sensor_c`: the frames' mean, not rounded.
+    `light` is proportional to the photons among the levels of the same `lamp`. `captures`: ids of the frames.
+    `light_std`, `light_calibration_std`: relative standard uncertainties of `light`, of its own, and common to all
+    levels of the lamp. `temperature_c`: to a degree where it groups darks; `sensor_c`: the frames' mean, not rounded.
     """
 
     exposure_s: float
@@ -680,7 +680,8 @@ class RecordedLevels:
         clipped = any(level.plane[name].zero_share > BLACK_CLIPPED_SHARE for level in own for name in names)
         if clipped:
             remarks.add(
-                "dark frames are clipped at 0 DN: black level, read noise, dark current and DSNU aren't determined; raise the black level"
+                "dark frames are clipped at 0 DN: black level, read noise, dark current and DSNU aren't determined; "
+                "raise the black level"
             )
         return cls(camera, gain_db, defects, names, bright, every, () if clipped else own, temperature, clipped)
 

@@ -1,4 +1,5 @@
-"""Captures that aren't what they are said to be: copies of a frame, frames exchanged between levels, a mosaic without colours."""
+"""Captures that aren't what they are said to be: copies of a frame, frames exchanged between levels, a mosaic without
+colours."""
 
 from __future__ import annotations
 
@@ -42,24 +43,29 @@ class CopiedFrames:
 
     @property
     def told(self) -> tuple[str, ...]:
-        """Which captures, and what is done, in one line each; in one line for all where there are more than `LISTED`."""
+        """Which captures, and what is done, in one line each; in one line for all where there are more than
+        `LISTED`."""
         if len(self.pairs) <= LISTED:
             return tuple(
-                f"the frame of capture {copy.id} ({copy.kind}) is bit for bit that of {twin.id} ({twin.kind}), noise and all: it wasn't taken anew "
+                f"the frame of capture {copy.id} ({copy.kind}) is bit for bit that of {twin.id} ({twin.kind}), noise "
+                "and all: it wasn't taken anew "
                 "and is left out; take it again"
                 for copy, twin in self.pairs
             )
         named = ", ".join(f"{copy.id} is {twin.id}" for copy, twin in self.pairs[:LISTED])
         line = (
-            f"the frames of {len(self.pairs)} captures of the {self.side} camera are copies of others, bit for bit, noise and all ({named} ..): they "
-            "weren't taken anew and are left out, so that temporal noise is unknown where no other repeat is left; give frames that were captured "
+            f"the frames of {len(self.pairs)} captures of the {self.side} camera are copies of others, bit for bit, "
+            f"noise and all ({named} ..): they "
+            "weren't taken anew and are left out, so that temporal noise is unknown where no other repeat is left; "
+            "give frames that were captured "
             "one by one"
         )
         return (line,)
 
 
 def copied_frames(recordings: RecordingSet, side: Side, captures: Sequence[Capture] | None = None) -> CopiedFrames:
-    """The copies among `captures` (all of the side). Frames of a standard deviation below `NOISELESS_DN` may be equal, and aren't tested."""
+    """The copies among `captures` (all of the side). Frames of a standard deviation below `NOISELESS_DN` may be equal,
+    and aren't tested."""
     first: dict[bytes, Capture] = {}
     found = []
     for capture in recordings.captures(side=side) if captures is None else captures:
@@ -93,7 +99,8 @@ SATURATED = 0.98  # of the highest mean, from which on a flat may saturate
 
 @dataclass(frozen=True)
 class JudgedFrame:
-    """A capture with the mean of its frame and the level that the others give its setting, in DN; `tolerance_dn`: within which these agree."""
+    """A capture with the mean of its frame and the level that the others give its setting, in DN; `tolerance_dn`:
+    within which these agree."""
 
     capture: Capture
     mean_dn: float
@@ -130,7 +137,8 @@ class ExchangedFrames:
             groups.setdefault((_setting(a.capture), _setting(b.capture)), []).append((a, b))
         pairs = "; ".join(f"{_told([a for a, _ in own])}, and {_told([b for _, b in own])}" for own in groups.values())
         return (
-            f"Captures of the {side} camera hold each other's frames: {pairs}; they are read as exchanged: exchange these frames, or what is "
+            f"Captures of the {side} camera hold each other's frames: {pairs}; they are read as exchanged: exchange "
+            "these frames, or what is "
             "stated of them."
         )
 
@@ -138,10 +146,10 @@ class ExchangedFrames:
 def exchanged_frames(recordings: RecordingSet, side: Side) -> ExchangedFrames | None:
     """Darks and flats of one side whose frames are exchanged in pairs; None where none is found.
 
-    Each flat has an expected level by the response that the others of its lamp follow (`robust_response`, over captures), each dark by the
-    others' line over the exposure (Theil and Sen). Two captures are exchanged where both are off their levels and each has that of the
-    other's setting. Levels nearer than `APART` tolerances can't be told apart. At most a quarter of a lamp's captures may be wrong.
-    """
+    Each flat has an expected level by the response that the others of its lamp follow (`robust_response`, over
+    captures), each dark by the others' line over the exposure (Theil and Sen). Two captures are exchanged where both
+    are off their levels and each has that of the other's setting. Levels nearer than `APART` tolerances can't be told
+    apart. At most a quarter of a lamp's captures may be wrong."""
     flats = recordings.captures(FlatCapture, side)
     if not flats:
         return None
@@ -247,14 +255,15 @@ def _setting(capture: Capture) -> str:
 #: Share of the signal, and DN, within which planes are alike: colours differ by tens of percent.
 ALIKE, ALIKE_DN = 0.005, 0.1
 BRIGHT_SHARE = 0.1  # of the range: signal from which on a light counts
-#: Of one light, analogue gains may make colours alike; then the variances over the signals differ by as much. Relative, and standard deviations of
-#: a variance, within which they are alike.
+#: Of one light, analogue gains may make colours alike; then the variances over the signals differ by as much. Relative,
+#: and standard deviations of a variance, within which they are alike.
 SAME_GAIN, SAME_GAIN_SIGMA = 0.1, 4.0
 
 
 @dataclass(frozen=True)
 class AlikePlanes:
-    """The captures of bright lights in which all planes are alike; `largest`: departure of a plane from their mean, as a share of the signal."""
+    """The captures of bright lights in which all planes are alike; `largest`: departure of a plane from their mean, as
+    a share of the signal."""
 
     stated: str
     lights: int
@@ -264,15 +273,16 @@ class AlikePlanes:
     def told(self, side: Side) -> str:
         """What is stated and what fits, as a sentence."""
         return (
-            f"The four planes of the {side} camera answer {self.lights} light{'s' if self.lights > 1 else ''} alike within {100 * self.largest:.2g} %, as "
-            f"those of a sensor without colour filters do, but cfa = {self.stated} is stated: correct cfa to MONO, or give frames that weren't made grey."
+            f"The four planes of the {side} camera answer {self.lights} light{'s' if self.lights > 1 else ''} alike "
+            f"within {100 * self.largest:.2g} %, as "
+            f"those of a sensor without colour filters do, but cfa = {self.stated} is stated: correct cfa to MONO, or "
+            "give frames that weren't made grey."
         )
 
 
 def alike_planes(recordings: RecordingSet, side: Side) -> AlikePlanes | None:
-    """The planes of a stated mosaic, where they are alike in every bright light: of flats and narrowband captures, the brightest frame of
-    each light that doesn't clip. None where they differ, or where no light is bright enough.
-    """
+    """The planes of a stated mosaic, where they are alike in every bright light: of flats and narrowband captures, the
+    brightest frame of each light that doesn't clip. None where they differ, or where no light is bright enough."""
     camera = recordings.camera(side)
     if camera.cfa == "MONO":
         return None

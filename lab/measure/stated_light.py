@@ -20,8 +20,8 @@ from lab.formats.recording_set import DataSheet
 class StatedLight:
     """The light of one flat. Amounts of one unit and wavelength compare where the lamp is the same.
 
-    `std`, `calibration_std`: relative standard uncertainties where it was measured, by its readings, and by the reference's calibration,
-    which is common to all that it measured.
+    `std`, `calibration_std`: relative standard uncertainties where it was measured, by its readings, and by the
+    reference's calibration, which is common to all that it measured.
     """
 
     amount: float
@@ -44,7 +44,8 @@ def stated_light(flat: FlatCapture) -> StatedLight:
 
 
 def most_frequent_gain_db(flats: Sequence[FlatCapture]) -> float:
-    """Return the amplification, dB, of most of the flats, the lowest of several that are equally frequent; 0 without flats."""
+    """Return the amplification, dB, of most of the flats, the lowest of several that are equally frequent; 0 without
+    flats."""
     gains = [flat.gain_db or 0.0 for flat in flats]
     return max(sorted(set(gains)), key=gains.count, default=0.0)
 
@@ -55,8 +56,9 @@ def most_frequent_gain_db(flats: Sequence[FlatCapture]) -> float:
 #
 #     n = E A t wavelength / (h c)
 #
-# E: irradiance in the plane of the sensor; A: area of a pixel, the square of the pitch; t: exposure. Source: EMVA 1288 release 4.0, eq. 3.
-# The photodiode stands where the sensor is, and the camera has no lens: behind one the sensor's irradiance is another.
+# E: irradiance in the plane of the sensor; A: area of a pixel, the square of the pitch; t: exposure. Source: EMVA 1288
+# release 4.0, eq. 3. The photodiode stands where the sensor is, and the camera has no lens: behind one the sensor's
+# irradiance is another.
 
 
 #: Irradiances of one exposure that differ by less are one level: sd of their readings, and a share that lamps move by.
@@ -69,7 +71,8 @@ def why_not(flats: Sequence[FlatCapture], camera: DataSheet) -> str | None:
         return None
     if camera.f_number is not None:
         return (
-            f"the flats' irradiances give no numbers of photons: the data sheet states a lens (f/{camera.f_number:g}), and the photodiode "
+            "the flats' irradiances give no numbers of photons: the data sheet states a lens "
+            f"(f/{camera.f_number:g}), and the photodiode "
             "doesn't look through it; take the lens off for them, and f_number out of the data sheet"
         )
     if camera.pixel_pitch_um is None:
@@ -85,8 +88,8 @@ def light_of(flats: Sequence[FlatCapture], camera: DataSheet) -> dict[str, State
 
 
 def photon_numbers(flats: Sequence[FlatCapture], camera: DataSheet) -> dict[str, StatedLight]:
-    """Photons by the id of the capture, of flats that have an irradiance and state no photons. Flats of one exposure whose irradiances
-    agree are one level, and have its mean."""
+    """Photons by the id of the capture, of flats that have an irradiance and state no photons. Flats of one exposure
+    whose irradiances agree are one level, and have its mean."""
     if why_not(flats, camera) is not None or camera.pixel_pitch_um is None:
         return {}
     area_m2 = (camera.pixel_pitch_um * 1e-6) ** 2

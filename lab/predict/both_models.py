@@ -1,4 +1,5 @@
-"""What the baseline and the improved model predict of the same recordings: checks, and sensitivities as a sweep shows them."""
+"""What the baseline and the improved model predict of the same recordings: checks, and sensitivities as a sweep shows
+them."""
 
 from __future__ import annotations
 
@@ -34,8 +35,8 @@ class SensitivityCurve:
 class BothModels:
     """Predictions by the baseline and by the improved model, for the sides that were judged.
 
-    baseline, improved : the checks of `lab.predict.validate`, the same in number and order; `improved` is empty where no effect was named
-    sensitivity : curves by side and channel, over the wavelengths of the fitted ones
+    baseline, improved : the checks of `lab.predict.validate`, the same in number and order; `improved` is empty where
+    no effect was named sensitivity : curves by side and channel, over the wavelengths of the fitted ones
     """
 
     baseline: tuple[Check, ...]
@@ -47,8 +48,8 @@ def baseline_of(improved: CameraFile, always: CameraFile | None, maker: Mapping[
     """Return the baseline that an improved camera was made from.
 
     always : the camera file that the diagnosis began with; None: the fitted camera, without effects
-    maker : the maker's curves, where a discrepancy was put into the improved camera's; None: the improved camera's hold no effect
-    """
+    maker : the maker's curves, where a discrepancy was put into the improved camera's; None: the improved camera's hold
+    no effect"""
     camera = improved.camera if maker is None else improved.camera.model_copy(update={"quantum_efficiency": maker})
     return CameraFile("baseline", camera, always.effects if always is not None else ())
 
@@ -111,7 +112,8 @@ def _sensitivities(
 
 
 def _apparent(file: CameraFile, channel: str, wavelength_nm: float) -> float:
-    """Return the quantum efficiency that a narrow line of light shows: the curve's, times what the effects make of the electrons."""
+    """Return the quantum efficiency that a narrow line of light shows: the curve's, times what the effects make of the
+    electrons."""
     line = Spectrum.of(
         np.array([wavelength_nm - LINE_NM, wavelength_nm, wavelength_nm + LINE_NM]), np.array([0.0, 1.0, 0.0])
     )

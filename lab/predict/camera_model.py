@@ -12,8 +12,8 @@ from sim.camera import CameraModel, Geometry, Lens, Side
 from sim.spectrum import Spectrum
 
 USUAL_PITCH_UM = 3.5  # where the pixel pitch isn't stated
-#: Gaussian sensitivity curves where neither fit nor data sheet has one, for the colour of edges and screens only: (wavelength of the
-#: peak, standard deviation), nm.
+#: Gaussian sensitivity curves where neither fit nor data sheet has one, for the colour of edges and screens only:
+#: (wavelength of the peak, standard deviation), nm.
 TYPICAL_SENSITIVITY_NM = {"R": (600.0, 40.0), "G": (535.0, 40.0), "B": (460.0, 30.0), "Y": (550.0, 90.0)}
 
 
@@ -28,7 +28,8 @@ class Assumed:
 def camera_model(
     recordings: RecordingSet, side: Side, fit: CameraFit | None = None, *, maker_curves: bool = False
 ) -> CameraModel:
-    """The baseline model of one camera. Each quantity is the fitted one, else the stated one, else a typical value (`assumptions`).
+    """The baseline model of one camera. Each quantity is the fitted one, else the stated one, else a typical value
+    (`assumptions`).
 
     `maker_curves`: take the stated sensitivity curves even where they were fitted, as a diagnosis tests them.
     """
@@ -129,7 +130,8 @@ def _curves(
 
 
 def _measured_efficiency(fit: CameraFit | None) -> tuple[float, float] | None:
-    """Wavelength (nm) and quantum efficiency that the noise fit measured by stated photon numbers; None where it has none."""
+    """Wavelength (nm) and quantum efficiency that the noise fit measured by stated photon numbers; None where it has
+    none."""
     noise = fit.noise if fit is not None else None
     if noise is None or noise.quantum_efficiency is None or noise.quantum_efficiency_wavelength_nm is None:
         return None
@@ -139,8 +141,8 @@ def _measured_efficiency(fit: CameraFit | None) -> tuple[float, float] | None:
 def _continued(fitted: Spectrum, stated: Spectrum) -> Spectrum:
     """A fitted sensitivity, continued beyond the sweep's wavelengths by the maker's curve, scaled to join at both ends.
 
-    A lamp emits beyond the sweep, too: without this, the last 10 nm at the red end can lack 8 % of a red channel's signal.
-    """
+    A lamp emits beyond the sweep, too: without this, the last 10 nm at the red end can lack 8 % of a red channel's
+    signal."""
     wavelength_nm, value = np.array(fitted.wavelength_nm), np.array(fitted.value)
     outer = np.array(stated.wavelength_nm)
     parts = []

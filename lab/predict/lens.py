@@ -29,7 +29,8 @@ _MTF_SHARE = 0.3
 
 
 class LensPsf(Frozen):
-    """The image of a field point at one wavelength: its centroid, and the share of its light in the window of the lens table."""
+    """The image of a field point at one wavelength: its centroid, and the share of its light in the window of the lens
+    table."""
 
     wavelength_nm: float
     encircled_share: float
@@ -111,7 +112,8 @@ def parse_glasses(replacements: list[str]) -> dict[str, GlassName]:
 
 
 def with_glasses(prescription: Prescription, glasses: Mapping[str, GlassName]) -> Prescription:
-    """The prescription with glasses replaced; each replacement is a warning. Raises InputError for a glass that it doesn't have."""
+    """The prescription with glasses replaced; each replacement is a warning. Raises InputError for a glass that it
+    doesn't have."""
     present = {surface.glass.name for surface in prescription.surfaces if surface.glass is not None}
     for name in glasses:
         if name not in present:
@@ -139,8 +141,8 @@ def trace_prescription(
 ) -> TracedPrescription:
     """Read and trace a prescription: results at 33 wavelengths and 21 field points.
 
-    `workers`: where the field points are traced; None: in this process. Raises InputError for a file that can't be read or traced.
-    """
+    `workers`: where the field points are traced; None: in this process. Raises InputError for a file that can't be read
+    or traced."""
     from sim.optics.system import OpticalSystem  # imports compiled code, which takes a second
     from sim.optics.traced_table import OpticalTable, TableSettings
 

@@ -1,8 +1,8 @@
-"""Replay: the captures of a recording set as a camera model predicts (mean frames) or draws them (whole recording sets).
+"""Replay: the captures of a recording set as a camera model predicts (mean frames) or draws them (whole recording
+sets).
 
-The forward model of `sim` computes every frame. This module gives it the scene that manifest and recordings determine. Position of an
-edge and levels of its two sides are taken from the recorded frame, as no model predicts them.
-"""
+The forward model of `sim` computes every frame. This module gives it the scene that manifest and recordings determine.
+Position of an edge and levels of its two sides are taken from the recorded frame, as no model predicts them."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ class Replay:
         return min(times, default=None)
 
     def expected(self, capture: Capture, effects: Sequence[Effect] = ()) -> FloatArray:
-        """Mean frame (rows, cols) in DN. Raises NotDetermined where manifest and recordings don't determine the scene."""
+        """Mean frame (rows, cols) in DN. Raises NotDetermined where manifest and recordings don't determine the
+        scene."""
         exposure, electrons = self._electrons(capture, effects)
         return sensor.dn_moments(electrons, self.camera, exposure.gain_db, read_out(self.camera, exposure, effects))[0]
 
@@ -79,7 +80,8 @@ class Replay:
         edge = self._edge(capture) if isinstance(capture, SlantedEdgeCapture) else None
         exposure = Exposure(
             self._scene(capture, edge), capture.exposure_s, capture.gain_db or 0.0, capture.temperature_c,
-            0.0 if capture.time is None or self._start is None else capture.time.timestamp() - self._start, placed="image",
+            0.0 if capture.time is None or self._start is None else capture.time.timestamp() - self._start,
+            placed="image",
         )  # fmt: skip
         electrons = expected_electrons(self.camera, exposure, effects)
         if isinstance(capture, SlantedEdgeCapture):
@@ -107,8 +109,8 @@ class Replay:
     def _levelled(
         self, capture: SlantedEdgeCapture, exposure: Exposure, electrons: FloatArray, effects: Sequence[Effect]
     ) -> FloatArray:
-        """Electrons with an edge's two levels matched to the recording, channel by channel, by a least squares line between predicted and
-        recorded electrons."""
+        """Electrons with an edge's two levels matched to the recording, channel by channel, by a least squares line
+        between predicted and recorded electrons."""
         dark = np.broadcast_to(np.asarray(dark_electrons(self.camera, exposure, effects), float), electrons.shape)
         gain = sensor.gain_dn_per_e(self.camera, exposure.gain_db)
         recorded = (self.recordings.frame(capture).astype(float) - self.camera.black_level_dn) / gain

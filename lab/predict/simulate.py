@@ -67,7 +67,8 @@ class SimulateOptions(Frozen):
 
 
 class Summary(Frozen):
-    """Statistics of a frame. Electrons are expected values, without noise; `snr` is the signal-to-noise ratio of a pixel at the mean level."""
+    """Statistics of a frame. Electrons are expected values, without noise; `snr` is the signal-to-noise ratio of a
+    pixel at the mean level."""
 
     exposure_s: float
     automatic_exposure: bool
@@ -111,7 +112,8 @@ class Simulation:
 def camera_for(
     camera: Path | None, lens: Path | None, cache: Path | None = None, progress: Progress | None = None
 ) -> CameraFile:
-    """The camera of a file, or the default camera (None). With `lens`, a prescription, its f-number and focal length are that lens's.
+    """The camera of a file, or the default camera (None). With `lens`, a prescription, its f-number and focal length
+    are that lens's.
 
     Raises InputError for a file that can't be used.
     """
@@ -124,7 +126,8 @@ def camera_for(
 def with_lens(
     content: CameraFile, lens: Path, cache: Path | None = None, progress: Progress | None = None
 ) -> CameraFile:
-    """The camera with the lens of a prescription, f-number and focal length included. Raises InputError for a file that can't be used."""
+    """The camera with the lens of a prescription, f-number and focal length included. Raises InputError for a file that
+    can't be used."""
     table = traced_table(lens, cache, progress)
     model = content.camera
     try:
@@ -142,8 +145,8 @@ def with_lens(
 def simulate(options: SimulateOptions, content: CameraFile, progress: Progress | None = None) -> Simulation:
     """One frame: scene -> electrons -> codes. The same options and camera give the same frame.
 
-    Raises InputError for a scene, a light or an exposure that can't be used: no light where the sensor sees, every pixel full.
-    """
+    Raises InputError for a scene, a light or an exposure that can't be used: no light where the sensor sees, every
+    pixel full."""
     tell = progress or (lambda text, share: None)
     content = _distorting(content)
     camera = content.camera
@@ -194,8 +197,8 @@ def simulate(options: SimulateOptions, content: CameraFile, progress: Progress |
 
 
 def _distorting(content: CameraFile) -> CameraFile:
-    """Add the distortion of the camera's geometry as an effect, because named scenes are projected by a pinhole. A traced lens brings its own
-    distortion."""
+    """Add the distortion of the camera's geometry as an effect, because named scenes are projected by a pinhole. A
+    traced lens brings its own distortion."""
     camera = content.camera
     straight = camera.geometry is None or not any(camera.geometry.distortion)
     if straight or isinstance(camera.lens.imaging, TracedLens):
@@ -204,14 +207,15 @@ def _distorting(content: CameraFile) -> CameraFile:
 
 
 def automatic_exposure_s(electrons_per_s: FloatArray, camera: CameraModel, gain_db: float = 0.0) -> float:
-    """The exposure (s, three digits) at which the brightest 1 % of the pixels reach 70 % of their capacity. Raises InputError beyond the
-    limits."""
+    """The exposure (s, three digits) at which the brightest 1 % of the pixels reach 70 % of their capacity. Raises
+    InputError beyond the limits."""
     bright = float(np.percentile(electrons_per_s, 100.0 - BRIGHTEST_PERCENT))
     bright = bright if bright > 0 else float(electrons_per_s.max())
     seconds = AUTO_SHARE * sensor.capacity_e(camera, gain_db) / bright
     if not SHORTEST_S <= seconds <= LONGEST_S:
         raise InputError(
-            f"the brightest pixels collect {bright:.3g} e/s: an exposure of {seconds:.3g} s would be needed, beyond the limits of {SHORTEST_S:g} and {LONGEST_S:g} s; give --exposure-s, or another light"
+            f"the brightest pixels collect {bright:.3g} e/s: an exposure of {seconds:.3g} s would be needed, beyond "
+            f"the limits of {SHORTEST_S:g} and {LONGEST_S:g} s; give --exposure-s, or another light"
         )
     return float(f"{seconds:.3g}")
 
@@ -243,7 +247,9 @@ def _check_light(
     curves = camera.quantum_efficiency.values()
     seen = min(c.wavelength_nm[0] for c in curves), max(c.wavelength_nm[-1] for c in curves)
     raise InputError(
-        f"scene {options.scene!r} under {options.illuminant!r} makes no electrons: its light runs from {white.wavelength_nm[0]:g} to {white.wavelength_nm[-1]:g} nm, the sensor sees {seen[0]:g} to {seen[1]:g} nm; give a light with power there"
+        f"scene {options.scene!r} under {options.illuminant!r} makes no electrons: its light runs from "
+        f"{white.wavelength_nm[0]:g} to {white.wavelength_nm[-1]:g} nm, the sensor sees {seen[0]:g} to {seen[1]:g} "
+        "nm; give a light with power there"
     )
 
 
@@ -293,7 +299,7 @@ def camera_sha256(content: CameraFile) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-# --- files -------------------------------------------------------------------------------------------------------------
+# --- files ------------------------------------------------------------------------------------------------------------
 
 
 def check_out(file: Path) -> None:
@@ -307,7 +313,8 @@ def check_out(file: Path) -> None:
 
 
 def write(simulation: Simulation, file: Path) -> SimulationRecord:
-    """Write the frame to `file`, the preview to NAME.preview.png and the record to NAME.json beside it; returns the record."""
+    """Write the frame to `file`, the preview to NAME.preview.png and the record to NAME.json beside it; returns the
+    record."""
     record = simulation.record.model_copy(update={"file": file.name})
     metadata = RawMetadata(
         exposure_s=record.summary.exposure_s,
@@ -335,12 +342,12 @@ def record_file(file: Path) -> Path:
     return file.with_name(f"{file.stem}.json")
 
 
-# --- preview -----------------------------------------------------------------------------------------------------------
+# --- preview ----------------------------------------------------------------------------------------------------------
 
 
 def neutral(camera: CameraModel, white: Spectrum) -> dict[str, float] | None:
-    """Relative signal of a white surface in the scene's light, by channel; None for a MONO camera, and where a channel gets no
-    signal."""
+    """Relative signal of a white surface in the scene's light, by channel; None for a MONO camera, and where a channel
+    gets no signal."""
     if camera.cfa == "MONO":
         return None
     codes = {channel: electrons_of(white, camera.quantum_efficiency[channel]) for channel in "RGB"}
@@ -348,7 +355,8 @@ def neutral(camera: CameraModel, white: Spectrum) -> dict[str, float] | None:
 
 
 def preview(frame: Frame, camera: CameraModel, white: Spectrum) -> NDArray[np.uint8]:
-    """A preview (rows, cols, 3: R, G, B), demosaicked, white-balanced on the scene's white, in sRGB. White is a full pixel."""
+    """A preview (rows, cols, 3: R, G, B), demosaicked, white-balanced on the scene's white, in sRGB. White is a full
+    pixel."""
     gain = camera.conversion_gain_dn_per_e
     span = min(camera.full_well_e * gain, camera.white_level_dn - camera.black_level_dn)
     if camera.cfa == "MONO":
@@ -428,10 +436,15 @@ def summary_lines(record: SimulationRecord, file: Path) -> list[str]:
     )
     noise = "expected, without noise" if record.options.expected else f"seed {record.options.seed}"
     return [
-        f"{file}: {camera['cols']} x {camera['rows']} {camera['cfa']}, {record.options.scene} under {record.options.illuminant}, {noise}",
         (
-            f"exposure {s.exposure_s:.4g} s ({how}); mean {s.mean_electrons:.4g} e, brightest {BRIGHTEST_PERCENT:g} % {s.brightest_percent_electrons:.4g} e; "
-            f"mean {s.mean_dn:.4g} DN, highest {s.highest_dn} DN; saturated {s.saturated_percent:.2g} %; SNR {s.snr:.3g} at the mean"
+            f"{file}: {camera['cols']} x {camera['rows']} {camera['cfa']}, {record.options.scene} under "
+            f"{record.options.illuminant}, {noise}"
+        ),
+        (
+            f"exposure {s.exposure_s:.4g} s ({how}); mean {s.mean_electrons:.4g} e, brightest {BRIGHTEST_PERCENT:g} % "
+            f"{s.brightest_percent_electrons:.4g} e; "
+            f"mean {s.mean_dn:.4g} DN, highest {s.highest_dn} DN; saturated {s.saturated_percent:.2g} %; SNR "
+            f"{s.snr:.3g} at the mean"
         ),
         f"preview {preview_file(file).name}, record {record_file(file).name}",
     ]

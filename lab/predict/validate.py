@@ -66,9 +66,9 @@ def validate(
 ) -> ValidationResult:
     """Checks of every side: `colorchecker`, `mtf`, `psf`. `models`: camera files in place of the fitted cameras.
 
-    A check passes where chi2 is below its 99.9 % quantile. Checks that the recordings don't determine are listed in `skipped`. `progress`
-    is called before each edge and kernel with the step and the share (0..1) that is done; an exception that it raises ends the work.
-    """
+    A check passes where chi2 is below its 99.9 % quantile. Checks that the recordings don't determine are listed in
+    `skipped`. `progress` is called before each edge and kernel with the step and the share (0..1) that is done; an
+    exception that it raises ends the work."""
     kinds: tuple[tuple[str, _Checking], ...] = (("colorchecker", _charts), ("mtf", _edges), ("psf", _kernels))
     begun = 0
     checks: list[Check] = []
@@ -112,7 +112,7 @@ def _check(
     )
 
 
-# --- the chart -------------------------------------------------------------------------------------------------------------
+# --- the chart --------------------------------------------------------------------------------------------------------
 
 
 def _charts(
@@ -189,7 +189,8 @@ def _chart(
 
 
 def _curve_std(model: CameraModel, channel: str, wavelength_nm: FloatArray) -> float:
-    """Relative standard deviation of a channel's response to broadband light, with errors of the curve correlated over 30 nm."""
+    """Relative standard deviation of a channel's response to broadband light, with errors of the curve correlated over
+    30 nm."""
     std, curve = model.quantum_efficiency_std.get(channel), model.quantum_efficiency[channel]
     if std is None:
         return 0.01
@@ -198,7 +199,7 @@ def _curve_std(model: CameraModel, channel: str, wavelength_nm: FloatArray) -> f
     return float(np.sqrt(np.sum(np.square(std.at(grid)))) / total) if total > 0 else 1.0
 
 
-# --- edges -----------------------------------------------------------------------------------------------------------------
+# --- edges ------------------------------------------------------------------------------------------------------------
 
 
 def _edges(
@@ -236,8 +237,10 @@ def _edges(
             reference.append(np.maximum(predicted, 0.1))
             curves.append(
                 CurveComparison(
-                    label=f"{capture.id}, {measured.angle_deg:.1f} deg", channel=channel, axis="spatial frequency, cy/px",
-                    x=tuple(MTF_FREQUENCIES.tolist()), predicted=tuple(predicted.tolist()), measured=tuple(measured.mtf.tolist()),
+                    label=f"{capture.id}, {measured.angle_deg:.1f} deg", channel=channel,
+                    axis="spatial frequency, cy/px",
+                    x=tuple(MTF_FREQUENCIES.tolist()), predicted=tuple(predicted.tolist()),
+                    measured=tuple(measured.mtf.tolist()),
                     measured_std=tuple(measured.mtf_std.tolist()),
                 )
             )  # fmt: skip
@@ -275,7 +278,7 @@ def _diagonal(blocks: Sequence[NDArray[Any]]) -> FloatArray:
     return out
 
 
-# --- kernels ---------------------------------------------------------------------------------------------------------------
+# --- kernels ----------------------------------------------------------------------------------------------------------
 
 
 def _kernels(

@@ -27,7 +27,8 @@ FREQUENCIES_CY_PER_PX = np.linspace(0.0, 0.5, 26)
 
 
 class TransferPoint(Frozen):
-    """Two flats of one exposure: the mean above black, and the temporal variance, half that of their difference (EMVA 1288)."""
+    """Two flats of one exposure: the mean above black, and the temporal variance, half that of their difference (EMVA
+    1288)."""
 
     side: Side
     channel: str
@@ -47,7 +48,8 @@ class SensitivityPoint(Frozen):
 
 
 class EdgeLook(Frozen):
-    """A slanted edge in the channel that has most of the pixels: contrast at `frequency_cy_per_px`, by the estimator of the fit."""
+    """A slanted edge in the channel that has most of the pixels: contrast at `frequency_cy_per_px`, by the estimator of
+    the fit."""
 
     side: Side
     region: str

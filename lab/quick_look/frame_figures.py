@@ -13,8 +13,8 @@ BINS = 64
 
 
 class ChannelFigures(Frozen):
-    """One channel of a frame. `counts`: pixels in each of the equal bins between 0 and the saturation; `saturated_share`: of its pixels, those
-    at or above the data sheet's white level."""
+    """One channel of a frame. `counts`: pixels in each of the equal bins between 0 and the saturation;
+    `saturated_share`: of its pixels, those at or above the data sheet's white level."""
 
     channel: str
     mean_dn: float

@@ -1,7 +1,7 @@
 """The curves of sessions, computed in a process of its own at low priority, so that no capture waits for them.
 
-The process is `python -m lab.quick_look.process`. Its standard input says which store, then one session's id a line; it answers each with a
-line of JSON. It ends when nobody asks for a while, and with the process that started it.
+The process is `python -m lab.quick_look.process`. Its standard input says which store, then one session's id a line; it
+answers each with a line of JSON. It ends when nobody asks for a while, and with the process that started it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class QuickLook:
         self._closed = False
 
     def curves(self, session_id: str) -> Curves:
-        """The newest curves of a session; without any yet, `looked_at` is 0. Where they are older than `HOLDS_S`, newer ones are asked for."""
+        """The newest curves of a session; without any yet, `looked_at` is 0. Where they are older than `HOLDS_S`, newer
+        ones are asked for."""
         with self._lock:
             known = self._known.get(session_id)
             fresh = known is not None and time.monotonic() - known.at_s < HOLDS_S
@@ -136,7 +137,7 @@ class QuickLook:
         return ""
 
 
-# --- the process -------------------------------------------------------------------------------------------------------
+# --- the process ------------------------------------------------------------------------------------------------------
 
 
 def serve() -> None:

@@ -298,9 +298,9 @@ def write_report(
     """Write the report as the file `out`, one self-contained page: completely, or not at all.
 
     `validation` and `diagnosis` may be None: the page says that they were not done. `provenance`: by default, what the
-    recordings themselves tell. `both`: predictions by the baseline and the improved model, where both are known. `limits`:
-    that the figures are judged by, where the laboratory states some. Raises InputError where the file can't be written.
-    """
+    recordings themselves tell. `both`: predictions by the baseline and the improved model, where both are known.
+    `limits`: that the figures are judged by, where the laboratory states some. Raises InputError where the file can't
+    be written."""
     file = Path(out)
     page = render_report(recordings, fit, validation, diagnosis, provenance or provenance_of(recordings), both, limits)
     return write_page(file, page)

@@ -1,4 +1,5 @@
-"""The first screen of the report: what was found, how sure that is, what it means, what to do; and two charts that show it."""
+"""The first screen of the report: what was found, how sure that is, what it means, what to do; and two charts that show
+it."""
 
 from __future__ import annotations
 
@@ -54,14 +55,16 @@ def _short(value: float) -> str:
 
 
 def _from_zero(value: ParameterValue, quantity: Quantity | None) -> str:
-    """Return how many standard deviations lie between a size and none, in brackets; empty where it has no such distance."""
+    """Return how many standard deviations lie between a size and none, in brackets; empty where it has no such
+    distance."""
     if quantity is None or quantity.absent != 0.0 or not value.std or value.interval is not None:
         return ""
     return f" ({plain_number(abs(value.value) / value.std, 2)} σ from 0)"
 
 
 def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, float]]]]:
-    """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, the rivals, and all the rest."""
+    """Return the probabilities of the models by side: the likeliest sets of effects, none further acting, the rivals,
+    and all the rest."""
     found = []
     for one in diagnosis.models if diagnosis is not None else ():
         shown = one.sets[:ODDS]
@@ -90,7 +93,7 @@ def effect_line(effect: NamedEffect) -> str:
     fields = law.choices() if law else {}
     sizes = [
         f"{described[name].meaning if name in described else words.parameter_name(name, value)} "
-        f"{measured(value.value, value.std, value.unit, value.interval)}{_from_zero(value, described.get(name))}{'' if value.sign_known else ', sign unknown'}"
+        f"{measured(value.value, value.std, value.unit, value.interval)}{_from_zero(value, described.get(name))}{'' if value.sign_known else ', sign unknown'}"  # noqa: E501
         for name, value in effect.parameters.items()
         if value.std is None or abs(value.value) >= TOLD_SIGMA * value.std
     ]
@@ -145,11 +148,15 @@ def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
     held = diagnosis.held_out
     if held is not None and held.n and diagnosis.effects:
         yield (
-            f"On {len(held.captures)} held-out captures, χ² per number falls from {_short(held.chi2_before / held.n)} to "
+            f"On {len(held.captures)} held-out captures, χ² per number falls from {_short(held.chi2_before / held.n)} "
+            "to "
             f"{_short(held.chi2_after / held.n)} (noise alone: 1)."
         )
     if diagnosis.false_alarm_rate is not None:
-        yield f"False-alarm rate: {100 * diagnosis.false_alarm_rate:.2g} % of healthy cameras are reported with a mismatch."
+        yield (
+            f"False-alarm rate: {100 * diagnosis.false_alarm_rate:.2g} % of healthy cameras are reported with a "
+            "mismatch."
+        )
 
 
 def meaning(
@@ -217,8 +224,8 @@ def _missed(values: Sequence[float], curve: ResidualCurve) -> float:
 
 
 def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
-    """For each of the first two named effects, the measurement that shows it most, where the baseline fits worst; then the measurements
-    that it fits worst. None where nothing was named."""
+    """For each of the first two named effects, the measurement that shows it most, where the baseline fits worst; then
+    the measurements that it fits worst. None where nothing was named."""
     if not diagnosis.effects:
         return []
     curves = [curve for curve in diagnosis.curves if len(curve.x) > 3]
@@ -244,7 +251,8 @@ def proof_words(curve: ResidualCurve) -> tuple[str, str]:
 
 
 def _as_sensitivity(curve: ResidualCurve, fit: FitResult, both: BothModels | None) -> ResidualCurve:
-    """Return a curve of signals in narrowband light as the quantum efficiency, which the exposures don't enter; others as they are."""
+    """Return a curve of signals in narrowband light as the quantum efficiency, which the exposures don't enter; others
+    as they are."""
     models = both.sensitivity.get(curve.side, {}) if both is not None else {}
     spectral = fit.cameras[curve.side].spectral if curve.side in fit.cameras else None
     if curve.measurement != "narrowband" or spectral is None or curve.channel not in models:
@@ -267,8 +275,8 @@ def _as_sensitivity(curve: ResidualCurve, fit: FitResult, both: BothModels | Non
 def proofs(fit: FitResult, diagnosis: DiagnosisResult | None, both: BothModels | None = None) -> list[Proof]:
     """Draw charts for the first screen.
 
-    The two measurements that show the named effects (`proof_curves`), with both models; of a healthy or an undiagnosed camera, its
-    photon transfer.
+    The two measurements that show the named effects (`proof_curves`), with both models; of a healthy or an undiagnosed
+    camera, its photon transfer.
     """
     shown = []
     for signals in proof_curves(diagnosis) if diagnosis is not None else ():
@@ -307,8 +315,8 @@ def answers(
     warnings: int = 0,
     both: BothModels | None = None,
 ) -> list[tuple[str, list[str]]]:
-    """The four questions, each with its answers in sentences. `left_out`: number of skipped steps; `warnings`: number of warnings about the
-    recordings."""
+    """The four questions, each with its answers in sentences. `left_out`: number of skipped steps; `warnings`: number
+    of warnings about the recordings."""
     return [
         ("What was found", list(found(fit, diagnosis))),
         ("How sure", list(certainty(diagnosis))),

@@ -42,12 +42,14 @@ class ChartData:
         return len(self._lines) - 1
 
     def packed(self) -> str:
-        """All figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that holds it."""
+        """All figures, a line of JSON each, compressed, as base64: no text of theirs can end the element that holds
+        it."""
         return base64.b64encode(gzip.compress("\n".join(self._lines).encode(), mtime=0)).decode("ascii")
 
 
 def _packed(values: Any) -> dict[str, str] | None:
-    """Numbers as plotly's typed array (float32, base64; NaN where there is none), None where it isn't an array worth packing."""
+    """Numbers as plotly's typed array (float32, base64; NaN where there is none), None where it isn't an array worth
+    packing."""
     if not isinstance(values, list | tuple) or len(values) < PACKED_FROM:
         return None
     rows = [row for row in values if isinstance(row, list | tuple)]

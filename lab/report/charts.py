@@ -1,5 +1,5 @@
-"""The report's charts as Plotly figures. Colours that differ between the light and the dark page are named "@fg", "@muted" and "@grid" and
-are replaced by the page's script. Uncertainty is drawn wherever the results state one."""
+"""The report's charts as Plotly figures. Colours that differ between the light and the dark page are named "@fg",
+"@muted" and "@grid" and are replaced by the page's script. Uncertainty is drawn wherever the results state one."""
 
 from __future__ import annotations
 
@@ -172,8 +172,8 @@ def linearity(noise: NoiseFit) -> Figure | None:
 
 
 def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Shapes and annotations for the wavelength bands in which a curve differs from the maker's: a strip along the top for each channel,
-    labelled with the difference in per cent."""
+    """Shapes and annotations for the wavelength bands in which a curve differs from the maker's: a strip along the top
+    for each channel, labelled with the difference in per cent."""
     shapes: list[dict[str, Any]] = []
     notes: list[dict[str, Any]] = []
     channels = list(spectral.quantum_efficiency)
@@ -199,7 +199,8 @@ def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[
                 "text": size,
                 "showarrow": False,
                 "font": {"size": 10, "color": colour},
-                "hovertext": f"{one.channel}, {one.from_nm:g} to {one.to_nm:g} nm: {size}, {one.significance_sigma:.1f} sigma",
+                "hovertext": f"{one.channel}, {one.from_nm:g} to {one.to_nm:g} nm: {size}, "
+                f"{one.significance_sigma:.1f} sigma",
             }
         )
     return shapes, notes
@@ -211,11 +212,11 @@ def quantum_efficiency(
     side: Side,
     models: Mapping[str, SensitivityCurve] | None = None,
 ) -> Figure:
-    """Return the quantum efficiency with its band (standard deviation times the fit's coverage factor) and the wavelength bands in
-    which it differs from the maker's.
+    """Return the quantum efficiency with its band (standard deviation times the fit's coverage factor) and the
+    wavelength bands in which it differs from the maker's.
 
-    `models`: curves of the baseline and the improved model by channel, drawn beside it. Without them, the maker's curve stands there,
-    scaled by the fitted factor where there is one.
+    `models`: curves of the baseline and the improved model by channel, drawn beside it. Without them, the maker's curve
+    stands there, scaled by the fitted factor where there is one.
     """
     data: list[Trace] = []
     scale = spectral.maker_scale or 1.0
@@ -296,7 +297,8 @@ def _panel_title(number: int, text: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Overlay:
-    """One channel's measured curve and its predictions: the baseline's and, where effects were named, the improved model's."""
+    """One channel's measured curve and its predictions: the baseline's and, where effects were named, the improved
+    model's."""
 
     channel: str
     x: Sequence[float]
@@ -307,7 +309,8 @@ class Overlay:
 
 
 def validated_overlays(checks: Sequence[tuple[Check, Check | None]]) -> dict[str, list[Overlay]]:
-    """Return panel title -> curves, one panel for each check by a first model and, where there is one, by the improved model."""
+    """Return panel title -> curves, one panel for each check by a first model and, where there is one, by the improved
+    model."""
     panels: dict[str, list[Overlay]] = {}
     for check, improved in checks:
         mended = {curve.channel: curve.predicted for curve in improved.curves} if improved is not None else {}
@@ -349,7 +352,8 @@ def _legend(name: str, **look: Any) -> Trace:
 def transfer_overlays(
     panels: Mapping[str, Sequence[Overlay]], columns: int = 3, model: str = "baseline"
 ) -> Figure | None:
-    """Measured MTF (points), the baseline's prediction (dashed), and the improved model's (solid) where effects were named."""
+    """Measured MTF (points), the baseline's prediction (dashed), and the improved model's (solid) where effects were
+    named."""
     if not panels:
         return None
     columns = min(columns, len(panels))
@@ -401,10 +405,11 @@ def transfer_overlays(
 
 
 def patch_comparison(patches: Sequence[PatchComparison], improved: Sequence[PatchComparison] | None = None) -> Figure:
-    """Return measured and predicted patches on the same axes, a panel for each channel, in per cent of its brightest measured patch.
+    """Return measured and predicted patches on the same axes, a panel for each channel, in per cent of its brightest
+    measured patch.
 
-    Bars: one standard deviation of measurement and prediction together. `improved`: the same patches by the improved model.
-    """
+    Bars: one standard deviation of measurement and prediction together. `improved`: the same patches by the improved
+    model."""
     channels = list(dict.fromkeys(patch.channel for patch in patches))
     first = BASELINE if improved is not None else "predicted"
     height, data, axes = 90 + 150 * len(channels), list[Trace](), dict[str, Any]()

@@ -105,5 +105,6 @@ def render_comparison(comparison: ComparisonResult) -> str:
 
 
 def write_comparison(folder: Path, comparison: ComparisonResult) -> Path:
-    """Write `folder`/compare.html, one self-contained page: completely, or not at all. InputError where it can't be written."""
+    """Write `folder`/compare.html, one self-contained page: completely, or not at all. InputError where it can't be
+    written."""
     return write_page(folder / "compare.html", render_comparison(comparison))

@@ -85,7 +85,8 @@ def mood(chi2: float, n: int) -> str:
 
 
 def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) -> list[ResidualCurve]:
-    """The curve of every measurement that the baseline fits worst, of held-out captures where there are any; worst first."""
+    """The curve of every measurement that the baseline fits worst, of held-out captures where there are any; worst
+    first."""
 
     def missed(curve: ResidualCurve) -> float:
         std = np.maximum(np.asarray(curve.measured_std), 1e-12)
@@ -97,11 +98,12 @@ def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) ->
     return sorted(chosen.values(), key=missed, reverse=True)[:most]
 
 
-# --- heat maps -----------------------------------------------------------------------------------------------------------
+# --- heat maps --------------------------------------------------------------------------------------------------------
 
 
 def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[str, Figure]]:
-    """Heat maps of significance by measurement and axis, one for each side and model (baseline, and improved model where effects were named)."""
+    """Heat maps of significance by measurement and axis, one for each side and model (baseline, and improved model
+    where effects were named)."""
     maps = []
     for side in sides:
         mine = [place for place in diagnosis.places if place.side == side]
@@ -171,7 +173,7 @@ def _short(sigma: float) -> str:
     return f"{sigma:.1f}" if sigma < 9.95 else f"{sigma:.0f}" if sigma < 99.5 else "99+"
 
 
-# --- residual pictures -----------------------------------------------------------------------------------------------------
+# --- residual pictures ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,7 @@ class _ResidualImages:
         )
 
 
-# --- smallest detectable effects -----------------------------------------------------------------------------------------------
+# --- smallest detectable effects --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

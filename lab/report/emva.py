@@ -1,4 +1,5 @@
-"""The EMVA 1288 data sheet: the standard's table, conditions and plots, from the fit's figures and the recordings' spatial stacks."""
+"""The EMVA 1288 data sheet: the standard's table, conditions and plots, from the fit's figures and the recordings'
+spatial stacks."""
 
 from __future__ import annotations
 
@@ -156,7 +157,8 @@ def _defect_sentence(defects: PixelDefects | None) -> str:
         for defect in defects.listed[:8]
     )
     return (
-        f"{defects.hot} pixels are hot and {defects.cold} cold in the longest dark ({defects.exposure_s:.4g} s), by more than 8 standard "
+        f"{defects.hot} pixels are hot and {defects.cold} cold in the longest dark ({defects.exposure_s:.4g} s), by "
+        "more than 8 standard "
         f"deviations of their plane. The strongest: {strongest}."
     )
 

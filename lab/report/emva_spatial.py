@@ -85,8 +85,9 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
 
 
 def spectrogram(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (cycles/px) and rms amplitude along the rows of an image: the root of the mean power spectrum of its rows, scaled so
-    that a white pattern of standard deviation s has the amplitude s at every frequency. Frequency 0 is left out."""
+    """Frequencies (cycles/px) and rms amplitude along the rows of an image: the root of the mean power spectrum of its
+    rows, scaled so that a white pattern of standard deviation s has the amplitude s at every frequency. Frequency 0 is
+    left out."""
     length = image.shape[1]
     power = np.mean(np.abs(np.fft.rfft(image - image.mean(), axis=1)) ** 2, axis=0) / length
     return np.asarray(np.fft.rfftfreq(length)[1:], float), np.asarray(np.sqrt(power[1:]), float)
@@ -127,13 +128,14 @@ def _spectrogram(name: str, image: FloatArray, left: float, unit: str) -> EmvaPl
                 margin={"l": 56, "r": 14, "t": 46, "b": 44},
             ),
         },
-        "A white pattern is flat at its standard deviation; peaks are periodic patterns, a rise towards low frequencies is shading.",
+        "A white pattern is flat at its standard deviation; peaks are periodic patterns, a rise towards low "
+        "frequencies is shading.",
     )
 
 
 def _histogram(name: str, image: FloatArray, left: float, unit: str, step: float = 0.0) -> EmvaPlot:
-    """Logarithmic histogram with the normal distribution of the same standard deviation, and the cumulative histogram of absolute deviations.
-    `step`: between possible values; a bin holds a whole number of them."""
+    """Logarithmic histogram with the normal distribution of the same standard deviation, and the cumulative histogram
+    of absolute deviations. `step`: between possible values; a bin holds a whole number of them."""
     rest = (image - image.mean()).ravel()
     reach = 1.05 * float(np.abs(rest).max()) or 1.0
     width = 2.0 * reach / HISTOGRAM_BINS
@@ -173,7 +175,8 @@ def _histogram(name: str, image: FloatArray, left: float, unit: str, step: float
                 margin={"l": 56, "r": 14, "t": 46, "b": 44},
             ),
         },
-        f"Mean image{', high-passed by 5 × 5 means' if name == 'PRNU' else ''}; residual temporal noise {measured(float(np.sqrt(left)), None, unit)}. "
+        f"Mean image{', high-passed by 5 × 5 means' if name == 'PRNU' else ''}; residual temporal noise "
+        f"{measured(float(np.sqrt(left)), None, unit)}. "
         "Defective pixels lie outside the normal distribution.",
     )
 
@@ -210,5 +213,6 @@ def _profiles(name: str, image: FloatArray, unit: str) -> EmvaPlot:
                 margin={"l": 56, "r": 14, "t": 46, "b": 44},
             ),
         },
-        "Left: horizontal profiles (over the columns), right: vertical ones. Single defects may lie outside the range shown.",
+        "Left: horizontal profiles (over the columns), right: vertical ones. Single defects may lie outside the range "
+        "shown.",
     )

@@ -1,4 +1,5 @@
-"""The data sheet's temporal plots: photon transfer, responsivity, SNR, linearity, dark current; and those of the joint fit."""
+"""The data sheet's temporal plots: photon transfer, responsivity, SNR, linearity, dark current; and those of the joint
+fit."""
 
 from __future__ import annotations
 
@@ -53,7 +54,8 @@ def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
                 yaxis=axis("σ²<sub>y</sub> − σ²<sub>y.dark</sub>, DN²", range=[0.0, 1.15 * float(excess.max())]),
             ),
         },
-        "Temporal variance against mean, dark subtracted. Solid: the line through the origin, fitted to 70 % of saturation; dotted: beyond.",
+        "Temporal variance against mean, dark subtracted. Solid: the line through the origin, fitted to 70 % of "
+        "saturation; dotted: beyond.",
     )
     if own.responsivity_dn_per_photon is not None:
         slope = own.responsivity_dn_per_photon
@@ -171,7 +173,8 @@ def _linearity(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str
             ),
         },
         f"Above: mean minus dark with the line that minimises relative deviations; below: the deviations. "
-        f"LE {measured(own.linearity_error_percent, own.linearity_error_percent_std, '%')} is their mean absolute value.",
+        f"LE {measured(own.linearity_error_percent, own.linearity_error_percent_std, '%')} is their mean absolute "
+        "value.",
     )
 
 
@@ -200,7 +203,8 @@ def _dark_current(own: Emva1288, colour: str) -> Iterator[EmvaPlot]:
                 yaxis2=axis("variance, DN²", domain=[0.0, 0.44]),
             ),
         },
-        "Above: mean of the darks; below: their temporal variance. Their slopes are the dark current, from means and from variances.",
+        "Above: mean of the darks; below: their temporal variance. Their slopes are the dark current, from means and "
+        "from variances.",
     )
 
 
@@ -228,7 +232,8 @@ def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
             },
             f"Over {spread.degrees_of_freedom} degrees of freedom a pixel; median {spread.median_e:.3g} e, 99 % below "
             f"{spread.percentile_99_e:.3g} e. The pixels' true variances differ by "
-            f"{measured(spread.spread_percent, spread.spread_percent_std, '%')}, sampling error subtracted; {spread.noisy_pixels} noisy pixels.",
+            f"{measured(spread.spread_percent, spread.spread_percent_std, '%')}, sampling error subtracted; "
+            f"{spread.noisy_pixels} noisy pixels.",
             of_plane=False,
         )
     law = noise.dark_current_temperature

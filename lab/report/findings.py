@@ -1,4 +1,5 @@
-"""What a diagnosis found, in the words of the report's first screen, with what proves it: for pages that aren't the report."""
+"""What a diagnosis found, in the words of the report's first screen, with what proves it: for pages that aren't the
+report."""
 
 from __future__ import annotations
 
@@ -19,9 +20,9 @@ class ProofCurve(Frozen):
 
 
 class DiagnosisFindings(Frozen):
-    """`verdict` in two words, `headline` in a sentence, and the questions of the report's first screen with their `answers`. `proofs`: the two
-    measurements that the baseline predicts worst. `pictures`: of each camera, the frame whose residuals the effects lessen most, where they do by a
-    tenth at least."""
+    """`verdict` in two words, `headline` in a sentence, and the questions of the report's first screen with their
+    `answers`. `proofs`: the two measurements that the baseline predicts worst. `pictures`: of each camera, the frame
+    whose residuals the effects lessen most, where they do by a tenth at least."""
 
     verdict: str
     headline: str

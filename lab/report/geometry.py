@@ -1,4 +1,5 @@
-"""The report's geometry: coverage, reprojection residuals, projection uncertainty, lateral colour, depth uncertainty, rectified pair."""
+"""The report's geometry: coverage, reprojection residuals, projection uncertainty, lateral colour, depth uncertainty,
+rectified pair."""
 
 from __future__ import annotations
 
@@ -95,7 +96,8 @@ def coverage(geometry: GeometryFit) -> Figure | None:
 
 
 def lines_of_vectors(at: FloatArray, vector: FloatArray, shape: tuple[float, float], name: str) -> list[Trace]:
-    """Vectors (n, 2) at positions (n, 2) in a frame of `shape` (rows, cols), x and y in px, drawn as lines enlarged by a round number."""
+    """Vectors (n, 2) at positions (n, 2) in a frame of `shape` (rows, cols), x and y in px, drawn as lines enlarged by
+    a round number."""
     usual = max(float(np.percentile(np.linalg.norm(vector, axis=1), 95)), 1e-9)
     wanted = ARROWS * shape[1] / usual
     scale = max([one for one in SCALES if one <= wanted], default=SCALES[0])
@@ -184,7 +186,8 @@ def depth_map(depth: DepthUncertainty) -> Figure | None:
 
 
 def lateral_colour(channels: tuple[ChannelGeometry, ...]) -> Figure | None:
-    """Radial shift of red and blue relative to green over the distance from the principal point, with a band of two standard deviations."""
+    """Radial shift of red and blue relative to green over the distance from the principal point, with a band of two
+    standard deviations."""
     drawn = [channel for channel in channels if channel.radius_px]
     if not drawn:
         return None
@@ -320,7 +323,10 @@ def charts_by_side(fits: Mapping[Side, GeometryFit | None]) -> list[tuple[str, d
     ]
     for place, one in enumerate(known):
         where = "at infinity" if one.distance_mm is None else "at the boards' distance"
-        caption = "Standard deviation in the worst direction; the rigid motion that the corners can't separate from the intrinsics is removed."
+        caption = (
+            "Standard deviation in the worst direction; the rigid motion that the corners can't separate from the "
+            "intrinsics is removed."
+        )
         found.append(
             (f"Uncertainty of the projection, {where}", of(at(place)), caption if place == len(known) - 1 else "")
         )

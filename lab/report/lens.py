@@ -1,4 +1,5 @@
-"""The page of a traced lens: its drawing with rays, illumination, distortion, lateral colour, MTF against field, PSF mosaic."""
+"""The page of a traced lens: its drawing with rays, illumination, distortion, lateral colour, MTF against field, PSF
+mosaic."""
 
 from __future__ import annotations
 
@@ -276,5 +277,6 @@ def render_lens(traced: TracedPrescription) -> str:
 
 
 def write_lens_report(folder: Path, traced: TracedPrescription) -> Path:
-    """Write `folder`/lens.html, one self-contained page: completely, or not at all. InputError where it can't be written."""
+    """Write `folder`/lens.html, one self-contained page: completely, or not at all. InputError where it can't be
+    written."""
     return write_page(folder / "lens.html", render_lens(traced))

@@ -32,7 +32,8 @@ def _npy(values: NDArray[Any]) -> bytes:
 
 
 def _files(maps: PixelMaps) -> Iterator[tuple[str, bytes]]:
-    """(name, content) of each file: arrays in single precision, pictures of the same size, and the range of the pictures' colours."""
+    """(name, content) of each file: arrays in single precision, pictures of the same size, and the range of the
+    pictures' colours."""
     stated: dict[str, dict[str, object]] = {}
     for name, (title, unit) in MAPS.items():
         values = getattr(maps, name)
@@ -53,9 +54,9 @@ def _files(maps: PixelMaps) -> Iterator[tuple[str, bytes]]:
 def write_maps(folder: Path, maps: PixelMaps) -> tuple[str, ...]:
     """Write the maps into `folder`; returns the names of the files written.
 
-    They are `offset_dn`, `dark_dn_per_s`, `gain`, each with `_std`, and `defective`, as .npy (rows, cols) and as .png; and their
-    description as maps.json. Maps that aren't determined are left out. Raises InputError where a file can't be written.
-    """
+    They are `offset_dn`, `dark_dn_per_s`, `gain`, each with `_std`, and `defective`, as .npy (rows, cols) and as .png;
+    and their description as maps.json. Maps that aren't determined are left out. Raises InputError where a file can't
+    be written."""
     names = []
     try:
         folder.mkdir(parents=True, exist_ok=True)

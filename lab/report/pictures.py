@@ -30,7 +30,8 @@ def png_data_uri(image: NDArray[np.uint8]) -> str:
 
 
 def photograph_data_uri(image: NDArray[np.uint8]) -> str:
-    """An image (rows, cols) or (rows, cols, 3: R, G, B) to look at, not to measure in: a WebP data URI, a tenth of the PNG's size."""
+    """An image (rows, cols) or (rows, cols, 3: R, G, B) to look at, not to measure in: a WebP data URI, a tenth of the
+    PNG's size."""
     pixels = image if image.ndim == 2 else image[..., ::-1]
     _, data = cv2.imencode(".webp", np.ascontiguousarray(pixels), [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])
     return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode("ascii")
@@ -47,8 +48,8 @@ def kernel_picture(kernel: ArrayLike, peak: float, margin: int = 0) -> str:
 
 
 def map_picture(values: ArrayLike, width_px: int | None = None) -> tuple[NDArray[np.uint8], float, float]:
-    """A map (rows, cols) in colours (rows, cols, 3: R, G, B) from its 1st percentile (dark) to its 99th (bright), and these two;
-    averaged down to `width_px` columns where it has more."""
+    """A map (rows, cols) in colours (rows, cols, 3: R, G, B) from its 1st percentile (dark) to its 99th (bright), and
+    these two; averaged down to `width_px` columns where it has more."""
     given = np.asarray(values, float)
     low, high = (float(limit) for limit in np.percentile(given, [1.0, 99.0]))
     share = np.clip((given - low) / max(high - low, 1e-12), 0.0, 1.0)
@@ -71,7 +72,8 @@ def difference_picture(difference: ArrayLike, limit: float, margin: int = 0) -> 
 
 
 def trimmed_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> int:
-    """Width of the border, in cells, in which all `kernels` stay below `share` of their highest value; at least 7 cells are left."""
+    """Width of the border, in cells, in which all `kernels` stay below `share` of their highest value; at least 7 cells
+    are left."""
     highest = max(float(kernel.max()) for kernel in kernels)
     size = min(min(kernel.shape) for kernel in kernels)
     margin = 0
@@ -86,8 +88,8 @@ def trimmed_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> i
 def patch_colours(patches: tuple[PatchComparison, ...]) -> dict[str, tuple[str, str]]:
     """Patch -> (measured, predicted) as CSS colours: camera R, G, B balanced on the measured white patch, gamma 2.2.
 
-    These are camera colours, not colorimetry. Both get the same balance, so that a difference on the page is one in the recording.
-    """
+    These are camera colours, not colorimetry. Both get the same balance, so that a difference on the page is one in the
+    recording."""
     measured: dict[str, dict[str, float]] = {}
     predicted: dict[str, dict[str, float]] = {}
     for patch in patches:

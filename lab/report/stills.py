@@ -1,8 +1,8 @@
-"""The first screen's charts as static SVG: what a print shows that is made before the page's script has drawn, a reader without scripts sees,
-and everybody does until the script draws the chart proper in its place.
+"""The first screen's charts as static SVG: what a print shows that is made before the page's script has drawn, a reader
+without scripts sees, and everybody does until the script draws the chart proper in its place.
 
-Of Plotly's figures it knows what those charts have: scatter traces with lines, markers and error bars on one abscissa and ordinates one above
-the other, and rectangles across the whole width.
+Of Plotly's figures it knows what those charts have: scatter traces with lines, markers and error bars on one abscissa
+and ordinates one above the other, and rectangles across the whole width.
 """
 
 from __future__ import annotations
@@ -203,5 +203,8 @@ def still(figure: Figure, number: int) -> Markup:
         colour = f' style="{_style(fill=note["font"]["color"])}"'
         parts.append(_text(x, y - 3, note["text"], size=note["font"]["size"], more=colour))
     named = escape(str(layout["yaxis"]["title"]["text"]).replace("<br>", " "), quote=True)
-    opening = f'<svg class="still" aria-label="{named}" viewBox="0 0 {WIDTH:g} {height:g}" style="{_style(fill="@fg")}" role="img">'
+    opening = (
+        f'<svg class="still" aria-label="{named}" viewBox="0 0 {WIDTH:g} {height:g}" style="{_style(fill="@fg")}" '
+        'role="img">'
+    )
     return Markup(opening + "".join(parts) + "</svg>")  # its texts are escaped

@@ -59,14 +59,18 @@ def models(has_both: bool, has_improved: bool) -> str:
     """Return what predicts on the pages of the checks, and why the predictions may differ."""
     if not has_both:
         return (
-            f"Predicted by the {FITTED}: the data sheet's camera with the noise and the sensitivities that were measured. No "
+            f"Predicted by the {FITTED}: the data sheet's camera with the noise and the sensitivities that were "
+            "measured. No "
             "improved camera is known here."
         )
     improved = "The improved model is the baseline with the named effects. " if has_improved else ""
     return (
-        "The baseline is the data sheet's camera with the maker's sensitivities, freed within their uncertainty, and the fitted "
-        f"noise: the model that the diagnosis tests. {improved}The {FITTED} has the sensitivities that were measured in place of "
-        "the maker's. It can predict a chart well where the baseline departs from it: what was measured is in its curves, "
+        "The baseline is the data sheet's camera with the maker's sensitivities, freed within their uncertainty, and "
+        "the fitted "
+        f"noise: the model that the diagnosis tests. {improved}The {FITTED} has the sensitivities that were measured "
+        "in place of "
+        "the maker's. It can predict a chart well where the baseline departs from it: what was measured is in its "
+        "curves, "
         "without a cause."
     )
 

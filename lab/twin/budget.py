@@ -1,7 +1,7 @@
 """Which parameters, as well as they are known at present, matter for a stated use of the camera.
 
-g = d use / d z at the model, by differences; the variance of the use is g' V g with V the posterior covariance. What a group k of parameters
-adds is what knowing it exactly would take away (linear propagation, conditional covariance):
+g = d use / d z at the model, by differences; the variance of the use is g' V g with V the posterior covariance. What a
+group k of parameters adds is what knowing it exactly would take away (linear propagation, conditional covariance):
 
     added_k = g' V g - g_r' (V_rr - V_rk V_kk^-1 V_kr) g_r,   r: all others
 """
@@ -36,8 +36,8 @@ Effects = tuple[Effect, ...]
 
 
 class Contribution(Frozen):
-    """What one effect, or one part of the camera, adds to the variance of a use: its share, and the standard deviation, per cent of the use,
-    that its own uncertainty makes."""
+    """What one effect, or one part of the camera, adds to the variance of a use: its share, and the standard deviation,
+    per cent of the use, that its own uncertainty makes."""
 
     name: str
     parameters: tuple[str, ...]

@@ -1,4 +1,5 @@
-"""What is changed between the session that a model was fitted to and the one that is predicted, and the model that carries it."""
+"""What is changed between the session that a model was fitted to and the one that is predicted, and the model that
+carries it."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ class Changes(Frozen):
     radiance_factor: Annotated[float | None, Quantity("1", "factor on the light", lower=1e-6, upper=1e6)] = None
 
     def spectrum(self) -> Spectrum | None:
-        """The changed lamp's radiance, W sr^-1 m^-2 nm^-1; None: the plan's. Raises InputError for a file that can't be used."""
+        """The changed lamp's radiance, W sr^-1 m^-2 nm^-1; None: the plan's. Raises InputError for a file that can't be
+        used."""
         if self.lamp is None:
             return None
         try:
@@ -78,7 +80,8 @@ def carried(content: CameraFile, changes: Changes) -> CameraFile:
     if changes.f_number is not None:
         if not isinstance(camera.lens.imaging, DiffractionLimited):
             raise InputError(
-                f"f_number={changes.f_number:g}: the model's lens is {camera.lens.imaging.kind}, which holds for f/{camera.lens.f_number:g} alone; "
+                f"f_number={changes.f_number:g}: the model's lens is {camera.lens.imaging.kind}, which holds for "
+                f"f/{camera.lens.f_number:g} alone; "
                 "give lens=FILE.zmx at that aperture"
             )
         lens = camera.lens.model_copy(update={"f_number": changes.f_number})
@@ -87,18 +90,21 @@ def carried(content: CameraFile, changes: Changes) -> CameraFile:
     if changes.temperature_c is not None:
         if reference_c is None:
             raise InputError(
-                f"temperature_c={changes.temperature_c:g}: the model doesn't say at which temperature its dark current holds; fit darks with temperature_c"
+                f"temperature_c={changes.temperature_c:g}: the model doesn't say at which temperature its dark "
+                "current holds; fit darks with temperature_c"
             )
         if abs(changes.temperature_c - reference_c) > SAME_C and not has_dark_law(content):
             raise InputError(
-                f"temperature_c={changes.temperature_c:g}: the model has no law of dark current beyond {reference_c:g} C; fit darks at two temperatures, or state "
+                f"temperature_c={changes.temperature_c:g}: the model has no law of dark current beyond "
+                f"{reference_c:g} C; fit darks at two temperatures, or state "
                 "dark_current_doubling_c in the camera file"
             )
     if changes.distance_mm is not None:
         focal_mm = camera.lens.focal_length_mm
         if changes.distance_mm <= 2.0 * focal_mm:
             raise InputError(
-                f"distance_mm={changes.distance_mm:g}: isn't above twice the focal length, {focal_mm:g} mm; give a larger one, or state focal_length_mm"
+                f"distance_mm={changes.distance_mm:g}: isn't above twice the focal length, {focal_mm:g} mm; give a "
+                "larger one, or state focal_length_mm"
             )
     return content
 

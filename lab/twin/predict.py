@@ -2,8 +2,8 @@
 
 mean = m(effects) + J E(z),   covariance = S + J cov(z) J'
 
-J is the Jacobian of the diagnosis's measurement model by nuisance parameters, effects' parameters and patches' reflectances, z their
-posterior (`lab.formats.model_posterior`), S noise, floors and the laws' tolerances.
+J is the Jacobian of the diagnosis's measurement model by nuisance parameters, effects' parameters and patches'
+reflectances, z their posterior (`lab.formats.model_posterior`), S noise, floors and the laws' tolerances.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def predict(
 
     light_std : relative standard deviation of the light to come, beside what the plan states
 
-    Raises InputError for a change that a model can't carry, before anything is computed, and where nothing can be predicted.
-    """
+    Raises InputError for a change that a model can't carry, before anything is computed, and where nothing can be
+    predicted."""
     sides = [side for side in plan.sides if side in models]
     if not sides:
         raise InputError(f"{plan.source}: no camera that the model has; give the plan of the same cameras")
@@ -83,14 +83,15 @@ def predict(
 
 
 def posterior_of(content: CameraFile) -> ModelPosterior:
-    """How well the model's parameters are known: its posterior, else one of independent parameters by the camera's `std`. Raises InputError
-    where it states neither."""
+    """How well the model's parameters are known: its posterior, else one of independent parameters by the camera's
+    `std`. Raises InputError where it states neither."""
     if content.posterior is not None:
         return content.posterior
     camera = content.camera
     if not camera.std:
         raise InputError(
-            f"{content.name}: the model states no uncertainties; take one that `diagnose --save` or `fit --write-cameras` wrote"
+            f"{content.name}: the model states no uncertainties; take one that `diagnose --save` or `fit "
+            "--write-cameras` wrote"
         )
     gain, std = camera.conversion_gain_dn_per_e, camera.std
     first = FirstEstimates(
@@ -121,7 +122,8 @@ def measured_blocks(study: Study) -> tuple[list[Block], list[Skipped]]:
 
 
 def is_predicted(block: Block, label: Label) -> bool:
-    """Whether a twin predicts a block's number: transfer functions by their real parts up to Nyquist, all else wholly."""
+    """Whether a twin predicts a block's number: transfer functions by their real parts up to Nyquist, all else
+    wholly."""
     return block.measurement is not SLANTED_EDGE or (
         label.x <= NYQUIST_CY_PER_PX and not label.condition.endswith(ASIDE)
     )
@@ -145,7 +147,10 @@ def _side(
     is_level = np.array([b.measurement.is_level for b in blocks for _ in b.labels])
     full = is_level & (mean > HIGHEST_SHARE * study.saturation_dn)
     if full.any():
-        reason = f"{full.sum()} levels are above {100 * HIGHEST_SHARE:g} % of saturation, {study.saturation_dn:.4g} DN: plan shorter exposures"
+        reason = (
+            f"{full.sum()} levels are above {100 * HIGHEST_SHARE:g} % of saturation, {study.saturation_dn:.4g} DN: "
+            "plan shorter exposures"
+        )
         skipped.append(Skipped(step="twin saturation", reason=reason, side=side))
         use &= ~full
     without = {}
@@ -168,8 +173,8 @@ def _side(
 
 
 def _study(content: CameraFile, posterior: ModelPosterior, session: RecordingSet, side: Side) -> tuple[Study, float]:
-    """The study of the session to come, whose figures are the model's; and the relative standard deviation of its dark current by the
-    camera's own doubling temperature."""
+    """The study of the session to come, whose figures are the model's; and the relative standard deviation of its dark
+    current by the camera's own doubling temperature."""
     camera, first = content.camera, posterior.first
     captures: list[Capture] = session.captures(side=side)
     gain = gain_dn_per_e(camera, captures[0].gain_db or 0.0)
@@ -300,7 +305,8 @@ def _numbers(
             found.append(
                 PredictedNumber.model_validate(
                     {
-                        "quantity": name, "captures": label.captures, "channel": label.channel, "where": label.condition,
+                        "quantity": name, "captures": label.captures, "channel": label.channel,
+                        "where": label.condition,
                         "x": label.x, "predicted": value, "std": std, **update,
                     }
                 )

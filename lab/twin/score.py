@@ -24,7 +24,8 @@ from sim.spectrum import FloatArray
 
 #: Half width of a 95 % interval, in standard deviations.
 WIDTH_95 = float(norm.ppf(0.975))
-#: Most relative change of an exposure, change of a temperature (C) and of a corner (px) that still is the session that was predicted.
+#: Most relative change of an exposure, change of a temperature (C) and of a corner (px) that still is the session that
+#: was predicted.
 MOST_EXPOSURE, MOST_C, MOST_PX = 0.25, 3.0, 4.0
 #: Least change of the logarithm of the likelihood that an effect makes for its name to be tested.
 LEAST_GAIN = 2.0
@@ -110,7 +111,8 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
         missing += len(prediction.numbers) - len(here)
         if not here:
             raise InputError(
-                f"{recordings.source}: none of the {side} camera's predicted numbers is measured there; give the session that was predicted"
+                f"{recordings.source}: none of the {side} camera's predicted numbers is measured there; give the "
+                "session that was predicted"
             )
         moved = np.array([_moved(prediction.numbers[i], prediction, recordings, measured) for i in here])
         seen = np.array([measured[prediction.numbers[i].key][0] for i in here])
@@ -125,12 +127,14 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
         numbers += [_scored(side, prediction.numbers[i], m, v) for i, m, v in zip(here, moved, seen, strict=True)]
     return TwinScore(
         source=recordings.source, quantities=tuple(_quantity(name, numbers, value) for name, value in parts.items()),
-        effects=tuple(effects), chi2=whole, n=len(numbers), numbers=tuple(numbers), missing=missing, skipped=tuple(skipped),
+        effects=tuple(effects), chi2=whole, n=len(numbers), numbers=tuple(numbers), missing=missing,
+        skipped=tuple(skipped),
     )  # fmt: skip
 
 
 def check_session(prediction: SidePrediction, recordings: RecordingSet, side: Side) -> None:
-    """Raises InputError where the recordings aren't of the session that was predicted: another data sheet, gain or setting."""
+    """Raises InputError where the recordings aren't of the session that was predicted: another data sheet, gain or
+    setting."""
     stated = recordings.camera(side)
     isnt = f"{recordings.source}: isn't the session that was predicted:"
     for key in SHEET:
@@ -173,7 +177,8 @@ def _with_curves(recordings: RecordingSet, prediction: SidePrediction, camera: C
 
 def _key(quantity: str, label: object) -> tuple[object, ...]:
     return PredictedNumber(
-        quantity=quantity, captures=label.captures, channel=label.channel, where=label.condition, x=label.x, predicted=0.0, std=0.0  # type: ignore[attr-defined]
+        quantity=quantity, captures=label.captures, channel=label.channel, where=label.condition, x=label.x,
+        predicted=0.0, std=0.0  # type: ignore[attr-defined]
     ).key  # fmt: skip
 
 
@@ -216,7 +221,8 @@ def _tested(side: Side, name: str, residual: FloatArray, change: FloatArray, cov
 def _scored(side: Side, number: PredictedNumber, moved: float, seen: float) -> ScoredNumber:
     away = seen - moved
     return ScoredNumber(
-        side=side, quantity=number.quantity, captures=number.captures, channel=number.channel, where=number.where, x=number.x,
+        side=side, quantity=number.quantity, captures=number.captures, channel=number.channel, where=number.where,
+        x=number.x,
         predicted=moved, std=number.std, measured=seen, deviation=away, deviation_sigma=away / number.std,
         deviation_percent=100.0 * away / max(abs(moved), 1e-12),
     )  # fmt: skip

@@ -24,8 +24,8 @@ class PredictedNumber(Frozen):
     quantity : the measurement: `chart`, `noise` (a temporal variance), `slanted_edge` (an MTF), `dark`
     fixed : the part that neither exposure nor temperature changes
     dark : the part by dark current, in proportion to the exposure, growing by exp(`warmth_per_c` x rise)
-    level_dn, level_slope : of a variance: the mean signal above black that it is predicted for, and its derivative by that
-    """
+    level_dn, level_slope : of a variance: the mean signal above black that it is predicted for, and its derivative by
+    that"""
 
     quantity: str
     captures: tuple[str, ...]
@@ -48,8 +48,8 @@ class PredictedNumber(Frozen):
 
 
 class SidePrediction(Frozen):
-    """The predictions of one camera. `covariance`: the lower triangle (n (n + 1) / 2), row by row, of noise and parameters together. `without`: the
-    numbers (n,) as they would be without an effect, by its name."""
+    """The predictions of one camera. `covariance`: the lower triangle (n (n + 1) / 2), row by row, of noise and
+    parameters together. `without`: the numbers (n,) as they would be without an effect, by its name."""
 
     camera: DataSheet
     captures: tuple[AnyCapture, ...]

@@ -1,4 +1,5 @@
-"""The session that is to come: the plan's captures with the changes, drawn by the model, so that the measuring layer can look at them."""
+"""The session that is to come: the plan's captures with the changes, drawn by the model, so that the measuring layer
+can look at them."""
 
 from __future__ import annotations
 
@@ -33,8 +34,8 @@ SENSOR = ("rows", "cols", "cfa", "bit_depth")
 def future_session(
     content: CameraFile, plan: RecordingSet, side: Side, changes: Changes, seed: int = SEED
 ) -> RecordingSet:
-    """The captures of one side that a twin predicts, with `changes`, as `content` draws them. Raises InputError where the plan is of another
-    camera, doesn't say where its edges are, or holds several gains."""
+    """The captures of one side that a twin predicts, with `changes`, as `content` draws them. Raises InputError where
+    the plan is of another camera, doesn't say where its edges are, or holds several gains."""
     stated = plan.camera(side)
     check_sensor(content, stated, plan.source)
     captures = [_changed(c, changes) for c in plan.captures(side=side) if isinstance(c, PREDICTED)]
@@ -66,7 +67,8 @@ def check_sensor(content: CameraFile, stated: DataSheet, source: str) -> None:
     for name in SENSOR:
         if getattr(stated, name) != getattr(content.camera, name):
             raise InputError(
-                f"{source}: {name} is {getattr(stated, name)}, the model's is {getattr(content.camera, name)}; give the plan of this camera"
+                f"{source}: {name} is {getattr(stated, name)}, the model's is {getattr(content.camera, name)}; give "
+                "the plan of this camera"
             )
 
 

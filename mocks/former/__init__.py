@@ -1,8 +1,8 @@
 """A second lab's camera: an image former of its own, which conceals physics in recordings.
 
-It shares no stage and no code with `sim`: an error of `sim` can't cancel against the same error here. `law` and `laws` hold the concealed physics,
-`camera` the sensor and its frames, `transfer` the lens, `scenes` the targets, `session` the order of the captures. What comes out is plain data
-(`DrawnSession`); `lab.challenge` makes recording sets of it.
+It shares no stage and no code with `sim`: an error of `sim` can't cancel against the same error here. `law` and `laws`
+hold the concealed physics, `camera` the sensor and its frames, `transfer` the lens, `scenes` the targets, `session` the
+order of the captures. What comes out is plain data (`DrawnSession`); `lab.challenge` makes recording sets of it.
 """
 
 from mocks.former.camera import ConcealedCamera

@@ -1,6 +1,7 @@
 """A camera of another make than `sim`'s, with concealed laws built in, and its raw frames.
 
-Poisson numbers are drawn by inversion of one normal number a pixel, so that a camera with a law and the same camera without it make the same
+Poisson numbers are drawn by inversion of one normal number a pixel, so that a camera with a law and the same camera
+without it make the same
 noise: the difference of two recordings is the law's alone.
 """
 
@@ -29,11 +30,12 @@ class ConcealedCamera:
     side                "left" or "right" of a pair
     offset_mm           distance to the right of the pair's left camera
     pair_middle_mm      where boards stand that both cameras see
-    bit_depth           of the converter; a code of another depth than 12 has as much more or less charge, so that the full well stays
-    """
+    bit_depth           of the converter; a code of another depth than 12 has as much more or less charge, so that the
+    full well stays"""
 
     def __init__(
-        self, seed: int, laws: Sequence[Law] = (), *, cfa: str | None = None, f_number: float | None = None, rows: int = 384, cols: int = 512, noise_draw: int = 0,
+        self, seed: int, laws: Sequence[Law] = (), *, cfa: str | None = None, f_number: float | None = None,
+        rows: int = 384, cols: int = 512, noise_draw: int = 0,
         side: str = "left", offset_mm: float = 0.0, pair_middle_mm: float = 0.0, bit_depth: int = BIT_DEPTH,
     ) -> None:  # fmt: skip
         self.side, self.offset_mm, self.pair_middle_mm = side, offset_mm, pair_middle_mm
@@ -130,7 +132,8 @@ class ConcealedCamera:
         return {c: np.full((self.rows, self.cols), self.rate(radiance, c, kind)) for c in self.quantum_efficiency}
 
     def nominal_rate(self, radiance: Array) -> float:
-        """Electrons a second of the brightest channel by the stated curves: exposures follow it, so that they don't tell what is concealed."""
+        """Electrons a second of the brightest channel by the stated curves: exposures follow it, so that they don't
+        tell what is concealed."""
         photons = radiance * WAVELENGTH_NM / HC_J_NM * np.pi / (4 * self.f_number**2 + 1) * self.lens_transmittance
         brightest = max(float((photons * q).sum()) for q in self.stated_efficiency.values())
         return brightest * self.fill_factor * (self.pitch_um * 1e-6) ** 2
@@ -196,8 +199,8 @@ class ConcealedCamera:
 
 
 def poisson(mean: Array, z: Array) -> Array:
-    """Poisson numbers of the given means from standard normal ones, monotonic in both: by inversion for small means, else by the normal
-    quantile with its skewness (Cornish and Fisher 1938)."""
+    """Poisson numbers of the given means from standard normal ones, monotonic in both: by inversion for small means,
+    else by the normal quantile with its skewness (Cornish and Fisher 1938)."""
     out = np.round(mean + np.sqrt(mean) * z + (z * z - 1.0) / 6.0)
     small = mean < NORMAL_FROM_E
     if np.any(small):
@@ -206,7 +209,8 @@ def poisson(mean: Array, z: Array) -> Array:
 
 
 def _poisson_quantile(mean: Array, probability: Array) -> Array:
-    """Least k at which the distribution function of a Poisson number reaches a probability, by adding its terms exp(-m) m^k / k!."""
+    """Least k at which the distribution function of a Poisson number reaches a probability, by adding its terms exp(-m)
+    m^k / k!."""
     k = np.zeros_like(mean)
     term = np.exp(-mean)
     left = np.flatnonzero((probability > term) & (mean > 0))  # not reached by the terms up to `number`

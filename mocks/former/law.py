@@ -1,4 +1,5 @@
-"""The base class of the concealed laws, and the grid of wavelengths on which the former draws and integrates spectra."""
+"""The base class of the concealed laws, and the grid of wavelengths on which the former draws and integrates
+spectra."""
 
 from __future__ import annotations
 
@@ -25,10 +26,10 @@ DARK = frozenset({"dark"})
 class Law:
     """One piece of physics that a camera conceals, built into the stages of `ConcealedCamera`.
 
-    A subclass overrides the methods of the stages that it changes; by default none changes anything. `effect` is its name in the list
-    of effects (docs/reference/results.md), None where that list has none. A law has a `strength` in `unit` and one of `variants` forms, which the
-    subclass's docstring lists in their order. Frame numbers `k` select the random numbers, so that a frame can be drawn again.
-    """
+    A subclass overrides the methods of the stages that it changes; by default none changes anything. `effect` is its
+    name in the list of effects (docs/reference/results.md), None where that list has none. A law has a `strength` in
+    `unit` and one of `variants` forms, which the subclass's docstring lists in their order. Frame numbers `k` select
+    the random numbers, so that a frame can be drawn again."""
 
     name: ClassVar[str]
     effect: ClassVar[str | None] = None
@@ -70,13 +71,15 @@ class Law:
         return self.effect
 
     def library_parameters(self) -> dict[str, float]:
-        """True values of the parameters that the library's effect of this name has, where the variant defines the same quantity."""
+        """True values of the parameters that the library's effect of this name has, where the variant defines the same
+        quantity."""
         return {}
 
     # illumination
 
     def radiance(self, radiance: Array, kind: str) -> Array:
-        """Spectral radiance (W sr^-1 m^-2 nm^-1, at WAVELENGTH_NM) that arrives where the radiometer read `radiance`."""
+        """Spectral radiance (W sr^-1 m^-2 nm^-1, at WAVELENGTH_NM) that arrives where the radiometer read
+        `radiance`."""
         return radiance
 
     def source_factor(self, elapsed_s: float) -> float:

@@ -1,7 +1,7 @@
 """Images of targets on the sensor, e-/s by channel before shading: edge, board, screen pattern, colour chart.
 
-An edge is the integral of the line spread function along its normal; patterns are drawn on a grid four times finer than the pixels.
-"""
+An edge is the integral of the line spread function along its normal; patterns are drawn on a grid four times finer than
+the pixels."""
 
 from __future__ import annotations
 
@@ -133,7 +133,8 @@ def pattern(
 
 
 def chart(camera: ConcealedCamera, light: Array, box: tuple[int, int, int, int]) -> dict[str, Array]:
-    """A ColorChecker of published reflectances on a grey card; `box`: first and last row and column (row0, col0, row1, col1)."""
+    """A ColorChecker of published reflectances on a grey card; `box`: first and last row and column (row0, col0, row1,
+    col1)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from colour import SDS_COLOURCHECKERS

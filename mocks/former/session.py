@@ -20,7 +20,8 @@ LINE_SIGMA_NM = 4.2466  # a full width of 10 nm
 FLAT_LEVELS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.65, 0.8, 0.92)
 EDGE_ANGLES_DEG = (5.0, 95.0, -40.0, 2.6)
 BOARD_TILTS_DEG = (
-    (0, 0, 0), (35, 0, 3), (-35, 0, -4), (0, 35, 5), (0, -35, 2), (25, 25, -6), (-25, 25, 4), (25, -25, 8), (-25, -25, -3), (10, -15, 20),
+    (0, 0, 0), (35, 0, 3), (-35, 0, -4), (0, 35, 5), (0, -35, 2), (25, 25, -6), (-25, 25, 4), (25, -25, 8), (-25, -25,
+    -3), (10, -15, 20),
 )  # fmt: skip
 DARK_SIDE = 0.08  # of an edge
 SCREEN_BLACK = 0.0035  # of its white
@@ -52,7 +53,8 @@ WHOLE_SESSION = Plan()
 
 @dataclass(frozen=True)
 class DrawnSession:
-    """What a session hands out, as plain data: the manifest of a recording set (docs/reference/recording-set.md) and the files that it names.
+    """What a session hands out, as plain data: the manifest of a recording set (docs/reference/recording-set.md) and
+    the files that it names.
 
     Frames are raw DN, spectra values at WAVELENGTH_NM, targets cells of a screen.
     """
@@ -104,21 +106,26 @@ class _Recorder:
         camera = self.camera
         curves = {c: self.noted(q) for c, q in camera.stated_efficiency.items()}
         steps = {
-            "dark": self.darks, "flat": self.flats, "narrowband": self.sweep, "chart": self.chart, "slanted_edge": self.edges,
+            "dark": self.darks, "flat": self.flats, "narrowband": self.sweep, "chart": self.chart,
+            "slanted_edge": self.edges,
             "charuco": self.boards, "screen": self.screen,
         }  # fmt: skip
         for kind in plan.kinds:
             steps[kind](plan)
         stated = {
-            "rows": camera.rows, "cols": camera.cols, "pixel_pitch_um": camera.pitch_um, "fill_factor": camera.fill_factor, "cfa": camera.cfa,
-            "bit_depth": camera.bit_depth, "black_level_dn": camera.black_level_dn, "white_level_dn": camera.full_code_dn, "f_number": camera.f_number,
-            "focal_length_mm": camera.focal_length_mm, "lens_transmittance": camera.lens_transmittance, "quantum_efficiency": curves,
+            "rows": camera.rows, "cols": camera.cols, "pixel_pitch_um": camera.pitch_um,
+            "fill_factor": camera.fill_factor, "cfa": camera.cfa,
+            "bit_depth": camera.bit_depth, "black_level_dn": camera.black_level_dn,
+            "white_level_dn": camera.full_code_dn, "f_number": camera.f_number,
+            "focal_length_mm": camera.focal_length_mm, "lens_transmittance": camera.lens_transmittance,
+            "quantum_efficiency": curves,
         }  # fmt: skip
         manifest = {"name": name, "cameras": {camera.side: stated}, "captures": self.captures}
         return DrawnSession(manifest, self.frames, self.spectra, self.targets)
 
     def take(
-        self, kind: str, images: dict[str, Array] | None, exposure_s: float, repeats: int = 1, temperature_c: float = 25.0, **more: Any
+        self, kind: str, images: dict[str, Array] | None, exposure_s: float, repeats: int = 1,
+        temperature_c: float = 25.0, **more: Any
     ) -> None:  # fmt: skip
         """Expose and note `repeats` frames; `more`: what this kind of capture states besides."""
         for law in self.camera.laws:
@@ -129,7 +136,8 @@ class _Recorder:
             self.frames[path] = self.camera.expose(images, exposure_s, k, temperature_c)
             when = BEGIN + timedelta(seconds=STEP_S * k)
             self.captures.append(
-                {"id": f"{self.prefix}c{k:04d}", "kind": kind, "side": self.camera.side, "frame": path, "exposure_s": exposure_s,
+                {"id": f"{self.prefix}c{k:04d}", "kind": kind, "side": self.camera.side, "frame": path,
+                "exposure_s": exposure_s,
                  "temperature_c": temperature_c, "time": when.isoformat(), **more}
             )  # fmt: skip
 
@@ -184,7 +192,8 @@ class _Recorder:
         for light in lights:
             path, exposure_s = self.noted(light), camera.exposure_for(light, 0.8)
             for angle in EDGE_ANGLES_DEG:
-                self.take("slanted_edge", edge(camera, angle, light, DARK_SIDE), exposure_s, 2, region=region, angle_deg=angle,
+                self.take("slanted_edge", edge(camera, angle, light, DARK_SIDE), exposure_s, 2, region=region,
+                angle_deg=angle,
                           light_radiance=path, field_mm=[0.0, 0.0])  # fmt: skip
 
     def boards(self, plan: Plan) -> None:

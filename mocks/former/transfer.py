@@ -29,7 +29,8 @@ class Transfer:
         self._tables: dict[float, Array] = {}
 
     def otf(self, frequency_cy_px: Array, angle_rad: float, radiance: Array, channel: str) -> Array:
-        """Optical transfer function along a direction (from x) in light of `radiance`; complex where the image isn't symmetric."""
+        """Optical transfer function along a direction (from x) in light of `radiance`; complex where the image isn't
+        symmetric."""
         f = np.asarray(frequency_cy_px) / self.camera.pitch_um
         return (self._weights(radiance, channel) @ self._spectral(frequency_cy_px, angle_rad)) * self._achromatic(
             f * np.cos(angle_rad), f * np.sin(angle_rad)
@@ -41,7 +42,8 @@ class Transfer:
         return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
 
     def filtered(self, images: dict[str, Array], radiance: Array, over: int) -> dict[str, Array]:
-        """Images on a grid `over` times finer than the pixels, filtered by the OTF, at the pixels' centres. The borders are continued."""
+        """Images on a grid `over` times finer than the pixels, filtered by the OTF, at the pixels' centres. The borders
+        are continued."""
         out: dict[str, Array] = {}
         table_f = np.linspace(0, 2.9, 881)  # linear interpolation errs by 1e-5
         table_angle = np.linspace(-np.pi / 2, np.pi / 2, 25 if self._aberrated else 2)
@@ -76,7 +78,8 @@ class Transfer:
         return any(law.image_shift_px(np.zeros(1), np.zeros(1), 550.0) is not None for law in self.camera.laws)
 
     def unshifted(self, row: Array, col: Array, channel: str, radiance: Array) -> tuple[Array, Array]:
-        """Where (px) the light that arrives at a position would arrive without the laws' shifts, averaged over the detected spectrum."""
+        """Where (px) the light that arrives at a position would arrive without the laws' shifts, averaged over the
+        detected spectrum."""
         if not self.shifts_image:
             return row, col
         camera = self.camera

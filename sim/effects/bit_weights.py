@@ -1,4 +1,5 @@
-"""Bit weights: the lowest bits of the converter have wrong weights, so that the widths of codes repeat every few codes."""
+"""Bit weights: the lowest bits of the converter have wrong weights, so that the widths of codes repeat every few
+codes."""
 
 from __future__ import annotations
 

@@ -30,7 +30,8 @@ class ColouredLineNoise(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"exponent"})
     sentence: ClassVar[str] = (
-        "Rows or columns share noise whose power falls with the frequency: broad bands and fine stripes in one, anew in "
+        "Rows or columns share noise whose power falls with the frequency: broad bands and fine stripes in one, anew "
+        "in "
         "every frame, dark or bright."
     )
 

@@ -28,7 +28,8 @@ class ResponseKnee(Effect):
     name: ClassVar[str] = "response_knee"
     family: ClassVar[Family] = Family.RESPONSE
     reference: ClassVar[str] = (
-        "EMVA Standard 1288 release 4.0 General, piecewise linear response; O. Yadid-Pecht, Wide-dynamic-range sensors, "
+        "EMVA Standard 1288 release 4.0 General, piecewise linear response; O. Yadid-Pecht, Wide-dynamic-range "
+        "sensors, "
         "Optical Engineering 38 (1999) 1650"
     )
     form_tolerance: ClassVar[float] = 0.05

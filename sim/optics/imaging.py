@@ -221,8 +221,13 @@ class MeasuredOtf(Frozen):
     def _check(self) -> Self:
         _check_wavelengths(self.wavelength_nm)
         x, y = np.array(self.frequency_x_cy_per_um), np.array(self.frequency_y_cy_per_um)
-        if x.size < 2 or x[0] != 0.0 or np.any(np.diff(x) <= 0) or np.any(np.diff(y) <= 0) or 0.0 not in [*y,
-                                                                                                          *([0.0] if not y.size else [])]:  # fmt: skip
+        if (
+            x.size < 2
+            or x[0] != 0.0
+            or np.any(np.diff(x) <= 0)
+            or np.any(np.diff(y) <= 0)
+            or 0.0 not in [*y, *([0.0] if not y.size else [])]
+        ):
             raise ValueError(
                 f"frequencies {x[:3].tolist()}... and {y[:3].tolist()}... cy/um have to ascend, from 0 along x and "
                 "from or through 0 along y: sort them, and give the transfer at 0"

@@ -171,10 +171,9 @@ def transfer(
     """Complex OTF along x (sagittal) and along y (tangential) of an image about `origin_mm`; 1 at frequency 0.
 
     Autocorrelation of the pupil in direction cosines: H(f) = integral A(s + a/2) A*(s - a/2) ds / integral |A|^2 ds,
-    |a| = f wavelength / n, A = sqrt(K / J) exp(2 pi i W / wavelength). W and sqrt(K / J) are Chebyshev sums fitted to the rays;
-    the overlap of the pupil with its shifted self is laid out by Gauss-Legendre nodes between its chords: no window
-    cuts anything off. Good where lines along the frequency cut the rim twice, which convex pupils grant.
-    """
+    |a| = f wavelength / n, A = sqrt(K / J) exp(2 pi i W / wavelength). W and sqrt(K / J) are Chebyshev sums fitted to
+    the rays; the overlap of the pupil with its shifted self is laid out by Gauss-Legendre nodes between its chords: no
+    window cuts anything off. Good where lines along the frequency cut the rim twice, which convex pupils grant."""
     wave = _FittedWave.of(rays, origin_mm)
     frequency = np.atleast_1d(np.asarray(frequency_lp_per_mm, float))
     return wave.transfer(frequency, False), wave.transfer(frequency, True)

@@ -60,7 +60,7 @@ kind = "cap"
 
 [targets.sphere]
 kind = "sphere"
-"""
+"""  # noqa: E501
 
 
 @dataclass

@@ -127,7 +127,7 @@ def test_a_capture_is_looked_at(shared: Running) -> None:
         assert client.effect(client.effects()[0].name) == client.effects()[0] and client.parameters()
 
 
-# --- the plugin --------------------------------------------------------------------------------------------------------
+# --- the plugin -------------------------------------------------------------------------------------------------------
 
 
 def test_a_reference_is_written_kept_and_compared(tmp_path: Path) -> None:

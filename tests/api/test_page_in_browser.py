@@ -1,4 +1,5 @@
-"""The operator's page in a real Chromium: axe, light and dark, a phone's width, the keyboard, the halt button, a calibration certified.
+"""The operator's page in a real Chromium: axe, light and dark, a phone's width, the keyboard, the halt button, a
+calibration certified.
 
 `make chromium` installs the browser. Without one these tests are skipped on a desk, and fail in CI.
 """
@@ -30,7 +31,7 @@ PATIENCE_MS = 30_000.0
 DROP = """async ([name, content]) => {
     const data = new DataTransfer();
     data.items.add(new File([Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0))], name));
-    document.getElementById("PLACE").dispatchEvent(new DragEvent("drop", {dataTransfer: data, bubbles: true, cancelable: true})) }"""
+    document.getElementById("PLACE").dispatchEvent(new DragEvent("drop", {dataTransfer: data, bubbles: true, cancelable: true})) }"""  # noqa: E501
 FINISHED = "#sessions tr:first-child .state.finished"
 
 
@@ -55,7 +56,8 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """A service with a finished session that was calibrated three times, the last one drifted; a session that is held; a recording set."""
+    """A service with a finished session that was calibrated three times, the last one drifted; a session that is held;
+    a recording set."""
     with serving(tmp_path_factory.mktemp("data")) as running, running.client() as client:
         (running.store.root / "limits.toml").write_text(LIMITS)
         asked = {"station": "fakes", "quick": True, "sequences": ["dark", "flat"], "name": "nightly"}
@@ -129,7 +131,8 @@ class Watched:
         return found
 
     def tab_to(self, wanted: str) -> None:
-        """Go on with Tab until the element of that text or name is reached; what is passed shows that it has the focus."""
+        """Go on with Tab until the element of that text or name is reached; what is passed shows that it has the
+        focus."""
         for _ in range(60):
             self.page.keyboard.press("Tab")
             on = self.focused()
@@ -156,7 +159,8 @@ class Watched:
 
 @pytest.mark.parametrize(("scheme", "viewport"), [("light", PHONE), ("dark", DESK)])
 def test_the_page_is_accessible(browser: Any, lab: Running, scheme: str, viewport: dict[str, int]) -> None:
-    """axe finds nothing serious in the log-in, the desk with all it can show, and the certificate; nothing runs off the screen."""
+    """axe finds nothing serious in the log-in, the desk with all it can show, and the certificate; nothing runs off the
+    screen."""
     watched = Watched(browser, lab, scheme, viewport)
     assert watched.serious() == [] and watched.sideways_px() == 0
     watched.log_in(lab)

@@ -305,7 +305,7 @@ def test_no_answer_names_a_path_of_the_server(running: Running, monkeypatch: pyt
         assert root not in answer and not found, (found, answer[:400])
 
 
-# --- Host, Origin ------------------------------------------------------------------------------------------------------
+# --- Host, Origin -----------------------------------------------------------------------------------------------------
 
 
 def raw(running: Running, request: str) -> str:
@@ -358,7 +358,7 @@ def test_no_answer_invites_other_sites(shared: Running) -> None:
             assert not [name for name in response.headers if name.startswith("access-control")]
 
 
-# --- headers and bodies ------------------------------------------------------------------------------------------------
+# --- headers and bodies -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", ["/", "/docs", "/health", "/static/operator.js", "/api/v1/me", "/nothing"])
@@ -406,7 +406,8 @@ def test_a_large_body_is_refused_stated_or_not(shared: Running) -> None:
 def test_no_path_leads_to_a_file(shared: Running, path: str) -> None:
     answer = raw(
         shared,
-        f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {shared.keys['admin']}\r\nConnection: close\r\n\r\n",
+        f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {shared.keys['admin']}\r\nConnection: "
+        "close\r\n\r\n",
     )
     assert answer.split()[1] in ("404", "422"), answer[:200]
     assert "root:" not in answer and "SQLite" not in answer and "import" not in answer

@@ -1,4 +1,5 @@
-"""Every driver that has an entry point keeps its family's contract, with its mock or its library's own camera at the other end."""
+"""Every driver that has an entry point keeps its family's contract, with its mock or its library's own camera at the
+other end."""
 
 from __future__ import annotations
 

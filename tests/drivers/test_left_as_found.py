@@ -21,7 +21,8 @@ from mocks.u3v import LIGHT_SOURCE, TRIGGER_CONTROL, U3vDevice
 from mocks.usb import InProcessBackend, UsbIpServer
 from mocks.wire import Tcp
 
-#: Uses an instrument and says so, then waits to be killed. Its arguments: the driver's module and class, the address, the folder, the use.
+#: Uses an instrument and says so, then waits to be killed. Its arguments: the driver's module and class, the address,
+#: the folder, the use.
 USER = """
 import sys, time
 from importlib import import_module

@@ -1,8 +1,9 @@
-"""Clients that know nothing of calibench, on each mock after the project's driver has used the instrument and let it go.
+"""Clients that know nothing of calibench, on each mock after the project's driver has used the instrument and let it
+go.
 
-They are packages of the index (the extra `dev`); those spectroradiometers for which the index has none that this environment takes are
-told their makers' commands on a plain serial port. For USB3 Vision cameras it has none, either; seabreeze is what the driver of the
-Ocean Optics spectrometers stands on.
+They are packages of the index (the extra `dev`); those spectroradiometers for which the index has none that this
+environment takes are told their makers' commands on a plain serial port. For USB3 Vision cameras it has none, either;
+seabreeze is what the driver of the Ocean Optics spectrometers stands on.
 """
 
 from __future__ import annotations
@@ -110,7 +111,8 @@ def ask_as_the_manual_has_it(port: serial.Serial, command: str, lines: int = 1) 
 def test_pr655_by_the_makers_commands(
     served: Callable[..., str], tmp_path: Path, model: str, step_nm: float, dialect: str, header_lines: int
 ) -> None:
-    """The maker's sequence (PR-655 manual, remote mode) on a plain serial port: the index has no client of a free licence."""
+    """The maker's sequence (PR-655 manual, remote mode) on a plain serial port: the index has no client of a free
+    licence."""
     address = served(PhotoResearch(Lamp(20.0), model=model, dialect=dialect), Pty(tmp_path / "pr"))
     with Pr655(address) as ours:
         expected = ours.measure().radiance_w_sr_m2_nm

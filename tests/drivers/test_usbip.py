@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from drivers.errors import Disconnected
 from drivers.usbip import Configuration, UsbIpBackend, find, open_device
 
-# A device 1209:000a at bus id 1-1: path, bus id, busnum 1, devnum 5, speed 5, ids, release, class, configurations, interfaces.
+# A device 1209:000a at bus id 1-1: path, bus id, busnum 1, devnum 5, speed 5, ids, release, class, configurations,
+# interfaces.
 DEVICE = (
     b"/sys/devices/x".ljust(256, b"\0")
     + b"1-1".ljust(32, b"\0")

@@ -1,4 +1,5 @@
-"""Jobs: their rows in the table, from the queue to the result, through failures, cancelling and the end of a process."""
+"""Jobs: their rows in the table, from the queue to the result, through failures, cancelling and the end of a
+process."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ def session(store: Store) -> str:
 
 
 def with_task(monkeypatch: pytest.MonkeyPatch, task: Callable[[PipelineRequest, Tell], object]) -> None:
-    """Jobs do `task` in place of the pipeline; what it returns is kept under the job's id, as the pipeline keeps its goal."""
+    """Jobs do `task` in place of the pipeline; what it returns is kept under the job's id, as the pipeline keeps its
+    goal."""
 
     def pipeline(request: PipelineRequest, tell: Tell, *, store: Store, capturer: object) -> None:
         task(request, tell)

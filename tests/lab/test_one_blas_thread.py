@@ -1,4 +1,5 @@
-"""The numerics have one thread for linear algebra, whoever calls them; afterwards the process has its own number again."""
+"""The numerics have one thread for linear algebra, whoever calls them; afterwards the process has its own number
+again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The pipeline: which steps each goal takes, what is kept, cancelling, and resolving. The steps themselves are stand-ins."""
+"""The pipeline: which steps each goal takes, what is kept, cancelling, and resolving. The steps themselves are
+stand-ins."""
 
 from __future__ import annotations
 
@@ -85,7 +86,7 @@ class Bench:
         return capture_here(self.store, fake_bench.station(), request, tell, self.bench.drivers)
 
 
-# --- goals ---------------------------------------------------------------------------------------------------------------
+# --- goals ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("goal", ["fit", "validate", "diagnose", "report"])
@@ -182,7 +183,7 @@ def test_a_source_is_a_folder_or_a_session(
             source_recordings(source, lambda opened=opened: opened)
 
 
-# --- the whole pipeline --------------------------------------------------------------------------------------------------
+# --- the whole pipeline -----------------------------------------------------------------------------------------------
 
 
 def test_the_whole_pipeline_captures_and_leaves_everything_in_the_sessions_folder(
@@ -259,7 +260,7 @@ def test_only_with_a_station_is_anything_captured(store: Store) -> None:
         run_pipeline(PipelineRequest("capture", capture=CaptureRequest()), store=store)
 
 
-# --- resolving -----------------------------------------------------------------------------------------------------------
+# --- resolving --------------------------------------------------------------------------------------------------------
 
 
 def proposal(capture: str, distance: float = 9.0, told_apart: float = 0.98, can_take: bool = True) -> CaptureProposal:

@@ -39,7 +39,8 @@ def _darks() -> RecordingSet:
         for k in range(8):
             name = f"dark-{side}-{k}"
             captures.append(
-                {"id": name, "kind": "dark", "side": side, "frame": f"frames/{name}.npy", "exposure_s": (0.01, 0.4)[k % 2],
+                {"id": name, "kind": "dark", "side": side, "frame": f"frames/{name}.npy", "exposure_s": (0.01,
+                0.4)[k % 2],
                  "time": f"2026-03-01T10:{5 * k:02d}:00Z", "temperature_c": 25.0}
             )  # fmt: skip
             frames[f"frames/{name}.npy"] = np.round(rng.normal(BLACK_DN, 2.0, (ROWS, COLS))).astype(np.uint16)

@@ -1,4 +1,5 @@
-"""The same work in this process, in processes of this computer and on a Dask cluster of worker processes: the same results."""
+"""The same work in this process, in processes of this computer and on a Dask cluster of worker processes: the same
+results."""
 
 from __future__ import annotations
 

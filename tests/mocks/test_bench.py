@@ -284,7 +284,8 @@ class TestTargets:
             assert (angle - region["angle_deg"] + 180) % 360 - 180 == pytest.approx(0, abs=1.5)
 
     def test_edge_profile_is_the_lens_and_filters(self, bench: Bench) -> None:
-        """A row through the sharp camera's centre edge, against the profile of the forward model at the fitted place."""
+        """A row through the sharp camera's centre edge, against the profile of the forward model at the fitted
+        place."""
         bench.place("edge-1")
         camera = hidden_truth(1).cameras["right"]
         rate = bench._light_rate("right")

@@ -1,7 +1,8 @@
-"""Every effect of the library is concealed on the bench, and the bench's frames are those that the forward model predicts.
+"""Every effect of the library is concealed on the bench, and the bench's frames are those that the forward model
+predicts.
 
-Predictions start from the scene and the radiometer's readings and use `sim.frame.expected_sequence`; the bench exposes frame by frame, with
-its own settings, clock and temperature.
+Predictions start from the scene and the radiometer's readings and use `sim.frame.expected_sequence`; the bench exposes
+frame by frame, with its own settings, clock and temperature.
 """
 
 from __future__ import annotations
@@ -160,8 +161,8 @@ def read_by(bench: Bench, kind: str) -> UniformField:
 def predicted(
     camera: HiddenCamera, exposures: Sequence[Exposure], effects: tuple[Effect, ...], gains: Sequence[float]
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Mean and variance (DN) of every frame of a sequence, by the forward model, an unsteady source's light as it was; `gains` of the
-    light."""
+    """Mean and variance (DN) of every frame of a sequence, by the forward model, an unsteady source's light as it was;
+    `gains` of the light."""
     found = []
     model = camera.model
     fine = any(isinstance(exposure.scene, ScreenPattern) for exposure in exposures)

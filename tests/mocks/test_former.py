@@ -99,7 +99,8 @@ def test_the_pupil_s_overlap_without_aberration_is_the_same() -> None:
 
 
 def test_strong_defocus_blurs_by_a_disc() -> None:
-    """Geometrical limit: a disc of diameter dz / N, 2 J1(q) / q with q = pi D f; the axis between the sphere and the parabola."""
+    """Geometrical limit: a disc of diameter dz / N, 2 J1(q) / q with q = pi D f; the axis between the sphere and the
+    parabola."""
     camera = ConcealedCamera(31, [DefocusLaw(60.0, 1)], cfa="MONO", f_number=2.0, rows=32, cols=32)
     f = np.array([0.01, 0.02, 0.03, 0.04])
     q = np.pi * 60.0 / camera.f_number * f / camera.pitch_um
@@ -118,7 +119,8 @@ def test_a_split_has_its_null_and_diffusion_its_gaussian() -> None:
 
 
 def test_an_edge_has_the_transfer_it_was_made_from() -> None:
-    """Through the slanted-edge estimator, within four of its standard uncertainties and 0.003 for the short region's levels."""
+    """Through the slanted-edge estimator, within four of its standard uncertainties and 0.003 for the short region's
+    levels."""
     camera = mono(rows=200, cols=200)
     frequency = np.arange(1, 11) * 0.05
     light = edge(camera, 5.0, LAMP, 0.08)["Y"] / camera.rate(LAMP, "Y")
@@ -129,7 +131,8 @@ def test_an_edge_has_the_transfer_it_was_made_from() -> None:
 
 
 def test_a_pattern_keeps_its_light() -> None:
-    """All lit, the middle has the rate itself; the sum over a pattern is that of its cells, but for what leaves at the rim."""
+    """All lit, the middle has the rate itself; the sum over a pattern is that of its cells, but for what leaves at the
+    rim."""
     camera = mono(DefocusLaw(12.0))
     white = pattern(camera, np.ones((80, 104)), LAMP, 0.0)["Y"]
     assert white[48, 64] == pytest.approx(camera.rate(LAMP, "Y"), rel=1e-6)

@@ -291,7 +291,8 @@ def test_descriptors(host: Host) -> None:
     while at < len(whole):
         kinds.append((whole[at], whole[at + 1]))
         at += whole[at]
-    # configuration, association, interface, U3V device information, 2 x (endpoint, companion), interface, endpoint, companion
+    # configuration, association, interface, U3V device information, 2 x (endpoint, companion), interface, endpoint,
+    # companion
     assert kinds == [
         (9, 2),
         (8, 11),

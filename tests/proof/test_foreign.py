@@ -67,8 +67,8 @@ def test_a_filter_before_an_aligned_screen_is_named() -> None:
 
 @pytest.mark.slow  # half a minute
 def test_an_aperture_of_half_the_stated_area_is_named() -> None:
-    """Truth: 0.45 of a pixel of 3.75 um, stated 0.89: the side is 1.02 um shorter. The bands of the screen, whose cells are 4.0 px, come out
-    about a tenth of the change too small, hence 10 %."""
+    """Truth: 0.45 of a pixel of 3.75 um, stated 0.89: the side is 1.02 um shorter. The bands of the screen, whose cells
+    are 4.0 px, come out about a tenth of the change too small, hence 10 %."""
     result = _shared("foreign_aperture")
     assert result.verdict == "explained"
     assert [e.name for e in result.effects] == ["pixel_aperture"]
@@ -95,7 +95,8 @@ def test_one_effect_by_another_law_is_named_alone(name: str, concealed: tuple[La
 
 
 MORE: list[tuple[Law, ...]] = [
-    (DefocusLaw(12.0, 1),), (ChargeDiffusionLaw(0.7, 2),), (OpticalLowPassFilterLaw(1.4, 1),), (InfraredCutFilterLaw(55.0, 1),),
+    (DefocusLaw(12.0, 1),), (ChargeDiffusionLaw(0.7, 2),), (OpticalLowPassFilterLaw(1.4, 1),),
+    (InfraredCutFilterLaw(55.0, 1),),
     (DefocusLaw(14.0, 1), NonlinearityLaw(1.5, 0)), (ChargeDiffusionLaw(0.8, 1), VeilingGlareLaw(2.0, 0)),
 ]  # fmt: skip
 

@@ -1,7 +1,7 @@
 """A dozen concealed cases with a new seed, drawn from the commit and the date; CALIBENCH_SEED repeats it.
 
-The assertions hold for any seed with a probability above 99.9 %, by the binomial limits given beside them. They are weaker than the goals
-of the proof, which a dozen cases can't judge.
+The assertions hold for any seed with a probability above 99.9 %, by the binomial limits given beside them. They are
+weaker than the goals of the proof, which a dozen cases can't judge.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ STRANGE: tuple[type[Law], ...] = (
 
 
 def fresh_seed() -> int:
-    """From the commit's hash and the date: another one every commit and every day, apart from tuning and proof seeds."""
+    """From the commit's hash and the date: another one every commit and every day, apart from tuning and proof
+    seeds."""
     if "CALIBENCH_SEED" in os.environ:
         return int(os.environ["CALIBENCH_SEED"])
     command = ["git", "rev-parse", "HEAD"]

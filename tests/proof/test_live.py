@@ -1,4 +1,5 @@
-"""The parts of the live proof, and three randomly drawn cases of it, over the wire; the seed is drawn from the commit and the date."""
+"""The parts of the live proof, and three randomly drawn cases of it, over the wire; the seed is drawn from the commit
+and the date."""
 
 from __future__ import annotations
 
@@ -140,7 +141,8 @@ def test_results_that_are_there_are_not_run_again(tmp_path: Path) -> None:
 
 
 def test_a_size_with_an_interval_is_drawn_and_told_with_it() -> None:
-    """A size without a standard deviation isn't an exact one: 21 in 20 to 27 um beside 22 um is a line from 20/22 to 27/22."""
+    """A size without a standard deviation isn't an exact one: 21 in 20 to 27 um beside 22 um is a line from 20/22 to
+    27/22."""
     case = every_case()["defocus"]
     found = result("explained", ("defocus", ("left",), {"defocus_um": 21.0}, ()))
     (effect,) = found.effects
@@ -148,7 +150,10 @@ def test_a_size_with_an_interval_is_drawn_and_told_with_it() -> None:
     told = effect.model_copy(update={"parameters": {"defocus_um": size}})
     runs = {"defocus": judged(case, found.model_copy(update={"effects": (told,)}))}
     assert "defocus_um 21 (20 to 27) um, 22" in table(runs)
-    start, end = LABEL_PX + PLOT_PX * (20.0 / 22.0 - LOW) / (HIGH - LOW), LABEL_PX + PLOT_PX * (27.0 / 22.0 - LOW) / (HIGH - LOW)  # fmt: skip
+    start, end = (
+        LABEL_PX + PLOT_PX * (20.0 / 22.0 - LOW) / (HIGH - LOW),
+        LABEL_PX + PLOT_PX * (27.0 / 22.0 - LOW) / (HIGH - LOW),
+    )
     assert f"M{start:.1f} " in drawing(runs) and f"H{end:.1f}" in drawing(runs)
 
 

@@ -71,8 +71,8 @@ def baseline_is_recovered(folder: Path) -> None:
 
 
 def the_left_cameras_two_filters_are_named_and_nothing_else(folder: Path) -> None:
-    """Wanted: displacement within 5 %, cut within 3 nm. Beside the filters, only what both sensors have: columns hold a fiftieth
-    of the DSNU's variance (see `mocks.truth`)."""
+    """Wanted: displacement within 5 %, cut within 3 nm. Beside the filters, only what both sensors have: columns hold a
+    fiftieth of the DSNU's variance (see `mocks.truth`)."""
     found = _result(folder, "diagnose")
     named = {effect["name"]: effect for effect in found["effects"]}
     assert set(named) - {"column_noise"} == {"optical_low_pass_filter", "infrared_cut_filter"}

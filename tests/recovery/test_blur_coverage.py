@@ -20,7 +20,8 @@ DRAWS = int(os.environ.get("CALIBENCH_COVERAGE_DRAWS", "200"))
 FREQUENCIES = np.arange(0.05, 1.0, 0.05)
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
-#: Line spreads as sums of Gaussians: share, shift px, sigma px; a Cauchy's share has "sigma" as its half width, below 0.
+#: Line spreads as sums of Gaussians: share, shift px, sigma px; a Cauchy's share has "sigma" as its half width, below
+#: 0.
 PROFILES = {
     "Gauss 0.3": [(1.0, 0.0, 0.3)],
     "Gauss 0.55": [(1.0, 0.0, 0.55)],
@@ -54,7 +55,8 @@ def transfer(parts, f):
 
 def test_edges_cover() -> None:
     print(
-        "\n| line spread | MTF50 | MTF10 | curve, where above 1 % | angle | sd of error / stated, MTF50 |\n| --- | --- | --- | --- | --- | --- |"
+        "\n| line spread | MTF50 | MTF10 | curve, where above 1 % | angle | sd of error / stated, MTF50 |\n| --- | "
+        "--- | --- | --- | --- | --- |"
     )
     rng = np.random.default_rng(1)
     pooled = {"mtf50": [], "mtf10": [], "curve": [], "angle": []}

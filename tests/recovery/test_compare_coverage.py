@@ -1,9 +1,9 @@
 """An unchanged camera, calibrated again and again: `compare` tells a drift in at most 1 % of the comparisons.
 
-Fifteen sessions of one camera, recorded in this process by the second image former: 105 comparisons. From session to session the
-noise is new, the sensor is warmer or cooler, the lamp swings and the radiometer reads with its repeatability, as on the mock bench
-(`mocks.bench`: 0.15 % and 2e-9 W sr^-1 m^-2 nm^-1 a sample of 2 nm, a swing of 0.04 % in 2400 s). What changed is told:
-`tests/lab/fit/test_compare.py`.
+Fifteen sessions of one camera, recorded in this process by the second image former: 105 comparisons. From session to
+session the noise is new, the sensor is warmer or cooler, the lamp swings and the radiometer reads with its
+repeatability, as on the mock bench (`mocks.bench`: 0.15 % and 2e-9 W sr^-1 m^-2 nm^-1 a sample of 2 nm, a swing of 0.04
+% in 2400 s). What changed is told: `tests/lab/fit/test_compare.py`.
 
 `pytest -m slow -s tests/recovery/test_compare_coverage.py` prints the number of alarms; some three minutes of one core.
 """
@@ -31,7 +31,8 @@ PLAN = Plan(kinds=("dark", "flat", "narrowband", "slanted_edge", "charuco", "scr
 
 
 class SwingingLamp(Law):
-    """The light swings by 0.04 % in 2400 s, in another phase in each session; the sensor's temperature by `WITHIN_C`."""
+    """The light swings by 0.04 % in 2400 s, in another phase in each session; the sensor's temperature by
+    `WITHIN_C`."""
 
     name = "swing"
 
@@ -89,7 +90,7 @@ def test_an_unchanged_camera_is_told_to_drift_in_one_percent_of_comparisons() ->
                 squares.setdefault(key, []).append((row.difference / row.difference_std) ** 2)
     print(f"{len(alarms)} of {len(pairs)} comparisons tell a drift")
     assert len(alarms) <= FALSE_ALARM_RATE * len(pairs), "\n".join(alarms)
-    # No standard deviation is too small. The mean square over all pairs of 15 sessions is twice the sample variance over its expectation: chi2
-    # of 14 degrees of freedom over 14, whose quantile of 1 - 1e-4 / 240 (figures) is 4.4.
+    # No standard deviation is too small. The mean square over all pairs of 15 sessions is twice the sample variance
+    # over its expectation: chi2 of 14 degrees of freedom over 14, whose quantile of 1 - 1e-4 / 240 (figures) is 4.4.
     worst = max(squares, key=lambda key: float(np.mean(squares[key])))
     assert np.mean(squares[worst]) < 4.4, worst

@@ -1,4 +1,5 @@
-"""Whether the threshold holds on images: healthy cameras drawn frame by frame by the forward model, through every estimator."""
+"""Whether the threshold holds on images: healthy cameras drawn frame by frame by the forward model, through every
+estimator."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ DRAWS = 24
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "cfa"), [(3, "MONO"), (4, "RGGB"), (5, "MONO")])
 def test_the_threshold_holds_on_images(seed: int, cfa: str) -> None:
-    """Of 24 draws at a rate of 1 %, more than 3 exceed it with a probability of 1e-5. No measurement's chi2 is above its number
-    of values by more than 4 sigmas of a mean of 24: then its covariance would be too narrow."""
+    """Of 24 draws at a rate of 1 %, more than 3 exceed it with a probability of 1e-5. No measurement's chi2 is above
+    its number of values by more than 4 sigmas of a mean of 24: then its covariance would be too narrow."""
     recordings = recordings_of(ConcealedCamera(seed, cfa=cfa, rows=96, cols=128), Plan())
     model, _ = measurement_model(recordings, "left")
     assert model is not None

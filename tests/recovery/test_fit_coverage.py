@@ -90,7 +90,8 @@ def test_photon_transfer_covers() -> None:
     ):
         error = np.array([getattr(fit, name) - getattr(camera, name) for fit in fits])
         score = error / np.array([getattr(fit, name + "_std") for fit in fits])
-        # 200 draws: a 95 % interval covers 95 +- 1.5 %; three of these. The mean score's standard deviation is 0.07; four.
+        # 200 draws: a 95 % interval covers 95 +- 1.5 %; three of these. The mean score's standard deviation is 0.07;
+        # four.
         covered = np.mean(np.abs(score) < 1.96)
         assert 0.905 <= covered <= 0.995, (name, covered)
         assert abs(score.mean()) < 0.28, (name, score.mean())
@@ -99,7 +100,8 @@ def test_photon_transfer_covers() -> None:
 
 @pytest.mark.parametrize("case", ["ideal", "nonlinear", "brighter_fatter"])
 def test_gain_of_full_size_frames(case: str) -> None:
-    """50 levels of two 640 x 480 frames: 0.1 % rms in all three cases, where a straight line is off by 1.6 and 2.1 %."""
+    """50 levels of two 640 x 480 frames: 0.1 % rms in all three cases, where a straight line is off by 1.6 and 2.1
+    %."""
     draws, gain, full = 12, 0.5, 7800.0
     rng = np.random.default_rng(21)
     stated = DataSheet(rows=480, cols=640, cfa="MONO", bit_depth=12)

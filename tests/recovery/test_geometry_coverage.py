@@ -1,4 +1,5 @@
-"""Are geometry's uncertainties true? Draws of corners seen by known cameras: errors over uncertainties, and the maps."""
+"""Are geometry's uncertainties true? Draws of corners seen by known cameras: errors over uncertainties, and the
+maps."""
 
 from __future__ import annotations
 
@@ -126,7 +127,8 @@ def test_geometry_covers() -> None:
     covered = np.abs(error) < 2.0 * np.sqrt(variance)
     ratio = np.sqrt((error**2).mean(axis=0).sum(axis=1) / variance.mean(axis=0).sum(axis=1))
     print(
-        f"\n{DRAWS} draws of {VIEWS} views, {NOISE_PX} px\n| figure | covered by 2 sd, % | sd of error / stated |\n| --- | --- | --- |"
+        f"\n{DRAWS} draws of {VIEWS} views, {NOISE_PX} px\n| figure | covered by 2 sd, % | sd of error / stated |\n| "
+        "--- | --- | --- |"
     )
     for name, score in scores.items():
         print(f"| {name} | {100 * np.mean(np.abs(score) < 2):.1f} | {np.std(score):.2f} |")
@@ -137,13 +139,15 @@ def test_geometry_covers() -> None:
     print(f"| compare says that an unchanged camera changed | {100 * np.mean(pairs_changed):.1f} (false alarms) | |")
     for name, score in scores.items():
         independent = len(score) if "depth" not in name else DRAWS
-        # P(|z| < 2) = 95.4 %, of so many draws +- 1 %; three and a half of these. The figures are 28: one in 80 runs falls out.
+        # P(|z| < 2) = 95.4 %, of so many draws +- 1 %; three and a half of these. The figures are 28: one in 80 runs
+        # falls out.
         limit = 3.5 * np.sqrt(0.954 * 0.046 / independent)
         assert abs(np.mean(np.abs(score) < 2) - 0.954) < limit, name
     pooled = np.concatenate([np.abs(score) < 2 for score in scores.values()])
     assert 0.93 <= pooled.mean() <= 0.97
     assert 0.93 <= covered.mean() <= 0.97
-    # Wanted: within 10 % everywhere. A standard deviation of 400 draws is itself known to 3.5 % where one direction dominates.
+    # Wanted: within 10 % everywhere. A standard deviation of 400 draws is itself known to 3.5 % where one direction
+    # dominates.
     assert ratio.min() > 0.9 and ratio.max() < 1.1
     # 1 %: up to 3 standard deviations more
     assert np.mean(sigma > 2.576) < 0.01 + 3 * np.sqrt(0.01 * 0.99 / DRAWS)
@@ -151,7 +155,8 @@ def test_geometry_covers() -> None:
 
 
 def test_projection_variance_is_that_of_many_solves() -> None:
-    """Wanted: within 10 % everywhere in the frame. So many draws know a variance to 5 % where one direction dominates."""
+    """Wanted: within 10 % everywhere in the frame. So many draws know a variance to 5 % where one direction
+    dominates."""
     x, y = grid(SHAPE)
     image = grid_points(x, y)
     truth = intrinsics_of(TRUTH.left, TRUTH.distortion_left)

@@ -21,7 +21,8 @@ from lab.measure.weighted_lines import linearity
 from sim.sensor.mosaic import planes
 
 DRAWS = 300
-#: Percentages that intervals which hold 93 % (97 %) of all draws fall below (exceed) by chance in one of a hundred figures.
+#: Percentages that intervals which hold 93 % (97 %) of all draws fall below (exceed) by chance in one of a hundred
+#: figures.
 LOWEST = 100.0 * float(stats.binom.ppf(0.01, DRAWS, 0.93)) / DRAWS
 HIGHEST = 100.0 * float(stats.binom.ppf(0.99, DRAWS, 0.97)) / DRAWS
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
@@ -29,7 +30,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 @dataclass(frozen=True)
 class Truth:
-    """A synthetic camera; electrons unless said. Light l (exposure s) gives `rate` l electrons in a plane of share 1."""
+    """A synthetic camera; electrons unless said. Light l (exposure s) gives `rate` l electrons in a plane of share
+    1."""
 
     cfa: str = "MONO"
     shape: tuple[int, int] = (96, 128)
@@ -159,7 +161,8 @@ def linear(t: Truth) -> dict[str, float]:
 
 
 def bent(t: Truth) -> dict[str, float]:
-    """Of a camera whose response bends and whose charge repels, in colour: percent at saturation (the full well's signal)."""
+    """Of a camera whose response bends and whose charge repels, in colour: percent at saturation (the full well's
+    signal)."""
     saturation = t.well * (1.0 - t.bend)  # electrons' worth of signal
     response = -100.0 * t.bend * saturation / t.well
     missing = 100.0 * 8.0 * t.shared * saturation / t.well
@@ -203,7 +206,8 @@ def value_of(fit: NoiseFit, path: str) -> tuple[float | None, float | None]:
 
 
 def table(name: str, fits: list[NoiseFit], truths: dict[str, float], draws: int) -> list[str]:
-    """Print coverage by figure; give those out of 93..97 % by more than the standard deviation of so many draws, and their mean where it is out."""
+    """Print coverage by figure; give those out of 93..97 % by more than the standard deviation of so many draws, and
+    their mean where it is out."""
     print(f"\n{name}, {draws} draws\n| figure | truth | mean | rms error | mean stated | 2-sigma coverage, % |")
     print("| --- | --- | --- | --- | --- | --- |")
     out, all_covered = [], []
@@ -213,7 +217,8 @@ def table(name: str, fits: list[NoiseFit], truths: dict[str, float], draws: int)
         error, std = pairs[:, 0] - truth, pairs[:, 1]
         covered = 100.0 * float(np.mean(np.abs(error) <= 2.0 * std))
         print(
-            f"| `{path}` | {truth:.5g} | {pairs[:, 0].mean():.5g} | {np.sqrt(np.mean(error**2)):.2g} | {std.mean():.2g} | {covered:.1f} |"
+            f"| `{path}` | {truth:.5g} | {pairs[:, 0].mean():.5g} | {np.sqrt(np.mean(error**2)):.2g} | "
+            f"{std.mean():.2g} | {covered:.1f} |"
         )
         all_covered.append(covered)
         if not LOWEST <= covered <= HIGHEST:

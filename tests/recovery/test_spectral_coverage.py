@@ -1,8 +1,8 @@
 """Are the uncertainties of the spectral sensitivity true? Draws of whole recordings of measured cameras.
 
-The share of fine structure that bands allow for was chosen on the first set of cameras and lights; the second has had no part in it:
-two cameras of another laboratory (National Physical Laboratory: Darrodi et al., J. Opt. Soc. Am. A 32, 381, 2015; in colour-science), the
-eye's cones as a third, and a monochromator's triangles at other wavelengths.
+The share of fine structure that bands allow for was chosen on the first set of cameras and lights; the second has had
+no part in it: two cameras of another laboratory (National Physical Laboratory: Darrodi et al., J. Opt. Soc. Am. A 32,
+381, 2015; in colour-science), the eye's cones as a third, and a monochromator's triangles at other wavelengths.
 """
 
 from __future__ import annotations
@@ -152,8 +152,8 @@ def test_spectral_covers(name_of_set: str) -> None:
     print(f"departures where there are none: {alarms} of {DRAWS - dented} fits; found: {sum(found_dent)} of {dented}")
     assert alarms <= 0.01 * (DRAWS - dented) + 3.0 * np.sqrt(0.01 * (DRAWS - dented)) and all(found_dent)
     for name, score in scores.items():
-        # Parts of curves and single cameras are shown, and held more loosely. Curves smoother than the share of fine structure allows
-        # for are covered more often, which only the first set, of curves with much of it, can limit.
+        # Parts of curves and single cameras are shown, and held more loosely. Curves smoother than the share of fine
+        # structure allows for are covered more often, which only the first set, of curves with much of it, can limit.
         whole = name.startswith(("quantum efficiency, ", "relative"))
         low, high = (0.93, 0.97) if whole else (0.91, 0.99)
         assert low <= np.mean(np.abs(score) <= 2.0) <= (high if name_of_set == "chosen on" else 1.0), name

@@ -1,4 +1,5 @@
-"""Do a twin's intervals hold? Many drawn cameras' sessions, each fitted, and predicted in three configurations that it was never in.
+"""Do a twin's intervals hold? Many drawn cameras' sessions, each fitted, and predicted in three configurations that it
+was never in.
 
 `pytest -m slow -s tests/recovery/test_twin_coverage.py` prints the share of each quantity.
 """

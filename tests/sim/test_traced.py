@@ -117,7 +117,7 @@ def test_distortion_moves_light_unless_the_scene_is_placed_in_the_image(
     """A bright spot at 45 px from the axis: barrel distortion of 4 % there draws it in by 1.8 px."""
     lens = synthetic_lens(corner_um=135.0, k=-0.04, colour=0.0)
     camera = _traced(colour_camera.model_copy(update={"cfa": "MONO",
-                                                      "quantum_efficiency": {"Y": colour_camera.quantum_efficiency["G"]}}),
+                                                      "quantum_efficiency": {"Y": colour_camera.quantum_efficiency["G"]}}),  # noqa: E501
                      lens.table())  # fmt: skip
     spot = np.zeros((9, 9), np.uint8)
     spot[4, 4] = 1

@@ -1,8 +1,9 @@
-"""kill -9 of the service, of a job's worker, and of the bench, at random moments: nothing is captured twice or lost, the shutter closes.
+"""kill -9 of the service, of a job's worker, and of the bench, at random moments: nothing is captured twice or lost,
+the shutter closes.
 
-Real processes: `calibench serve`, `calibench bench`, a Dask scheduler with a worker. After each kill the session and the job tell the reason and go on, and every
-finished session is read back: each capture of its plan once, each frame with its hash. `make kills` takes KILLS of them, by default 20.
-"""
+Real processes: `calibench serve`, `calibench bench`, a Dask scheduler with a worker. After each kill the session and
+the job tell the reason and go on, and every finished session is read back: each capture of its plan once, each frame
+with its hash. `make kills` takes KILLS of them, by default 20."""
 
 from __future__ import annotations
 
@@ -87,7 +88,8 @@ class Laboratory:
         said_s: dict[str, float] = {}
 
         def watch() -> None:
-            """When the service says that the shutter is closed and that the station is safe, and when the registry does: it answers some time after that."""
+            """When the service says that the shutter is closed and that the station is safe, and when the registry
+            does: it answers some time after that."""
             began_s = time.monotonic()
             until = began_s + PATIENCE_S
             while session_id in store.under_way() and time.monotonic() < until:
@@ -213,7 +215,8 @@ def test_nothing_is_lost_and_the_shutter_closes(tmp_path: Path) -> None:
         captures += lab.check(session_id)
         runs = len(lab.client.session(session_id).runs)
     print(
-        f"\n{dict(lab.seen)}; {len(finished) + 1} sessions, {captures} captures, each once and intact; runs of the last: {runs}"
+        f"\n{dict(lab.seen)}; {len(finished) + 1} sessions, {captures} captures, each once and intact; runs of the "
+        f"last: {runs}"
     )
     for what, seconds in (
         ("the shutter was closed", sorted(lab.closed_s)),
@@ -222,7 +225,8 @@ def test_nothing_is_lost_and_the_shutter_closes(tmp_path: Path) -> None:
     ):
         within = sum(one <= CLOSED_S for one in seconds)
         print(
-            f"{what} {seconds[len(seconds) // 2]:.1f} s after the restart (median), {seconds[-1]:.1f} s at most; within the {CLOSED_S:g} s "
+            f"{what} {seconds[len(seconds) // 2]:.1f} s after the restart (median), {seconds[-1]:.1f} s at most; "
+            f"within the {CLOSED_S:g} s "
             f"that are wanted in {within} of {len(seconds)}"
         )
     print(f"load of the machine {os.getloadavg()[0]:.1f}")

@@ -1,7 +1,8 @@
-"""A day in virtual time: darks and flats on a mock bench whose instruments fail at 1 % of their answers, in every way they know.
+"""A day in virtual time: darks and flats on a mock bench whose instruments fail at 1 % of their answers, in every way
+they know.
 
-Each failure ends the run with one line; the session is taken up again until it is finished. `make soak` takes 20,000 captures,
-SOAK_CAPTURES another number. The exposures are such that 20,000 captures take 24 hours on the bench's clock.
+Each failure ends the run with one line; the session is taken up again until it is finished. `make soak` takes 20,000
+captures, SOAK_CAPTURES another number. The exposures are such that 20,000 captures take 24 hours on the bench's clock.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ MOST_RUNS = 50 + CAPTURES
 
 
 def faults(seed: int, answers: int, kinds: tuple[str, ...] = KINDS) -> tuple[Fault, ...]:
-    """Faults of every kind at RATE of so many answers, after the first ones, with which a driver connects for the first time."""
+    """Faults of every kind at RATE of so many answers, after the first ones, with which a driver connects for the first
+    time."""
     rng = np.random.default_rng(seed)
     seconds = {"late": 1.5, "unplug": 0.3}
     broken = np.flatnonzero(rng.random(answers) < RATE) + 20
@@ -124,7 +126,8 @@ def bench(tmp_path: Path) -> Iterator[_Bench]:
 def test_a_day_of_captures_with_faults_ends_whole(
     tmp_path: Path, bench: _Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # pytest keeps every log record, and with the traceback of a run that ended all that run held: its journal first of all.
+    # pytest keeps every log record, and with the traceback of a run that ended all that run held: its journal first of
+    # all.
     monkeypatch.setattr(logging.getLogger("bluesky"), "propagate", False)
     pairs = CAPTURES // 2
     flats = max(1, pairs // 8)
@@ -165,7 +168,8 @@ def test_a_day_of_captures_with_faults_ends_whole(
     assert problems == []
     assert len({capture.frame for capture in captures}) == len(captures) == 2 * pairs_of(plan)
     assert not bench.place.light.shutter_open
-    # Flat: once darks and flats have been drawn (after 60 %), memory grows by less than 64 bytes a capture and 32 MB of caches.
+    # Flat: once darks and flats have been drawn (after 60 %), memory grows by less than 64 bytes a capture and 32 MB of
+    # caches.
     pairs_taken = pairs_of(plan)
     first = [rss for done, rss in memory if done >= 0.6 * pairs_taken][:5]
     growth = memory[-1][1] - min(first)
@@ -175,8 +179,10 @@ def test_a_day_of_captures_with_faults_ends_whole(
     with capsys.disabled():
         hours = (bench.place.clock.now() - began_s) / 3600
         print(
-            f"\nsoak: {len(captures)} captures, {hours:.1f} h of virtual time, {sum(complaints.values())} runs ended by faults, {sum(retaken.values())} frames "
-            f"taken again, memory {growth / 1e6:+.1f} MB over the last two fifths, {slope / 1e3:+.2f} MB a thousand captures there"
+            f"\nsoak: {len(captures)} captures, {hours:.1f} h of virtual time, {sum(complaints.values())} runs ended "
+            f"by faults, {sum(retaken.values())} frames "
+            f"taken again, memory {growth / 1e6:+.1f} MB over the last two fifths, {slope / 1e3:+.2f} MB a thousand "
+            "captures there"
         )
         for words, count in (complaints + retaken).most_common(16):
             print(f"  {count} x {words} ...")

@@ -1,4 +1,5 @@
-"""Alembic's entry: upgrades the connection that `lab.capture.store` hands over, or the URL in CALIBENCH_DATABASE_URL."""
+"""Alembic's entry: upgrades the connection that `lab.capture.store` hands over, or the URL in
+CALIBENCH_DATABASE_URL."""
 
 from __future__ import annotations
 

@@ -52,7 +52,8 @@ def healthy_draws(
     workers: Workers | None = None,
 ) -> list[HealthyDraw]:
     """`count` draws of the recordings by the baseline of `model`; measurements of captures that can't be replayed are
-    left out. Each draw has a generator of its own, so that they are the same wherever `workers` do them (None: in this process)."""
+    left out. Each draw has a generator of its own, so that they are the same wherever `workers` do them (None: in this
+    process)."""
     workers = workers or Workers()
     camera = _at_recorded_levels(recordings, side, model.camera)
     if workers.scheduler is not None:

@@ -7,9 +7,8 @@ about which it is linear, are projected out of both. With z = G'r and R = G'G, t
 
     S(c) = max over u >= 0 of 2 z_c'u - u'R_cc u,
 
-the gain in chi2. A parameter of one sign has one column, one of either sign has two. A pair may score far above both of its
-members, which growing sets one by one never sees (FINEMAP: Benner et al., 2016, Bioinformatics 32, 1493).
-"""
+the gain in chi2. A parameter of one sign has one column, one of either sign has two. A pair may score far above both of
+its members, which growing sets one by one never sees (FINEMAP: Benner et al., 2016, Bioinformatics 32, 1493)."""
 
 from __future__ import annotations
 
@@ -23,7 +22,8 @@ from scipy.optimize import nnls
 
 from sim.spectrum import FloatArray
 
-#: Added to the variances of unit columns: without it, the active set of least squares cycles between columns that are all but equal.
+#: Added to the variances of unit columns: without it, the active set of least squares cycles between columns that are
+#: all but equal.
 RIDGE = 1e-8
 #: Sets of one size from which larger ones are made.
 EXTENDED = 60
@@ -35,8 +35,8 @@ LEAST_ANGLE = 1e-6
 
 @dataclass(frozen=True)
 class LinearSet:
-    """Some alternatives, of different owners, by index; their score S, the log odds S / 2 less their costs, and the coefficients u of
-    each alternative's columns."""
+    """Some alternatives, of different owners, by index; their score S, the log odds S / 2 less their costs, and the
+    coefficients u of each alternative's columns."""
 
     members: tuple[int, ...]
     score: float
@@ -46,8 +46,8 @@ class LinearSet:
 
 @dataclass(frozen=True)
 class LinearProblem:
-    """z (p,) and R (p, p), with p columns. `owners`: the effect of each alternative; `columns`: its columns, by index. Of the
-    alternatives of one owner a set holds one at most. `cost`: log odds that each owner has to earn."""
+    """z (p,) and R (p, p), with p columns. `owners`: the effect of each alternative; `columns`: its columns, by index.
+    Of the alternatives of one owner a set holds one at most. `cost`: log odds that each owner has to earn."""
 
     z: FloatArray
     gram: FloatArray
@@ -68,8 +68,9 @@ class LinearProblem:
         return cls(stacked.T @ white, stacked.T @ stacked, tuple(owners), columns, cost)
 
     def best(self, size: int) -> tuple[LinearSet, ...]:
-        """The sets of `size` members whose log odds are higher than those of each set without one of them, highest first. All singles and
-        all pairs are compared; of larger sets those that extend the best of the next smaller size."""
+        """The sets of `size` members whose log odds are higher than those of each set without one of them, highest
+        first. All singles and all pairs are compared; of larger sets those that extend the best of the next smaller
+        size."""
         if size not in self._found:
             made = (
                 list(self.singles.values())
@@ -136,7 +137,8 @@ class LinearProblem:
 
     @cached_property
     def pairs(self) -> Sequence[LinearSet]:
-        """Every pair of owners. Which of their alternatives is fixed by the best two columns: exact where each alternative has one."""
+        """Every pair of owners. Which of their alternatives is fixed by the best two columns: exact where each
+        alternative has one."""
         z, size = self.z / self._size, self._size
         rho = self.gram / np.outer(size, size)
         angle = np.maximum(1.0 - rho**2, LEAST_ANGLE)
@@ -152,7 +154,8 @@ class LinearProblem:
         return found
 
     def _larger(self, smaller: Sequence[LinearSet]) -> list[LinearSet]:
-        """The best smaller sets, each with the owners that promise most beside it: by what one column takes of what the set leaves."""
+        """The best smaller sets, each with the owners that promise most beside it: by what one column takes of what the
+        set leaves."""
         found: dict[frozenset[str], LinearSet] = {}
         for start in smaller[:EXTENDED]:
             gain = self._gain_beside(start)
@@ -173,7 +176,8 @@ class LinearProblem:
         return list(found.values())
 
     def _gain_beside(self, start: LinearSet) -> FloatArray:
-        """What every column by itself takes of the residual that a set leaves, its active columns free to move, (p,)."""
+        """What every column by itself takes of the residual that a set leaves, its active columns free to move,
+        (p,)."""
         where = np.concatenate([self.columns[m] for m in start.members]).astype(int)
         active = where[np.concatenate(start.share) > 0]
         rho = self.gram / np.outer(self._size, self._size)

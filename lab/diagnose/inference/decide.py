@@ -37,10 +37,10 @@ class Verdict:
     """What one side shows.
 
     `before`, `after`: mismatches of the baseline, and with the named effects. `named`: most significant first.
-    `abstained`: candidates that weren't named. `discrepancies`: of the blocks that have a mismatch left. `held_out`: measurements whose
-    held-out numbers contradict the model with the named effects, of those that have no other mismatch. `vetoed`: names that held-out
-    numbers contradict. `outlying`: captures whose levels aren't those of what is stated, by the block that they alone disturb.
-    `models`: sets of effects with their probabilities.
+    `abstained`: candidates that weren't named. `discrepancies`: of the blocks that have a mismatch left. `held_out`:
+    measurements whose held-out numbers contradict the model with the named effects, of those that have no other
+    mismatch. `vetoed`: names that held-out numbers contradict. `outlying`: captures whose levels aren't those of what
+    is stated, by the block that they alone disturb. `models`: sets of effects with their probabilities.
     """
 
     model: MeasurementModel
@@ -141,8 +141,8 @@ def decide(
 
 
 def _verdict(told: Verdict, left: Sequence[int], refused: Sequence[VetoedCandidate], policy: DecisionPolicy) -> Verdict:
-    """The verdict with what is left without a name, in the blocks `left` and where held-out numbers contradict the model: single
-    captures that are outlying, or a discrepancy that predicts held-out captures."""
+    """The verdict with what is left without a name, in the blocks `left` and where held-out numbers contradict the
+    model: single captures that are outlying, or a discrepancy that predicts held-out captures."""
     model, effects = told.model, told.effects
     gaussian = model.seen_gaussian(effects)
     outlying = {i: found for i in left for found in (outlying_levels(model, i, effects, policy),) if found}
@@ -181,8 +181,8 @@ def _weighed_anew(
     barred: set[frozenset[str]],
     report: Callable[[str], None],
 ) -> tuple[list[Candidate], list[Candidate]]:
-    """Return what stood beside a vetoed name, weighed again with the vetoed effect among the rivals, and what lost by that. `barred`: sets
-    whose names were vetoed; they aren't returned to, and the set at hand is added."""
+    """Return what stood beside a vetoed name, weighed again with the vetoed effect among the rivals, and what lost by
+    that. `barred`: sets whose names were vetoed; they aren't returned to, and the set at hand is added."""
     names = frozenset(c.effect.name for c in named)
     without = _refitted(search, named, vetoed_one)
     if not without or names in barred:
@@ -210,13 +210,13 @@ def _veto(search: Search, named: Sequence[Candidate], candidate: Candidate) -> V
 def _with_a_size(
     model: MeasurementModel, candidate: Candidate, effects: tuple[Effect, ...], policy: DecisionPolicy
 ) -> Candidate | None:
-    """Return the candidate as the recordings tell its size where every parameter is compatible with absence by its standard deviation, or
-    None where the likelihood doesn't exclude absence either.
+    """Return the candidate as the recordings tell its size where every parameter is compatible with absence by its
+    standard deviation, or None where the likelihood doesn't exclude absence either.
 
-    Of several sizes that the recordings don't tell apart (a quadratic and a cubic bend), one by itself is told where that fits as well, the
-    likeliest. A size that no normal distribution describes, as it is tied to a shape (a flicker's modulation to its frequency) or small in
-    number (one hot pixel of a few hundred), is told by the interval of its profile likelihood.
-    """
+    Of several sizes that the recordings don't tell apart (a quadratic and a cubic bend), one by itself is told where
+    that fits as well, the likeliest. A size that no normal distribution describes, as it is tied to a shape (a
+    flicker's modulation to its frequency) or small in number (one hot pixel of a few hundred), is told by the interval
+    of its profile likelihood."""
     if not candidate.is_compatible_with_absence(policy.least_size_sigma):
         return candidate
     at, sizes = effects.index(candidate.effect), candidate.sizes
@@ -239,12 +239,13 @@ def _with_a_size(
 def _with_every_mode(
     model: MeasurementModel, candidate: Candidate, effects: tuple[Effect, ...], policy: DecisionPolicy
 ) -> Candidate:
-    """Return the candidate with the posterior's other modes, where the recordings don't tell them apart from the one told.
+    """Return the candidate with the posterior's other modes, where the recordings don't tell them apart from the one
+    told.
 
-    Parameters that act by their square have such modes: all signs turned, and, where an effect has several, any of them in the place of
-    all (a bowed and a tilted image are as far out of focus at one place); those are looked for by a refit from each alone. Turned signs
-    are told as a sign that is unknown. Other modes are told beside the one that is told; each is a size of its own, so that none is a
-    standard deviation of another.
+    Parameters that act by their square have such modes: all signs turned, and, where an effect has several, any of them
+    in the place of all (a bowed and a tilted image are as far out of focus at one place); those are looked for by a
+    refit from each alone. Turned signs are told as a sign that is unknown. Other modes are told beside the one that is
+    told; each is a size of its own, so that none is a standard deviation of another.
     """
     effect = candidate.effect
     signed = {
@@ -281,8 +282,8 @@ def _with_every_mode(
 def _with_equal_choices(
     model: MeasurementModel, candidate: Candidate, effects: tuple[Effect, ...], policy: DecisionPolicy
 ) -> Candidate:
-    """Return the candidate with those other choices among its prototypes by which the recordings are as likely, all parameters as they
-    are."""
+    """Return the candidate with those other choices among its prototypes by which the recordings are as likely, all
+    parameters as they are."""
     kind = type(candidate.effect)
     names = kind.told_choices()
     if not names:
@@ -302,8 +303,9 @@ def _is_part_of_unknown(
     discrepancies: Iterable[Discrepancy],
     policy: DecisionPolicy,
 ) -> bool:
-    """Say whether the measurement that an effect changes most holds a discrepancy that is strong beside it: both may have one unknown
-    cause. An effect whose rivals are excluded, and whose law holds in another measurement, has no part in what one measurement leaves."""
+    """Say whether the measurement that an effect changes most holds a discrepancy that is strong beside it: both may
+    have one unknown cause. An effect whose rivals are excluded, and whose law holds in another measurement, has no part
+    in what one measurement leaves."""
     if excludes_rivals(candidate, policy):
         return False
     strongest = model.strongest_block(candidate.effect, effects)

@@ -1,9 +1,9 @@
 """Families: what is named where recordings show which physics is missing, and no single law of it.
 
-A family is claimed for a candidate whose own name doesn't hold. Given that the cause is one of the weighed effects, with a discrepancy
-beside each, the family has to hold `family_probability`, and the nearest law has to explain `family_least_share` of the excess chi2 in the
-measurements that it acts on. A family is also told in place of a name that holds where other members fit about as well.
-"""
+A family is claimed for a candidate whose own name doesn't hold. Given that the cause is one of the weighed effects,
+with a discrepancy beside each, the family has to hold `family_probability`, and the nearest law has to explain
+`family_least_share` of the excess chi2 in the measurements that it acts on. A family is also told in place of a name
+that holds where other members fit about as well."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from sim.effects.library import effects as library
 
 
 def family_claim(search: Search, named: Sequence[Candidate], candidate: Candidate) -> Candidate | None:
-    """A candidate without a name as one that its family is named for, with the likeliest law fitted beside what is named; None where
-    no family holds it."""
+    """A candidate without a name as one that its family is named for, with the likeliest law fitted beside what is
+    named; None where no family holds it."""
     model, policy = search.model, search.policy
     others = tuple(c.effect for c in named)
     if not candidate.among_listed or candidate.remark:  # what wrong metadata would explain as well is no claim
@@ -64,8 +64,8 @@ def _start(search: Search, others: tuple[Effect, ...], kind: type[Effect]) -> Ef
 
 
 def tied_family(candidate: Candidate, policy: DecisionPolicy) -> Candidate:
-    """The candidate as its family where the recordings can't tell its members apart: no member reaches `family_probability`, and all
-    together do."""
+    """The candidate as its family where the recordings can't tell its members apart: no member reaches
+    `family_probability`, and all together do."""
     if candidate.members or candidate.probability >= policy.family_probability:
         return candidate
     family = type(candidate.effect).family

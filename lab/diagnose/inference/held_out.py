@@ -1,5 +1,5 @@
-"""The veto of held-out captures: they take no part in the choice, but a name, a discrepancy or a silence that they contradict isn't
-given."""
+"""The veto of held-out captures: they take no part in the choice, but a name, a discrepancy or a silence that they
+contradict isn't given."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from sim.spectrum import FloatArray
 
 @dataclass(frozen=True)
 class VetoedCandidate:
-    """A candidate whose name the held-out captures contradict: their chi2 without and with it, over n numbers of these captures."""
+    """A candidate whose name the held-out captures contradict: their chi2 without and with it, over n numbers of these
+    captures."""
 
     candidate: Candidate
     chi2_without: float
@@ -32,7 +33,8 @@ class VetoedCandidate:
 def held_out_residual(
     model: MeasurementModel, effects: Effects = (), kernels: Mapping[int, FloatArray] | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Residual (k,) and covariance (k, k) of the k held-out numbers given all seen ones. Discrepancies enter by their posterior means
+    """Residual (k,) and covariance (k, k) of the k held-out numbers given all seen ones. Discrepancies enter by their
+    posterior means
     alone: a larger variance gains nothing."""
     seen = model.seen
     gaussian = model.gaussian(effects)
@@ -51,9 +53,9 @@ def held_out_mismatches(
 ) -> tuple[Slice, ...]:
     """Measurements whose held-out numbers contradict the model, most significant first.
 
-    chi2 of a measurement's k held-out numbers given all seen ones, form tolerances of the effects in the covariance, over
-    (1 + `covariance_slack`)^2 is chi2_k. A measurement contradicts where P(chi2_k > chi2), times the number of measurements, is below
-    `held_out_false_alarm_rate`.
+    chi2 of a measurement's k held-out numbers given all seen ones, form tolerances of the effects in the covariance,
+    over (1 + `covariance_slack`)^2 is chi2_k. A measurement contradicts where P(chi2_k > chi2), times the number of
+    measurements, is below `held_out_false_alarm_rate`.
     """
     left, covariance = held_out_residual(model, effects, kernels)
     out = np.flatnonzero(~model.seen)
@@ -92,15 +94,17 @@ def _kernels(
 def vetoed(
     model: MeasurementModel, candidate: Candidate, effects: Effects, without: Effects, policy: DecisionPolicy
 ) -> VetoedCandidate | None:
-    """The veto of held-out numbers on a name, or None. `effects`: the named set; `without`: the set fitted without the candidate.
+    """The veto of held-out numbers on a name, or None. `effects`: the named set; `without`: the set fitted without the
+    candidate.
 
-    Let w be the difference of both sets' predictions in standard deviations of the held-out numbers, lambda = |w|^2. If the name is
-    right, chi2 rises by it by 2 w.e - lambda, with e normal of variance 1 + lambda / G along w, where G = 2 `log_odds` is what the
-    parameters' uncertainty follows from. For a quantile z of that, the rise is z^2 (1 + lambda / G) at most, whatever lambda. Where
-    neither set describes the held-out numbers, the noise is as much larger as they show: the lesser chi2 over their number.
+    Let w be the difference of both sets' predictions in standard deviations of the held-out numbers, lambda = |w|^2. If
+    the name is right, chi2 rises by it by 2 w.e - lambda, with e normal of variance 1 + lambda / G along w, where G = 2
+    `log_odds` is what the parameters' uncertainty follows from. For a quantile z of that, the rise is z^2 (1 + lambda /
+    G) at most, whatever lambda. Where neither set describes the held-out numbers, the noise is as much larger as they
+    show: the lesser chi2 over their number.
 
-    The nearest law of a family stands in the improved model with a discrepancy beside it, and without the name a discrepancy stands alone:
-    these are compared.
+    The nearest law of a family stands in the improved model with a discrepancy beside it, and without the name a
+    discrepancy stands alone: these are compared.
     """
     where = model.affected(type(candidate.effect))
     beside: dict[int, FloatArray] = {}

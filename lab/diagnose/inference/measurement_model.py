@@ -54,9 +54,9 @@ class MeasurementModel:
 
     `always` are effects that the baseline has: they act first, and their laws have tolerances like those of others.
     `unstated_jacobian` has columns (n,) by nuisance parameters that stand for what nobody states, per prior standard
-    deviation. `gain_is_known`: whether the camera's conversion gain is stated or measured, and not 1 for want of both. `noise`: the first estimates about
-    which the predictions are linear. Predictions are cached by block, as most effects act on few blocks.
-    """
+    deviation. `gain_is_known`: whether the camera's conversion gain is stated or measured, and not 1 for want of both.
+    `noise`: the first estimates about which the predictions are linear. Predictions are cached by block, as most
+    effects act on few blocks."""
 
     blocks: tuple[Block, ...]
     camera: CameraModel
@@ -180,8 +180,8 @@ class MeasurementModel:
         return columns
 
     def _form_changes(self, acting: Effects) -> dict[str, FloatArray]:
-        """Changes (n,) of the prediction by the other forms of the acting effects' laws, by `form_name`: columns of the Jacobian by
-        coefficients that are 0 for the form as it stands, and 1 for the other, per standard deviation."""
+        """Changes (n,) of the prediction by the other forms of the acting effects' laws, by `form_name`: columns of the
+        Jacobian by coefficients that are 0 for the form as it stands, and 1 for the other, per standard deviation."""
         base, found = None, {}
         for i, effect in enumerate(acting):
             for number, other in enumerate(effect.other_forms()):
@@ -227,8 +227,8 @@ class MeasurementModel:
         tolerated: float = 1.0,
         least_tolerance: float = 0.0,
     ) -> Gaussian:
-        """The distribution under these effects, of all numbers or of those that `where` (n,) marks. `tolerated`: share of the declared form
-        tolerances; each is `least_tolerance` at least."""
+        """The distribution under these effects, of all numbers or of those that `where` (n,) marks. `tolerated`: share
+        of the declared form tolerances; each is `least_tolerance` at least."""
         where = np.ones(len(self.value), bool) if where is None else where
         acting = self._numbered((*self.always, *effects))
         blocks = tuple(
@@ -311,11 +311,11 @@ class MeasurementModel:
         return np.asarray(self.mean(effects) + moved + self.discrepancy_mean(effects, discrepancies or {}))
 
     def stated_mean(self, found: Mapping[str, float]) -> FloatArray:
-        """Prediction of all numbers by the baseline alone, (n,), with the nuisance parameters `found` by a better model, within
-        `MOST_PRIOR_STD` of their first guesses.
+        """Prediction of all numbers by the baseline alone, (n,), with the nuisance parameters `found` by a better
+        model, within `MOST_PRIOR_STD` of their first guesses.
 
-        The posterior means of a baseline that lacks physics are no camera's: nuisance parameters stand in for what is missing, some by
-        tens of their prior standard deviations.
+        The posterior means of a baseline that lacks physics are no camera's: nuisance parameters stand in for what is
+        missing, some by tens of their prior standard deviations.
         """
         columns = self.nuisance_jacobian()
         near = {n: float(np.clip(v, -MOST_PRIOR_STD, MOST_PRIOR_STD)) for n, v in found.items() if n in columns}

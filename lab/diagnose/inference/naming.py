@@ -17,8 +17,8 @@ from sim.effects.base import Effect
 def named_members(
     search: Search, best: Fit, report: Callable[[str], None], barred: Collection[frozenset[str]] = ()
 ) -> tuple[list[Candidate], list[Candidate]]:
-    """Return the members of a set whose names hold, and those that were given up, in that order. `barred`: sets that aren't returned to,
-    by their effects' names.
+    """Return the members of a set whose names hold, and those that were given up, in that order. `barred`: sets that
+    aren't returned to, by their effects' names.
 
     One at a time: the weakest member that is too weak for any name; then the member for which a rival is likelier; then
     members that one discrepancy replaces, or whose name doesn't hold. After each change the rest is fitted and weighed
@@ -45,7 +45,8 @@ def named_members(
             gain, needed = current.log_posterior - without.log_posterior, search.needed_log_odds
             if gain < needed or search.member_log_odds(current, index) >= needed:
                 given_up.append(replace(candidate, among_listed=()))  # no claim, of its family neither
-            # else it explains no more than what the other members' laws may lack: a mismatch beyond that is located without it
+            # else it explains no more than what the other members' laws may lack: a mismatch beyond that is located
+            # without it
             current = without
             continue
         members, likelier = [], None
@@ -84,8 +85,8 @@ def named_members(
 
 
 def _still_certain(search: Search, certain: dict[str, Candidate], before: Fit, now: Fit) -> dict[str, Candidate]:
-    """Return the certain names that stay so when members leave or come: those that share no measurement that shows both. What was certain
-    beside an effect which took up what its law lacks has to be weighed again without that."""
+    """Return the certain names that stay so when members leave or come: those that share no measurement that shows
+    both. What was certain beside an effect which took up what its law lacks has to be weighed again without that."""
     changed = [e for e in (*before.effects, *now.effects) if (e.name in before.names) != (e.name in now.names)]
     if not changed or not certain:
         return certain
@@ -110,8 +111,8 @@ def holds(candidate: Candidate, policy: DecisionPolicy) -> bool:
 
 
 def excludes_rivals(candidate: Candidate, policy: DecisionPolicy) -> bool:
-    """Say whether rivals and an unknown cause are excluded, a discrepancy allowed beside each, and the law holds in a measurement that
-    shows it: what another measurement leaves is then told beside the name."""
+    """Say whether rivals and an unknown cause are excluded, a discrepancy allowed beside each, and the law holds in a
+    measurement that shows it: what another measurement leaves is then told beside the name."""
     first = candidate.among_listed[0] if candidate.among_listed else None
     return (
         candidate.is_closed_somewhere
@@ -123,8 +124,8 @@ def excludes_rivals(candidate: Candidate, policy: DecisionPolicy) -> bool:
 
 
 def _too_weak(search: Search, fit: Fit) -> int | None:
-    """The weakest member that can't be named whatever its rivals: too small a gain, or none in the means that it must show in. Tested before
-    anything is weighed, as that fits every rival of every member."""
+    """The weakest member that can't be named whatever its rivals: too small a gain, or none in the means that it must
+    show in. Tested before anything is weighed, as that fits every rival of every member."""
     log_odds = [search.member_log_odds(fit, i) for i in range(len(fit.effects))]
     weak = [
         odds

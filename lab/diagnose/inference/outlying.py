@@ -1,4 +1,5 @@
-"""Captures whose level isn't that of what is stated of them: a factor on the light of single captures (data snooping, Baarda 1968)."""
+"""Captures whose level isn't that of what is stated of them: a factor on the light of single captures (data snooping,
+Baarda 1968)."""
 
 from __future__ import annotations
 
@@ -32,11 +33,12 @@ class OutlyingLevel:
 def outlying_levels(
     model: MeasurementModel, index: int, effects: Effects, policy: DecisionPolicy
 ) -> tuple[OutlyingLevel, ...]:
-    """Captures of one measurement of levels, seen or held out, by whose factors alone it agrees with the model; none where it doesn't.
+    """Captures of one measurement of levels, seen or held out, by whose factors alone it agrees with the model; none
+    where it doesn't.
 
-    With d_c the signal of a capture's numbers, 0 elsewhere, the factor of capture c gains (d_c' C^-1 r)^2 / (d_c' C^-1 d_c) in chi2.
-    The best capture is taken while its gain is above the chi2_1 quantile of `slice_false_alarm_rate` over the number of captures, all
-    factors fitted again each time.
+    With d_c the signal of a capture's numbers, 0 elsewhere, the factor of capture c gains (d_c' C^-1 r)^2 / (d_c' C^-1
+    d_c) in chi2. The best capture is taken while its gain is above the chi2_1 quantile of `slice_false_alarm_rate` over
+    the number of captures, all factors fitted again each time.
     """
     block, at = model.blocks[index], model.slices[index]
     if not block.reads >= LEVEL or block.measurement.places:
@@ -74,8 +76,8 @@ def outlying_levels(
 
 
 def freed(model: MeasurementModel, outlying: Mapping[int, Sequence[OutlyingLevel]]) -> MeasurementModel:
-    """The model with the light of outlying captures as nuisance parameters: what is stated of these moves nothing that other measurements
-    share with them, as the black level. `outlying`: by block."""
+    """The model with the light of outlying captures as nuisance parameters: what is stated of these moves nothing that
+    other measurements share with them, as the black level. `outlying`: by block."""
     if not outlying:
         return model
     columns = dict(model.unstated_jacobian)

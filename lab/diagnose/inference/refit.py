@@ -110,7 +110,8 @@ class Fit:
         return tuple(e.name for e in self.effects)
 
     def jacobian_columns(self, effects: Effects, coords: Sequence[Coordinate]) -> dict[Coordinate, FloatArray]:
-        """Columns of the Jacobian for the coordinates of those of `effects` that are members of this set with the same parameters."""
+        """Columns of the Jacobian for the coordinates of those of `effects` that are members of this set with the same
+        parameters."""
         fitted = [(e, name) for e, std in zip(self.effects, self.std, strict=True) for name in std]
         column = dict(zip(fitted, self.jacobian.T, strict=True))
         return {c: column[key] for c in coords if (key := (effects[c.index], c.name)) in column}
@@ -145,12 +146,12 @@ class _Tolerated(NamedTuple):
 def _likeliest_tolerance(
     model: MeasurementModel, effects: Effects, policy: DecisionPolicy, tolerance: float | None = None
 ) -> _Tolerated:
-    """The share of the form tolerances, down to `least_tolerated_share`, by which the seen numbers are likeliest; the whole, and `tolerance`
-    at least, where that is given.
+    """The share of the form tolerances, down to `least_tolerated_share`, by which the seen numbers are likeliest; the
+    whole, and `tolerance` at least, where that is given.
 
-    By the declared tolerances alone, of two laws that fit equally well the one with the smaller tolerance is far likelier: by 8 in the
-    logarithm for a low-pass filter of 1 % beside a vibration of 5 %, even where the numbers meet the vibration's form to a tenth of that.
-    """
+    By the declared tolerances alone, of two laws that fit equally well the one with the smaller tolerance is far
+    likelier: by 8 in the logarithm for a low-pass filter of 1 % beside a vibration of 5 %, even where the numbers meet
+    the vibration's form to a tenth of that."""
     if tolerance is not None:
         gaussian = model.seen_gaussian(effects, 1.0, tolerance)
         return _Tolerated(1.0, gaussian, gaussian.log_likelihood(model.seen_value))
@@ -176,13 +177,13 @@ def refit(
 ) -> Fit:
     """Maximum a posteriori of all parameters, from `start`.
 
-    The covariance has the likeliest share of the form tolerances. Standard deviations follow from the Jacobian and hold the
-    whole of them: a law's error that has a parameter's own signature moves the parameter, and can't be seen. Dispensable
-    parameters stay absent in a converged fit unless they gain `dispensable_log_odds`. `rough`: fewer steps, enough to
-    rank sets. `beside`: a fit whose Jacobian is reused for members that stand as they do there; it changes little by
-    what joins them. `of_any_size`: sizes far from the usual ones aren't drawn towards them (`_wide_residual`), for the values of effects that
-    are named; a law that needs such a size is no likelier by that. `tolerance`: the whole of the form tolerances, and this at least, in
-    place of the likeliest share.
+    The covariance has the likeliest share of the form tolerances. Standard deviations follow from the Jacobian and hold
+    the whole of them: a law's error that has a parameter's own signature moves the parameter, and can't be seen.
+    Dispensable parameters stay absent in a converged fit unless they gain `dispensable_log_odds`. `rough`: fewer steps,
+    enough to rank sets. `beside`: a fit whose Jacobian is reused for members that stand as they do there; it changes
+    little by what joins them. `of_any_size`: sizes far from the usual ones aren't drawn towards them
+    (`_wide_residual`), for the values of effects that are named; a law that needs such a size is no likelier by that.
+    `tolerance`: the whole of the form tolerances, and this at least, in place of the likeliest share.
     """
     coords = coordinates(start, model.camera)
     known = {} if beside is None else beside.jacobian_columns(start, coords)
@@ -205,8 +206,8 @@ def refit_alone(
     sizes: Collection[str],
     policy: DecisionPolicy,
 ) -> Fit:
-    """Return the fit of a set in which of one member's `sizes` only `parameter` is fitted, the others absent; its shapes, and the other
-    members, are fitted as always."""
+    """Return the fit of a set in which of one member's `sizes` only `parameter` is fitted, the others absent; its
+    shapes, and the other members, are fitted as always."""
     coords = coordinates(effects, model.camera)
     gone = [c for c in coords if c.index == index and c.name in sizes and c.name != parameter]
     less = moved(effects, gone, np.array([c.to_u(c.absent) for c in gone]))
@@ -216,12 +217,13 @@ def refit_alone(
 def profile_interval(
     model: MeasurementModel, effects: Effects, index: int, parameter: str, policy: DecisionPolicy
 ) -> tuple[float, float]:
-    """Return the interval of one member's parameter by its profile likelihood, in the parameter's unit (Pawitan, In All Likelihood, 2001).
+    """Return the interval of one member's parameter by its profile likelihood, in the parameter's unit (Pawitan, In All
+    Likelihood, 2001).
 
-    It holds the values at which the log posterior of all other parameters, fitted there, is within `least_size_sigma`^2 / 2 of its largest.
-    The parameter itself has no prior. The covariance holds the whole of the form tolerances, as standard deviations do. An end to which the
-    posterior doesn't fall is a bound of the parameter, or `MOST_WIDENED` times as far from absence as the fit.
-    """
+    It holds the values at which the log posterior of all other parameters, fitted there, is within `least_size_sigma`^2
+    / 2 of its largest. The parameter itself has no prior. The covariance holds the whole of the form tolerances, as
+    standard deviations do. An end to which the posterior doesn't fall is a bound of the parameter, or `MOST_WIDENED`
+    times as far from absence as the fit."""
     coords = coordinates(effects, model.camera)
     (one,) = [c for c in coords if c.index == index and c.name == parameter]
     others = [c for c in coords if c is not one]
@@ -361,11 +363,13 @@ def coordinate_prior(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArr
 
 
 def _wide_residual(t: FloatArray) -> FloatArray:
-    """r with -r^2 / 2 the log prior of coordinates t, in widths from its centre: r = t up to |t| = 1, |r| = sqrt(1 + 2 ln |t|) from there.
+    """r with -r^2 / 2 the log prior of coordinates t, in widths from its centre: r = t up to |t| = 1, |r| = sqrt(1 + 2
+    ln |t|) from there.
 
-    It is the normal prior of the likeliest width that isn't below the declared one: -t^2 / 2, and -1/2 - ln |t|, whose slopes agree at
-    |t| = 1. A normal prior pulls a parameter far out by many of its standard deviations: a lamp's drift of 5 %/min, usual 0.3, to 3.8.
-    """
+    It is the normal prior of the likeliest width that isn't below the declared one: -t^2 / 2, and -1/2 - ln |t|, whose
+    slopes agree at
+    |t| = 1. A normal prior pulls a parameter far out by many of its standard deviations: a lamp's drift of 5 %/min,
+    usual 0.3, to 3.8."""
     far = np.maximum(np.abs(t), 1.0)
     return np.asarray(np.where(far > 1.0, np.sign(t) * np.sqrt(1.0 + 2.0 * np.log(far)), t))
 
@@ -380,7 +384,8 @@ def _standard_deviations(
     jacobian: FloatArray, coords: Sequence[Coordinate], u: FloatArray, prior_std: FloatArray, effects: int
 ) -> list[dict[str, float | None]]:
     """Of every effect's parameters, from (J'J + P^-1)^-1. With s the standard deviation of u = p^k, that of p is s / (k
-    |p|^(k - 1)), and at most s^(1/k), which holds at p = 0. A flat prior between two bounds has their distance over sqrt(12)."""
+    |p|^(k - 1)), and at most s^(1/k), which holds at p = 0. A flat prior between two bounds has their distance over
+    sqrt(12)."""
     low, high = np.array([c.bounds for c in coords]).T
     prior_std = np.where(np.isfinite(prior_std), prior_std, (high - low) / np.sqrt(12.0))
     curvature = jacobian.T @ jacobian + np.diag(1.0 / prior_std**2)

@@ -92,7 +92,8 @@ class Signatures:
         return LinearProblem.of(self.white, [t for _, _, t in self.columns], [e.name for e, _, _ in self.columns], cost)
 
     def starts(self, one: LinearSet) -> tuple[Effect, ...]:
-        """Where a refit of a set of this problem starts: its members scaled by their shares; a single one as `Score.start`."""
+        """Where a refit of a set of this problem starts: its members scaled by their shares; a single one as
+        `Score.start`."""
         found = []
         for member, share in zip(one.members, one.share, strict=True):
             effect, prototypes, _ = self.columns[member]
@@ -126,16 +127,16 @@ class Signatures:
         return float(np.quantile(top, quantile))
 
 
-#: Of every candidate and each of its alternative sets of prototypes: the prototypes, and their changes of the seen numbers
-#: (n, prototypes).
+#: Of every candidate and each of its alternative sets of prototypes: the prototypes, and their changes of the seen
+#: numbers (n, prototypes).
 Changes = Sequence[tuple[type[Effect], tuple[Effect, ...], FloatArray]]
 
 
 def prototype_changes(
     model: MeasurementModel, camera: CameraModel, current: Effects, candidates: Iterable[type[Effect]]
 ) -> Changes:
-    """What all prototypes of the candidates change beside a set of `current` effects. Candidates that change nothing that was measured
-    are left out."""
+    """What all prototypes of the candidates change beside a set of `current` effects. Candidates that change nothing
+    that was measured are left out."""
     base = model.mean(current)
     return [
         (effect, prototypes, np.stack([model.mean((*current, e)) - base for e in prototypes], axis=1)[model.seen])
@@ -164,8 +165,9 @@ def signatures_of(
     jacobian: FloatArray | None = None,
     tolerated: float = 1.0,
 ) -> Signatures:
-    """The same of changes that are known, by the covariance that `current` effects give with a share of their form tolerances. Those beside a
-    smaller set stand for those beside `current`: an effect's change depends little on what it stands beside."""
+    """The same of changes that are known, by the covariance that `current` effects give with a share of their form
+    tolerances. Those beside a smaller set stand for those beside `current`: an effect's change depends little on what
+    it stands beside."""
     gaussian = model.seen_gaussian(current, tolerated)
     white = gaussian.whiten(model.seen_value - gaussian.mean)
     out = np.zeros((len(white), 0))

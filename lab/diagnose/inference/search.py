@@ -1,5 +1,5 @@
-"""Which sets of effects explain the seen numbers: all small sets are compared in closed form about the sets fitted so far, the best
-few are refitted in full, until none is better."""
+"""Which sets of effects explain the seen numbers: all small sets are compared in closed form about the sets fitted so
+far, the best few are refitted in full, until none is better."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ MOST_STEPS = 12
 
 @dataclass(frozen=True)
 class Model:
-    """A set of effects by name, with its posterior probability among all sets of listed effects. `refitted`: False where that is of the
-    linear problem about another set."""
+    """A set of effects by name, with its posterior probability among all sets of listed effects. `refitted`: False
+    where that is of the linear problem about another set."""
 
     effects: tuple[str, ...]
     probability: float
@@ -38,8 +38,8 @@ class Model:
 
 @dataclass(frozen=True)
 class ModelSet:
-    """What the search says: the smallest set of models that holds `policy.model_set_share`, likeliest first; every effect's probability
-    of being a part, likeliest first; and what the budget left, sets of effects by name."""
+    """What the search says: the smallest set of models that holds `policy.model_set_share`, likeliest first; every
+    effect's probability of being a part, likeliest first; and what the budget left, sets of effects by name."""
 
     models: tuple[Model, ...] = ()
     inclusion: tuple[tuple[str, float], ...] = ()
@@ -62,10 +62,10 @@ class _Proposal:
 class Search:
     """The sets that were fitted so far, by their effects' names, and the search over further ones.
 
-    `threshold` is that of the scores, which one healthy camera in a hundred reaches; `above_noise`: by how much drawn healthy cameras have
-    raised it. `changes`: of the candidates' prototypes, beside
-    no effect. `clock` gives the CPU time (s) that the budget is counted in, from the search's beginning. `not_weighed`: what the budget
-    left.
+    `threshold` is that of the scores, which one healthy camera in a hundred reaches; `above_noise`: by how much drawn
+    healthy cameras have raised it. `changes`: of the candidates' prototypes, beside
+    no effect. `clock` gives the CPU time (s) that the budget is counted in, from the search's beginning. `not_weighed`:
+    what the budget left.
     """
 
     model: MeasurementModel
@@ -90,7 +90,8 @@ class Search:
         return self.clock() - self._begin > self.policy.search_cpu_s
 
     def signatures(self, fit: Fit) -> Signatures:
-        """Residual and signatures about a fitted set, its parameters projected out, of the candidates that aren't in it."""
+        """Residual and signatures about a fitted set, its parameters projected out, of the candidates that aren't in
+        it."""
         if fit.effects not in self._signatures:
             others = [c for c in self.changes if c[0].name not in fit.names]
             self._signatures[fit.effects] = signatures_of(self.model, fit.effects, others, fit.jacobian, fit.tolerated)
@@ -104,7 +105,8 @@ class Search:
 
     @cached_property
     def needed_log_odds(self) -> float:
-        """Gain in log posterior that an effect has to earn: it is there with `least_inclusion_probability`, by how often effects occur."""
+        """Gain in log posterior that an effect has to earn: it is there with `least_inclusion_probability`, by how
+        often effects occur."""
         policy = self.policy
         likely = policy.included_log_odds + float(special.logit(policy.least_inclusion_probability))
         return likely + 0.5 * self.above_noise
@@ -120,9 +122,10 @@ class Search:
     # --- search ------------------------------------------------------------------------------------------------------
 
     def best(self, report: Callable[[str], None] = lambda _: None) -> Fit:
-        """From no effect on: the likeliest of the sets with one effect more, one exchanged or one less, until the log odds don't rise;
-        then of the sets with one effect exchanged for two, or two or three more that by themselves aren't seen. Of each kind the best in
-        closed form are refitted, about the current set, or about it without the member that is exchanged."""
+        """From no effect on: the likeliest of the sets with one effect more, one exchanged or one less, until the log
+        odds don't rise; then of the sets with one effect exchanged for two, or two or three more that by themselves
+        aren't seen. Of each kind the best in closed form are refitted, about the current set, or about it without the
+        member that is exchanged."""
         current = self.fitted((), converged=True)
         for step in range(MOST_STEPS):
             report(f"looking for {'another' if step else 'an'} effect")
@@ -133,7 +136,8 @@ class Search:
         return current
 
     def _refitted(self, current: Fit, *, wide: bool) -> Fit | None:
-        """The likeliest of the sets about the current one, refitted as far as the budget goes; None where it is no better."""
+        """The likeliest of the sets about the current one, refitted as far as the budget goes; None where it is no
+        better."""
         for proposal in self._proposals(current, wide=wide):
             if self.is_spent:
                 self.leave(proposal.start)
@@ -180,8 +184,8 @@ class Search:
             self.not_weighed[frozenset(e.name for e in effects)] = tuple(e.name for e in effects)
 
     def _proposals(self, current: Fit, *, wide: bool) -> list[_Proposal]:
-        """The sets to be refitted next, of every kind the best in turn, as a linear problem compares sets about one fit better than about
-        several."""
+        """The sets to be refitted next, of every kind the best in turn, as a linear problem compares sets about one fit
+        better than about several."""
         extended, exchanged = (
             (self._wide_extensions, self._wide_exchanges) if wide else (self._extensions, self._exchanges)
         )
@@ -193,14 +197,15 @@ class Search:
         return list(found.values())[: self.policy.refitted_pairs if wide else self.policy.refitted_sets]
 
     def _extensions(self, current: Fit) -> list[_Proposal]:
-        """One effect more: those that promise a share of what the best does. The others are scored again about the set with that one."""
+        """One effect more: those that promise a share of what the best does. The others are scored again about the set
+        with that one."""
         seen = self._seen_sets(current, 1)
         least = self.policy.promised_share * seen[0].score if seen else 0.0
         return [self._proposal(current, one) for one in seen if one.score > least]
 
     def _wide_extensions(self, current: Fit) -> list[_Proposal]:
-        """Two effects more, or three, where fewer aren't seen. What hides a pair is fitted first and exchanged for it then, as sets are
-        compared better about a fit that is nearer."""
+        """Two effects more, or three, where fewer aren't seen. What hides a pair is fitted first and exchanged for it
+        then, as sets are compared better about a fit that is nearer."""
         seen: list[LinearSet] = []
         for size in range(1, LARGEST_STEP + 1):
             seen = seen or self._seen_sets(current, size)
@@ -215,8 +220,9 @@ class Search:
         return [self._proposal(origin, one) for one in seen]
 
     def _wide_exchanges(self, current: Fit, index: int) -> list[_Proposal]:
-        """Two effects in the place of a member. Where one of them was fitted in its place, the other is scored about that fit, which has
-        to promise more than the current set has. Of other pairs, the score has to be above the member's by what an effect has to earn."""
+        """Two effects in the place of a member. Where one of them was fitted in its place, the other is scored about
+        that fit, which has to promise more than the current set has. Of other pairs, the score has to be above the
+        member's by what an effect has to earn."""
         origin, gone = self._less(current, index), current.effects[index].name
         problem, rest = self.problem(origin), frozenset(origin.names)
         halves = [f for key, f in self.fits.items() if rest < key and len(key) == len(rest) + 1 and gone not in key]
@@ -239,8 +245,8 @@ class Search:
         return self.fitted((*fit.effects[:index], *fit.effects[index + 1 :]), converged=True)
 
     def _seen_sets(self, origin: Fit, size: int) -> list[LinearSet]:
-        """The sets of `size` effects beside `origin` that promise what they have to earn, or whose score, as refits may gain more, is above
-        the threshold for every member; best first."""
+        """The sets of `size` effects beside `origin` that promise what they have to earn, or whose score, as refits may
+        gain more, is above the threshold for every member; best first."""
         if len(origin.effects) + size > self.policy.most_effects:
             return []
         sets = self.problem(origin).best(size)
@@ -256,8 +262,8 @@ class Search:
         return _Proposal(self._start(origin, self.signatures(origin).starts(one)), origin)
 
     def _start(self, origin: Fit, linear: Effects) -> tuple[Effect, ...]:
-        """Where the refit of a set starts: at the linear problem's coefficients, or where its members stood when each was fitted by
-        itself, as a large effect isn't linear: whichever is likelier."""
+        """Where the refit of a set starts: at the linear problem's coefficients, or where its members stood when each
+        was fitted by itself, as a large effect isn't linear: whichever is likelier."""
         alone = [self.fits.get(frozenset((e.name,))) for e in linear]
         if origin.effects or len(linear) < 2 or not any(alone):
             return (*origin.effects, *linear)
@@ -288,11 +294,12 @@ class Search:
         return self.fitted(rest, converged=True)
 
     def member_log_odds(self, fit: Fit, index: int) -> float:
-        """Return the log posterior of a fitted set over that without one of its members; beside others, the lesser of that with the
-        likeliest share of the laws' form tolerances and that with the whole, and `beside_tolerance` at least.
+        """Return the log posterior of a fitted set over that without one of its members; beside others, the lesser of
+        that with the likeliest share of the laws' form tolerances and that with the whole, and `beside_tolerance` at
+        least.
 
-        What a strong effect's law may lack is no second effect: a set with one more effect fits with a small share where the set without
-        it needs the whole, and would be likelier by the whole's cost alone.
+        What a strong effect's law may lack is no second effect: a set with one more effect fits with a small share
+        where the set without it needs the whole, and would be likelier by the whole's cost alone.
         """
         without = self.without(fit, index)
         odds = fit.log_posterior - without.log_posterior
@@ -301,7 +308,8 @@ class Search:
         return min(odds, self._by_whole_tolerances(fit) - self._by_whole_tolerances(without))
 
     def _by_whole_tolerances(self, fit: Fit) -> float:
-        """Log posterior of a fitted set with the whole of its laws' form tolerances, and `beside_tolerance` at least."""
+        """Log posterior of a fitted set with the whole of its laws' form tolerances, and `beside_tolerance` at
+        least."""
         key = frozenset(fit.names)
         if key not in self._whole:
             self._whole[key] = refit(
@@ -312,8 +320,8 @@ class Search:
     # --- what it says ------------------------------------------------------------------------------------------------
 
     def models(self) -> ModelSet:
-        """Every set that was fitted, and those with one or two effects beside a likely one, in closed form, with their probabilities. Rough
-        fits that may reach a share are fitted to convergence."""
+        """Every set that was fitted, and those with one or two effects beside a likely one, in closed form, with their
+        probabilities. Rough fits that may reach a share are fitted to convergence."""
         top = max(self.log_odds(f) for f in self._listed())
         for fit in self._listed():
             is_near = self.promised_log_odds(fit) > top + math.log(self.policy.least_rival_probability)
@@ -335,10 +343,10 @@ class Search:
         )
 
     def weighed(self) -> dict[frozenset[str], float]:
-        """Log posterior of sets of listed effects, by name. A set's prior is `policy.included_log_odds` for each effect, how often effects
-        occur; a name has to earn more, for its false alarms are limited. Of sets that weren't fitted, those of one or two effects beside a
-        fitted set that isn't far below the likeliest, by the linear problem about that: the value about the nearest, the fitted set
-        that has most of their effects."""
+        """Log posterior of sets of listed effects, by name. A set's prior is `policy.included_log_odds` for each
+        effect, how often effects occur; a name has to earn more, for its false alarms are limited. Of sets that weren't
+        fitted, those of one or two effects beside a fitted set that isn't far below the likeliest, by the linear
+        problem about that: the value about the nearest, the fitted set that has most of their effects."""
         prior, near = self.policy.included_log_odds, math.log(self.policy.least_rival_probability)
         found = {frozenset(f.names): f.log_posterior - prior * len(f.effects) for f in self._listed()}
         cost = {e.name: prior + self._parameters_cost(e) for e in self.candidates}

@@ -1,8 +1,8 @@
 """Causes that must show in means can't be told from variances alone.
 
-A variance follows from the slope of the response at the mean level (v = K (dy/de)^2 e), so that a law which changes it through a quantity that
-mean levels depend on changes these, too. Its evidence in means may be weak, or missing because no level's light is stated; then other causes,
-and errors of the variances, look like it.
+A variance follows from the slope of the response at the mean level (v = K (dy/de)^2 e), so that a law which changes it
+through a quantity that mean levels depend on changes these, too. Its evidence in means may be weak, or missing because
+no level's light is stated; then other causes, and errors of the variances, look like it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from sim.uniform import LEVEL
 
 
 def must_show_in_means(model: MeasurementModel, kind: type[Effect]) -> bool:
-    """Whether an effect changes variances that were measured, and each only through quantities that mean levels depend on."""
+    """Whether an effect changes variances that were measured, and each only through quantities that mean levels depend
+    on."""
     shared = [b.reads & may_change(kind) for b in model.blocks if b.measurement.of_variances and b.touched_by(kind)]
     return bool(shared) and all(quantities <= LEVEL for quantities in shared)
 
@@ -31,10 +32,11 @@ def is_judged_in_means(model: MeasurementModel, kind: type[Effect]) -> bool:
 def shown_in_means(
     model: MeasurementModel, effect: Effect, effects: Effects, without: Effects, policy: DecisionPolicy
 ) -> bool:
-    """Whether the seen numbers that aren't variances are likelier with an effect, by `least_means_log_odds`, where it must show in them.
+    """Whether the seen numbers that aren't variances are likelier with an effect, by `least_means_log_odds`, where it
+    must show in them.
 
-    `effects`: the fitted set; `without`: the set fitted without the effect. True for effects that needn't show in means.
-    """
+    `effects`: the fitted set; `without`: the set fitted without the effect. True for effects that needn't show in
+    means."""
     if not must_show_in_means(model, type(effect)):
         return True
     if not is_judged_in_means(model, type(effect)):

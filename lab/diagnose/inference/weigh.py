@@ -33,15 +33,15 @@ class Candidate:
 
     `log_odds`: log posterior of its set over that of the set without it.
     `explained_share`: of the excess chi2 in the measurements that it acts on.
-    `is_closed`: what is left there is within noise and the form tolerances of the named laws. `is_closed_somewhere`: it is in one of the
-    measurements that show the effect.
+    `is_closed`: what is left there is within noise and the form tolerances of the named laws. `is_closed_somewhere`: it
+    is in one of the measurements that show the effect.
     `remark`: metadata that would explain the recordings as well, in words.
-    `among_listed`: probabilities of the effect and its rivals if the cause is one of them, likeliest first; empty where none was weighed.
-    `intervals`: of sizes that no normal distribution describes, from low to high; their standard deviation is None.
-    `unsigned`: parameters whose sign, turned together, the recordings don't tell. `modes`: values of the parameters in other modes of the
-    posterior that are as likely. `alike`: the effect by others of its choices, of which the recordings don't tell it.
-    `members`: where the family is named and not the effect, the family's effects with their probabilities, likeliest first.
-    """
+    `among_listed`: probabilities of the effect and its rivals if the cause is one of them, likeliest first; empty where
+    none was weighed. `intervals`: of sizes that no normal distribution describes, from low to high; their standard
+    deviation is None. `unsigned`: parameters whose sign, turned together, the recordings don't tell. `modes`: values of
+    the parameters in other modes of the posterior that are as likely. `alike`: the effect by others of its choices, of
+    which the recordings don't tell it. `members`: where the family is named and not the effect, the family's effects
+    with their probabilities, likeliest first."""
 
     effect: Effect
     std: dict[str, float | None]
@@ -66,20 +66,22 @@ class Candidate:
 
     @property
     def alternatives(self) -> tuple[tuple[str, float], ...]:
-        """What may be meant besides the effect, likeliest first: the other members of a family that is named, and rivals."""
+        """What may be meant besides the effect, likeliest first: the other members of a family that is named, and
+        rivals."""
         others = [(n, p) for n, p in self.members if n != self.effect.name]
         return tuple(sorted([*others, *self.rivals], key=lambda item: -item[1]))
 
     @property
     def sizes(self) -> dict[str, float]:
-        """The fitted parameters that size the effect, with their values without it: all but shapes, or all where there is nothing else."""
+        """The fitted parameters that size the effect, with their values without it: all but shapes, or all where there
+        is nothing else."""
         kind = type(self.effect)
         absent = {name: q.absent for name, q in kind.quantities().items() if q.absent is not None and name in self.std}
         return {name: value for name, value in absent.items() if name not in kind.shapes} or absent
 
     def is_compatible_with_absence(self, sigma: float) -> bool:
-        """Say whether every parameter that sizes the effect lies within `sigma` standard deviations of its value without it. A parameter
-        whose standard deviation isn't known isn't compatible."""
+        """Say whether every parameter that sizes the effect lies within `sigma` standard deviations of its value
+        without it. A parameter whose standard deviation isn't known isn't compatible."""
         sizes = self.sizes
 
         def is_near(name: str, value: float) -> bool:
@@ -99,11 +101,13 @@ def weigh(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | None]:
 
     Hypotheses, each with its log posterior:
 
-    - the member, and every effect whose score is near its own in its place. Where both act, a model discrepancy is allowed beside either,
+    - the member, and every effect whose score is near its own in its place. Where both act, a model discrepancy is
+      allowed beside either,
       so that neither is preferred for what both leave;
-    - where no law holds, for the family's sake: the same with a discrepancy in each measurement that the member acts on, beside every effect;
-    - unknown: discrepancies in place of the member, with the other members as they are or refitted, or misstated metadata.
-    """
+    - where no law holds, for the family's sake: the same with a discrepancy in each measurement that the member acts
+      on, beside every effect;
+    - unknown: discrepancies in place of the member, with the other members as they are or refitted, or misstated
+      metadata."""
     model, policy, effect = search.model, search.policy, fit.effects[index]
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
     without, affected = search.without(fit, index), model.affected_blocks(effect)
@@ -169,8 +173,8 @@ def _among_listed(weights: Mapping[str, float]) -> tuple[tuple[str, float], ...]
 
 
 def _rival_fits(search: Search, fit: Fit, index: int, without: Fit) -> dict[str, Fit]:
-    """The set with each effect in the place of a member that promises enough in closed form: fitted roughly, and to convergence
-    where it isn't far behind. What the budget leaves is noted."""
+    """The set with each effect in the place of a member that promises enough in closed form: fitted roughly, and to
+    convergence where it isn't far behind. What the budget leaves is noted."""
     policy = search.policy
     log_odds = fit.log_posterior - without.log_posterior
     scores = [s for s in search.signatures(without).scores() if s.effect.name not in fit.names]
@@ -242,8 +246,9 @@ def explained(
 
 
 def closes_somewhere(model: MeasurementModel, fit: Fit, index: int, policy: DecisionPolicy) -> bool:
-    """Say whether the law of a member holds in one of the measurements that show it: chi2 of its seen numbers there, by the covariance
-    with form tolerances, is within `noise_sigma` of their count. A measurement shows it as `shown_chi2` and `shown_share` say."""
+    """Say whether the law of a member holds in one of the measurements that show it: chi2 of its seen numbers there, by
+    the covariance with form tolerances, is within `noise_sigma` of their count. A measurement shows it as `shown_chi2`
+    and `shown_share` say."""
     effect = fit.effects[index]
     others = tuple(e for e in fit.effects if e is not effect)
     changes = {i: model.change_chi2(effect, others, i) for i in model.affected_blocks(effect)}

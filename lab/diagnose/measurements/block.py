@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from lab.diagnose.measurements.study import Study
 
 Effects = Sequence[Effect]
-#: `Block.reach` of measurements by ln(level): a departure from linearity may change over a factor of exp(0.8) = 2.2 in level.
+#: `Block.reach` of measurements by ln(level): a departure from linearity may change over a factor of exp(0.8) = 2.2 in
+#: level.
 LEVEL_REACH = 0.8
 
 
@@ -28,13 +29,15 @@ LEVEL_REACH = 0.8
 class Measurement:
     """The declaration of a measurement in its module, where `lab.diagnose.measurements.library` finds it.
 
-    `make` takes the `Study` of a side and returns the measured numbers. It raises NotDetermined where the recordings don't
-    determine them.
+    `make` takes the `Study` of a side and returns the measured numbers. It raises NotDetermined where the recordings
+    don't determine them.
     """
 
     name: str  # identifier in results: lower case and underscores
     title: str  # in reports: a noun phrase in a laboratory's words
-    order: int  # in reports, ascending: 100 dark frames, 200 uniform light, 300 charts and edges, 400 screens, 500 boards, 600 pairs
+    # in reports, ascending: 100 dark frames, 200 uniform light, 300 charts and edges, 400 screens, 500 boards, 600
+    # pairs
+    order: int
     axis: str  # quantity of `Label.x`
     unit: str  # of the axis
     make: Callable[[Study], Block]
@@ -43,7 +46,8 @@ class Measurement:
     is_level: bool = False
     #: Whether the numbers are variances, or correlations, of noise.
     of_variances: bool = False
-    #: The quantity of `Label.condition` ("orientation"). Mismatches are located, and curves drawn, by its values. "": it has none.
+    #: The quantity of `Label.condition` ("orientation"). Mismatches are located, and curves drawn, by its values. "":
+    #: it has none.
     conditions: str = ""
     #: Words before the conditions where the report lists them ("edges at"); "": `conditions`.
     conditions_words: str = ""
@@ -53,7 +57,8 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted mean (n,), and its Jacobian: name of a nuisance parameter -> derivative (n,) per prior standard deviation."""
+    """Predicted mean (n,), and its Jacobian: name of a nuisance parameter -> derivative (n,) per prior standard
+    deviation."""
 
     mean: FloatArray
     jacobian: dict[str, FloatArray]
@@ -72,7 +77,8 @@ class Label:
 
 @dataclass(frozen=True)
 class Block:
-    """The n numbers of one measurement: values, covariance of their noise, labels, and the prediction for given effects."""
+    """The n numbers of one measurement: values, covariance of their noise, labels, and the prediction for given
+    effects."""
 
     measurement: Measurement
     reach: float  # correlation length of a model discrepancy and of a law's error, in the unit of `position`

@@ -21,17 +21,19 @@ from sim.camera import Side
 from sim.effects.pixel_aperture import PixelAperture
 from sim.spectrum import FloatArray
 
-#: Where the fill factor isn't stated: least side of the pixel's aperture (px), number of sides tried between it and 1, and number of
-#: principal components that stand for their changes.
+#: Where the fill factor isn't stated: least side of the pixel's aperture (px), number of sides tried between it and 1,
+#: and number of principal components that stand for their changes.
 LEAST_SIDE, APERTURES, APERTURE_DIRECTIONS = 0.5, 10, 4
 #: Remark on an assumed quantity that has nuisance parameters.
 FREE_BESIDE = {"fill_factor": ", but contrast may be that of any aperture"}
 #: Remark where nothing tells the conversion gain.
 NO_GAIN = (
-    "neither stated nor measured: what is told in electrons elsewhere is told in DN, and the improved model takes 1 DN/e; capture repeated flats at "
+    "neither stated nor measured: what is told in electrons elsewhere is told in DN, and the improved model takes 1 "
+    "DN/e; capture repeated flats at "
     "three levels, or state it"
 )
-#: Share of the fitted full well from which on a pixel counts as clipped, as noise takes some pixels of that level to the full well.
+#: Share of the fitted full well from which on a pixel counts as clipped, as noise takes some pixels of that level to
+#: the full well.
 _NEAR_FULL = 0.985
 
 
@@ -55,9 +57,8 @@ def measurement_model(
 ) -> tuple[MeasurementModel | None, tuple[Skipped, ...]]:
     """The measurement model of one side (None where no measurement is determined), and what was skipped or assumed.
 
-    The baseline camera is made of the data sheet and of the side's `fit`. `baseline` stands in place of both: a camera file,
-    whose effects are then part of the baseline. `study`: that of `study_of`, where it is there already.
-    """
+    The baseline camera is made of the data sheet and of the side's `fit`. `baseline` stands in place of both: a camera
+    file, whose effects are then part of the baseline. `study`: that of `study_of`, where it is there already."""
     camera_fit = fit.cameras.get(side) if fit is not None else None
     skipped = [
         Skipped(
@@ -97,8 +98,10 @@ def _far_from_full(study: Study) -> list[Skipped]:
     if reach >= LEAST_REACH:
         return []
     reason = (
-        f"the brightest flat reaches {100 * reach:.2g} % of it, {100 * LEAST_REACH:.0f} % are needed: parameters that refer to full well (nonlinearity's, "
-        f"brighter-fatter's) are extrapolated from there, and hold for signals up to {highest - study.noise.black:.4g} DN; expose longer, or correct "
+        f"the brightest flat reaches {100 * reach:.2g} % of it, {100 * LEAST_REACH:.0f} % are needed: parameters that "
+        "refer to full well (nonlinearity's, "
+        "brighter-fatter's) are extrapolated from there, and hold for signals up to "
+        f"{highest - study.noise.black:.4g} DN; expose longer, or correct "
         "bit_depth or white_level_dn"
     )
     return [Skipped(step="diagnose full_well_e", reason=reason, side=study.side)]

@@ -1,4 +1,5 @@
-"""Lateral colour of boards: displacement of the corners in red and blue from those in green, and between wavelengths."""
+"""Lateral colour of boards: displacement of the corners in red and blue from those in green, and between
+wavelengths."""
 
 from __future__ import annotations
 
@@ -61,7 +62,8 @@ def board_colour_block(study: Study) -> Block:
             f"boards in light of {lit} wavelengths, but no pose in two of them: nothing to hold them against; give the "
             "pictures of one pose the same `pose`"
             if lit > 1
-            else "one channel or one wavelength: nothing to hold it against; take a pose in light of two wavelengths, under "
+            else "one channel or one wavelength: nothing to hold it against; take a pose in light of two wavelengths, "
+            "under "
             "one `pose`",
         )
     values, variances, labels, pairs = [], [], [], []
@@ -143,12 +145,13 @@ def _table(study: Study, place: Array, gap: Array, number: int) -> FloatArray:
 
 
 def _rings(table: FloatArray) -> list[tuple[float, float, float]]:
-    """Of each ring with corners enough: mean distance (half diagonals), outward displacement (px) and its variance (px^2).
+    """Of each ring with corners enough: mean distance (half diagonals), outward displacement (px) and its variance
+    (px^2).
 
-    `table` (corners, 6): distance, outward unit vector (x, y), displacement (x, y) in px, number of the view. Least squares of
-    displacement = common shift + outward unit vector x displacement of the ring. The common shift, as of a prism, is no lateral
-    colour and isn't returned. Outliers beyond 6 robust standard deviations are left out. The variance is the larger of that of
-    independent corners and of the sandwich estimate clustered by view.
+    `table` (corners, 6): distance, outward unit vector (x, y), displacement (x, y) in px, number of the view. Least
+    squares of displacement = common shift + outward unit vector x displacement of the ring. The common shift, as of a
+    prism, is no lateral colour and isn't returned. Outliers beyond 6 robust standard deviations are left out. The
+    variance is the larger of that of independent corners and of the sandwich estimate clustered by view.
     """
     if len(table) < 4 * FEWEST_CORNERS:
         return []

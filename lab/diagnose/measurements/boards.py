@@ -1,12 +1,12 @@
 """Boards: reprojection residuals of the corners of boards, averaged over cells of the frame.
 
-Focal length, principal point, the boards' poses and their warp are always fitted, and never a finding. Brown's distortion
-(k1 k2 p1 p2 k3) is fitted, too, where it isn't known: a lens that distorts isn't at fault. Where the camera was calibrated before,
-its distortion is the baseline and isn't fitted. Departures from it are then findings (`distortion` along the radius, `decentre`
-across it).
+Focal length, principal point, the boards' poses and their warp are always fitted, and never a finding. Brown's
+distortion (k1 k2 p1 p2 k3) is fitted, too, where it isn't known: a lens that distorts isn't at fault. Where the camera
+was calibrated before, its distortion is the baseline and isn't fitted. Departures from it are then findings
+(`distortion` along the radius, `decentre` across it).
 
-An effect's shifts of the corners are projected like the residuals: the part that the fitted parameters could take up is removed.
-"""
+An effect's shifts of the corners are projected like the residuals: the part that the fitted parameters could take up is
+removed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ REFERENCE_NM = 550.0
 
 
 def views_of(study: Study, side: Side) -> tuple[list[BoardView], list[Skipped]]:
-    """The boards found in the charuco captures of a side, and the captures in which none was found. Computed once a study."""
+    """The boards found in the charuco captures of a side, and the captures in which none was found. Computed once a
+    study."""
     kept: dict[Side, tuple[list[BoardView], list[Skipped]]] = study.once(_no_views)
     if side not in kept:
         kept[side] = find_boards(study.recordings, side)
@@ -144,7 +145,8 @@ def shifts_px(study: Study, place: FloatArray, effects: Effects) -> FloatArray:
 
 
 def _cells(study: Study, corners: _Corners, views: int) -> list[tuple[np.ndarray, bool]]:
-    """(mask of its corners (n,), whether held out) of each cell of the frame with corners enough, seen and held-out views apart."""
+    """(mask of its corners (n,), whether held out) of each cell of the frame with corners enough, seen and held-out
+    views apart."""
     camera = study.camera
     row = np.clip((corners.place[:, 1] + 0.5) / camera.rows * ROWS, 0, ROWS - 1e-9).astype(int)
     col = np.clip((corners.place[:, 0] + 0.5) / camera.cols * COLS, 0, COLS - 1e-9).astype(int)
@@ -161,8 +163,8 @@ def _cells(study: Study, corners: _Corners, views: int) -> list[tuple[np.ndarray
 def _averages(
     study: Study, corners: _Corners, cells: Sequence[tuple[np.ndarray, bool]]
 ) -> tuple[FloatArray, list[tuple[float, str, list[int], bool]], FloatArray]:
-    """Weights (2 cells, 2 n) that average shifts along and across the radius; (radius, direction, views, held out) and the number
-    of views of each."""
+    """Weights (2 cells, 2 n) that average shifts along and across the radius; (radius, direction, views, held out) and
+    the number of views of each."""
     camera = study.camera
     away = corners.place - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
     radius = np.hypot(*away.T)
@@ -179,7 +181,8 @@ def _averages(
 
 
 def _between_views(corners: _Corners, mean: FloatArray, noise_px: float) -> float:
-    """Variance (px^2) of a view's mean residual over a cell beyond that of independent corners: imperfect prints, motion, shading.
+    """Variance (px^2) of a view's mean residual over a cell beyond that of independent corners: imperfect prints,
+    motion, shading.
 
     The mean over views of (mean residual)^2 - noise^2 / n, of views with n >= 4 corners in the cell; at least 0.
     """
@@ -199,8 +202,8 @@ def _between_views(corners: _Corners, mean: FloatArray, noise_px: float) -> floa
 def _calibrated(
     corners: _Corners, projected: FloatArray, solution: Solution, shape: tuple[int, int]
 ) -> dict[str, FloatArray]:
-    """Jacobian by the terms of a known distortion, as nuisance parameters: name -> (2 cells,), px per `CALIBRATED_STD_PX` at the
-    frame's corner."""
+    """Jacobian by the terms of a known distortion, as nuisance parameters: name -> (2 cells,), px per
+    `CALIBRATED_STD_PX` at the frame's corner."""
     intrinsics = solution.state.intrinsics[0]
     focal = float(intrinsics[0])
     x, y = ((corners.place[:, k] - intrinsics[2 + k]) / focal for k in (0, 1))

@@ -16,8 +16,8 @@ BORDER_FLOOR = 0.0015
 def cell_border_block(study: Study) -> Block:
     """Coefficient of P (1 - P) in the fit of the pattern P, which is 0 on dark and 1 on lit cells (`pattern_fit`).
 
-    It is the excess of light where the blurred picture is grey: at borders of cells. A nonlinear response of the camera and the
-    grey levels of the screen change it.
+    It is the excess of light where the blurred picture is grey: at borders of cells. A nonlinear response of the camera
+    and the grey levels of the screen change it.
     """
     found = patterns(study)
     points = [(g, p, len(p.bands) + BORDER) for g, group in enumerate(found) for p in group]
@@ -38,7 +38,8 @@ def cell_border_block(study: Study) -> Block:
     return Block(
         measurement=CELL_BORDERS, reach=1e9, value=value,
         covariance=joint_covariance(points, study) + np.diag(np.full(len(value), BORDER_FLOOR**2)),
-        labels=tuple(Label(float(i), p.channel, "borders of cells", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
+        labels=tuple(Label(float(i), p.channel, "borders of cells", p.captures, p.held_out) for i, (_, p,
+        _) in enumerate(points)),
         reads=SHOWN | {"signal.response"}, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 

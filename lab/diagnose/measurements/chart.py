@@ -1,4 +1,5 @@
-"""Mean levels of the patches of a ColorChecker chart, against its published reflectances and the maker's sensitivity curves."""
+"""Mean levels of the patches of a ColorChecker chart, against its published reflectances and the maker's sensitivity
+curves."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ PATCH_COLOUR_STD = 0.004  # the same, independent in each channel
 PATCH_LEVEL_STD = (
     4.0e-4  # standard deviation of a patch's reflectance (perfect diffuser: 1): gloss, errors of dark patches
 )
-#: Prior standard deviation of the light's level on the chart, and of its gradient from the middle to a side of the frame, relative.
+#: Prior standard deviation of the light's level on the chart, and of its gradient from the middle to a side of the
+#: frame, relative.
 CHART_SCALE_STD, CHART_GRADIENT_STD = 0.05, 0.005
 
 
@@ -57,9 +59,9 @@ class Patch:
 def chart_block(study: Study) -> Block:
     """Mean level (DN) of every patch of a ColorChecker24 by channel.
 
-    Nuisance parameters: level and gradient of the light, the maker's sensitivity curves, black level and dark current. Tolerances of
-    the reflectances are in the covariance. Raises NotDetermined where the sensitivity curves aren't stated, and with fewer than
-    twelve unclipped patches.
+    Nuisance parameters: level and gradient of the light, the maker's sensitivity curves, black level and dark current.
+    Tolerances of the reflectances are in the covariance. Raises NotDetermined where the sensitivity curves aren't
+    stated, and with fewer than twelve unclipped patches.
     """
     if not study.stated.quantum_efficiency:
         raise NotDetermined(
@@ -155,7 +157,8 @@ def patch_levels(study: Study) -> list[Patch]:
                         continue
                     inside = slice(rows[0] // step, rows[1] // step), slice(cols[0] // step, cols[1] // step)
                     points.append(
-                        Patch(tuple(part), name, channel, float(values.mean()), values.size, row, col, mean, Surroundings.of_box(low, plane.shape, *inside),
+                        Patch(tuple(part), name, channel, float(values.mean()), values.size, row, col, mean,
+                        Surroundings.of_box(low, plane.shape, *inside),
                               float(spread[inside].mean()), part[0].id in out)
                     )  # fmt: skip
     return points
@@ -164,9 +167,9 @@ def patch_levels(study: Study) -> list[Patch]:
 def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> FloatArray:
     """Covariance (n, n), DN^2, of the levels of n patches.
 
-    It is the sum of shot and read noise and PRNU, tolerances of the reflectance (one common to repeats and channels, one for each
-    channel), of the point spread function's tail, rounding, and the lamp's repeatability, common to all patches of a capture.
-    """
+    It is the sum of shot and read noise and PRNU, tolerances of the reflectance (one common to repeats and channels,
+    one for each channel), of the point spread function's tail, rounding, and the lamp's repeatability, common to all
+    patches of a capture."""
     noise = study.noise
     pixels = np.array([p.pixels for p in points])
     repeats = np.array([len(p.captures) for p in points])
@@ -187,8 +190,8 @@ def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> F
 
 
 def reflectance_covariance(names: StrArray, channel: StrArray, signal: FloatArray) -> FloatArray:
-    """Covariance (n, n), DN^2, of n patches' levels by the tolerances of their reflectances: one common to repeats and channels, one for
-    each channel. `names`, `channel`: (n,) of the patches; `signal`: their levels above dark, DN."""
+    """Covariance (n, n), DN^2, of n patches' levels by the tolerances of their reflectances: one common to repeats and
+    channels, one for each channel. `names`, `channel`: (n,) of the patches; `signal`: their levels above dark, DN."""
     same = names[:, None] == names
     perfect = np.array([signal[channel == c].max() / 0.9 for c in channel])  # DN of a perfect diffuser
     common = np.outer(signal, signal) * PATCH_STD**2 + np.outer(perfect, perfect) * PATCH_LEVEL_STD**2
@@ -197,7 +200,8 @@ def reflectance_covariance(names: StrArray, channel: StrArray, signal: FloatArra
 
 
 def _spread(study: Study, plane: FloatArray, channel: str, light: str) -> FloatArray:
-    """Change (DN) of a plane of the mosaic by the baseline's point spread function: plane convolved with it, less the plane.
+    """Change (DN) of a plane of the mosaic by the baseline's point spread function: plane convolved with it, less the
+    plane.
 
     The recording stands for the scene, as well inside a patch blur changes it by a fraction of a per cent.
     """
@@ -211,7 +215,8 @@ def _spread(study: Study, plane: FloatArray, channel: str, light: str) -> FloatA
 
 
 def _row_light(points: list[Patch], model: Uniform, rows: int, lit: FloatArray) -> dict[str, FloatArray]:
-    """Jacobian of the patches' levels by a light that varies while a frame is taken, of each capture's frames at once."""
+    """Jacobian of the patches' levels by a light that varies while a frame is taken, of each capture's frames at
+    once."""
     by_capture: dict[tuple[ChartCapture, ...], list[int]] = {}
     for i, p in enumerate(points):
         by_capture.setdefault(p.captures, []).append(i)
@@ -227,7 +232,8 @@ def _row_light(points: list[Patch], model: Uniform, rows: int, lit: FloatArray) 
 
 
 def _mixing(study: Study, points: list[Patch], electrons: FloatArray, model: Uniform) -> FloatArray:
-    """Factors (n,) on the patches' electrons by effects that move charge between neighbouring pixels of different channels."""
+    """Factors (n,) on the patches' electrons by effects that move charge between neighbouring pixels of different
+    channels."""
     factor = np.ones(len(points))
     by_patch: dict[tuple[str, str], dict[str, int]] = {}
     for i, p in enumerate(points):
@@ -241,7 +247,8 @@ def _mixing(study: Study, points: list[Patch], electrons: FloatArray, model: Uni
 
 
 def patch_boxes(capture: ChartCapture) -> list[tuple[str, tuple[int, int], tuple[int, int], float, float]]:
-    """(name, rows, columns, centre row, centre column) of the inner part of each patch: a square of 0.44 of the patch's side."""
+    """(name, rows, columns, centre row, centre column) of the inner part of each patch: a square of 0.44 of the patch's
+    side."""
     corners = np.array(capture.corners, float)
     found = []
     names = list(reflectances(capture.chart))

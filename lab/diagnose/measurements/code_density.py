@@ -1,8 +1,8 @@
 """The code-density test of the converter: the histogram of codes in uniform light.
 
-Noise and shading make the histogram of many frames smooth on the scale of the noise's standard deviation at each level. Structure on
-a finer scale comes from the converter (differential nonlinearity), or from processing of the codes after it.
-"""
+Noise and shading make the histogram of many frames smooth on the scale of the noise's standard deviation at each level.
+Structure on a finer scale comes from the converter (differential nonlinearity), or from processing of the codes after
+it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-#: Common divisor of all codes from which on the codes were shifted: one stuck bit gives 2, two stuck bits are taken as a shift.
+#: Common divisor of all codes from which on the codes were shifted: one stuck bit gives 2, two stuck bits are taken as
+#: a shift.
 SHIFTED_FROM = 4
 LEAST_NOISE = 3.0  # standard deviation of the light's noise, codes; below, noise doesn't smooth the histogram
 LEAST_COUNT = 30.0  # of a code that is looked at
@@ -67,15 +68,16 @@ class CodeCounts:
 
 
 def code_block(study: Study) -> Block:
-    """Code-density test of all uniform light: steps (DN) by the code, combs of a few codes' period, and the variance of the counts about a
-    smooth curve."""
+    """Code-density test of all uniform light: steps (DN) by the code, combs of a few codes' period, and the variance of
+    the counts about a smooth curve."""
     counts = study.once(counted)
     joined = int(np.bitwise_or.reduce(np.flatnonzero(sum(c.count for c in counts.values()))))
     apart = joined & -joined  # the largest power of two that divides every code
     if apart >= SHIFTED_FROM:
         raise NotDetermined(
             "code_density",
-            f"every code is a multiple of {apart}, as of a converter of {apart.bit_length() - 1} bits less whose codes were shifted: its steps aren't judged; write the frames as they left the converter",
+            f"every code is a multiple of {apart}, as of a converter of {apart.bit_length() - 1} bits less whose "
+            "codes were shifted: its steps aren't judged; write the frames as they left the converter",
         )
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
@@ -130,15 +132,17 @@ def code_block(study: Study) -> Block:
 
     return Block(
         measurement=CODE_DENSITY, reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
-        covariance=block_diag(*covariances), labels=tuple(labels), reads=frozenset({"codes.codes"}), predict=predict, scale=np.concatenate(scales),
+        covariance=block_diag(*covariances), labels=tuple(labels), reads=frozenset({"codes.codes"}), predict=predict,
+        scale=np.concatenate(scales),
         along=np.array(places),
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Counts:
-    """Counts of every code in some frames, (white level + 1,), and the counts that light and noise give an ideal converter; `groups`: pixels
-    of one level, as their first code, their number, and the probabilities of their codes."""
+    """Counts of every code in some frames, (white level + 1,), and the counts that light and noise give an ideal
+    converter; `groups`: pixels of one level, as their first code, their number, and the probabilities of their
+    codes."""
 
     count: FloatArray
     expected: FloatArray
@@ -160,8 +164,8 @@ class _Counts:
 def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
     """A plane's pixels by level, as `_Counts.groups`.
 
-    Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels. Its variance is proportional to the signal above
-    black, and scaled so that its mean is the measured mean square of the departures from the local mean.
+    Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels. Its variance is proportional to the
+    signal above black, and scaled so that its mean is the measured mean square of the departures from the local mean.
     """
     surface = ndimage.uniform_filter(plane, AROUND, mode="reflect")
     own = AROUND**2 / (AROUND**2 - 1.0)
@@ -233,14 +237,15 @@ def prepared(study: Study, counts: _Counts) -> CodeCounts | None:
 
 @cache
 def _smoothing(half: int) -> FloatArray:
-    """Weights (2 half + 1,) of the Savitzky-Golay filter: the value in the middle of the polynomial of degree `DEGREE` that least
-    squares fit to 2 half + 1 values."""
+    """Weights (2 half + 1,) of the Savitzky-Golay filter: the value in the middle of the polynomial of degree `DEGREE`
+    that least squares fit to 2 half + 1 values."""
     x = np.arange(-half, half + 1) / half
     return np.asarray(np.linalg.pinv(np.vander(x, DEGREE + 1, increasing=True))[0])
 
 
 def _covariance(linear: FloatArray, codes: CodeCounts, counts: _Counts) -> FloatArray:
-    """Covariance of `linear` (m, codes) @ counts. Each pixel has one code: the counts of a group's pixels are multinomial."""
+    """Covariance of `linear` (m, codes) @ counts. Each pixel has one code: the counts of a group's pixels are
+    multinomial."""
     found = (linear * np.maximum(codes.expected, 1.0)) @ linear.T
     means = []
     for first, number, probability in counts.groups:
@@ -252,7 +257,8 @@ def _covariance(linear: FloatArray, codes: CodeCounts, counts: _Counts) -> Float
 
 
 def _combs(codes: CodeCounts) -> tuple[FloatArray, list[tuple[float, str]]]:
-    """Weights (combs, codes) of the counts that give the combs' amplitudes relative to the mean count, and (mean code, words) of each.
+    """Weights (combs, codes) of the counts that give the combs' amplitudes relative to the mean count, and (mean code,
+    words) of each.
 
     For every frequency of `COMBS`: the cosine and, below 1/2 cycle a code, the sine part of the residuals' Fourier sum.
     """
@@ -276,12 +282,12 @@ def _spacing(study: Study) -> int:
 
 
 def _steps(study: Study, codes: CodeCounts) -> tuple[FloatArray, list[int]]:
-    """Weights of the counts that give how many codes' worth is missing about each of `PLACES` parts of the converter's range, and these
-    codes.
+    """Weights of the counts that give how many codes' worth is missing about each of `PLACES` parts of the converter's
+    range, and these codes.
 
-    Codes count the less, the further they are from the place, and not at all from the next place on: what is missing anywhere is shared by
-    the two places beside it. It is missing against `expected` and the parabola that it lacks on either side of both neighbours.
-    """
+    Codes count the less, the further they are from the place, and not at all from the next place on: what is missing
+    anywhere is shared by the two places beside it. It is missing against `expected` and the parabola that it lacks on
+    either side of both neighbours."""
     spacing = _spacing(study)
     table, at = [], []
     for k in range(1, int(2.0**study.camera.bit_depth / spacing)):
@@ -323,7 +329,8 @@ class _Part:
 
 
 def _parts(codes: CodeCounts) -> list[_Part]:
-    """The parts with codes enough. Var(chi2) = 2 n sum_k r_k^2 with the residuals' autocorrelation r of the smoothing filter."""
+    """The parts with codes enough. Var(chi2) = 2 n sum_k r_k^2 with the residuals' autocorrelation r of the smoothing
+    filter."""
     square = codes.rough.power(2)
     variance = np.asarray(square @ np.maximum(codes.smooth, 1.0))
     unequal = np.asarray(square @ np.square(codes.smooth))
@@ -346,8 +353,8 @@ def _parts(codes: CodeCounts) -> list[_Part]:
 def widths(codes: CodeCounts, effects: Effects, study: Study) -> FloatArray:
     """Width (codes,) of each code: the interval of the converter's input that gives it, 1 for an ideal converter.
 
-    The input is cut at the edges of the ideal converter's codes. Where the converter's law is straight over several of these intervals, what
-    lands on each code is exact; other intervals are sampled `FINE` times.
+    The input is cut at the edges of the ideal converter's codes. Where the converter's law is straight over several of
+    these intervals, what lands on each code is exact; other intervals are sampled `FINE` times.
     """
     size, law = len(codes.count), Uniform(study.camera, effects).codes
     edge = np.asarray(np.arange(size + 2 * MARGIN + 1) - 0.5 - MARGIN, float)  # from the first counted code on

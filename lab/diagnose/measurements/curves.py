@@ -1,5 +1,5 @@
-"""Nuisance parameters of the maker's sensitivity curves: scale, tilt, bend, smooth errors of a few per mille, a constant leak, and what they
-don't state beyond their ends."""
+"""Nuisance parameters of the maker's sensitivity curves: scale, tilt, bend, smooth errors of a few per mille, a
+constant leak, and what they don't state beyond their ends."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from sim.uniform import SPECTRAL, Uniform, electron_rate
 
 # Relative prior standard deviations.
 LEAK_STD = 2.0e-4  # of the curve's peak, at all wavelengths: sensitivity where the maker states none
-#: Sensitivity beyond a curve's ends, of what falls from its last value to 0 where silicon turns transparent (band gap of 1.12 eV) and where
-#: glass and oxide turn opaque: any share from none to all, whose root mean square is this.
+#: Sensitivity beyond a curve's ends, of what falls from its last value to 0 where silicon turns transparent (band gap
+#: of 1.12 eV) and where glass and oxide turn opaque: any share from none to all, whose root mean square is this.
 BEYOND_STD, SILICON_NM, GLASS_NM = 3.0**-0.5, 1107.0, 330.0
 CURVE_SCALE_STD = 0.2  # errors of gain, aperture and lens included
 LEVEL_STD = 0.5  # of all signals where gain, f-number or pitch aren't known
@@ -33,10 +33,11 @@ CURVE_STEP_NM = 2.5  # of a curve that `freed_curve` returns
 class CurveJacobian:
     """Electron rates of n pairs of light and channel, and their Jacobian by nuisance parameters of the maker's curves.
 
-    Parameters of a channel: scale, tilt, bend, smooth errors (squared-exponential prior on knots), the unknown course between the
-    maker's samples, a leak, and the sensitivity beyond the curve's ends, which only light that lies there shows. The derivative of the rate by a factor 1 + d(w) on the curve is the rate with the curve times d(w):
-    exact, as the rate is linear in the curve. The baseline's rates are those of `sim.uniform.electron_rate`. Effects enter as ratios of sums over
-    1 nm, in which the sums' discretisation error cancels.
+    Parameters of a channel: scale, tilt, bend, smooth errors (squared-exponential prior on knots), the unknown course
+    between the maker's samples, a leak, and the sensitivity beyond the curve's ends, which only light that lies there
+    shows. The derivative of the rate by a factor 1 + d(w) on the curve is the rate with the curve times d(w): exact, as
+    the rate is linear in the curve. The baseline's rates are those of `sim.uniform.electron_rate`. Effects enter as
+    ratios of sums over 1 nm, in which the sums' discretisation error cancels.
     """
 
     def __init__(
@@ -46,9 +47,9 @@ class CurveJacobian:
         measured_e_per_s: FloatArray | None = None,
         scale: float = 1.0,
     ) -> None:
-        """`items`: n of (path of the radiance, channel, exposure in s, kind of capture, reflectance). `measured_e_per_s` (n,): where
-        gain, f-number or pitch aren't known, the rates are scaled to their sum, and the common level is a nuisance parameter.
-        `scale`: a factor on all rates."""
+        """`items`: n of (path of the radiance, channel, exposure in s, kind of capture, reflectance).
+        `measured_e_per_s` (n,): where gain, f-number or pitch aren't known, the rates are scaled to their sum, and the
+        common level is a nuisance parameter. `scale`: a factor on all rates."""
         self.study, self.items = study, items
         self.kind = items[0][3]
         lights = {path: study.spectrum(path) for path in {item[0] for item in items}}
@@ -109,8 +110,8 @@ class CurveJacobian:
 
     @cached_property
     def sample_shares(self) -> FloatArray:
-        """Derivatives d ln(rate) / d ln(radiance) of the baseline's rates by the radiance in each nanometre, (n, wavelengths). Rows
-        sum to 1."""
+        """Derivatives d ln(rate) / d ln(radiance) of the baseline's rates by the radiance in each nanometre, (n,
+        wavelengths). Rows sum to 1."""
         return np.asarray(self._weight / np.maximum(self._total, 1e-300)[:, None])
 
     def _under(self, effects: Effects) -> tuple[FloatArray, FloatArray]:
@@ -154,8 +155,8 @@ class CurveJacobian:
 
 
 def curve_modes(wavelength_nm: FloatArray) -> FloatArray:
-    """Relative changes (modes, wavelengths) of a curve by its nuisance parameters, one prior standard deviation each: scale, tilt,
-    bend, and the principal components of the smooth errors."""
+    """Relative changes (modes, wavelengths) of a curve by its nuisance parameters, one prior standard deviation each:
+    scale, tilt, bend, and the principal components of the smooth errors."""
     knots = np.arange(380.0, 781.0, 20.0)
     cov = CURVE_ROUGH_STD**2 * np.exp(-0.5 * ((knots[:, None] - knots) / CURVE_ROUGH_NM) ** 2)
     size, vector = np.linalg.eigh(cov)
@@ -170,8 +171,8 @@ def curve_modes(wavelength_nm: FloatArray) -> FloatArray:
 
 
 def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) -> Spectrum:
-    """A maker's curve, corrected by fitted nuisance parameters. `quantities`: names as of `CurveJacobian.jacobian`, values in prior
-    standard deviations. The curve itself where none is of this channel. Values are limited to 0..1."""
+    """A maker's curve, corrected by fitted nuisance parameters. `quantities`: names as of `CurveJacobian.jacobian`,
+    values in prior standard deviations. The curve itself where none is of this channel. Values are limited to 0..1."""
     names = [name for name in quantities if name.startswith(f"curve:{channel}:")]
     if not names:
         return curve
@@ -184,7 +185,8 @@ def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) 
 
 
 def _beyond(curve: Spectrum, wavelength_nm: FloatArray) -> FloatArray:
-    """Largest sensitivity beyond a curve's samples: from its value at either end linearly to 0 at `SILICON_NM` and `GLASS_NM`; 0 within."""
+    """Largest sensitivity beyond a curve's samples: from its value at either end linearly to 0 at `SILICON_NM` and
+    `GLASS_NM`; 0 within."""
     (low, *_, high), (first, *_, last) = curve.wavelength_nm, curve.value
     above = last * (SILICON_NM - wavelength_nm) / max(SILICON_NM - high, 1.0)
     below = first * (wavelength_nm - GLASS_NM) / max(low - GLASS_NM, 1.0)
@@ -203,8 +205,8 @@ def _last_place(value: FloatArray) -> float:
 def _between_samples(curve: Spectrum, wavelength_nm: FloatArray) -> FloatArray:
     """Relative difference of a cubic spline through a curve's samples from linear interpolation, limited to +-0.2.
 
-    A data sheet's samples, 5 nm apart, don't say which is right. At the foot of a colour filter they differ by some per cent.
-    """
+    A data sheet's samples, 5 nm apart, don't say which is right. At the foot of a colour filter they differ by some per
+    cent."""
     if len(curve.wavelength_nm) < 4:
         return np.zeros_like(wavelength_nm)
     straight = curve.at(wavelength_nm)

@@ -29,7 +29,8 @@ def dark_field_block(study: Study) -> Block:
     if min(study.camera.rows // rows, study.camera.cols // cols) < CELL_PX:
         raise NotDetermined(
             "dark_field",
-            f"frames of {study.camera.rows} x {study.camera.cols} px: too small to be split into cells, which need {rows * CELL_PX} x {cols * CELL_PX} px",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: too small to be split into cells, which need "
+            f"{rows * CELL_PX} x {cols * CELL_PX} px",
         )
     value = np.concatenate([part.cells.ravel() - part.cells.mean() for *_, part in points])
     row, col = (g.ravel() for g in np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij"))
@@ -78,7 +79,8 @@ def dark_field_block(study: Study) -> Block:
     longest = max(float(exposures.max()), 1e-9)
     return Block(
         measurement=DARK_FIELD, reach=0.5, value=value, covariance=np.asarray(covariance, float),
-        labels=tuple(Label(float(radius[k]), "all", f.condition.name, part.captures, out) for f, out, part in points for k in range(count)),
+        labels=tuple(Label(float(radius[k]), "all", f.condition.name, part.captures, out) for f, out,
+        part in points for k in range(count)),
         reads=DARK_CURRENT | ADDED, predict=predict, scale=np.repeat(np.maximum(exposures / longest, 0.1), count),
     )  # fmt: skip
 

@@ -1,8 +1,8 @@
 """Statistics of dark frames, from which all measurements of dark frames take their numbers. Each frame is read once.
 
-The baseline's dark frame has the mean black level + dark current x exposure at every temperature, and normal noise and a normal fixed
-pattern of independent pixels. The measurements state powers as logarithms and counts as square roots, whose variance hardly depends
-on their size.
+The baseline's dark frame has the mean black level + dark current x exposure at every temperature, and normal noise and
+a normal fixed pattern of independent pixels. The measurements state powers as logarithms and counts as square roots,
+whose variance hardly depends on their size.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ CELLS = 4, 6  # of a frame: rows, columns
 LEAST_CELL_PX = 2  # least side of a cell
 CELL_FLOOR_DN = 0.005  # standard deviation of a cell's mean beside noise
 MOST_CONDITIONS = 3  # conditions whose fixed pattern is measured: the shortest, the longest, the warmest
-#: Lower edges of the bins in which outlying pixels are counted, in standard deviations of a pixel's fixed pattern. The first two count
-#: dark pixels as well, below their negatives.
+#: Lower edges of the bins in which outlying pixels are counted, in standard deviations of a pixel's fixed pattern. The
+#: first two count dark pixels as well, below their negatives.
 TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0, 200.0, 600.0
 
 
@@ -63,8 +63,8 @@ class DarkCondition:
 
 @dataclass(frozen=True)
 class DarkPattern:
-    """The fixed pattern of one condition: statistics of the mean frame, and of the lower median of up to `MEDIAN_OF` frames. Each
-    frame's mean is subtracted first."""
+    """The fixed pattern of one condition: statistics of the mean frame, and of the lower median of up to `MEDIAN_OF`
+    frames. Each frame's mean is subtracted first."""
 
     frames: int  # of the mean
     of_median: int  # frames of the median
@@ -83,7 +83,8 @@ class DarkPattern:
 
 @dataclass(frozen=True)
 class DarkNoise:
-    """The temporal noise of one condition, from Helmert contrasts: frame k less the mean of those before it, times sqrt(k / (k + 1)).
+    """The temporal noise of one condition, from Helmert contrasts: frame k less the mean of those before it, times
+    sqrt(k / (k + 1)).
 
     Contrasts have the variance of one frame and are independent of each other.
     """
@@ -114,8 +115,8 @@ class DarkStatistics:
 def conditions(study: Study) -> list[DarkCondition]:
     """Dark captures by exposure and temperature, at the most frequent gain. The last third of the repeats is held out.
 
-    Two repeats stay together, as temporal noise needs both: in every third condition both are held out. Raises NotDetermined without
-    dark captures.
+    Two repeats stay together, as temporal noise needs both: in every third condition both are held out. Raises
+    NotDetermined without dark captures.
     """
     captures = study.recordings.captures(DarkCapture, study.side)
     if not captures:
@@ -157,15 +158,19 @@ def conditions(study: Study) -> list[DarkCondition]:
 
 
 def dark_frames(study: Study) -> list[DarkStatistics]:
-    """The statistics of all dark captures by condition. Raises NotDetermined where there are none, or where the frames are too small
-    to be split into cells."""
+    """The statistics of all dark captures by condition. Raises NotDetermined where there are none, or where the frames
+    are too small to be split into cells."""
     every = conditions(study)
     least_px = LEAST_CELL_PX * max(CELLS)
     if min(study.camera.rows, study.camera.cols) < least_px:
         raise NotDetermined(
             "dark", f"frames of {study.camera.rows} x {study.camera.cols} px: their cells need {least_px} px a side"
         )
-    usual = [c for c in every if study.temperature_c is None or c.temperature_c is None or abs(c.temperature_c - study.temperature_c) < 2.0] or every  # fmt: skip
+    usual = [
+        c
+        for c in every
+        if study.temperature_c is None or c.temperature_c is None or abs(c.temperature_c - study.temperature_c) < 2.0
+    ] or every
     warmest = max(every, key=lambda c: (c.temperature_c or 0.0, c.exposure_s))
     picked = list(dict.fromkeys([usual[0].name, usual[-1].name, warmest.name]))[:MOST_CONDITIONS]
     sound = study.once(sound_pixels)
@@ -200,7 +205,8 @@ def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDA
 
 
 class _Contrasts:
-    """What contrasts tell of the temporal noise. They are added one by one and not kept: a condition may have hundreds of frames."""
+    """What contrasts tell of the temporal noise. They are added one by one and not kept: a condition may have hundreds
+    of frames."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._squares: Image = np.zeros(shape, np.float32)  # sum of squared contrasts without row and column noise
@@ -309,7 +315,8 @@ DEFECTS = frozenset({"charge.defects", "signal.telegraph"})
 
 
 def fine_conditions(step: str, frames: Sequence[DarkStatistics], least_dn: float) -> list[DarkStatistics]:
-    """Conditions whose temporal noise, of a pixel, exceeds `least_dn`. Raises NotDetermined for `step` where there are none."""
+    """Conditions whose temporal noise, of a pixel, exceeds `least_dn`. Raises NotDetermined for `step` where there are
+    none."""
     every = [f for f in frames if f.changing]
     if not every:
         raise NotDetermined(step, "no two dark frames of the same exposure and temperature")
@@ -328,7 +335,10 @@ def by_part(frames: Sequence[DarkStatistics]) -> dict[bool, list[DarkNoise]]:
 def too_coarse(frames: Sequence[DarkStatistics], limit_dn: float) -> str:
     """The reason why dark frames of so little noise aren't judged, in one line."""
     noise = min(np.sqrt(c.pixel_dn2) for f in frames for c in f.changing.values())
-    return f"the temporal noise of dark frames is {noise:.2f} DN, below the limit of {limit_dn} DN: codes are too coarse to show how it is distributed; a higher gain would"
+    return (
+        f"the temporal noise of dark frames is {noise:.2f} DN, below the limit of {limit_dn} DN: codes are too coarse "
+        "to show how it is distributed; a higher gain would"
+    )
 
 
 def captures_of(frames: DarkStatistics, held_out: bool) -> tuple[str, ...]:

@@ -19,14 +19,15 @@ from lab.errors import NotDetermined
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform, noise_values
 
-#: Most points of the grid on which the dark current over the field is evaluated. A grid much coarser than the pixels moves the laws'
-#: origin and the cells' borders: with 50 DN of glow in a corner, a cell's mean is then off by a hundred standard deviations.
+#: Most points of the grid on which the dark current over the field is evaluated. A grid much coarser than the pixels
+#: moves the laws' origin and the cells' borders: with 50 DN of glow in a corner, a cell's mean is then off by a hundred
+#: standard deviations.
 MOST_POINTS = 1e6
 
 
 def dark_current_map(study: Study, effects: Effects) -> Callable[[float | None], FloatArray]:
-    """Function of the temperature (C) that returns the dark current (rows, cols), e/s: by pixel, or by squares of pixels where the
-    frame has more than `MOST_POINTS` pixels."""
+    """Function of the temperature (C) that returns the dark current (rows, cols), e/s: by pixel, or by squares of
+    pixels where the frame has more than `MOST_POINTS` pixels."""
     camera = study.camera
     down = math.ceil(math.sqrt(camera.rows * camera.cols / MOST_POINTS))
     coarse = camera.model_copy(
@@ -40,7 +41,8 @@ def dark_current_map(study: Study, effects: Effects) -> Callable[[float | None],
 
 
 def added_dark_e_per_s(study: Study, effects: Effects) -> Callable[[float | None], float]:
-    """Function of the temperature (C) that returns the change of the mean dark current by effects, without defective pixels, e/s."""
+    """Function of the temperature (C) that returns the change of the mean dark current by effects, without defective
+    pixels, e/s."""
     if not Uniform(study.camera, effects).changes_dark_current:
         return lambda temperature_c: 0.0
     at = dark_current_map(study, effects)
@@ -56,9 +58,8 @@ def added_dark_dn(study: Study, effects: Effects) -> Callable[[Capture], float]:
 def dark_level_block(study: Study) -> Block:
     """Mean of every dark frame without defective pixels, DN.
 
-    Nuisance parameters: black level and dark current. Effects may add an offset that drifts with time or temperature, dark current,
-    image lag, and the converter's error at these codes. Raises NotDetermined without dark captures.
-    """
+    Nuisance parameters: black level and dark current. Effects may add an offset that drifts with time or temperature,
+    dark current, image lag, and the converter's error at these codes. Raises NotDetermined without dark captures."""
     frames = study.once(dark_frames)
     captures = [(c, f.condition, c in f.condition.held_out) for f in frames for c in f.condition.captures]
     value = np.array([f.means[c.id] for f in frames for c in f.condition.captures])
@@ -83,12 +84,19 @@ def dark_level_block(study: Study) -> Block:
     same = np.array([[a[1] is b[1] for b in captures] for a in captures])
     # the coordinate of smoothness: 10 degrees count as twice the range of exposures
     reach = float(max(np.ptp(exposures), 1e-3))
-    warmer = np.array([0.0 if k.temperature_c is None or noise.dark_c is None else k.temperature_c - noise.dark_c for _, k, _ in captures])  # fmt: skip
+    warmer = np.array(
+        [
+            0.0 if k.temperature_c is None or noise.dark_c is None else k.temperature_c - noise.dark_c
+            for _, k, _ in captures
+        ]
+    )
     return Block(
         measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
-        covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse, coarse),
+        covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse,
+        coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
-        reads=LAG | DARK_CURRENT | {"signal.offset_dn", "codes.codes"}, scattered_by=LINES, predict=predict, scale=np.ones(len(value)),
+        reads=LAG | DARK_CURRENT | {"signal.offset_dn", "codes.codes"}, scattered_by=LINES, predict=predict,
+        scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -114,7 +122,8 @@ def black_level_block(study: Study) -> Block:
         measurement=BLACK_LEVEL, reach=1.0, value=np.array([study.noise.black]),
         covariance=np.array([[std**2]]),
         labels=(Label(0.0, "all", "stated level", tuple(c.id for c in shortest.captures), False),),
-        reads=frozenset(), predict=lambda effects: Prediction(np.array([stated]), {}), scale=np.array([max(stated, 1.0)]),
+        reads=frozenset(), predict=lambda effects: Prediction(np.array([stated]), {}), scale=np.array([max(stated,
+        1.0)]),
     )  # fmt: skip
 
 

@@ -1,4 +1,5 @@
-"""Row and column noise of dark frames, fixed row and column patterns, and the correlation of noise along rows and columns."""
+"""Row and column noise of dark frames, fixed row and column patterns, and the correlation of noise along rows and
+columns."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ LEAST_LINE_DN = 0.3  # temporal noise of a pixel below which codes are too coars
 
 
 def temporal_line_block(lines: Lines, study: Study) -> Block:
-    """Temporal row (column) noise: ln of the power spectrum of the lines' means over that of white noise, by frequency band.
+    """Temporal row (column) noise: ln of the power spectrum of the lines' means over that of white noise, by frequency
+    band.
 
     0 where pixels are independent. Raises NotDetermined without repeats, and where codes are too coarse.
     """
@@ -72,8 +74,8 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
 def fixed_line_block(lines: Lines, study: Study) -> Block:
     """Fixed row (column) pattern in the mean frame of the shortest exposure.
 
-    The numbers are ln of the power spectrum of the lines' means over that of white noise, by frequency band, and the mean of odd
-    lines less that of even ones, DN. Raises NotDetermined where codes are too coarse.
+    The numbers are ln of the power spectrum of the lines' means over that of white noise, by frequency band, and the
+    mean of odd lines less that of even ones, DN. Raises NotDetermined where codes are too coarse.
     """
     frames = study.once(dark_frames)
     name = "row_pattern" if lines == "rows" else "column_pattern"
@@ -150,10 +152,11 @@ def _fixed_share(frames: DarkStatistics) -> dict[bool, float]:
 
 
 def correlation_block(study: Study) -> Block:
-    """Correlation of temporal noise along rows and columns: ln of its power at low frequencies over that of white noise.
+    """Correlation of temporal noise along rows and columns: ln of its power at low frequencies over that of white
+    noise.
 
-    The means of the lines are excluded. 0 where pixels are independent. Raises NotDetermined where codes are too coarse or frames
-    too small.
+    The means of the lines are excluded. 0 where pixels are independent. Raises NotDetermined where codes are too coarse
+    or frames too small.
     """
     fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN)
     value, variance, labels = [], [], []
@@ -175,7 +178,8 @@ def correlation_block(study: Study) -> Block:
     if not labels:
         raise NotDetermined(
             "dark_correlation",
-            f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share is measured from {int(np.ceil(1.0 / LEVEL_BAND[0]))} px a side on",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share is measured from "
+            f"{int(np.ceil(1.0 / LEVEL_BAND[0]))} px a side on",
         )
     n = len(labels)
     # no effect predicts an excess: row and column noise has no spectrum along its lines

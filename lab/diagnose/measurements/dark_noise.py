@@ -19,11 +19,11 @@ LEAST_NOISE_DN = 0.4  # below, codes are too coarse to measure temporal noise
 
 
 def dark_noise_block(study: Study) -> Block:
-    """Temporal variance of dark frames by exposure and temperature, DN^2. It grows with the dark signal (shot noise), not with an
-    offset.
+    """Temporal variance of dark frames by exposure and temperature, DN^2. It grows with the dark signal (shot noise),
+    not with an offset.
 
-    Nuisance parameters: read noise, dark current, gain. Raises NotDetermined without repeats, and where codes are too coarse.
-    """
+    Nuisance parameters: read noise, dark current, gain. Raises NotDetermined without repeats, and where codes are too
+    coarse."""
     frames = study.once(dark_frames)
     points = [(f, out, c) for f in frames for out, c in f.changing.items()]
     if not points:
@@ -75,13 +75,15 @@ def dark_noise_block(study: Study) -> Block:
     return Block(
         measurement=DARK_NOISE, reach=float(max(np.ptp(exposures), 1e-3)), value=value,
         covariance=covariance,
-        labels=tuple(Label(f.condition.exposure_s, "all", f.condition.name, captures_of(f, out), out) for f, out, _ in points),
+        labels=tuple(Label(f.condition.exposure_s, "all", f.condition.name, captures_of(f, out), out) for f, out,
+        _ in points),
         reads=DEFECTS | {"charge.dark_current", "signal.lines"}, predict=predict, scale=value,
     )  # fmt: skip
 
 
 def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn2: float) -> float:
-    """What defective pixels add to the mean variance (DN^2) of contrasts that are clipped at `CLIP` standard deviations."""
+    """What defective pixels add to the mean variance (DN^2) of contrasts that are clipped at `CLIP` standard
+    deviations."""
     cut = CLIP * np.sqrt(variance_dn2)
     more = 0.0
     for hot in model.hot:

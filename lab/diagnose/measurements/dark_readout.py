@@ -1,5 +1,5 @@
-"""What read-out does in dark frames: noise that rows share anew in every frame, and fixed offsets of rows and columns. Light frames have
-both as well, additively in DN."""
+"""What read-out does in dark frames: noise that rows share anew in every frame, and fixed offsets of rows and columns.
+Light frames have both as well, additively in DN."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ MOST_FRAMES = 12  # of a condition
 #: Prior relative standard deviation of the cube root of a band's power about its neighbours': a factor of 2.2 in power.
 NEIGHBOUR_STD = 0.3
 NEIGHBOURS = 2  # bands on either side
-#: Relative standard deviation by which the power of rows in light departs from that in the dark: the chip is warmer or cooler, and the
-#: read-out busier.
+#: Relative standard deviation by which the power of rows in light departs from that in the dark: the chip is warmer or
+#: cooler, and the read-out busier.
 LIGHT_STD = 0.15
-#: Share of the fixed offsets by which they may be others in light: a CMOS camera's even and odd rows differ by 0.09 DN in the dark, and
-#: don't in light.
+#: Share of the fixed offsets by which they may be others in light: a CMOS camera's even and odd rows differ by 0.09 DN
+#: in the dark, and don't in light.
 OFFSETS_STD = 0.5
 
 
 @dataclass(frozen=True)
 class DarkRowPower:
-    """Power of the rows of single frames beyond that of pixels' noise, by band of frequency, DN^2, and its standard deviation."""
+    """Power of the rows of single frames beyond that of pixels' noise, by band of frequency, DN^2, and its standard
+    deviation."""
 
     power_dn2: FloatArray  # (bands,)
     std_dn2: FloatArray  # (bands,)
@@ -38,7 +39,8 @@ class DarkRowPower:
 
 @dataclass(frozen=True)
 class DarkReadOut:
-    """Statistics of repeated dark frames. A row of a spectrum is the mean over as many neighbouring ones as the mosaic's period has."""
+    """Statistics of repeated dark frames. A row of a spectrum is the mean over as many neighbouring ones as the
+    mosaic's period has."""
 
     contrasts: int  # independent differences of repeats
     power_dn2: FloatArray  # (rows / 2 + 1,): of the rows of single frames, by cycles a frame
@@ -49,10 +51,11 @@ class DarkReadOut:
     def noise(self, bands: Sequence[range]) -> DarkRowPower:
         """The noise of rows in `bands`, each a range of cycles a frame.
 
-        With a = `contrasts` x cycles of the band, its power P is gamma-distributed about the true one, tau, and P^(1/3) has the mean
-        tau^(1/3) G(a + 1/3) / G(a) / a^(1/3), G the gamma function. Without other knowledge tau^(1/3) then has the variance (a P)^(2/3)
-        (G(a - 2/3) / G(a) - (G(a - 1/3) / G(a))^2). It is weighed with the mean over the neighbouring bands by `NEIGHBOUR_STD`, as a power
-        may be small by chance: two repeats have two degrees of freedom in the lowest band.
+        With a = `contrasts` x cycles of the band, its power P is gamma-distributed about the true one, tau, and P^(1/3)
+        has the mean tau^(1/3) G(a + 1/3) / G(a) / a^(1/3), G the gamma function. Without other knowledge tau^(1/3) then
+        has the variance (a P)^(2/3) (G(a - 2/3) / G(a) - (G(a - 1/3) / G(a))^2). It is weighed with the mean over the
+        neighbouring bands by `NEIGHBOUR_STD`, as a power may be small by chance: two repeats have two degrees of
+        freedom in the lowest band.
         """
         shape = self.contrasts * np.array([len(band) for band in bands], float)
         scale = np.cbrt(shape * [self.power_dn2[list(band)].mean() for band in bands])
@@ -69,7 +72,8 @@ class DarkReadOut:
         return DarkRowPower(power, np.hypot(std, LIGHT_STD * np.maximum(power, 0.0)))
 
     def offsets(self, bands: Sequence[range], step: int) -> DarkRowPower:
-        """The power of the rows of `offsets_dn` that isn't in those of light frames: their noise, and what may differ by `OFFSETS_STD`."""
+        """The power of the rows of `offsets_dn` that isn't in those of light frames: their noise, and what may differ
+        by `OFFSETS_STD`."""
         rows = row_profile(self.offsets_dn, step)
         fixed = np.abs(np.fft.rfft(rows)) ** 2 / len(rows)
         modes = np.array([len(band) for band in bands], float)
@@ -86,11 +90,12 @@ def row_profile(frame: NDArray[np.floating], step: int) -> FloatArray:
 
 
 def dark_readout(study: Study) -> DarkReadOut | None:
-    """What repeated dark frames show of the read-out; None where there are none, or their codes are too coarse to show it.
+    """What repeated dark frames show of the read-out; None where there are none, or their codes are too coarse to show
+    it.
 
-    Noise is measured by Helmert contrasts: frame k less the mean of those before it, times sqrt(k / (k + 1)). Fixed offsets are those of
-    exposures up to the longest flat's, as a dark current that differs from pixel to pixel grows with the exposure.
-    """
+    Noise is measured by Helmert contrasts: frame k less the mean of those before it, times sqrt(k / (k + 1)). Fixed
+    offsets are those of exposures up to the longest flat's, as a dark current that differs from pixel to pixel grows
+    with the exposure."""
     every = conditions(study) if study.recordings.captures("dark", study.side) else []
     step, longest_s = mosaic.step(study.camera.cfa), max((g[0].exposure_s for g in study.flat_levels()), default=0.0)
     power, pixel_dn2, contrasts = np.zeros(0), 0.0, 0
@@ -118,8 +123,8 @@ def dark_readout(study: Study) -> DarkReadOut | None:
 
 
 def _read(study: Study, condition: DarkCondition, step: int) -> tuple[FloatArray, float, NDArray[np.float32]]:
-    """Of the repeats of one condition: power of the rows of each contrast (contrasts, rows / 2 + 1), DN^2; variance of a pixel without
-    that of whole rows, DN^2; and the mean frame, DN."""
+    """Of the repeats of one condition: power of the rows of each contrast (contrasts, rows / 2 + 1), DN^2; variance of
+    a pixel without that of whole rows, DN^2; and the mean frame, DN."""
     lines, pixel = [], []
     mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
     for k, capture in enumerate(condition.captures[:MOST_FRAMES]):

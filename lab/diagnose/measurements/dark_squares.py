@@ -28,15 +28,16 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-SCREEN_FLOOR = 6e-4  # share of the lit screen's level: light of lit parts that the model doesn't follow, and of the screen's surroundings
+# share of the lit screen's level: light of lit parts that the model doesn't follow, and of the screen's surroundings
+SCREEN_FLOOR = 6e-4
 
 
 def screen_block(study: Study) -> Block:
     """Mean level in the dark squares of a pattern on a screen, less that of the dark screen, by channel, DN.
 
-    Only pixels at least 7 px away from lit ones count. The baseline's point spread function reaches them, which is predicted from
-    the lit pixels. A veil adds a share of the frame's mean. Raises NotDetermined without white, black and patterned captures of one
-    pose and exposure, or without dark squares wide enough.
+    Only pixels at least 7 px away from lit ones count. The baseline's point spread function reaches them, which is
+    predicted from the lit pixels. A veil adds a share of the frame's mean. Raises NotDetermined without white, black
+    and patterned captures of one pose and exposure, or without dark squares wide enough.
     """
     recordings, side, camera, noise = study.recordings, study.side, study.camera, study.noise
     by_pose: dict[str, dict[str, list[Any]]] = {}
@@ -104,7 +105,8 @@ def screen_block(study: Study) -> Block:
     return Block(
         measurement=SCREEN, reach=1e9, value=value, covariance=covariance,
         labels=tuple(Label(float(i), p.channel, p.kind, p.captures, p.held_out) for i, p in enumerate(points)),
-        reads=REFLECTIONS | {"image.veils", "signal.response"}, predict=predict, scale=np.array([p.white for p in points]),
+        reads=REFLECTIONS | {"image.veils", "signal.response"}, predict=predict,
+        scale=np.array([p.white for p in points]),
     )  # fmt: skip
 
 
@@ -144,8 +146,8 @@ def _dark_squares(
     held_out: bool,
     blacks: int,
 ) -> list[_DarkSquares]:
-    """The dark squares of a pattern in each channel. `part`: its captures; `shown`, `white`, `black`: mean frames of the pattern, of the lit
-    and of the dark screen; `blacks`: number of dark-screen captures."""
+    """The dark squares of a pattern in each channel. `part`: its captures; `shown`, `white`, `black`: mean frames of
+    the pattern, of the lit and of the dark screen; `blacks`: number of dark-screen captures."""
     camera, noise = study.camera, study.noise
     found = []
     step = mosaic.step(camera.cfa)
@@ -174,8 +176,9 @@ def _dark_squares(
         fx = np.fft.rfftfreq(2 * share.shape[1], step)[None, :]
         radiance = study.spectrum(part[0].screen.radiance) if part[0].screen.radiance else None
         otf = np.real(optical_transfer(camera, channel, radiance, fx, fy))
-        # pixels above half the contrast are drawn as lit: the total is right, and far away the outline doesn't matter. How far a screen
-        # goes on beyond the frame's border isn't known: the tail is the mean of two cases, no light there, and the mirror image
+        # pixels above half the contrast are drawn as lit: the total is right, and far away the outline doesn't matter.
+        # How far a screen goes on beyond the frame's border isn't known: the tail is the mean of two cases, no light
+        # there, and the mirror image
         ends, endless = (
             np.fft.irfft2(np.fft.rfft2(whole) * otf, whole.shape)[: share.shape[0], : share.shape[1]][use].mean()
             for whole in (np.pad(picture, pad), np.pad(picture, pad, mode="symmetric"))
@@ -188,8 +191,10 @@ def _dark_squares(
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
                          float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
-                         added, use, Surroundings.of(harmonics(added), use), 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
-                         float(black[plane][use].mean()) - noise.black, float(np.linalg.norm(rounding_std_dn(noise.spread_dn2(lights)))))
+                         added, use, Surroundings.of(harmonics(added), use), 0.5 * float(endless - ends),
+                         means[0] - means[1], float(full[bright].mean()),
+                         float(black[plane][use].mean()) - noise.black,
+                         float(np.linalg.norm(rounding_std_dn(noise.spread_dn2(lights)))))
         )  # fmt: skip
     return found
 

@@ -1,4 +1,5 @@
-"""Defective pixels in dark frames: numbers of pixels that depart in every frame, and of pixels that flicker from frame to frame."""
+"""Defective pixels in dark frames: numbers of pixels that depart in every frame, and of pixels that flicker from frame
+to frame."""
 
 from __future__ import annotations
 
@@ -24,26 +25,29 @@ from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
 LEAST_COUNTED_DN = 0.6  # temporal noise of a pixel below which codes are too coarse for the tails of its distribution
-#: Lower edges of the bins of temporal variance, over the first one, which a healthy pixel passes with the probability `FLICKER_CHANCE`.
+#: Lower edges of the bins of temporal variance, over the first one, which a healthy pixel passes with the probability
+#: `FLICKER_CHANCE`.
 FLICKER_EDGES = 1.0, 1.6, 2.6, 5.0, 12.0
 FLICKER_CHANCE = 1e-5
 #: Telegraph noise: draws of the frames in which a pixel is at its higher level, and the shares of such frames.
 JUMPS, HIGH_SHARES = 400, (0.5, 0.15, 0.5, 0.85)
-#: Standard deviation of a rooted count beside chance (about 1 for large counts): one more defective pixel is no finding.
+#: Standard deviation of a rooted count beside chance (about 1 for large counts): one more defective pixel is no
+#: finding.
 COUNT_STD = 0.6
-#: A pixel that is `FAR` standard deviations off in each of several frames is neither a distribution's tail nor a particle. Whether there
-#: is any counts as `PRESENCE` more, nearly seven of `COUNT_STD`.
+#: A pixel that is `FAR` standard deviations off in each of several frames is neither a distribution's tail nor a
+#: particle. Whether there is any counts as `PRESENCE` more, nearly seven of `COUNT_STD`.
 FAR, PRESENCE = 20.0, 4.0
 
 
 def _rooted(counts: FloatArray) -> FloatArray:
-    """Anscombe transform 2 sqrt(n + 3/8) of Poisson counts: standard deviation 1 except for small ones (Anscombe 1948)."""
+    """Anscombe transform 2 sqrt(n + 3/8) of Poisson counts: standard deviation 1 except for small ones (Anscombe
+    1948)."""
     return np.asarray(2.0 * np.sqrt(counts + 0.375))
 
 
 def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0) -> FloatArray:
-    """Covariance of `_rooted` counts: their exact variance for Poisson counts of mean `expected`, `COUNT_STD`, and `uncertain`, the
-    standard deviation of the expected counts."""
+    """Covariance of `_rooted` counts: their exact variance for Poisson counts of mean `expected`, `COUNT_STD`, and
+    `uncertain`, the standard deviation of the expected counts."""
     number = np.arange(60.0)
     mean = np.minimum(expected, 20.0)[:, None]
     share = np.exp(xlogy(number, mean) - mean - gammaln(number + 1.0))
@@ -52,12 +56,13 @@ def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0)
 
 
 def defective_pixel_block(study: Study) -> Block:
-    """Anscombe-transformed numbers of pixels by their deviation from their surroundings in the median of repeats, by exposure.
+    """Anscombe-transformed numbers of pixels by their deviation from their surroundings in the median of repeats, by
+    exposure.
 
-    The bins are `TAIL_EDGES`, in standard deviations of single pixels. Hot pixels are the same in every frame, and as bright as the exposure is long. Telegraph noise
-    is predicted where the temporal noise exceeds `LEAST_COUNTED_DN`: with less, all repeats of a pixel have one code. That any pixel is
-    far off in several frames, where none is expected, counts as `PRESENCE` more. Raises NotDetermined without dark captures.
-    """
+    The bins are `TAIL_EDGES`, in standard deviations of single pixels. Hot pixels are the same in every frame, and as
+    bright as the exposure is long. Telegraph noise is predicted where the temporal noise exceeds `LEAST_COUNTED_DN`:
+    with less, all repeats of a pixel have one code. That any pixel is far off in several frames, where none is
+    expected, counts as `PRESENCE` more. Raises NotDetermined without dark captures."""
     frames = [f for f in study.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
     low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]])
@@ -111,8 +116,8 @@ def defective_pixel_block(study: Study) -> Block:
 
 
 def _pixel_noise(study: Study, frames: DarkStatistics, part: DarkPattern) -> tuple[float, float]:
-    """(temporal, fixed) standard deviation of single pixels, DN. fixed^2 = spread^2 of the median frame - its temporal variance. Of a
-    single frame, all counts as temporal."""
+    """(temporal, fixed) standard deviation of single pixels, DN. fixed^2 = spread^2 of the median frame - its temporal
+    variance. Of a single frame, all counts as temporal."""
     moving = next((c.pixel_dn2 for c in frames.changing.values()), None)
     left = _order_moments(part.of_median)[1]
     if moving is None:
@@ -152,9 +157,9 @@ def _tail_shares(
 ) -> FloatArray:
     """Expected shares of all pixels in the bins of `TAIL_EDGES` and the two of dark pixels, (bins,).
 
-    A pixel's value is the lower median of `frames` numbers with the standard deviation `moving` (DN) and the skewness `skew`, on a
-    normal fixed deviation of standard deviation `fixed` (DN). It is compared with the edges times `spread` (DN).
-    """
+    A pixel's value is the lower median of `frames` numbers with the standard deviation `moving` (DN) and the skewness
+    `skew`, on a normal fixed deviation of standard deviation `fixed` (DN). It is compared with the edges times `spread`
+    (DN)."""
     low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]]) * spread + _order_moments(frames)[0] * moving
     u = np.linspace(-7.5, 7.5, 61) if fixed > 0.02 * moving else np.zeros(1)
     weight = np.exp(-0.5 * u * u)
@@ -183,12 +188,14 @@ def _tail_shares(
 
 
 def _upper(z: FloatArray, skew: float) -> FloatArray:
-    """Probability that a variable of mean 0, variance 1 and small skewness exceeds z (first term of the Edgeworth series)."""
+    """Probability that a variable of mean 0, variance 1 and small skewness exceeds z (first term of the Edgeworth
+    series)."""
     return np.asarray(ndtr(-z) + np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) * skew / 6.0 * (z * z - 1.0))
 
 
 def flickering_pixel_block(study: Study) -> Block:
-    """Anscombe-transformed numbers of pixels by their temporal variance over that of their surroundings, all dark frames together.
+    """Anscombe-transformed numbers of pixels by their temporal variance over that of their surroundings, all dark
+    frames together.
 
     Raises NotDetermined without repeats, and where codes are too coarse.
     """
@@ -237,8 +244,8 @@ def _flicker_edges(freedom: int) -> FloatArray:
 
 
 def _chance_above(freedom: FloatArray, noncentral: FloatArray, edges: FloatArray) -> FloatArray:
-    """Probability (n, edges) that chi-squared variables, (n,) degrees of freedom and non-centralities, exceed the edges: exact where all are
-    central, else their cube root is taken as normal (Abdel-Aty 1954)."""
+    """Probability (n, edges) that chi-squared variables, (n,) degrees of freedom and non-centralities, exceed the
+    edges: exact where all are central, else their cube root is taken as normal (Abdel-Aty 1954)."""
     if not np.any(noncentral):
         return np.asarray(chdtrc(freedom[:, None], edges[None, :]))
     a = (freedom + noncentral)[:, None]
@@ -250,8 +257,8 @@ def _chance_above(freedom: FloatArray, noncentral: FloatArray, edges: FloatArray
 def _hot_above(
     study: Study, part: Sequence[DarkStatistics], out: bool, rate: FloatArray, edges: FloatArray
 ) -> FloatArray:
-    """Probability (rates, edges) that the shot noise of hot pixels of `rate` (e/s) takes them above the edges: a scaled chi-squared
-    variable with the right first two moments."""
+    """Probability (rates, edges) that the shot noise of hot pixels of `rate` (e/s) takes them above the edges: a scaled
+    chi-squared variable with the right first two moments."""
     count = np.array([f.changing[out].contrasts for f in part], float)
     noise = np.array([f.changing[out].pixel_dn2 for f in part])
     charge = study.noise.gain**2 * rate[:, None] * np.array([f.condition.exposure_s for f in part])
@@ -266,9 +273,9 @@ def _hot_above(
 class _JumpDraws:
     """`JUMPS` draws, always the same, of the frames in which a pixel with telegraph noise is at its higher level.
 
-    They are drawn with the shares `HIGH_SHARES` in turn. For any other share, draws are weighted by their likelihood under it over
-    the sum of their likelihoods under `HIGH_SHARES`, so that means over draws change smoothly with the share (multiple importance
-    sampling, Veach and Guibas 1995).
+    They are drawn with the shares `HIGH_SHARES` in turn. For any other share, draws are weighted by their likelihood
+    under it over the sum of their likelihoods under `HIGH_SHARES`, so that means over draws change smoothly with the
+    share (multiple importance sampling, Veach and Guibas 1995).
     """
 
     sums: dict[
@@ -314,8 +321,8 @@ def _jump_above(
     edges: FloatArray,
     freedom: int,
 ) -> FloatArray:
-    """Probability (amplitudes, edges) that telegraph noise takes pixels above the edges: mean over draws with the weights `weight`.
-    `unit` (draws,): the non-centrality of an amplitude of 1 DN."""
+    """Probability (amplitudes, edges) that telegraph noise takes pixels above the edges: mean over draws with the
+    weights `weight`. `unit` (draws,): the non-centrality of an amplitude of 1 DN."""
     found = []
     for amplitude in amplitude_e:
         away = np.square(study.noise.gain * amplitude) * unit

@@ -1,9 +1,9 @@
 """The slanted-edge estimator of the diagnosis, as a linear operator on the values of an edge's pixels.
 
-`lab.fit.mtf` locates the edge, measures its noise, and sets up the normal equations of the spline that describes its edge spread
-function (ESF). From these, `Estimator` estimates by weighted least squares how the optical transfer function (OTF) departs from the
-baseline's at a few frequencies. `Operators` applies the same estimator to a model: OTF -> ESF (`Quadrature`) -> right side of the
-normal equations -> reported numbers.
+`lab.fit.mtf` locates the edge, measures its noise, and sets up the normal equations of the spline that describes its
+edge spread function (ESF). From these, `Estimator` estimates by weighted least squares how the optical transfer
+function (OTF) departs from the baseline's at a few frequencies. `Operators` applies the same estimator to a model: OTF
+-> ESF (`Quadrature`) -> right side of the normal equations -> reported numbers.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from lab.measure.edge_mtf import ROUGHNESS_SHARE, EdgeGeometry
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
-#: Frequencies at which the OTF's real and imaginary parts are measured, as shares of the highest one. The imaginary part is taken as
-#: 0 up to `STILL`, as a phase in proportion to frequency only moves the edge.
+#: Frequencies at which the OTF's real and imaginary parts are measured, as shares of the highest one. The imaginary
+#: part is taken as 0 up to `STILL`, as a phase in proportion to frequency only moves the edge.
 REAL_AT = np.array([0.04, 0.09, 0.15, 0.22, 0.30, 0.39, 0.49, 0.60, 0.72, 0.86, 1.0])
 IMAGINARY_AT = np.array([0.28, 0.42, 0.57, 0.72, 0.86, 1.0])
 STILL = 0.14
@@ -49,8 +49,8 @@ class Quadrature:
     def of(highest: float, reach_px: float) -> Quadrature:
         """For frequencies up to `highest` (cy/px) and distances up to `reach_px`.
 
-        Pieces are 1/4 cy/px wide below 1 cy/px, 1/2 below 2, and 1 above, with 8, 6 and 6 Gauss-Legendre nodes. A double image 3 px
-        away is integrated to 1e-4.
+        Pieces are 1/4 cy/px wide below 1 cy/px, 1/2 below 2, and 1 above, with 8, 6 and 6 Gauss-Legendre nodes. A
+        double image 3 px away is integrated to 1e-4.
         """
         cuts = np.concatenate([np.arange(0.0, 1.0, 0.25), np.arange(1.0, 2.0, 0.5), np.arange(2.0, 64.0)])
         cuts = np.append(cuts[cuts < highest], highest)
@@ -83,8 +83,8 @@ class Estimator:
 
     profile = level + contrast x (baseline + shift x slope + sum of departures x shapes) + gradients of the illumination
 
-    A shape is the change of the profile by a unit change of the OTF at one frequency. The rows of the result are contrast, then
-    contrast x shift, and contrast x departures.
+    A shape is the change of the profile by a unit change of the OTF at one frequency. The rows of the result are
+    contrast, then contrast x shift, and contrast x departures.
     """
 
     rows: FloatArray  # (rows, distances): the operator on a profile
@@ -93,8 +93,9 @@ class Estimator:
 
     @staticmethod
     def of(geometry: EdgeGeometry, spread: FloatArray, shapes: FloatArray) -> Estimator:
-        """The estimator at an edge's geometry. `spread` (k + g, distances): takes a profile to the right side of the normal equations of
-        k spline and g gradient coefficients (`spread_operator`). `shapes` (j, distances): level, contrast, slope, departures."""
+        """The estimator at an edge's geometry. `spread` (k + g, distances): takes a profile to the right side of the
+        normal equations of k spline and g gradient coefficients (`spread_operator`). `shapes` (j, distances): level,
+        contrast, slope, departures."""
         size = geometry.spline.size
         matrix, right = geometry.gram[:-1, :-1], geometry.gram[:-1, -1]
         bridged = matrix[:size, :size] + geometry.spline.roughness(
@@ -123,8 +124,8 @@ class Operators:
     shade: FloatArray  # (edges, distances): relative illumination, which the operators contain
 
     def report(self, otf: ComplexArray, frequency: FloatArray, change: FloatArray | None = None) -> FloatArray:
-        """The estimates (edges, rows) for a model's OTFs (edges, nodes), at the quadrature's `frequency`, and a further `change` of
-        its profiles (edges, distances)."""
+        """The estimates (edges, rows) for a model's OTFs (edges, nodes), at the quadrature's `frequency`, and a further
+        `change` of its profiles (edges, distances)."""
         rows = self.constant + (self.odd @ np.real(otf)[..., None])[..., 0]
         if np.any(np.imag(otf)):
             rows = rows + (self.even @ (np.imag(otf) / frequency)[..., None])[..., 0]
@@ -144,7 +145,8 @@ def profile_interpolation(reach_px: float) -> tuple[FloatArray, FloatArray, spar
     left = np.floor(place + 1e-9).astype(int)
     t = place - left
     weights = np.stack(
-        [0.5 * t * (-1 + t * (2 - t)), 1 + 0.5 * t * t * (-5 + 3 * t), 0.5 * t * (1 + t * (4 - 3 * t)), 0.5 * t * t * (t - 1)], axis=1
+        [0.5 * t * (-1 + t * (2 - t)), 1 + 0.5 * t * t * (-5 + 3 * t), 0.5 * t * (1 + t * (4 - 3 * t)),
+        0.5 * t * t * (t - 1)], axis=1
     )  # fmt: skip
     index = left[:, None] + np.array([-1, 0, 1, 2])
     rows = np.repeat(np.arange(len(fine)), 4)
@@ -152,8 +154,8 @@ def profile_interpolation(reach_px: float) -> tuple[FloatArray, FloatArray, spar
 
 
 def spread_operator(geometry: EdgeGeometry, reach_px: float) -> FloatArray:
-    """Operator (k + g, coarse distances) that takes a profile to the right side of an edge's normal equations: k spline and g gradient
-    coefficients."""
+    """Operator (k + g, coarse distances) that takes a profile to the right side of an edge's normal equations: k spline
+    and g gradient coefficients."""
     fine, _, between = profile_interpolation(reach_px)
     distance = np.asarray(geometry.distance_px, float)
     weight = _shared_out(distance, np.asarray(geometry.weight, float), fine)
@@ -166,8 +168,9 @@ def spread_operator(geometry: EdgeGeometry, reach_px: float) -> FloatArray:
 
 
 def departure_shapes(quadrature: Quadrature, top: float) -> tuple[FloatArray, FloatArray]:
-    """Cubic splines that are 1 at one of the measured frequencies and 0 at the others, at the quadrature's nodes: (nodes, real parts) and
-    (nodes, imaginary parts). All are 0 at frequency 0 and from 1.25 `top` on; `top` is the highest measured frequency, cy/px."""
+    """Cubic splines that are 1 at one of the measured frequencies and 0 at the others, at the quadrature's nodes:
+    (nodes, real parts) and (nodes, imaginary parts). All are 0 at frequency 0 and from 1.25 `top` on; `top` is the
+    highest measured frequency, cy/px."""
     f = quadrature.frequency
     tables = []
     for at, still in ((REAL_AT, np.zeros(1)), (IMAGINARY_AT, np.array([0.0, 0.5 * STILL, STILL]))):
@@ -178,7 +181,8 @@ def departure_shapes(quadrature: Quadrature, top: float) -> tuple[FloatArray, Fl
 
 
 def _shared_out(distance: FloatArray, amount: FloatArray, grid: FloatArray) -> FloatArray:
-    """Sums (grid,) of amounts at any distances, each shared between the two nearest points of a regular grid as in linear interpolation."""
+    """Sums (grid,) of amounts at any distances, each shared between the two nearest points of a regular grid as in
+    linear interpolation."""
     place = (distance - grid[0]) / FINE_PX
     left = place.astype(int)
     right_part = amount * (place - left)
@@ -186,7 +190,8 @@ def _shared_out(distance: FloatArray, amount: FloatArray, grid: FloatArray) -> F
 
 
 def relative_covariance(covariance: FloatArray, rows: FloatArray) -> FloatArray:
-    """Covariance of the departures over the contrast, to first order, from an estimate's `rows` and their `covariance`."""
+    """Covariance of the departures over the contrast, to first order, from an estimate's `rows` and their
+    `covariance`."""
     departure = rows[2:] / rows[0]
     jacobian = (
         np.concatenate([-departure[:, None], np.zeros((len(departure), 1)), np.eye(len(departure))], axis=1) / rows[0]

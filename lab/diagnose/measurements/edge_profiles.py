@@ -1,4 +1,5 @@
-"""The slanted edges of a side: their regions, seen and held-out repeats, and the share of their noise that repeats have in common."""
+"""The slanted edges of a side: their regions, seen and held-out repeats, and the share of their noise that repeats have
+in common."""
 
 from __future__ import annotations
 
@@ -45,8 +46,8 @@ class MeasuredEdge:
 def measured_edges(study: Study) -> list[MeasuredEdge]:
     """All edges of the slanted-edge captures, by region and channel. Edges are searched for where no region is stated.
 
-    Raises NotDetermined where f-number or pixel pitch isn't stated, without slanted-edge captures, and where no edge is measured.
-    """
+    Raises NotDetermined where f-number or pixel pitch isn't stated, without slanted-edge captures, and where no edge is
+    measured."""
     if not study.diffraction_is_known:
         raise NotDetermined(
             "slanted_edge", "f-number or pixel pitch isn't stated: no diffraction to hold the edges against"
@@ -102,10 +103,11 @@ def _direction_deg(study: Study, capture: SlantedEdgeCapture, region: Region, an
 def _fixed_share(
     study: Study, group: Sequence[SlantedEdgeCapture], frames: int, channel: str, region: Region, measured: EdgeMtf
 ) -> float:
-    """Share of the noise variance of a mean of `frames` frames that is fixed (PRNU): 1 - temporal variance / total variance.
+    """Share of the noise variance of a mean of `frames` frames that is fixed (PRNU): 1 - temporal variance / total
+    variance.
 
-    The temporal variance is taken from the difference of two repeats on the light side, else from shot and read noise. 0 where
-    neither is known; at most 0.95.
+    The temporal variance is taken from the difference of two repeats on the light side, else from shot and read noise.
+    0 where neither is known; at most 0.95.
     """
     total = measured.noise_std_light**2
     if len(group) > 1:

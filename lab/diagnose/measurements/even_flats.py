@@ -32,10 +32,11 @@ def _unclipped(study: Study, capture: Any) -> bool:
 
 
 def flats(study: Study) -> tuple[list[FlatLevel], dict[bool, tuple[FloatArray, float]]]:
-    """Unclipped flats by level, darkest first; and for seen (False) and held-out (True) ones a mean image with its pixels' variance.
+    """Unclipped flats by level, darkest first; and for seen (False) and held-out (True) ones a mean image with its
+    pixels' variance.
 
-    The image (rows, cols) is the mean over frames above the dark level, each plane of the mosaic over its mean, weighted by signal. The
-    variance is that of a pixel of the image by shot and read noise.
+    The image (rows, cols) is the mean over frames above the dark level, each plane of the mosaic over its mean,
+    weighted by signal. The variance is that of a pixel of the image by shot and read noise.
     """
     out = study.once(held_out_flats)
     levels: list[FlatLevel] = []
@@ -87,8 +88,8 @@ def _green_dark(study: Study) -> float:
 
 
 def green_planes(study: Study, frame: Any) -> tuple[Any, Any]:
-    """The green pixels on red rows, without those at the border, and for each the mean of its four diagonal neighbours, the greens on blue
-    rows. A gradient of the light cancels in their ratio."""
+    """The green pixels on red rows, without those at the border, and for each the mean of its four diagonal neighbours,
+    the greens on blue rows. A gradient of the light cancels in their ratio."""
     row, col = mosaic.phases(study.camera.cfa)["G"][0]
     red_rows = frame[row + 2 * (row == 0) : -1 : 2, col + 2 * (col == 0) : -1 : 2]
     first = row + 2 * (row == 0) - 1, col + 2 * (col == 0) - 1
@@ -99,7 +100,8 @@ def green_planes(study: Study, frame: Any) -> tuple[Any, Any]:
 
 
 def green_ratio(study: Study, frame: Any) -> float:
-    """Ratio of the two greens' means in a frame above the dark level, less 1, corrected for their difference in dark frames."""
+    """Ratio of the two greens' means in a frame above the dark level, less 1, corrected for their difference in dark
+    frames."""
     red_rows, blue_rows = green_planes(study, frame)
     below = max(float(blue_rows.mean(dtype=float)), 1e-3)
     return (float(red_rows.mean(dtype=float)) - study.once(_green_dark)) / below - 1.0

@@ -1,4 +1,5 @@
-"""Shading of flat fields: means over cells of the frame, relative to the frame's mean, against cos^4 (or the lens's) fall-off."""
+"""Shading of flat fields: means over cells of the frame, relative to the frame's mean, against cos^4 (or the lens's)
+fall-off."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ AXIS_STD, AXIS_STD_KNOWN = (
 MOST_FRAMES, MOST_LEVELS = 6, 2  # brightest levels, of seen and of held-out flats each
 BLOCK_PX = 4  # side of the blocks in a channel's plane at which its fixed pattern is measured
 ALIKE = 1.5  # largest ratio of the fixed pattern's variance in blocks to that of independent pixels
-#: Variance of rows between frames over that by noise from which on the light flickers. A healthy set exceeds it once in thousands.
+#: Variance of rows between frames over that by noise from which on the light flickers. A healthy set exceeds it once in
+#: thousands.
 VARYING = 4.0
 
 
@@ -53,8 +55,8 @@ class _ChannelCells:
 def shading_block(study: Study) -> Block:
     """Means over 6 x 8 cells of the brightest unclipped flats, relative to the mean of the frame, by channel.
 
-    Nuisance parameters: row and column of the optical axis. Raises NotDetermined where focal length or pixel pitch isn't stated, for
-    frames too small, and without unclipped flats.
+    Nuisance parameters: row and column of the optical axis. Raises NotDetermined where focal length or pixel pitch
+    isn't stated, for frames too small, and without unclipped flats.
     """
     if study.stated.focal_length_mm is None or study.stated.pixel_pitch_um is None:
         raise NotDetermined(
@@ -85,16 +87,18 @@ def shading_block(study: Study) -> Block:
     return Block(
         measurement=FLAT_FIELD, reach=0.2 * float(np.ptp(x_mm)),
         value=np.concatenate([p.cells for p in planes]), covariance=_covariance(planes),
-        labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures), p.held_out)
+        labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures),
+        p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | ADDED | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT, predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
+        reads=SHADING | ADDED | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT, predict=predict,
+        scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
 
 
 def _planes(study: Study) -> list[_ChannelCells]:
-    """The mean of the brightest levels' frames by channel, seen and held-out ones apart. Levels are ranked by rounded means, so that
-    noise doesn't choose."""
+    """The mean of the brightest levels' frames by channel, seen and held-out ones apart. Levels are ranked by rounded
+    means, so that noise doesn't choose."""
     out = study.once(held_out_flats)
     groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
     groups.sort(key=lambda g: -float(np.round(np.mean(list(study.levels(g[0]).whole.values())), 0)))
@@ -154,16 +158,16 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Chan
 def _pattern_variance(plane: FloatArray, shot: float) -> float:
     """Relative variance of a pixel by the fixed pattern, such that a cell of n pixels has 1 / n of it.
 
-    It is measured on differences of adjacent blocks of 4 x 4 pixels, so that a pattern that is correlated over a few pixels counts in
-    full. It is limited to 1..ALIKE times the variance of adjacent pixels: a pattern correlated more strongly isn't one of pixels.
-    """
+    It is measured on differences of adjacent blocks of 4 x 4 pixels, so that a pattern that is correlated over a few
+    pixels counts in full. It is limited to 1..ALIKE times the variance of adjacent pixels: a pattern correlated more
+    strongly isn't one of pixels."""
     single = _adjacent(plane, 1) - shot
     return float(np.clip(_adjacent(plane, BLOCK_PX) - shot, max(single, 0.0), ALIKE * max(single, 0.0)))
 
 
 def _adjacent(plane: FloatArray, size: int) -> float:
-    """Half the mean square of differences between adjacent blocks' means, times the pixels of a block: the variance of a pixel, where
-    pixels are independent. Blocks have `size` x `size` pixels."""
+    """Half the mean square of differences between adjacent blocks' means, times the pixels of a block: the variance of
+    a pixel, where pixels are independent. Blocks have `size` x `size` pixels."""
     rows, cols = (n // size for n in plane.shape)
     blocks = plane[: rows * size, : cols * size].reshape(rows, size, cols, size).mean((1, 3))
     steps = np.concatenate([np.square(np.diff(blocks, axis=axis)).ravel() for axis in (0, 1)])
@@ -172,8 +176,8 @@ def _adjacent(plane: FloatArray, size: int) -> float:
 
 
 def _row_covariance(bands: FloatArray, noise: float) -> FloatArray:
-    """Relative covariance (ROWS, ROWS) of the rows of cells in the mean of all frames, by flicker of the light: 0 where the variance
-    between frames is below `VARYING` times `noise`, that of a row of cells. `bands` (frames, ROWS)."""
+    """Relative covariance (ROWS, ROWS) of the rows of cells in the mean of all frames, by flicker of the light: 0 where
+    the variance between frames is below `VARYING` times `noise`, that of a row of cells. `bands` (frames, ROWS)."""
     count = len(bands)
     if count < 2:
         return np.zeros((ROWS, ROWS))
@@ -201,7 +205,8 @@ def _covariance(planes: Sequence[_ChannelCells]) -> FloatArray:
     return covariance
 
 
-#: Gauss-Legendre nodes and weights in a cell: means over cells are exact for shading up to the fifth power of the coordinates.
+#: Gauss-Legendre nodes and weights in a cell: means over cells are exact for shading up to the fifth power of the
+#: coordinates.
 _POINTS, _SHARES = np.polynomial.legendre.leggauss(3)
 
 
@@ -234,7 +239,8 @@ def _shaded(planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effect
 
 
 def _row_light(planes: Sequence[_ChannelCells], base: FloatArray, model: Uniform, rows: int) -> dict[str, FloatArray]:
-    """Jacobian of the cells `base` by a light that varies while a frame is taken, of the seen and of the held-out frames."""
+    """Jacobian of the cells `base` by a light that varies while a frame is taken, of the seen and of the held-out
+    frames."""
     edges = np.linspace(0, rows, ROWS + 1).astype(int)
 
     def of(light: FloatArray) -> FloatArray:

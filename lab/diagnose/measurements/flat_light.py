@@ -38,7 +38,8 @@ def reading(study: Study, flat: FlatCapture) -> FlatLight | None:
 
 
 def relative_rates(study: Study, readings: Sequence[FlatLight]) -> Mapping[tuple[str, str], float]:
-    """(reading, channel) -> electron rate (photon rate, where photons are stated) over that by the first reading of the same lamp."""
+    """(reading, channel) -> electron rate (photon rate, where photons are stated) over that by the first reading of the
+    same lamp."""
     first: dict[Hashable, FlatLight] = {}
     for one in readings:
         first.setdefault(one.lamp, one)
@@ -58,7 +59,8 @@ def _rate(study: Study, one: FlatLight, channel: str) -> float:
 
 
 def misstated_levels(fit: CameraFit | None) -> tuple[InconsistentLevel, ...]:
-    """Levels whose stated number of photons contradicts the others, as found by the noise fit (`lab.fit.noise.evaluation`)."""
+    """Levels whose stated number of photons contradicts the others, as found by the noise fit
+    (`lab.fit.noise.evaluation`)."""
     if fit is None or fit.noise is None:
         return ()
     return tuple(level for level in fit.noise.inconsistent_levels if level.light_unit == "photons" and level.captures)

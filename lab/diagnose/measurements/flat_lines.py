@@ -1,4 +1,5 @@
-"""Lines in flat fields: steps where the areas of two read-outs meet, and the difference of even and odd rows and columns."""
+"""Lines in flat fields: steps where the areas of two read-outs meet, and the difference of even and odd rows and
+columns."""
 
 from __future__ import annotations
 
@@ -22,11 +23,11 @@ LEAST_PLACES = 8  # places from which on the spread of steps is measured; with f
 
 
 def line_block(study: Study) -> Block:
-    """Steps in the means of rows and columns at halves and quarters of a side, and the difference of even and odd lines of a plane of the
-    mosaic, relative to the mean signal.
+    """Steps in the means of rows and columns at halves and quarters of a side, and the difference of even and odd lines
+    of a plane of the mosaic, relative to the mean signal.
 
-    What dark frames have of both is subtracted, and may be another in light by `OFFSETS_STD`. The standard deviation of a step is measured at all other places. No effect predicts a
-    step. Raises NotDetermined without unclipped
+    What dark frames have of both is subtracted, and may be another in light by `OFFSETS_STD`. The standard deviation of
+    a step is measured at all other places. No effect predicts a step. Raises NotDetermined without unclipped
     flats, and for frames too small.
     """
     _, images = study.once(flats)
@@ -74,14 +75,16 @@ def line_block(study: Study) -> Block:
     }
     return Block(
         measurement=FLAT_LINES, reach=1.0, value=np.array(values), covariance=covariance, labels=tuple(labels),
-        reads=frozenset(), predict=lambda effects: Prediction(np.zeros(len(values)), jacobian), scale=np.ones(len(values)),
+        reads=frozenset(), predict=lambda effects: Prediction(np.zeros(len(values)), jacobian),
+        scale=np.ones(len(values)),
     )  # fmt: skip
 
 
 def without_dark(
     study: Study, dark: DarkReadOut, levels: Sequence[FlatLevel], image: FloatArray
 ) -> tuple[FloatArray, float]:
-    """The mean image of flat `levels` without the offsets of dark frames, (rows, cols), and the variance that their noise adds to a pixel."""
+    """The mean image of flat `levels` without the offsets of dark frames, (rows, cols), and the variance that their
+    noise adds to a pixel."""
     signal = np.array([float(np.mean(list(u.mean.values()))) for u in levels])
     # each frame of the image counts by its signal, and is divided by that of the plane
     weight = np.where(signal >= LEAST_SIGNAL * study.noise.read_dn, signal * [len(u.captures) for u in levels], 0.0)
@@ -95,10 +98,11 @@ def without_dark(
 
 
 def _steps(line: FloatArray, period: int, least: float) -> list[tuple[float, float, float, float]]:
-    """(share of the side, step, its standard deviation, variance of the step for lines of variance 1) where read-outs may meet.
+    """(share of the side, step, its standard deviation, variance of the step for lines of variance 1) where read-outs
+    may meet.
 
-    Least squares fit a straight line with a step to the means of `width` lines on either side. `least`: standard deviation of a line
-    by noise and PRNU; `period`: of the mosaic.
+    Least squares fit a straight line with a step to the means of `width` lines on either side. `least`: standard
+    deviation of a line by noise and PRNU; `period`: of the mosaic.
     """
     width = max(len(line) // 16 // (2 * period) * 2 * period, 4 * period)
     x = np.arange(-width, width) + 0.5
@@ -117,8 +121,8 @@ def _steps(line: FloatArray, period: int, least: float) -> list[tuple[float, flo
 
 
 def _stripes(line: FloatArray, period: int, least: float) -> tuple[float, float]:
-    """Mean of the even lines of a plane of the mosaic less that of the odd ones, and its standard deviation, from the second differences
-    of lines four periods apart."""
+    """Mean of the even lines of a plane of the mosaic less that of the odd ones, and its standard deviation, from the
+    second differences of lines four periods apart."""
     lag = 4 * period
     pairs = line[: len(line) // (2 * period) * 2 * period].reshape(-1, 2, period)
     value = float((pairs[:, 0] - pairs[:, 1]).mean())

@@ -1,5 +1,5 @@
-"""Flicker: light that changes while a rolling shutter exposes row after row, seen in the rows of single flat frames. Noise of rows and a fixed
-pattern of rows show there, too; what dark frames have of both is predicted."""
+"""Flicker: light that changes while a rolling shutter exposes row after row, seen in the rows of single flat frames.
+Noise of rows and a fixed pattern of rows show there, too; what dark frames have of both is predicted."""
 
 from __future__ import annotations
 
@@ -24,22 +24,23 @@ from sim.uniform import Uniform
 MOST_FRAMES, MOST_LEVELS = 6, 8  # frames of a level; levels of a session
 WIDEN = 1.25  # ratio of the lower ends of successive frequency bands
 HIGHEST = 0.45  # cy/row
-#: Relative prior standard deviation of a band's power, common to all levels: noise of pixels that isn't white. Five times as much above
+#: Relative prior standard deviation of a band's power, common to all levels: noise of pixels that isn't white. Five
+#: times as much above
 #: 0.15 cy/row.
 COLOUR_STD = 0.1
 #: Prior standard deviation of the relative amplitude by which the fixed pattern of rows changes from level to level.
 PATTERN_STD = 3e-5
-#: The same of its smooth part, at one cycle a frame, and the power of the frequency by which it falls: shading is another at each level of a
-#: response that isn't quite linear. A real CMOS camera, linear to 0.5 % with shading of 2 %, has 1e-3 at one cycle, 1e-4 at four and 5e-5
-#: at ten.
+#: The same of its smooth part, at one cycle a frame, and the power of the frequency by which it falls: shading is
+#: another at each level of a response that isn't quite linear. A real CMOS camera, linear to 0.5 % with shading of 2 %,
+#: has 1e-3 at one cycle, 1e-4 at four and 5e-5 at ten.
 SMOOTH_STD, SMOOTH_POWER = 1e-3, 1.5
-#: Without repeated dark frames, the power of rows beyond that of pixels' noise is anything up to three times the variance of the read noise:
-#: a camera whose rows are noisier than its pixels shows nothing but stripes.
+#: Without repeated dark frames, the power of rows beyond that of pixels' noise is anything up to three times the
+#: variance of the read noise: a camera whose rows are noisier than its pixels shows nothing but stripes.
 MOST_ROW_NOISE = 3.0
 LEAST_ROWS = 24  # of a plane of the mosaic
 LEAST_POWER = 0.05  # of a band over that of the pixels' noise, as predicted
-#: Times within a period at which a frame may begin, interpolated between `PHASES`; and how often they are found anew, beside the mean
-#: of all frames that follows from them.
+#: Times within a period at which a frame may begin, interpolated between `PHASES`; and how often they are found anew,
+#: beside the mean of all frames that follows from them.
 FINE_PHASES, REFINEMENTS = 240, 3
 
 
@@ -60,16 +61,18 @@ class _Level:
 
 
 def flicker_block(study: Study) -> Block:
-    """Power spectrum of the rows of single flat frames, relative to the mean of all, over that of the pixels' noise; cube roots.
+    """Power spectrum of the rows of single flat frames, relative to the mean of all, over that of the pixels' noise;
+    cube roots.
 
-    q(r) = row means of a frame / row means of all frames - 1. Power at k cycles a frame: |sum over r of q(r) exp(-2 pi i k r / rows)|^2
-    / (rows x variance of a row's mean). The cube root of its mean over a band is nearly normal (Wilson and Hilferty 1931): mean
-    1 - 2 / (9 v), variance 2 / (9 v) for v degrees of freedom. The rows' offsets in dark frames are subtracted, and the spectrum of their
-    noise is expected in light as well (`dark_readout`), with its standard deviation as a nuisance parameter of each band. Without repeated
-    dark frames the spectrum is a free parameter of each band up to `MOST_ROW_NOISE`, so that only what grows with the light is seen.
-    Other nuisance parameters: the spectrum of the pixels' noise, and the fixed pattern of rows. A frame begins at that time within a
-    period of the light for which the predicted rows are most like its own. Raises NotDetermined without unclipped, repeated flats, and for
-    too few rows.
+    q(r) = row means of a frame / row means of all frames - 1. Power at k cycles a frame: |sum over r of q(r) exp(-2 pi
+    i k r / rows)|^2 / (rows x variance of a row's mean). The cube root of its mean over a band is nearly normal (Wilson
+    and Hilferty 1931): mean 1 - 2 / (9 v), variance 2 / (9 v) for v degrees of freedom. The rows' offsets in dark
+    frames are subtracted, and the spectrum of their noise is expected in light as well (`dark_readout`), with its
+    standard deviation as a nuisance parameter of each band. Without repeated dark frames the spectrum is a free
+    parameter of each band up to `MOST_ROW_NOISE`, so that only what grows with the light is seen. Other nuisance
+    parameters: the spectrum of the pixels' noise, and the fixed pattern of rows. A frame begins at that time within a
+    period of the light for which the predicted rows are most like its own. Raises NotDetermined without unclipped,
+    repeated flats, and for too few rows.
     """
     groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
     groups = [g[:MOST_FRAMES] for g in groups if len(g) > 1 and _is_lit(study, g[0])]
@@ -130,14 +133,16 @@ def flicker_block(study: Study) -> Block:
     return Block(
         measurement=FLAT_ROWS, reach=LOG_REACH, along=np.log(np.tile(frequency, len(levels))),
         value=value, covariance=np.diag(2.0 / (9.0 * freedom)),
-        labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s", tuple(c.id for c in level.captures), level.held_out)
+        labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s",
+        tuple(c.id for c in level.captures), level.held_out)
                      for level in levels for f in frequency),
         reads=ROW_LIGHT if dark is not None else ROW_LIGHT | ADDED, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
 def _is_lit(study: Study, capture: Any) -> bool:
-    """Whether a flat's signal exceeds the noise by as much as one that is part of a mean image: rows are relative to it."""
+    """Whether a flat's signal exceeds the noise by as much as one that is part of a mean image: rows are relative to
+    it."""
     signal = float(np.mean(list(study.levels(capture).whole.values()))) - dark_level_dn(study, capture)
     return signal >= LEAST_SIGNAL * study.noise.read_dn
 
@@ -146,7 +151,8 @@ LOG_REACH = 1.0  # correlation length in ln(frequency)
 
 
 def _bands(rows: int, highest_cy_per_row: float) -> list[range]:
-    """Cycles a frame in each band, from 1 to `highest_cy_per_row` (at most `HIGHEST`). Each band begins at `WIDEN` times the last."""
+    """Cycles a frame in each band, from 1 to `highest_cy_per_row` (at most `HIGHEST`). Each band begins at `WIDEN`
+    times the last."""
     top = int(min(highest_cy_per_row, HIGHEST) * rows)
     bands, low = [], 1
     while low <= top:
@@ -211,12 +217,12 @@ def _measured(
 
 
 def _any_row_noise(study: Study, levels: Sequence[_Level]) -> DarkRowPower:
-    """The noise of rows where no dark frames tell it: what is most like the seen flats beside light that varies from row to row, and so
-    wide a standard deviation that any other is as good.
+    """The noise of rows where no dark frames tell it: what is most like the seen flats beside light that varies from
+    row to row, and so wide a standard deviation that any other is as good.
 
-    A prediction is linear in this power, and so it is taken about the likeliest: of the seen levels' power P = 1 + x `row_share` +
-    y / `variance` by least squares with x, y >= 0, x up to `MOST_ROW_NOISE` times the read noise's variance.
-    """
+    A prediction is linear in this power, and so it is taken about the likeliest: of the seen levels' power P = 1 + x
+    `row_share` + y / `variance` by least squares with x, y >= 0, x up to `MOST_ROW_NOISE` times the read noise's
+    variance."""
     from scipy.optimize import nnls  # here: the library takes a while to load
 
     stated_e = study.stated.read_noise_e
@@ -262,7 +268,8 @@ def _added_power(
 
 
 def _nearest(rows: FloatArray, by_phase: FloatArray) -> FloatArray:
-    """The light (frames, rows) of least squares from rows (frames, rows), of `by_phase` (phases, rows), interpolated linearly between
+    """The light (frames, rows) of least squares from rows (frames, rows), of `by_phase` (phases, rows), interpolated
+    linearly between
     phases: it is continuous in the law's parameters."""
     phases = len(by_phase)
     mismatch = np.square(by_phase).sum(1) - 2.0 * rows @ by_phase.T
@@ -277,7 +284,8 @@ def _nearest(rows: FloatArray, by_phase: FloatArray) -> FloatArray:
 def _pattern_power(
     study: Study, levels: Sequence[_Level], model: Uniform, bands: Sequence[range], step: int
 ) -> FloatArray:
-    """Power (levels x bands,) that a fixed pattern of rows adds: it is a larger share of a low level than of the mean of all."""
+    """Power (levels x bands,) that a fixed pattern of rows adds: it is a larger share of a low level than of the mean
+    of all."""
     added = study.noise.gain * row_profile(model.added_e - model.added_e.mean(), step)
     share = np.array([added / level.signal for level in levels])
     weight = np.array([float(level.weight.sum()) for level in levels])

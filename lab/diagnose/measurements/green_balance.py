@@ -43,16 +43,17 @@ class _Ratio:
 def green_block(study: Study) -> Block:
     """Signal of the green pixels on red rows over that on blue rows, less 1.
 
-    It is measured by level of flats, by wavelength of narrowband light, and by cell of the frame relative to the cells' mean. Raises
-    NotDetermined for a camera without a mosaic, for frames too small, and without unclipped captures of uniform light.
-    """
+    It is measured by level of flats, by wavelength of narrowband light, and by cell of the frame relative to the cells'
+    mean. Raises NotDetermined for a camera without a mosaic, for frames too small, and without unclipped captures of
+    uniform light."""
     if study.camera.cfa == "MONO":
         raise NotDetermined("green_balance", "the camera has no colour mosaic")
     if any(n < cells for n, cells in zip(_green_shape(study), CELLS, strict=True)):
         least = " x ".join(str(2 * (cells + 1)) for cells in CELLS)
         raise NotDetermined(
             "green_balance",
-            f"frames of {study.camera.rows} x {study.camera.cols} px: {CELLS[0]} x {CELLS[1]} cells of greens need {least} px",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: {CELLS[0]} x {CELLS[1]} cells of greens need "
+            f"{least} px",
         )
     levels, images = study.once(flats)
     rows_dn2 = _rows_dn2(study, levels)
@@ -96,8 +97,8 @@ def green_block(study: Study) -> Block:
 
 
 def _rows_dn2(study: Study, levels: Sequence[FlatLevel]) -> float:
-    """Variance of the greens' difference from frame to frame beyond shot and read noise, DN^2: row noise. It is reduced by about its
-    uncertainty, so that chance isn't taken for row noise; at least 0."""
+    """Variance of the greens' difference from frame to frame beyond shot and read noise, DN^2: row noise. It is reduced
+    by about its uncertainty, so that chance isn't taken for row noise; at least 0."""
     excess, weights = 0.0, 0.0
     for u in levels:
         signal = u.mean["G2"]
@@ -121,11 +122,11 @@ def _green_shape(study: Study) -> tuple[int, int]:
 
 
 def _share(rows: FloatArray | int, cols: FloatArray | int) -> Any:
-    """Variance of the difference of two means, for pixels of variance 1: of n = rows x cols green pixels, and of the means of their four
-    neighbours.
+    """Variance of the difference of two means, for pixels of variance 1: of n = rows x cols green pixels, and of the
+    means of their four neighbours.
 
-    The first has 1 / n. The second is over (rows + 1) x (cols + 1) pixels, which count half at a border: along a side of m its sum of
-    squared weights is (m - 1/2) / m^2.
+    The first has 1 / n. The second is over (rows + 1) x (cols + 1) pixels, which count half at a border: along a side
+    of m its sum of squared weights is (m - 1/2) / m^2.
     """
     count = rows * cols
     return 1.0 / count + (rows - 0.5) * (cols - 0.5) / count**2
@@ -149,7 +150,8 @@ def _by_level(study: Study, levels: Sequence[FlatLevel], rows_dn2: float) -> lis
         c = u.captures[0]
         mean = {"R": u.mean["R"], "G": 0.5 * (u.mean["G1"] + signal), "B": u.mean["B"]}
         found.append(
-            _Ratio(float(np.mean(u.ratios)), std, 0.0, f"{signal:.4g} DN", tuple(c.id for c in u.captures), u.held_out, mean, c.exposure_s, study.elapsed_s(c))
+            _Ratio(float(np.mean(u.ratios)), std, 0.0, f"{signal:.4g} DN", tuple(c.id for c in u.captures), u.held_out,
+            mean, c.exposure_s, study.elapsed_s(c))
         )  # fmt: skip
     return found
 
@@ -171,15 +173,16 @@ def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
             found.append(
                 _Ratio(
                     green_ratio(study, frame), float(np.sqrt(dn2)) / signal, capture.wavelength_nm,
-                    f"{capture.wavelength_nm:g} nm", (capture.id,), i % 3 == 1, {"R": own["R"], "G": 0.5 * (own["G1"] + signal), "B": own["B"]},
+                    f"{capture.wavelength_nm:g} nm", (capture.id,), i % 3 == 1, {"R": own["R"],
+                    "G": 0.5 * (own["G1"] + signal), "B": own["B"]},
                     capture.exposure_s, study.elapsed_s(capture),
                 )
             )  # fmt: skip
     return found
 
 
-#: Quantities of the stages by which neighbouring pixels differ in uniform light. A light that changes from row to row isn't among them: a
-#: green is held against the mean of the rows above and below.
+#: Quantities of the stages by which neighbouring pixels differ in uniform light. A light that changes from row to row
+#: isn't among them: a green is held against the mean of the rows above and below.
 GREENS = frozenset({"charge.collected", "charge.kernels"})
 
 

@@ -34,10 +34,11 @@ def harmonics(picture: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Means of a picture about a place, weighted by normal distributions. The picture continues as its mirror image beyond the frame.
+    """Means of a picture about a place, weighted by normal distributions. The picture continues as its mirror image
+    beyond the frame.
 
-    The cosine transform turns the convolution into a product, of which wide distributions leave only the lowest frequencies.
-    """
+    The cosine transform turns the convolution into a product, of which wide distributions leave only the lowest
+    frequencies."""
 
     table: FloatArray  # (k, l): product of the transforms of picture and place
     rows: int  # of the picture

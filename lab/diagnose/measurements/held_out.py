@@ -11,16 +11,16 @@ from lab.diagnose.measurements.study import Study
 
 
 def held_out_of(group: Sequence[Capture], index: int, groups: int) -> set[str]:
-    """Ids of the held-out captures of a group of repeats: the last third, at least one. Of groups without repeats, every third is held
-    out, where there are three or more (`groups`: their number, `index`: this one's)."""
+    """Ids of the held-out captures of a group of repeats: the last third, at least one. Of groups without repeats,
+    every third is held out, where there are three or more (`groups`: their number, `index`: this one's)."""
     if len(group) > 1:
         return {c.id for c in group[len(group) - max(len(group) // 3, 1) :]}
     return {group[0].id} if groups >= 3 and index % 3 == 1 else set()
 
 
 def held_out_flats(study: Study) -> frozenset[str]:
-    """Ids of held-out flats: the last third of a level's repeats where it has six or more, as temporal noise needs pairs. Of other
-    levels, every third from the darkest on, never the brightest."""
+    """Ids of held-out flats: the last third of a level's repeats where it has six or more, as temporal noise needs
+    pairs. Of other levels, every third from the darkest on, never the brightest."""
     groups = study.flat_levels()
     size = {id(g): float(np.mean(list(study.levels(g[0]).whole.values()))) for g in groups}
     out: set[str] = set()

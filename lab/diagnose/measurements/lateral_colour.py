@@ -13,12 +13,13 @@ from sim.point import displaced_um
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import Uniform
 
-COLOUR_FLOOR_PX = 0.012  # standard deviation beside noise: where cells are whole pixels, errors of the drawn pattern don't average out
+# standard deviation beside noise: where cells are whole pixels, errors of the drawn pattern don't average out
+COLOUR_FLOOR_PX = 0.012
 
 
 def colour_block(study: Study) -> Block:
-    """Displacement (px) of a pattern's red and blue images from the green one: radial at two distances from the frame's middle, and
-    tangential at one.
+    """Displacement (px) of a pattern's red and blue images from the green one: radial at two distances from the frame's
+    middle, and tangential at one.
 
     Raises NotDetermined for a camera without a green channel, and where no pattern is fitted.
     """
@@ -69,10 +70,11 @@ def colour_block(study: Study) -> Block:
 def colour_shift_px(
     study: Study, channel: str, distance: float, light: Spectrum | None, effects: Effects, kind: str = "bernoulli"
 ) -> float:
-    """Predicted radial displacement of a channel's image from the green one, px, at `distance` (half diagonals) from the middle.
+    """Predicted radial displacement of a channel's image from the green one, px, at `distance` (half diagonals) from
+    the middle.
 
-    It is the mean over four directions of the displacement by the effects, weighted over wavelengths by the photons that each channel
-    detects. `light` None: a flat spectrum; `kind`: of the capture.
+    It is the mean over four directions of the displacement by the effects, weighted over wavelengths by the photons
+    that each channel detects. `light` None: a flat spectrum; `kind`: of the capture.
     """
     wavelength = np.arange(400.0, 721.0, 10.0)
     outwards = outward_shifts_px(study, distance, wavelength, effects)

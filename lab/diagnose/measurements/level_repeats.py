@@ -1,4 +1,5 @@
-"""The scatter of repeated levels beyond that by pixels' noise and a steady lamp: whether the light changes from frame to frame."""
+"""The scatter of repeated levels beyond that by pixels' noise and a steady lamp: whether the light changes from frame
+to frame."""
 
 from __future__ import annotations
 
@@ -13,8 +14,8 @@ from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.uniform import Uniform
 
-#: Relative standard deviation of a steady lamp's light from frame to frame: data sheets of regulated halogen sources and integrating
-#: spheres state 0.05 %, twice that at most. No finding by itself.
+#: Relative standard deviation of a steady lamp's light from frame to frame: data sheets of regulated halogen sources
+#: and integrating spheres state 0.05 %, twice that at most. No finding by itself.
 STEADY_LAMP = 5.0e-4
 #: Least degrees of freedom of a number, and most numbers, each of settings of neighbouring exposures.
 LEAST_FREEDOM, MOST_NUMBERS = 4, 4
@@ -23,19 +24,21 @@ LEAST_FREEDOM, MOST_NUMBERS = 4, 4
 def level_repeats_block(study: Study) -> Block:
     """(S / noise)^(1/3) of flat settings with repeats, pooled over neighbouring exposures.
 
-    S is the variance of a setting's relative levels, with f = n - 1 degrees of freedom; noise its expectation by the noise of pixels. The
-    cube root of chi2_f / f is all but normal, of mean 1 - 2 / (9 f) and variance 2 / (9 f), also for few degrees of freedom, where a
-    logarithm would hide much of a large variance (Wilson and Hilferty, PNAS 17, 684, 1931). The means of dark frames scatter, as rows of
-    one frame share noise of low frequencies and black levels jump; by the same DN^2 do those of flats. Nuisance parameters: that
-    variance (`_dark_scatter`); a lamp's usual unsteadiness, whose variance is uncertain by s0^2, s0 = `STEADY_LAMP`; and how much wider S
-    scatters the larger it is. Image lag adds to S what each repeat's predecessor leaves in it. Settings out of line with the others are
-    left out (`steady`): other measurements find those. Raises NotDetermined for fewer than `LEAST_FREEDOM` degrees of freedom.
-    """
+    S is the variance of a setting's relative levels, with f = n - 1 degrees of freedom; noise its expectation by the
+    noise of pixels. The cube root of chi2_f / f is all but normal, of mean 1 - 2 / (9 f) and variance 2 / (9 f), also
+    for few degrees of freedom, where a logarithm would hide much of a large variance (Wilson and Hilferty, PNAS 17,
+    684, 1931). The means of dark frames scatter, as rows of one frame share noise of low frequencies and black levels
+    jump; by the same DN^2 do those of flats. Nuisance parameters: that variance (`_dark_scatter`); a lamp's usual
+    unsteadiness, whose variance is uncertain by s0^2, s0 = `STEADY_LAMP`; and how much wider S scatters the larger it
+    is. Image lag adds to S what each repeat's predecessor leaves in it. Settings out of line with the others are left
+    out (`steady`): other measurements find those. Raises NotDetermined for fewer than `LEAST_FREEDOM` degrees of
+    freedom."""
     groups = _by_exposure(_seen(study))
     if not groups:
         raise NotDetermined(
             "level_repeats",
-            f"fewer than {LEAST_FREEDOM + 1} repeats of flat settings: how steady the light is can't be told; repeat one setting ten times",
+            f"fewer than {LEAST_FREEDOM + 1} repeats of flat settings: how steady the light is can't be told; repeat "
+            "one setting ten times",
         )
     freedom = np.array([sum(len(r.away) - 1 for r in group) for group in groups], float)
     noise = np.array([_weighted(group, [r.noise for r in group]) for group in groups])
@@ -88,8 +91,8 @@ def _seen(study: Study) -> list[RepeatedMeans]:
 def _dark_scatter(study: Study) -> tuple[float, float]:
     """Variance of a dark frame's mean beside that by the noise of independent pixels, DN^2, and its standard deviation.
 
-    A variance v of f degrees of freedom stands for a true one of about v f / (f - 2), known to sqrt(2 / f) of it. Without repeated dark
-    frames it may be as large as rows leave whose noise is that of their pixels.
+    A variance v of f degrees of freedom stands for a true one of about v f / (f - 2), known to sqrt(2 / f) of it.
+    Without repeated dark frames it may be as large as rows leave whose noise is that of their pixels.
     """
     noise, camera = study.noise, study.camera
     whole = noise.jitter_dn**2
@@ -101,7 +104,8 @@ def _dark_scatter(study: Study) -> tuple[float, float]:
 
 
 def _by_exposure(repeats: list[RepeatedMeans]) -> list[list[RepeatedMeans]]:
-    """Settings in the order of their exposure, in at most `MOST_NUMBERS` groups of at least `LEAST_FREEDOM` degrees of freedom."""
+    """Settings in the order of their exposure, in at most `MOST_NUMBERS` groups of at least `LEAST_FREEDOM` degrees of
+    freedom."""
     ordered = sorted(repeats, key=lambda r: (r.captures[0].exposure_s, r.captures[0].id))
     whole = sum(len(r.away) - 1 for r in ordered)
     wanted = max(LEAST_FREEDOM, -(-whole // MOST_NUMBERS))
@@ -126,8 +130,8 @@ def _weighted(group: list[RepeatedMeans], value: list[float]) -> float:
 
 
 def _of_lag(study: Study, effects: Effects, group: list[RepeatedMeans]) -> float:
-    """Variance that image lag adds to the repeats' relative levels about the mean of each setting, as the first repeat often follows
-    another level."""
+    """Variance that image lag adds to the repeats' relative levels about the mean of each setting, as the first repeat
+    often follows another level."""
     carried, total = study.carried_e(effects), 0.0
     for repeats in group:
         signal_e = [

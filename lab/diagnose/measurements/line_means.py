@@ -1,9 +1,9 @@
 """Scatter of the means of single frames by row and column noise of effects.
 
-The pixels of a line share its noise, so that the mean of a channel scatters by more than the noise of independent pixels. Of n lines
-whose noise has the power spectrum S(f) (e^2) across lines, the mean over all lines has the variance S(0) / n, and half of the
-difference between even and odd lines S(1/2) / n. In a mosaic, channels on the same lines share both.
-"""
+The pixels of a line share its noise, so that the mean of a channel scatters by more than the noise of independent
+pixels. Of n lines whose noise has the power spectrum S(f) (e^2) across lines, the mean over all lines has the variance
+S(0) / n, and half of the difference between even and odd lines S(1/2) / n. In a mosaic, channels on the same lines
+share both."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ class LineMeans:
         self._kept: dict[tuple[str, str, float], dict[str, FloatArray]] = {}
 
     def jacobian(self, effects: Effects) -> dict[str, FloatArray]:
-        """Name of a nuisance parameter -> column (n,), DN per standard deviation. Empty without effects that add line noise."""
+        """Name of a nuisance parameter -> column (n,), DN per standard deviation. Empty without effects that add line
+        noise."""
         columns: dict[str, FloatArray] = {}
         camera, gain = self._study.camera, self._study.noise.gain
         for one in Uniform(camera, effects).lines:

@@ -40,21 +40,22 @@ class Periodogram:
         return max(float(self._level.mean()), 1e-12)
 
     def _relative(self, power: FloatArray) -> FloatArray:
-        """Power over the level, of expectation 1 for white noise. The level is a mean over L modes and gamma-distributed, so that the
-        expectation of its inverse is L / (L - 1)."""
+        """Power over the level, of expectation 1 for white noise. The level is a mean over L modes and
+        gamma-distributed, so that the expectation of its inverse is L / (L - 1)."""
         modes = self._level.size
         return np.asarray(power / self.level * (1.0 - 1.0 / modes if modes > 1 else 1.0))
 
     def line(self, lines: Lines) -> tuple[FloatArray, FloatArray, float]:
-        """(frequency, power over the level, number of the level's modes) of the lines' means, for frequencies above 0 and below
+        """(frequency, power over the level, number of the level's modes) of the lines' means, for frequencies above 0
+        and below
         0.5 cy/px."""
         table, frequency = (self.table[:, 0], self.rows) if lines == "rows" else (self.table[0], self.cols)
         use = (frequency > 0) & (frequency < 0.4999)
         return frequency[use], self._relative(table[use]), float(self._level.size)
 
     def along(self, lines: Lines) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(frequency, power over the level, number of modes) along rows (columns), for frequencies up to the level band. Powers are means over
-        all rows (columns) without the lines' means."""
+        """(frequency, power over the level, number of modes) along rows (columns), for frequencies up to the level
+        band. Powers are means over all rows (columns) without the lines' means."""
         if lines == "rows":
             inside, frequency = self.table[np.abs(self.rows) > 1.5 / len(self.rows)], self.cols
             power, modes = inside.mean(axis=0), float(len(inside))
@@ -95,7 +96,8 @@ class Bands:
 
     @staticmethod
     def of(frequency: FloatArray, count: int, power: float = 1.0) -> Bands:
-        """At most `count` bands of at least two frequencies. Their edges follow k^`power`: above 1, low bands are narrower."""
+        """At most `count` bands of at least two frequencies. Their edges follow k^`power`: above 1, low bands are
+        narrower."""
         share = np.linspace(0.0, 1.0, min(count, max(len(frequency) // 3, 1)) + 1) ** power
         edges = np.unique(np.rint(len(frequency) * share).astype(int))
         edges = edges[np.append(np.diff(edges) > 1, True)]
@@ -119,5 +121,6 @@ def log_mean_bias(modes: FloatArray | float) -> FloatArray:
 
 
 def log_mean_variance(modes: FloatArray | float) -> FloatArray:
-    """Variance of ln(mean of n = `modes` exponential variables): trigamma(n), times 1 + 1 / n as few modes have a long lower tail."""
+    """Variance of ln(mean of n = `modes` exponential variables): trigamma(n), times 1 + 1 / n as few modes have a long
+    lower tail."""
     return np.asarray(polygamma(1, modes) * (1.0 + 1.0 / np.asarray(modes)))

@@ -27,11 +27,12 @@ RADIOMETER_STD = 0.002  # of a radiometer's reading, common to the channels; the
 
 
 def linearity_block(study: Study) -> Block:
-    """Mean of every unclipped flat frame by channel, DN, against the exposure, or the number of photons where that is stated.
+    """Mean of every unclipped flat frame by channel, DN, against the exposure, or the number of photons where that is
+    stated.
 
-    Nuisance parameters: black level, dark current, the electron rate of each channel in each lamp, and the radiometer's readings. What
-    remains is nonlinearity. Raises NotDetermined for flats without stated light, for fewer than three levels, and where fewer than
-    four means are unclipped.
+    Nuisance parameters: black level, dark current, the electron rate of each channel in each lamp, and the radiometer's
+    readings. What remains is nonlinearity. Raises NotDetermined for flats without stated light, for fewer than three
+    levels, and where fewer than four means are unclipped.
     """
     groups = [g for g in study.flat_levels() if reading(study, g[0]) is not None and g[0].id not in study.misstated]
     if not groups and study.flat_levels():
@@ -81,8 +82,10 @@ def linearity_block(study: Study) -> Block:
         return Prediction(light_dn + levels.beside_light_dn(effects), jacobian)
 
     return Block(
-        measurement=PHOTON_TRANSFER, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
-        labels=tuple(Label(float(v), channel, _setting(c), (c.id,), out) for (c, channel, _, out), v in zip(points, value, strict=True)),
+        measurement=PHOTON_TRANSFER, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value,
+        covariance=covariance,
+        labels=tuple(Label(float(v), channel, _setting(c), (c.id,), out) for (c, channel, _, out), v in zip(points,
+        value, strict=True)),
         reads=LEVEL | LAG | DARK_CURRENT, scattered_by=LINES, predict=predict, scale=signal,
     )  # fmt: skip
 
@@ -90,7 +93,8 @@ def linearity_block(study: Study) -> Block:
 def _changed(
     study: Study, readings: list[FlatLight], relative: Mapping[tuple[str, str], float], effects: Effects
 ) -> Mapping[tuple[str, str], float]:
-    """`relative` rates, (reading, channel) -> rate over that by the lamp's first reading, as effects on the spectrum change them.
+    """`relative` rates, (reading, channel) -> rate over that by the lamp's first reading, as effects on the spectrum
+    change them.
 
     Light stated in photons changes by the same factor at all levels, which is part of its free rate.
     """
@@ -108,10 +112,11 @@ def _changed(
 def _of_readings(
     study: Study, readings: list[FlatLight], lights: list[FlatLight], channels: list[str]
 ) -> dict[str, tuple[float, np.ndarray]]:
-    """Nuisance parameters of the radiometer's readings: name -> (relative prior standard deviation, mask (n,) of the means it changes).
+    """Nuisance parameters of the radiometer's readings: name -> (relative prior standard deviation, mask (n,) of the
+    means it changes).
 
-    One for each reading, and one for each reading and channel. None where every lamp was read once, as its free rate covers that.
-    """
+    One for each reading, and one for each reading and channel. None where every lamp was read once, as its free rate
+    covers that."""
     found: dict[str, tuple[float, np.ndarray]] = {}
     if len(readings) == len({one.lamp for one in readings}):
         return found
@@ -125,8 +130,8 @@ def _of_readings(
 
 
 def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], signal: FloatArray) -> FloatArray:
-    """Covariance (n, n) of flat frames' means, DN^2: shot and read noise, the lamp's repeatability (common to a frame's channels), and
-    floor and rounding (common to repeats)."""
+    """Covariance (n, n) of flat frames' means, DN^2: shot and read noise, the lamp's repeatability (common to a frame's
+    channels), and floor and rounding (common to repeats)."""
     noise = study.noise
     pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
     group_of = {c.id: i for i, group in enumerate(groups) for c in group}

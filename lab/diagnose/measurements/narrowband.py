@@ -32,8 +32,8 @@ _READINGS = 8  # readings from which on their standard deviation is measured
 def narrowband_block(study: Study) -> Block:
     """Mean of every unclipped narrowband frame by channel, DN, against the maker's sensitivity curves.
 
-    Nuisance parameters: black level, dark current, and smooth errors of the curves (`curves`). Raises NotDetermined where the curves
-    aren't stated, and for fewer than four means.
+    Nuisance parameters: black level, dark current, and smooth errors of the curves (`curves`). Raises NotDetermined
+    where the curves aren't stated, and for fewer than four means.
     """
     if not study.stated.quantum_efficiency:
         raise NotDetermined(
@@ -90,7 +90,8 @@ def narrowband_block(study: Study) -> Block:
 
     return Block(
         measurement=NARROWBAND, reach=25.0, value=value, covariance=covariance,
-        labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _, o in points),
+        labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _,
+        o in points),
         reads=LEVEL | LAG | DARK_CURRENT | SPECTRAL, scattered_by=LINES, predict=predict, scale=np.maximum(signal, 1.0),
     )  # fmt: skip
 
@@ -98,8 +99,8 @@ def narrowband_block(study: Study) -> Block:
 def _narrowband_covariance(
     study: Study, points: list[tuple[Any, str, float, bool]], signal: FloatArray, curves: CurveJacobian
 ) -> FloatArray:
-    """Covariance (n, n) of narrowband means, DN^2: shot and read noise, floor and rounding (common to repeats), the radiometer's readings,
-    and the lamp's repeatability (common to a frame's channels)."""
+    """Covariance (n, n) of narrowband means, DN^2: shot and read noise, floor and rounding (common to repeats), the
+    radiometer's readings, and the lamp's repeatability (common to a frame's channels)."""
     noise = study.noise
     exposures = np.array([c.exposure_s for c, *_ in points])
     pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
@@ -124,12 +125,13 @@ def _narrowband_covariance(
 
 
 def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expected: FloatArray) -> float:
-    """Relative standard deviation s of a radiometer's readings, common to the channels, from second differences along wavelength.
+    """Relative standard deviation s of a radiometer's readings, common to the channels, from second differences along
+    wavelength.
 
-    With u the ln of measured over expected signal at neighbouring wavelengths, u_2 - (u_1 + u_3) / 2 has the variance 1.5 s^2 + that of
-    the noise. The median of its magnitude isn't moved by a few outlying wavelengths. At most `RADIOMETER_STD`, so that structure of
-    the light or of filters isn't taken for noise; that, too, for fewer than `_READINGS` readings.
-    """
+    With u the ln of measured over expected signal at neighbouring wavelengths, u_2 - (u_1 + u_3) / 2 has the variance
+    1.5 s^2 + that of the noise. The median of its magnitude isn't moved by a few outlying wavelengths. At most
+    `RADIOMETER_STD`, so that structure of the light or of filters isn't taken for noise; that, too, for fewer than
+    `_READINGS` readings."""
     deviation: dict[str, tuple[float, float, float]] = {}
     by_frame: dict[str, list[int]] = {}
     for i, (capture, *_) in enumerate(points):
@@ -153,11 +155,11 @@ def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expect
 
 
 def _sample_std(repeats: Iterable[Sequence[Spectrum]]) -> float:
-    """Relative standard deviation of a sample of a radiometer's reading, independent of its neighbours. `repeats`: the readings of each
-    wavelength.
+    """Relative standard deviation of a sample of a radiometer's reading, independent of its neighbours. `repeats`: the
+    readings of each wavelength.
 
-    Of two readings: the standard deviation of their log ratio over sqrt 2, at samples above a tenth of the peak. The median over pairs
-    is taken, at most `MOST_SAMPLE_STD`.
+    Of two readings: the standard deviation of their log ratio over sqrt 2, at samples above a tenth of the peak. The
+    median over pairs is taken, at most `MOST_SAMPLE_STD`.
     """
     found = []
     for readings in repeats:

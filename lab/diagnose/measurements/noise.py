@@ -20,8 +20,8 @@ GAIN_STD, READ_STD = 0.3, 0.3  # relative prior standard deviations of conversio
 def variance_block(study: Study) -> Block:
     """Temporal variance of flats by channel, DN^2, against their mean signal.
 
-    Nuisance parameters: conversion gain, and read noise at each gain setting. Raises NotDetermined for fewer than four variances.
-    """
+    Nuisance parameters: conversion gain, and read noise at each gain setting. Raises NotDetermined for fewer than four
+    variances."""
     of_channel = channel_planes(study)
     points: list[tuple[Repeats, str, float, float, float]] = []
     for repeats in study.once(flat_repeats):
@@ -63,7 +63,8 @@ def variance_block(study: Study) -> Block:
 
 
 def shot_variance(study: Study, signal_dn: FloatArray, gain_dn_per_e: FloatArray, effects: Effects) -> FloatArray:
-    """Variance (n,), DN^2, of uniform light without read noise, at mean signals above black (n,), DN, of captures with the given gains (n,)."""
+    """Variance (n,), DN^2, of uniform light without read noise, at mean signals above black (n,), DN, of captures with
+    the given gains (n,)."""
     noise, model = study.noise, Uniform(study.camera, effects)
     light = study.field.light / study.field.light.mean()
     electrons, slope = behind(signal_dn / gain_dn_per_e, light, effects, study)
@@ -82,7 +83,8 @@ def channel_planes(study: Study) -> dict[str, list[str]]:
 
 
 def behind(signal_e: FloatArray, light: FloatArray, effects: Effects, study: Study) -> tuple[FloatArray, FloatArray]:
-    """Electrons (levels, points of the field) that give the measured mean signals (levels,), e, and the response's slope there.
+    """Electrons (levels, points of the field) that give the measured mean signals (levels,), e, and the response's
+    slope there.
 
     `light` (points,): relative illumination, of mean 1. A nonlinear response is inverted by three fixed-point steps.
     """

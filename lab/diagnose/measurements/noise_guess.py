@@ -36,8 +36,8 @@ USUAL_JITTER_FREEDOM = 2.0  # degrees of freedom that count for the usual one
 UNKNOWN_JITTER_DN = 0.05  # where no dark frames are repeated
 USUAL_PRNU = 0.008  # where no flats tell
 USUAL_LAMP = 3e-4  # relative standard deviation of a flat frame's mean, where no flats are repeated
-#: Local mean of a plane of the mosaic: side of the box and width of the border that is left out, px. The wide one is used in planes of
-#: at least `WIDE_PLANE_PX` a side. In planes below `LEAST_PLANE_PX` PRNU isn't measured.
+#: Local mean of a plane of the mosaic: side of the box and width of the border that is left out, px. The wide one is
+#: used in planes of at least `WIDE_PLANE_PX` a side. In planes below `LEAST_PLANE_PX` PRNU isn't measured.
 WIDE_WINDOW_PX, NARROW_WINDOW_PX = (9, 6), (3, 1)
 WIDE_PLANE_PX, LEAST_PLANE_PX = 24, 6
 ALIKE_C = 2.0  # dark captures whose temperatures differ by less than this from the nearest count as of one temperature
@@ -61,19 +61,20 @@ class NoiseGuess:
     dark_std: float  # standard deviation of `dark_dn_per_s`
 
     def spread_dn2(self, signal_dn: FloatArray) -> FloatArray:
-        """Variance (DN^2) of pixels at a signal before rounding: shot noise, read noise (0 where rounding hides it), PRNU."""
+        """Variance (DN^2) of pixels at a signal before rounding: shot noise, read noise (0 where rounding hides it),
+        PRNU."""
         return np.asarray(
             self.gain * signal_dn + variance_before_rounding(self.read_dn**2) + (self.prnu * signal_dn) ** 2
         )
 
 
 def noise_guess(study: Study) -> NoiseGuess:
-    """Return the noise fit's gain, black level, dark current and PRNU where there is a fit; else first estimates from dark and flat
-    captures. The read noise is that of the dark frames as recorded, rounding included. What these don't determine is taken from the data
-    sheet, else a usual value.
+    """Return the noise fit's gain, black level, dark current and PRNU where there is a fit; else first estimates from
+    dark and flat captures. The read noise is that of the dark frames as recorded, rounding included. What these don't
+    determine is taken from the data sheet, else a usual value.
 
-    Without a fit, the gain is the slope of temporal variance over signal of repeated flats, else the stated one, else that of any repeats.
-    """
+    Without a fit, the gain is the slope of temporal variance over signal of repeated flats, else the stated one, else
+    that of any repeats."""
     first = _from_darks(study, _as_stated(study))
     fitted = study.fitted
     if fitted is not None and fitted.conversion_gain_dn_per_e is not None:
@@ -94,7 +95,8 @@ def noise_guess(study: Study) -> NoiseGuess:
 
 
 def _as_fitted(study: Study, first: NoiseGuess, fitted: NoiseFit, gain_at_0_db: float) -> NoiseGuess:
-    """Return the noise fit's figures in the place of first estimates. The fit states its gain for 0 dB, and its read noise without
+    """Return the noise fit's figures in the place of first estimates. The fit states its gain for 0 dB, and its read
+    noise without
     rounding: that of the dark frames stays."""
     flats = study.recordings.captures(FlatCapture, study.side)
     gain = gain_at_0_db * 10.0 ** (most_frequent_gain_db(flats) / 20.0)
@@ -123,14 +125,16 @@ def _as_stated(study: Study) -> NoiseGuess:
     # without dark frames: a dark current as stated, or of some tens of electrons
     expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
     return NoiseGuess(
-        black=black, dark_dn_per_s=0.0, dark_c=study.temperature_c, gain=1.0, gain_is_known=False, read_dn=1.0, prnu=USUAL_PRNU,
+        black=black, dark_dn_per_s=0.0, dark_c=study.temperature_c, gain=1.0, gain_is_known=False, read_dn=1.0,
+        prnu=USUAL_PRNU,
         jitter_dn=BLACK_FLOOR_DN, jitter_freedom=0.0, jitter_lamp=USUAL_LAMP, black_std=black_std,
         dark_std=max(expected * (stated.conversion_gain_dn_per_e or 1.0), 0.5),
     )  # fmt: skip
 
 
 def _from_darks(study: Study, stated: NoiseGuess) -> NoiseGuess:
-    """Return black level, dark current, read noise and repeatability by the dark captures; as stated where there are none.
+    """Return black level, dark current, read noise and repeatability by the dark captures; as stated where there are
+    none.
 
     They are of one temperature, that of most captures: the baseline's dark current doesn't depend on it.
     """
@@ -138,7 +142,12 @@ def _from_darks(study: Study, stated: NoiseGuess) -> NoiseGuess:
     darks = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
     if not darks:
         return stated
-    off = [0.0 if study.temperature_c is None or g[0].temperature_c is None else abs(g[0].temperature_c - study.temperature_c) for g in darks]  # fmt: skip
+    off = [
+        0.0
+        if study.temperature_c is None or g[0].temperature_c is None
+        else abs(g[0].temperature_c - study.temperature_c)
+        for g in darks
+    ]
     sound = study.once(sound_pixels)
     frames_mean = [np.array([float(recordings.frame(c).mean(where=sound)) for c in g]) for g in darks]
     near = [i for i, away in enumerate(off) if away <= min(off) + ALIKE_C]
@@ -165,14 +174,15 @@ def _from_darks(study: Study, stated: NoiseGuess) -> NoiseGuess:
         own_dn2 = read**2 / recordings.frame(first[0]).size
     jitter, freedom = _jitter(study, darks, frames_mean, own_dn2)
     return replace(
-        stated, black=black, dark_dn_per_s=dark, dark_c=dark_c, read_dn=read, jitter_dn=max(jitter, BLACK_FLOOR_DN), jitter_freedom=freedom,
+        stated, black=black, dark_dn_per_s=dark, dark_c=dark_c, read_dn=read, jitter_dn=max(jitter, BLACK_FLOOR_DN),
+        jitter_freedom=freedom,
         black_std=black_std, dark_std=dark_std,
     )  # fmt: skip
 
 
 def _transfer_points(study: Study, black: float) -> tuple[list[float], list[float], float]:
-    """Signal (DN) and temporal variance (DN^2) of repeated flats by level and channel; and the PRNU, of the last plane whose signal is
-    between 0.3 and 0.8 of saturation."""
+    """Signal (DN) and temporal variance (DN^2) of repeated flats by level and channel; and the PRNU, of the last plane
+    whose signal is between 0.3 and 0.8 of saturation."""
     step, prnu = mosaic.step(study.camera.cfa), USUAL_PRNU
     signal, variance = [], []
     for group in study.flat_levels():
@@ -207,8 +217,8 @@ def _transfer_points(study: Study, black: float) -> tuple[list[float], list[floa
 def variance_between_pixels(plane: FloatArray) -> float:
     """Variance (DN^2) between the pixels of a plane (rows, cols), about the local mean over w x w pixels.
 
-    The local mean holds 1 / w^2 of the pixel itself: the variance is divided by 1 - 1 / w^2. Planes below `WIDE_PLANE_PX` get the
-    narrow window.
+    The local mean holds 1 / w^2 of the pixel itself: the variance is divided by 1 - 1 / w^2. Planes below
+    `WIDE_PLANE_PX` get the narrow window.
     """
     width, border = WIDE_WINDOW_PX if min(plane.shape) >= WIDE_PLANE_PX else NARROW_WINDOW_PX
     rough = (plane - ndimage.uniform_filter(plane, width))[border:-border, border:-border]
@@ -216,8 +226,8 @@ def variance_between_pixels(plane: FloatArray) -> float:
 
 
 def _scene_gain(study: Study, black: float, read_dn: float) -> float | None:
-    """Gain (DN/e) from two repeats of any scene: temporal variance over signal, in eight bins of pixels of similar signal. None without
-    repeats."""
+    """Gain (DN/e) from two repeats of any scene: temporal variance over signal, in eight bins of pixels of similar
+    signal. None without repeats."""
     signal, variance = [], []
     for group in study.groups(None, lambda c: c.model_dump_json(exclude={"id", "frame", "time", "temperature_c"})):
         if len(group) < 2 or group[0].kind == "dark":
@@ -236,8 +246,8 @@ def _scene_gain(study: Study, black: float, read_dn: float) -> float | None:
 
 
 def _transfer_slope(signal: FloatArray, variance: FloatArray, read_dn: float) -> float:
-    """Gain (DN/e): slope of the temporal variance over signal, of a line through the read noise's variance at signal 0, weighted by the
-    inverse variance."""
+    """Gain (DN/e): slope of the temporal variance over signal, of a line through the read noise's variance at signal 0,
+    weighted by the inverse variance."""
     weight = 1.0 / np.maximum(variance, 1e-9)
     return float(np.sum(weight * signal * (variance - read_dn**2)) / np.sum(weight * signal**2))
 
@@ -255,12 +265,12 @@ def _even_rows(frame: Any, step: int) -> FloatArray:
 def _jitter(
     study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float
 ) -> tuple[float, float]:
-    """Standard deviation of the repeats' means (DN) about a linear drift with time that all groups have in common, and its degrees of
-    freedom.
+    """Standard deviation of the repeats' means (DN) about a linear drift with time that all groups have in common, and
+    its degrees of freedom.
 
-    Settings out of line are left out (`steady`). With few repeats it is shrunk towards the usual: the variance `USUAL_JITTER_DN`^2 +
-    `own_dn2`, that of a frame's mean by its pixels' noise, counts as `USUAL_JITTER_FREEDOM` degrees of freedom.
-    """
+    Settings out of line are left out (`steady`). With few repeats it is shrunk towards the usual: the variance
+    `USUAL_JITTER_DN`^2 + `own_dn2`, that of a frame's mean by its pixels' noise, counts as `USUAL_JITTER_FREEDOM`
+    degrees of freedom."""
     repeats = []
     for group, mean in zip(groups, means, strict=True):
         if len(group) > 1:
@@ -282,8 +292,8 @@ def _jitter(
 
 
 class TemporalVariance:
-    """Temporal variance of a pixel from repeats, which are added one by one and not kept: mean over pixels of the sample variance, after each
-    frame's mean is subtracted.
+    """Temporal variance of a pixel from repeats, which are added one by one and not kept: mean over pixels of the
+    sample variance, after each frame's mean is subtracted.
 
     The squares about the repeats' mean are summed by Welford's recursion (Technometrics 4, 419, 1962).
     """

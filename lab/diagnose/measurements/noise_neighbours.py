@@ -23,8 +23,8 @@ CORRELATION_FLOOR = 3e-4  # standard deviation of a correlation beside chance
 def neighbour_block(study: Study) -> Block:
     """Correlation of the temporal noise of neighbouring pixels (`PAIRS`), by level of light and in the dark.
 
-    It is 0 where pixels are independent, whatever gain, noise and level are. Raises NotDetermined without repeats whose noise
-    exceeds a code.
+    It is 0 where pixels are independent, whatever gain, noise and level are. Raises NotDetermined without repeats whose
+    noise exceeds a code.
     """
     points = [r for r in (*study.once(dark_repeats), *study.once(flat_repeats)) if np.all(np.isfinite(r.correlation))]
     if not points:
@@ -64,7 +64,7 @@ def neighbour_block(study: Study) -> Block:
     return Block(
         measurement=NOISE_NEIGHBOURS, reach=LEVEL_REACH, along=np.repeat(np.log(level), len(names)),
         value=value, covariance=covariance + CORRELATION_FLOOR**2 * np.eye(len(value)),
-        labels=tuple(Label(r.level if bright else 0.0, name, f"{r.exposure_s:.4g} s" if bright else f"dark, {r.exposure_s:.4g} s", r.captures, r.held_out)
+        labels=tuple(Label(r.level if bright else 0.0, name, f"{r.exposure_s:.4g} s" if bright else f"dark, {r.exposure_s:.4g} s", r.captures, r.held_out)  # noqa: E501
                      for r, bright in zip(points, lit, strict=True) for name in names),
         reads=frozenset({"signal.filters", "charge.correlation"}), predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
@@ -81,9 +81,9 @@ def correlations(
 ) -> FloatArray:
     """Predicted correlations by `PAIRS` in uniform light, (6,): means over the phases of the mosaic.
 
-    `shot_e2` and `share` (planes,): variance of the shot noise, and share of each neighbour's departure from its mean that a pixel
-    takes over. Read noise (`read_e2`) is independent. `kernel` filters both within a plane. Rounding (`rounding_e2`) is added last
-    and is independent.
+    `shot_e2` and `share` (planes,): variance of the shot noise, and share of each neighbour's departure from its mean
+    that a pixel takes over. Read noise (`read_e2`) is independent. `kernel` filters both within a plane. Rounding
+    (`rounding_e2`) is added last and is independent.
     """
     period = 1 if cfa == "MONO" else 2
     at = dict.fromkeys(planes, (0, 0)) if period == 1 else _phase_of(cfa)

@@ -26,8 +26,8 @@ OVERSAMPLE = 4  # samples a pixel, along rows and columns
 LARGEST_PX = 320  # largest side of the window that is fitted: enough for a band's contrast to 1e-3
 MARGIN_PX = 12  # border of frame and window that isn't fitted, as the drawing lacks the light from outside
 MARGIN_CELLS = 2.0  # border of the pattern that isn't fitted
-#: Rings above 0.5 cy/px, by the larger of |fx| and fy, that alias. Each is one term of the fit and isn't reported. The inner edges divide
-#: it into finer rings, at whose mean frequencies an effect's OTF is evaluated.
+#: Rings above 0.5 cy/px, by the larger of |fx| and fy, that alias. Each is one term of the fit and isn't reported. The
+#: inner edges divide it into finer rings, at whose mean frequencies an effect's OTF is evaluated.
 BEYOND_CY_PER_PX = ((0.5, 0.54, 0.58, 0.62), (0.62, 0.68, 0.74, 0.8), (0.8, 0.9, 1.0, 1.15, 1.35, 4.0))
 LEAST_PIXELS = 1500  # of a channel
 
@@ -46,7 +46,8 @@ def from_middle(camera: CameraModel, points: FloatArray) -> tuple[FloatArray, Fl
 
 
 def pattern_window(seen: FloatArray, warp: ScreenWarp, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """The window of the frame that is fitted: rows and columns about the pattern's middle, in even numbers and beginning at even ones.
+    """The window of the frame that is fitted: rows and columns about the pattern's middle, in even numbers and
+    beginning at even ones.
 
     Raises NotDetermined where the pattern lies outside the frame.
     """
@@ -76,7 +77,8 @@ class BeyondPart:
 
     @staticmethod
     def of(picture: FloatArray, fx: FloatArray, fy: FloatArray, power: FloatArray) -> BeyondPart:
-        """The part whose power spectrum is `power` (rows, cols / 2 + 1), at the frequencies `fx` (1, cols / 2 + 1) and `fy` (rows, 1)."""
+        """The part whose power spectrum is `power` (rows, cols / 2 + 1), at the frequencies `fx` (1, cols / 2 + 1) and
+        `fy` (rows, 1)."""
         x, y = (float(np.average(np.broadcast_to(np.abs(f), power.shape), weights=power)) for f in (fx, fy))
         return BeyondPart(picture, (x, x), (y, -y))
 
@@ -117,7 +119,8 @@ class Canvas:
 
     @cached_property
     def low(self) -> NDArray[np.complex128]:
-        """Fourier transform of the drawn pattern up to 0.5 cy/px, (rows, cols / 2 + 1), as of point samples at the pixels' centres."""
+        """Fourier transform of the drawn pattern up to 0.5 cy/px, (rows, cols / 2 + 1), as of point samples at the
+        pixels' centres."""
         return self._below(self.drawn)
 
     def as_shown(self, effects: Effects, camera: CameraModel) -> NDArray[np.complex128]:
@@ -145,7 +148,8 @@ class Canvas:
         return fft.fftfreq(self.shape[0])[:, None], fft.rfftfreq(self.shape[1])[None, :]
 
     def passed(self, otf: CubicSpline, fill_factor: float) -> FloatArray:
-        """OTF of a lens, symmetric about the axis, times that of the pixel's aperture at `frequencies`, (rows, cols / 2 + 1)."""
+        """OTF of a lens, symmetric about the axis, times that of the pixel's aperture at `frequencies`, (rows, cols / 2
+        + 1)."""
         fy, fx = self.frequencies
         return np.asarray(otf(np.hypot(fx, fy)) * aperture_otf(fx, fy, fill_factor))
 
@@ -155,7 +159,8 @@ class Canvas:
 
     @cached_property
     def whole(self) -> _Spectrum:
-        """Spectrum of the drawn pattern at all frequencies of the drawing, as of point samples at the pixels' centres."""
+        """Spectrum of the drawn pattern at all frequencies of the drawing, as of point samples at the pixels'
+        centres."""
         rows, cols = self.fine.shape
         fy, fx = fft.fftfreq(rows, 1.0 / OVERSAMPLE)[:, None], fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
         # divided by the sinc of a sample's square, and shifted from the first sample's centre to the pixel's
@@ -169,11 +174,11 @@ class Canvas:
         return np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE])
 
     def beyond(self, otf: CubicSpline, fill_factor: float) -> list[list[BeyondPart]]:
-        """The aliased parts of the picture, from frequencies above 0.5 cy/px that the lens passes: a list for each ring and each pair of
-        opposite sectors (|fx| >= |fy| or not), of its finer rings.
+        """The aliased parts of the picture, from frequencies above 0.5 cy/px that the lens passes: a list for each ring
+        and each pair of opposite sectors (|fx| >= |fy| or not), of its finer rings.
 
-        Where cells are a whole number of pixels the spectrum repeats, and aliases are coherent with what lies below 0.5 cy/px.
-        """
+        Where cells are a whole number of pixels the spectrum repeats, and aliases are coherent with what lies below 0.5
+        cy/px."""
         above = self._above(otf, fill_factor)
         found = []
         for edges in BEYOND_CY_PER_PX:
@@ -203,7 +208,8 @@ class Canvas:
         return _Above(np.where(radius < highest, high, 0.0), fx, fy, keep)
 
     def _aliased(self, part: NDArray[np.complex128], rows: NDArray[np.bool_]) -> FloatArray:
-        """The picture (rows, cols) of a part of that spectrum, sampled at the pixels. `rows`: which rows of the full spectrum it has."""
+        """The picture (rows, cols) of a part of that spectrum, sampled at the pixels. `rows`: which rows of the full
+        spectrum it has."""
         cols = OVERSAMPLE * self.shape[1]
         spread = np.zeros((len(rows), part.shape[1]), complex)
         spread[rows] = part
@@ -237,14 +243,16 @@ class _Above:
 
 
 def lens_otf(study: Study, channel: str, light: Spectrum | None) -> CubicSpline:
-    """OTF of the baseline's lens without the pixel's aperture, against frequency (cy/px). On axis it is the same in all directions."""
+    """OTF of the baseline's lens without the pixel's aperture, against frequency (cy/px). On axis it is the same in all
+    directions."""
     f = np.linspace(0.0, 2.0, 101)
     whole = np.real(optical_transfer(study.camera, channel, light, f, 0.0 * f, (), "bernoulli"))
     return CubicSpline(f, whole / aperture_otf(f, 0.0 * f, study.camera.fill_factor))
 
 
 def channel_pixels(study: Study, canvas: Canvas, channel: str, seen: FloatArray) -> NDArray[np.bool_]:
-    """Mask (rows, cols) of the window's pixels of a channel inside the pattern. `seen`: the frame, NaN where the screen isn't.
+    """Mask (rows, cols) of the window's pixels of a channel inside the pattern. `seen`: the frame, NaN where the screen
+    isn't.
 
     Raises NotDetermined for fewer than `LEAST_PIXELS`.
     """

@@ -1,4 +1,5 @@
-"""Contrast of the image of a random pattern over that of the baseline camera, by spatial frequency, orientation and channel."""
+"""Contrast of the image of a random pattern over that of the baseline camera, by spatial frequency, orientation and
+channel."""
 
 from __future__ import annotations
 
@@ -24,11 +25,11 @@ PLACINGS = 4  # Gauss-Newton steps that find an image's shift
 
 
 def contrast_block(study: Study) -> Block:
-    """Contrast of a random pattern over that of the baseline, by frequency, orientation and channel: the bands' coefficients of
-    `pattern_fit`.
+    """Contrast of a random pattern over that of the baseline, by frequency, orientation and channel: the bands'
+    coefficients of `pattern_fit`.
 
-    Nuisance parameters: the contrast's scale, and a blur of the screen's cells. Raises NotDetermined where no band is known to
-    `LARGEST_STD`.
+    Nuisance parameters: the contrast's scale, and a blur of the screen's cells. Raises NotDetermined where no band is
+    known to `LARGEST_STD`.
     """
     found = patterns(study)
     labels: list[Label] = []
@@ -84,7 +85,8 @@ def contrast_block(study: Study) -> Block:
 def _transfers(
     study: Study, sights: dict[str, tuple[Pattern, list[int], list[int]]], effects: Effects
 ) -> NDArray[np.complex128]:
-    """OTFs of the channels of one pose, (channels, nodes), at the nodes of all bands and then of the parts beyond the bands."""
+    """OTFs of the channels of one pose, (channels, nodes), at the nodes of all bands and then of the parts beyond the
+    bands."""
     camera, first = study.camera, next(iter(sights.values()))[0]
     fx = np.concatenate([*(b.fx for b in first.bands), first.beyond[:, 0].ravel()])
     fy = np.concatenate([*(b.fy for b in first.bands), first.beyond[:, 1].ravel()])
@@ -100,11 +102,12 @@ def _transfers(
 
 
 def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Weights that take a ratio of OTFs to the bands' coefficients: of its real part and of its imaginary part at the bands' nodes,
-    (bands, nodes) each, and of its real part at the frequencies of the parts beyond, (bands, frequencies).
+    """Weights that take a ratio of OTFs to the bands' coefficients: of its real part and of its imaginary part at the
+    bands' nodes, (bands, nodes) each, and of its real part at the frequencies of the parts beyond, (bands,
+    frequencies).
 
-    The real part is split into even powers of the frequency, fitted over the nodes by least squares, and a rest. The rest, and the
-    imaginary part, enter by their means over the lower and the upper half of each band.
+    The real part is split into even powers of the frequency, fitted over the nodes by least squares, and a rest. The
+    rest, and the imaginary part, enter by their means over the lower and the upper half of each band.
     """
     fx, fy = (np.concatenate([getattr(band, name) for band in p.bands]) for name in ("fx", "fy"))
     halves = np.zeros((2 * len(p.bands), len(fx)))
@@ -127,8 +130,8 @@ def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _in_place(p: Pattern, ratio: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """A ratio of OTFs without the shift s that the registration would take up.
 
-    s solves sum over nodes of P f Im(ratio exp(-2 pi i f s)) = 0 along both axes, P the power of the pattern, by Gauss-Newton steps.
-    """
+    s solves sum over nodes of P f Im(ratio exp(-2 pi i f s)) = 0 along both axes, P the power of the pattern, by
+    Gauss-Newton steps."""
     if not np.any(np.abs(np.imag(ratio)) > 1e-6):
         return ratio
     turn = 2.0 * np.pi * np.array([np.concatenate([b.fx for b in p.bands]), np.concatenate([b.fy for b in p.bands])])

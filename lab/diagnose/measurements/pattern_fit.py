@@ -1,14 +1,15 @@
 """The fit of a random (Bernoulli) pattern on a screen: its image as a linear combination of parts of the drawn pattern.
 
-The pattern is drawn where the checkerboard captures place it (`lab.measure.screen_registration`), and blurred by the baseline's OTF.
-The drawn pattern P is split into bands P_b of frequency and orientation. The recorded image, black subtracted and divided by white
-less black, is fitted by least squares over the pixels of each channel:
+The pattern is drawn where the checkerboard captures place it (`lab.measure.screen_registration`), and blurred by the
+baseline's OTF. The drawn pattern P is split into bands P_b of frequency and orientation. The recorded image, black
+subtracted and divided by white less black, is fitted by least squares over the pixels of each channel:
 
-    image = sum over bands of c_b P_b + border P (1 - P) + ghost T + constant + shifts . gradient P + parts of P beyond the bands
+    image = sum over bands of c_b P_b + border P (1 - P) + ghost T + constant + shifts . gradient P + parts of P beyond
+    the bands
 
-T is the recorded image, rotated by 180 degrees about the frame's middle. For the baseline camera every c_b and the coefficients of
-the parts beyond are 1, all others 0. P is sampled at the same pixels as the image, so that both are aliased alike. A channel whose
-image is displaced from the green one is drawn at its own place.
+T is the recorded image, rotated by 180 degrees about the frame's middle. For the baseline camera every c_b and the
+coefficients of the parts beyond are 1, all others 0. P is sampled at the same pixels as the image, so that both are
+aliased alike. A channel whose image is displaced from the green one is drawn at its own place.
 """
 
 from __future__ import annotations
@@ -54,12 +55,14 @@ from sim.spectrum import FloatArray, Spectrum
 RINGS_CY_PER_PX = (0.0, 0.03, 0.08, 0.14, 0.2, 0.27, 0.34, 0.42, 0.5)  # edges of the bands in frequency
 SECTORS = 4  # bands in orientation: about 0, 45, 90, 135 degrees
 NODES = (4, 3)  # of a band, in radius and angle, at which an effect's OTF is evaluated
-#: Highest total order of the even powers of (fx, fy) that describe an effect's change of the OTF over all bands; the rest enters by
-#: halves of bands. Where cells are a whole number of pixels, a mosaic's red and blue pixels have the same samples at f and
-#: 1/2 cy/px - f. Errors within a strong band at low frequencies would then leak into a weak one at high frequencies.
+#: Highest total order of the even powers of (fx, fy) that describe an effect's change of the OTF over all bands; the
+#: rest enters by halves of bands. Where cells are a whole number of pixels, a mosaic's red and blue pixels have the
+#: same samples at f and 1/2 cy/px - f. Errors within a strong band at low frequencies would then leak into a weak one
+#: at high frequencies.
 EVEN_ORDER = 8
-#: Highest total order, and the frequency at which the powers end, of the change of the OTF that the registration fits. With more freedom
-#: (order 6) it takes a displacement that goes with the phase of the cells on the pixels for an OTF: 0.025 px where 0.01 px is reached.
+#: Highest total order, and the frequency at which the powers end, of the change of the OTF that the registration fits.
+#: With more freedom (order 6) it takes a displacement that goes with the phase of the cells on the pixels for an OTF:
+#: 0.025 px where 0.01 px is reached.
 REGISTERED_ORDER, REGISTERED_CY_PER_PX = 4, 1.5
 EVEN_TERMS = sum(order + 1 for order in range(0, EVEN_ORDER + 1, 2))
 GHOST_BLUR_PX = 3.0  # standard deviation of the Gaussian blur of the ghost's term
@@ -88,7 +91,8 @@ class Pattern:
     )
     shown: FloatArray  # (k, k): covariance by temporal noise of the repeats
     common: FloatArray  # (k, k): covariance by what seen and held-out repeats share: white, black, registration
-    mix: FloatArray  # (bands, EVEN_TERMS + 4 bands + parts): change of the bands' coefficients by a unit of `_LinearModel.mix`'s terms
+    # (bands, EVEN_TERMS + 4 bands + parts): change of the bands' coefficients by a unit of `_LinearModel.mix`'s terms
+    mix: FloatArray
     beyond: FloatArray  # (parts, 2, 2): (fx, fy) of the parts beyond the bands, cy/px, each at two frequencies
     shown_by: Callable[[Effects], FloatArray]  # change of the coefficients by effects on the screen's light
     levels_e: tuple[float, float]  # electrons on dark and on lit cells
@@ -100,7 +104,8 @@ class Pattern:
     ]  # four points (x, y) from the frame's middle with the mean and the variances of its pixels
 
 
-#: Indices of the coefficients after the bands': cell borders, ghost, constant, shift x, shift y, radial, radial^3, tangential.
+#: Indices of the coefficients after the bands': cell borders, ghost, constant, shift x, shift y, radial, radial^3,
+#: tangential.
 BORDER, GHOST, CONSTANT, SHIFT_X, RADIAL, RADIAL3, ACROSS = 0, 1, 2, 3, 5, 6, 7
 
 
@@ -118,7 +123,8 @@ class Band:
 
 
 def patterns(study: Study) -> list[list[Pattern]]:
-    """The fits of all Bernoulli patterns, computed once a study: a list for each (pose, target), by channel, seen and held out.
+    """The fits of all Bernoulli patterns, computed once a study: a list for each (pose, target), by channel, seen and
+    held out.
 
     Raises NotDetermined where f-number or pixel pitch isn't stated, and where no pattern is fitted.
     """
@@ -154,7 +160,8 @@ def _patterns(study: Study) -> list[list[Pattern]]:
 
 
 def mean_rate(study: Study, captures: Sequence[Capture]) -> FloatArray:
-    """Mean of the captures' frames above black level and dark current, DN/s. Raises NotDetermined where one is saturated."""
+    """Mean of the captures' frames above black level and dark current, DN/s. Raises NotDetermined where one is
+    saturated."""
     recordings, noise = study.recordings, study.noise
     total = np.zeros((study.camera.rows, study.camera.cols))
     for capture in captures:
@@ -174,7 +181,8 @@ def _measured(
     boards: Sequence[Any],
     out: set[str],
 ) -> list[Pattern]:
-    """The fits of one pattern at one pose. `group`: its captures, of which those in `out` are held out; `boards`: checkerboards."""
+    """The fits of one pattern at one pose. `group`: its captures, of which those in `out` are held out; `boards`:
+    checkerboards."""
     camera = study.camera
     white, black = mean_rate(study, whites), mean_rate(study, blacks)
     contrast = white - black
@@ -213,7 +221,8 @@ def _measured(
             step = design.coefficients(picture[design.mask])[design.shifts]
             if np.abs(_field(camera, points, step)).max() <= MOVED_PX:
                 break
-            # where cells are a whole number of pixels, a loss of contrast looks like a common shift: a step without one is tried as well
+            # where cells are a whole number of pixels, a loss of contrast looks like a common shift: a step without one
+            # is tried as well
             tried = []
             for part in (step, step * SCALING):
                 field = _field(camera, points, moved + part)
@@ -244,7 +253,8 @@ def _measured(
             found.append(
                 Pattern(
                     captures=tuple(c.id for c in part), held_out=part[0].id in out, channel=channel, bands=design.bands,
-                    value=value, shown=shown, common=common, mix=design.mix, beyond=design.beyond, shown_by=shown_by, levels_e=levels, light=light,
+                    value=value, shown=shown, common=common, mix=design.mix, beyond=design.beyond, shown_by=shown_by,
+                    levels_e=levels, light=light,
                     ghost=ghost_by, reach=design.reach, places_um=_places_um(camera, points),
                 )
             )  # fmt: skip
@@ -252,7 +262,8 @@ def _measured(
 
 
 def _places_um(camera: CameraModel, points: FloatArray) -> tuple[tuple[float, float], ...]:
-    """Four points (x, y) from the frame's middle, um, whose mean and variances are those of `points` (pixels, 2), px."""
+    """Four points (x, y) from the frame's middle, um, whose mean and variances are those of `points` (pixels, 2),
+    px."""
     middle, spread = (
         np.mean(points, axis=0) - 0.5 * np.array([camera.cols - 1, camera.rows - 1]),
         np.std(points, axis=0),
@@ -262,7 +273,8 @@ def _places_um(camera: CameraModel, points: FloatArray) -> tuple[tuple[float, fl
 
 
 def _field(camera: CameraModel, points: FloatArray, shifts: FloatArray) -> FloatArray:
-    """Displacement (2, pixels), px, at which a drawing is sampled for an image with these shifts (x, y, radial, radial^3, tangential)."""
+    """Displacement (2, pixels), px, at which a drawing is sampled for an image with these shifts (x, y, radial,
+    radial^3, tangential)."""
     u, v, r2 = from_middle(camera, points)
     x, y, radial, radial3, across = shifts
     outwards = radial + radial3 * r2
@@ -272,8 +284,8 @@ def _field(camera: CameraModel, points: FloatArray, shifts: FloatArray) -> Float
 def _ghost_by(
     study: Study, design: _LinearModel, seen: FloatArray, window: tuple[slice, slice]
 ) -> Callable[[Effects], float]:
-    """Function of effects: change of the ghost's coefficient by their reflections. They act on the pattern's and on the lit screen's image,
-    whose ratio is fitted."""
+    """Function of effects: change of the ghost's coefficient by their reflections. They act on the pattern's and on the
+    lit screen's image, whose ratio is fitted."""
     picture, lit = np.nan_to_num(seen), np.isfinite(seen).astype(float)
     weight = (design.inverse[len(design.bands) + GHOST] @ design.columns).astype(np.float32)
     before = picture[window][design.mask]
@@ -288,8 +300,8 @@ def _ghost_by(
 
 
 def _shown_by(study: Study, design: _LinearModel, canvas: Canvas) -> Callable[[Effects], FloatArray]:
-    """Function of effects: change (k,) of a pattern's coefficients by those on the screen's light. The pattern is drawn as such a screen
-    shows it, over the lit screen."""
+    """Function of effects: change (k,) of a pattern's coefficients by those on the screen's light. The pattern is drawn
+    as such a screen shows it, over the lit screen."""
     none = np.zeros(len(design.inverse))
 
     @lru_cache(maxsize=8)
@@ -323,7 +335,8 @@ def _refined(
         canvas.sampled(part)[mask] for part in (drawn, 2j * np.pi * whole.fx * drawn, 2j * np.pi * whole.fy * drawn)
     )
     terms = warp.basis(mask_points(mask, window))
-    # a smooth change of the OTF is fitted as well: with the phase of the cells on the pixels, aliases look like a displacement
+    # a smooth change of the OTF is fitted as well: with the phase of the cells on the pixels, aliases look like a
+    # displacement
     fx, fy = (np.clip(f, -REGISTERED_CY_PER_PX, REGISTERED_CY_PER_PX) for f in (whole.fx, whole.fy))
     powers = even_powers(fx, fy, REGISTERED_ORDER, REGISTERED_CY_PER_PX)
     smooth = [canvas.sampled(term * lens)[mask] for term in powers]
@@ -335,8 +348,8 @@ def _refined(
 
 
 def _band_masks(canvas: Canvas) -> Iterator[tuple[tuple[float, float], float | None, NDArray[np.bool_]]]:
-    """(edges of its ring in cy/px, middle of its sector in rad, mask of its frequencies) of every band that isn't empty. The lowest ring is
-    one band, with None for the sector."""
+    """(edges of its ring in cy/px, middle of its sector in rad, mask of its frequencies) of every band that isn't
+    empty. The lowest ring is one band, with None for the sector."""
     fy, fx = canvas.frequencies
     radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
     for i, (low, high) in enumerate(pairwise(RINGS_CY_PER_PX)):
@@ -362,8 +375,9 @@ class _LinearModel:
     columns: FloatArray  # (k, pixels)
     fixed: FloatArray  # (pixels,): weak parts beyond the bands, which have no coefficient
     inverse: FloatArray  # (k, k): of the normal matrix
-    #: (bands, EVEN_TERMS + 4 bands + parts): coefficients of the bands in least squares fits of even powers of the frequency times P,
-    #: of the halves of the bands, of these with a phase of 90 degrees, and of the parts beyond the bands.
+    #: (bands, EVEN_TERMS + 4 bands + parts): coefficients of the bands in least squares fits of even powers of the
+    #: frequency times P, of the halves of the bands, of these with a phase of 90 degrees, and of the parts beyond the
+    #: bands.
     mix: FloatArray
     beyond: FloatArray  # as in Pattern
     passed: FloatArray  # (rows, cols / 2 + 1): OTF that P was drawn with
@@ -379,8 +393,8 @@ class _LinearModel:
         turned: FloatArray,
         laid: FloatArray,
     ) -> _LinearModel:
-        """The model of a channel. `seen`: the recorded image; `turned`: the same, blurred and rotated by 180 degrees; `laid`
-        (rows, cols / 2 + 1): power spectrum by which the nodes of the bands are placed."""
+        """The model of a channel. `seen`: the recorded image; `turned`: the same, blurred and rotated by 180 degrees;
+        `laid` (rows, cols / 2 + 1): power spectrum by which the nodes of the bands are placed."""
         camera = study.camera
         fy, fx = canvas.frequencies
         radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
@@ -455,8 +469,8 @@ class _LinearModel:
         return float(np.sqrt(np.mean(np.square(left))))
 
     def solved(self, seen: FloatArray, temporal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Coefficients (k,); their covariance by temporal noise of variance `temporal` (pixels,); and their covariance by the rest of the
-        residuals.
+        """Coefficients (k,); their covariance by temporal noise of variance `temporal` (pixels,); and their covariance
+        by the rest of the residuals.
 
         As the pixels' variances differ, the latter is estimated from the squared residuals (White 1980).
         """
@@ -487,8 +501,8 @@ def _band(
     *,
     whole: bool,
 ) -> Band:
-    """The band of the frequencies `part` and its nodes: the band is divided into `NODES` cells in radius and angle, and each has its node at
-    the mean of the power `laid`, and its share of `power`."""
+    """The band of the frequencies `part` and its nodes: the band is divided into `NODES` cells in radius and angle, and
+    each has its node at the mean of the power `laid`, and its share of `power`."""
     r, a = radius[part], away[part]
     on, p = (np.where(r > 0, at[part], 0.0) for at in (laid, power))  # no blur changes frequency 0
     span = np.pi if whole else np.pi / SECTORS

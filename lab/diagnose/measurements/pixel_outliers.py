@@ -17,16 +17,17 @@ if TYPE_CHECKING:
 CLIP = 4.5  # standard deviations at which pixels are clipped in robust statistics
 MEDIAN_OF = 5  # most frames whose median shows defective pixels
 SMOOTH_PX, LOCAL_PX = 9, 33  # sides of the boxes for the local mean and the local variance of a pixel's surroundings
-#: Standard deviations of the fixed pattern from which on a pixel counts as defective and is left out of the frames' means.
+#: Standard deviations of the fixed pattern from which on a pixel counts as defective and is left out of the frames'
+#: means.
 DEFECTIVE = 10.0
 
 
 def sound_pixels(study: Study) -> NDArray[np.bool_]:
     """Mask (rows, cols) of the pixels that aren't defective.
 
-    A defective pixel departs by more than `DEFECTIVE` standard deviations from its surroundings in the median of repeated dark frames,
-    at the longest exposure or at the highest temperature. In a small frame, a single hot pixel of 3000 e/s would dominate the noise of
-    the mean, and one that saturates would make it nonlinear.
+    A defective pixel departs by more than `DEFECTIVE` standard deviations from its surroundings in the median of
+    repeated dark frames, at the longest exposure or at the highest temperature. In a small frame, a single hot pixel of
+    3000 e/s would dominate the noise of the mean, and one that saturates would make it nonlinear.
     """
     groups = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
     sound = np.ones((study.camera.rows, study.camera.cols), bool)
@@ -42,8 +43,8 @@ def sound_pixels(study: Study) -> NDArray[np.bool_]:
 
 
 def from_surroundings(frames: list[Image]) -> tuple[Image, Image]:
-    """Departures (rows, cols) of the pixels of the frames' lower median from their local mean, without the means of rows and columns;
-    and their local standard deviation, DN."""
+    """Departures (rows, cols) of the pixels of the frames' lower median from their local mean, without the means of
+    rows and columns; and their local standard deviation, DN."""
     level = [f - row_means(f)[:, None] for f in frames]
     median: Image = np.sort(np.array(level), axis=0)[(len(frames) - 1) // 2]
 
@@ -64,7 +65,8 @@ def from_surroundings(frames: list[Image]) -> tuple[Image, Image]:
 
 
 def robust_std(image: Image) -> float:
-    """Standard deviation of the pixels within five standard deviations of 0, by iteration; at least a quarter of a code."""
+    """Standard deviation of the pixels within five standard deviations of 0, by iteration; at least a quarter of a
+    code."""
     low, high = np.quantile(image.ravel()[:: max(image.size // 200_000, 1)], [0.02, 0.98])
     std = max(float(high - low) / 4.107, 0.3)
     for _ in range(3):
@@ -80,8 +82,9 @@ def row_means(image: Image) -> Image:
 
 
 def without_lines(image: Image, cut: Image) -> tuple[Image, dict[Lines, float]]:
-    """An image less the means of the rows and columns of `cut`, the clipped image; and the variance of these means beyond that of
-    independent pixels, by lines. It is taken from differences of neighbouring lines, in which smooth structure cancels."""
+    """An image less the means of the rows and columns of `cut`, the clipped image; and the variance of these means
+    beyond that of independent pixels, by lines. It is taken from differences of neighbouring lines, in which smooth
+    structure cancels."""
     rows, cols = cut.mean(axis=1, dtype=np.float64), cut.mean(axis=0, dtype=np.float64)
     own = float(np.var(np.diff(cut, axis=1), dtype=np.float64)) / 2.0
     spare: dict[Lines, float] = {
@@ -93,8 +96,8 @@ def without_lines(image: Image, cut: Image) -> tuple[Image, dict[Lines, float]]:
 
 
 def local_variance(squares: Image, freedom: int) -> Image:
-    """Local variance (rows, cols): mean of `squares` over `LOCAL_PX` x `LOCAL_PX` pixels, outliers clipped, over the degrees of freedom
-    of a pixel's sum of squares."""
+    """Local variance (rows, cols): mean of `squares` over `LOCAL_PX` x `LOCAL_PX` pixels, outliers clipped, over the
+    degrees of freedom of a pixel's sum of squares."""
     usual = float(np.mean(np.minimum(squares, 16.0 * freedom * np.median(squares) / 0.45)))
     cap = np.float32(64.0 * usual)
     rough = ndimage.uniform_filter(np.minimum(squares, cap), LOCAL_PX, mode="mirror")

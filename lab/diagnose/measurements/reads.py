@@ -1,4 +1,5 @@
-"""Quantities of the stages (`sim.stages`) that several measurements read, and the effects that change such quantities."""
+"""Quantities of the stages (`sim.stages`) that several measurements read, and the effects that change such
+quantities."""
 
 from __future__ import annotations
 

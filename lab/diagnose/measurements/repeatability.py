@@ -1,8 +1,8 @@
 """Repeatability of levels: the scatter of repeats of one setting beyond the noise of pixels.
 
-It is measured, as no data sheet states it, and is a tolerance of every level. A capture whose shutter or light isn't as stated mustn't
-widen that tolerance: settings whose scatter is out of line with the others are left out (`steady`), and stay a departure for the
-diagnosis to find.
+It is measured, as no data sheet states it, and is a tolerance of every level. A capture whose shutter or light isn't as
+stated mustn't widen that tolerance: settings whose scatter is out of line with the others are left out (`steady`), and
+stay a departure for the diagnosis to find.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from lab.diagnose.measurements.study import Study
 
 LAMP_FLOOR = 1.0e-4  # least relative standard deviation of a level, common to the channels of a capture
-#: False-alarm probability, over all settings, of calling one out of line; and the largest share of settings out of line: with more,
-#: the scatter is taken as the light's.
+#: False-alarm probability, over all settings, of calling one out of line; and the largest share of settings out of
+#: line: with more, the scatter is taken as the light's.
 OUT_OF_LINE_PROBABILITY, OUT_OF_LINE_SHARE = 1.0e-3, 0.25
 #: Efficiency of the median of squares relative to their mean, by which degrees of freedom are multiplied.
 MEDIAN_EFFICIENCY = 0.37
@@ -42,8 +42,8 @@ class RepeatedMeans:
 
 
 def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[RepeatedMeans]:
-    """The repeats of every flat setting: levels over all unclipped channels, relative to their mean. Frames that may hold image lag of
-    another level are left out (`Study.settled`). `black` in DN, `gain` in DN/e."""
+    """The repeats of every flat setting: levels over all unclipped channels, relative to their mean. Frames that may
+    hold image lag of another level are left out (`Study.settled`). `black` in DN, `gain` in DN/e."""
     found = []
     for group in map(study.settled, study.flat_levels()):
         planes = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
@@ -66,12 +66,12 @@ def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> 
 def steady(repeats: Sequence[RepeatedMeans]) -> list[RepeatedMeans]:
     """The settings whose scatter is in line with that of the others.
 
-    Setting g with n_g repeats has S_g = sum((a - b t)^2), b the common trend with time (weighted median of the settings' slopes). It is
-    distributed as (s_g^2 + s^2) chi2_f with f = n_g - 1 degrees of freedom and s_g^2 the variance by the noise of pixels. The common
-    variance s^2 is the one at which the median over settings of S_g / (s_g^2 + s^2) / median(chi2_f) is 1. A setting is out of line
-    where S_g / f / (s_g^2 + s^2) exceeds the quantile of the F distribution at `OUT_OF_LINE_PROBABILITY` / number of settings. Where
-    more than `OUT_OF_LINE_SHARE` of the settings are, or where there are fewer than four, all are returned.
-    """
+    Setting g with n_g repeats has S_g = sum((a - b t)^2), b the common trend with time (weighted median of the
+    settings' slopes). It is distributed as (s_g^2 + s^2) chi2_f with f = n_g - 1 degrees of freedom and s_g^2 the
+    variance by the noise of pixels. The common variance s^2 is the one at which the median over settings of S_g /
+    (s_g^2 + s^2) / median(chi2_f) is 1. A setting is out of line where S_g / f / (s_g^2 + s^2) exceeds the quantile of
+    the F distribution at `OUT_OF_LINE_PROBABILITY` / number of settings. Where more than `OUT_OF_LINE_SHARE` of the
+    settings are, or where there are fewer than four, all are returned."""
     if len(repeats) * OUT_OF_LINE_SHARE < 1.0:
         return list(repeats)
     noise = np.array([r.noise for r in repeats])
@@ -103,8 +103,8 @@ def weighted_median(value: FloatArray, weight: FloatArray) -> float:
 
 
 def level_repeatability(repeats: Sequence[RepeatedMeans]) -> float:
-    """Relative standard deviation of repeated levels beyond the noise of pixels and a common drift with time, over the settings in line.
-    Settings are weighted by the inverse variance of their noise. 0 without repeats."""
+    """Relative standard deviation of repeated levels beyond the noise of pixels and a common drift with time, over the
+    settings in line. Settings are weighted by the inverse variance of their noise. 0 without repeats."""
     repeats = steady(repeats)
     weight = np.array([1.0 / (r.noise + LAMP_FLOOR**2) for r in repeats])
     moved = sum(w * float(r.elapsed_s @ r.elapsed_s) for w, r in zip(weight, repeats, strict=True))
@@ -117,8 +117,8 @@ def level_repeatability(repeats: Sequence[RepeatedMeans]) -> float:
 
 
 def level_std(study: Study, groups: list[list[Any]]) -> FloatArray:
-    """Relative standard deviation (groups,) of a frame's level: the common one, or a setting's own where that is larger, as in a
-    flickering light that short exposures don't average. A setting out of line has the common one."""
+    """Relative standard deviation (groups,) of a frame's level: the common one, or a setting's own where that is
+    larger, as in a flickering light that short exposures don't average. A setting out of line has the common one."""
     noise = study.noise
     found = np.full(len(groups), noise.jitter_lamp)
     place = {c.id: i for i, group in enumerate(groups) for c in group}

@@ -1,5 +1,5 @@
-"""Light that changes while a frame is taken, in measurements of single frames: a scatter, as the time at which a frame begins in a
-period of the light isn't known."""
+"""Light that changes while a frame is taken, in measurements of single frames: a scatter, as the time at which a frame
+begins in a period of the light isn't known."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ ROW_LIGHT = frozenset({"light.rows"})
 def row_light_scatter(
     model: Uniform, rows: int, exposure_s: float, frames: float, of: Callable[[FloatArray], FloatArray]
 ) -> list[FloatArray]:
-    """Vectors v_k (n,) such that sum_k v_k v_k' is the covariance of n numbers in the mean of `frames` frames that begin at random
-    times. `of`: factors on the light by row (phases, rows) -> the numbers of single frames (phases, n)."""
+    """Vectors v_k (n,) such that sum_k v_k v_k' is the covariance of n numbers in the mean of `frames` frames that
+    begin at random times. `of`: factors on the light by row (phases, rows) -> the numbers of single frames (phases,
+    n)."""
     if not model.varies_by_row:
         return []
     numbers = of(model.row_factors_by_phase(rows, exposure_s, PHASES))

@@ -15,10 +15,11 @@ CLIPPED_SHARE = 2e-4  # of a plane's pixels: with fewer clipped ones its mean is
 
 
 def clipping_level_dn(study: Study) -> float:
-    """Code (DN) from which on a pixel counts as clipped: the converter's highest, or less where the full well is reached before it.
+    """Code (DN) from which on a pixel counts as clipped: the converter's highest, or less where the full well is
+    reached before it.
 
-    Pixels at full well have no shot noise. A plane is taken to be there where its 97, 99 and 99.9 % quantiles lie closer together
-    than a third of their distance by shot noise.
+    Pixels at full well have no shot noise. A plane is taken to be there where its 97, 99 and 99.9 % quantiles lie
+    closer together than a third of their distance by shot noise.
     """
     white = study.camera.white_level_dn
     gain = study.stated.conversion_gain_dn_per_e

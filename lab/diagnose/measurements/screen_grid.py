@@ -40,8 +40,8 @@ class _Line:
     places: int  # effective number of independent frequencies
 
     def normal(self, power: float) -> float:
-        """Standard normal quantile of the probability that the largest of `places` exponential variables of mean 1 is at most `power`.
-        Above `CERTAIN`, quantile q becomes CERTAIN (1 + ln(q / CERTAIN))."""
+        """Standard normal quantile of the probability that the largest of `places` exponential variables of mean 1 is
+        at most `power`. Above `CERTAIN`, quantile q becomes CERTAIN (1 + ln(q / CERTAIN))."""
         rare = np.log(self.places) - power  # ln of the probability to exceed it, where that is small
         normal = float(np.sqrt(-2.0 * rare)) if rare < -600.0 else -float(special.ndtri(-np.expm1(-np.exp(rare))))
         # only the order of magnitude matters there
@@ -51,8 +51,8 @@ class _Line:
 def grid_block(study: Study) -> Block:
     """Strength of the strongest spectral line of the lit screen by channel, as a standard normal quantile.
 
-    Lines along rows and columns, and lines that flats show as well, are the camera's and left out. Raises NotDetermined without
-    white captures, and where the screen fills too little of the frame.
+    Lines along rows and columns, and lines that flats show as well, are the camera's and left out. Raises NotDetermined
+    without white captures, and where the screen fills too little of the frame.
     """
     groups = study.groups(WhiteCapture, lambda c: (c.screen.pose, c.exposure_s))
     if not groups:
@@ -108,7 +108,8 @@ def _line(study: Study, group: Sequence[Any], channel: str) -> _Line:
     # a product of two cosines of amplitude 1 has four lines of a quarter
     unit = (0.25 * window.sum()) ** 2 / noise[i, j]
     return _Line(
-        channel, tuple(c.id for c in group), float(np.hypot(fy[i, 0], fx[0, j])) / step, float(relative[i, j]), float(unit), int(0.6 * count.sum())
+        channel, tuple(c.id for c in group), float(np.hypot(fy[i, 0], fx[0, j])) / step, float(relative[i, j]),
+        float(unit), int(0.6 * count.sum())
     )  # fmt: skip
 
 
@@ -128,7 +129,8 @@ def _box(bright: NDArray[np.bool_]) -> tuple[slice, slice]:
 
 
 def _power(plane: FloatArray, step: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Power spectrum of a plane over its smooth part less 1, the mean power of noise at every frequency, and the window (Hann)."""
+    """Power spectrum of a plane over its smooth part less 1, the mean power of noise at every frequency, and the window
+    (Hann)."""
     smooth = ndimage.gaussian_filter(plane, GRID_DETREND_PX / step, mode="nearest")
     window = np.outer(np.hanning(plane.shape[0]), np.hanning(plane.shape[1]))
     relative = plane / np.maximum(smooth, 1e-12) - 1.0

@@ -1,7 +1,7 @@
 """Slanted edges: the optical transfer function (OTF) across each edge, measured, and predicted by a camera model.
 
-A prediction goes through the same estimator at the recorded edge's geometry (`edge_estimator.Operators`), shading and nonlinear
-response included. A pair (channel, light) is called a sight.
+A prediction goes through the same estimator at the recorded edge's geometry (`edge_estimator.Operators`), shading and
+nonlinear response included. A pair (channel, light) is called a sight.
 """
 
 from __future__ import annotations
@@ -51,20 +51,23 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
 from sim.uniform import SHADING, SPECTRAL, Uniform, electron_rate
 
-EDGE_FLOOR = 3e-4  # standard deviation of the OTF beside noise: numerical error of the estimator and of the model's wavelength sampling
+# standard deviation of the OTF beside noise: numerical error of the estimator and of the model's wavelength sampling
+EDGE_FLOOR = 3e-4
 #: Highest measured frequency, and its largest share of the lens's cutoff.
 HIGHEST_MEASURED_CY_PER_PX, CUTOFF_SHARE = 1.15, 0.95
 #: Suffix of the condition of imaginary parts, and their distance from real parts in `Block.along`.
 ASIDE, APART_CY_PER_PX = ", asymmetry", 100.0
-#: Prior standard deviation of the curvature of the target's illumination across the edge: relative change of the level at `UNEVEN_PX`.
+#: Prior standard deviation of the curvature of the target's illumination across the edge: relative change of the level
+#: at `UNEVEN_PX`.
 UNEVEN_STD, UNEVEN_PX = 0.003, 50.0
 UNEVEN_ORDER = 4  # of the polynomial in the distance from the edge that describes shading
 #: Edges whose directions differ by less (deg) share one direction.
 ALIKE_DEG = 0.35
-#: Prior relative standard deviations of a spectrum that isn't stated: of a tilt over 150 nm, and of triangles of half-width `PART_NM`.
+#: Prior relative standard deviations of a spectrum that isn't stated: of a tilt over 150 nm, and of triangles of
+#: half-width `PART_NM`.
 TILT_STD, PART_STD, PART_NM = 0.5, 0.6, 60.0
-#: Number of wavelengths for the OTF with effects; for unstated spectra; and step (nm) for the diffraction-limited OTF, whose cutoff has
-#: a kink.
+#: Number of wavelengths for the OTF with effects; for unstated spectra; and step (nm) for the diffraction-limited OTF,
+#: whose cutoff has a kink.
 WAVELENGTHS, FINE_WAVELENGTHS, FINE_NM = 10, 48, 2.0
 HIGHEST_CY_PER_PX = 10.0  # of the quadrature
 KEPT = 64  # most entries of each cache
@@ -77,7 +80,8 @@ _Key = tuple[Effect, ...]
 
 
 def _kept(store: dict[K, V], key: K, make: Callable[[], V]) -> V:
-    """The value of `key` in the cache `store`, computed by `make` if it is missing. The oldest of `KEPT` entries is dropped."""
+    """The value of `key` in the cache `store`, computed by `make` if it is missing. The oldest of `KEPT` entries is
+    dropped."""
     if key not in store:
         if len(store) >= KEPT:
             store.pop(next(iter(store)))
@@ -86,12 +90,12 @@ def _kept(store: dict[K, V], key: K, make: Callable[[], V]) -> V:
 
 
 def edge_block(study: Study) -> Block:
-    """OTF of every slanted edge by channel: the real part, which is contrast, and the imaginary part about the profile's middle, which
-    only an asymmetric blur has.
+    """OTF of every slanted edge by channel: the real part, which is contrast, and the imaginary part about the
+    profile's middle, which only an asymmetric blur has.
 
-    Errors of the two parts are correlated, as the light side has more noise than the dark side. Nuisance parameters: curvature of the
-    illumination across the edge, and spectra that aren't stated. Raises NotDetermined where f-number or pixel pitch isn't stated, and
-    where no edge is measured.
+    Errors of the two parts are correlated, as the light side has more noise than the dark side. Nuisance parameters:
+    curvature of the illumination across the edge, and spectra that aren't stated. Raises NotDetermined where f-number
+    or pixel pitch isn't stated, and where no edge is measured.
     """
     edges = _Edges(study)
     x = edges.frequencies
@@ -103,7 +107,8 @@ def edge_block(study: Study) -> Block:
         measurement=SLANTED_EDGE, reach=0.2, value=edges.value.ravel(),
         covariance=edges.covariance,
         labels=tuple(
-            Label(float(f), e.channel, e.orientation + (ASIDE if k >= len(REAL_AT) else ""), tuple(c.id for c in e.part), e.held_out)
+            Label(float(f), e.channel, e.orientation + (ASIDE if k >= len(REAL_AT) else ""),
+            tuple(c.id for c in e.part), e.held_out)
             for e in edges.edges for k, f in enumerate(x)
         ),
         reads=TRANSFER_AT | CHANGING | {"image.transmittance"}, predict=predict,
@@ -150,7 +155,8 @@ class _Edges:
         split = len(REAL_AT)
         f = self._quadrature.frequency
         self._level = np.array(
-            [[*np.interp(self.frequencies[:split], f, np.real(row)), *np.interp(self.frequencies[split:], f, np.imag(row))]
+            [[*np.interp(self.frequencies[:split], f, np.real(row)), *np.interp(self.frequencies[split:], f,
+            np.imag(row))]
              for row in self._baseline]
         )  # fmt: skip
         self.value = self._numbers(self._recorded)
@@ -163,8 +169,8 @@ class _Edges:
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Covariance (n, n) of all edges' numbers: noise, rounding and floor. Edges on the same pixels in the same direction share the
-        fixed part of their noise (PRNU)."""
+        """Covariance (n, n) of all edges' numbers: noise, rounding and floor. Edges on the same pixels in the same
+        direction share the fixed part of their noise (PRNU)."""
         factors = [np.linalg.cholesky(c + 1e-16 * np.eye(len(c))) for c in self._noise]
         size = self.value.shape[1]
         out = np.zeros((self.value.size,) * 2)
@@ -182,8 +188,8 @@ class _Edges:
     def _rounded(self) -> FloatArray:
         """Changes (waves, edges, frequencies) of the numbers by rounding, one standard deviation each.
 
-        Where noise is less than about half a code, rounding adds a saw-tooth of the level to the profile. Its harmonics enter with free
-        phases, as no level is known to a fraction of a code.
+        Where noise is less than about half a code, rounding adds a saw-tooth of the level to the profile. Its harmonics
+        enter with free phases, as no level is known to a fraction of a code.
         """
         contrast = np.array([e.measured.light_level - e.measured.dark_level for e in self.edges])[:, None]
         level_dn = np.maximum(self._light_profile * contrast, 0.0)
@@ -207,8 +213,8 @@ class _Edges:
     def _reported(
         self, effects: tuple[Effect, ...], more: FloatArray | None = None, otf: ComplexArray | None = None
     ) -> FloatArray:
-        """The estimators' rows (edges, rows) for the model, whose profiles are shifted to the recorded ones' position. `more` (edges,
-        distances): a further change of the profiles; `otf` (edges, nodes): in place of the effects'."""
+        """The estimators' rows (edges, rows) for the model, whose profiles are shifted to the recorded ones' position.
+        `more` (edges, distances): a further change of the profiles; `otf` (edges, nodes): in place of the effects'."""
         otf, change = self._otf(effects) if otf is None else otf, self._change(effects)
         if more is not None:
             change = more if change is None else change + more
@@ -293,11 +299,11 @@ class _Edges:
     def _wavelengths(
         self, spectral: tuple[Effect, ...], dispersed: bool
     ) -> tuple[FloatArray, FloatArray, ComplexArray]:
-        """A few wavelengths (w,), nm, their weights (sights, w), and the error of the diffraction-limited OTF with these few (sights,
-        directions, nodes).
+        """A few wavelengths (w,), nm, their weights (sights, w), and the error of the diffraction-limited OTF with
+        these few (sights, directions, nodes).
 
-        Where the image is displaced by wavelength (`dispersed`), or weights would be large, the wavelengths are chosen for this spectrum.
-        """
+        Where the image is displaced by wavelength (`dispersed`), or weights would be large, the wavelengths are chosen
+        for this spectrum."""
 
         def worked_out() -> tuple[FloatArray, FloatArray, ComplexArray]:
             grid, perfect = self._perfect
@@ -314,7 +320,8 @@ class _Edges:
 
     @cached_property
     def _few(self) -> FloatArray:
-        """Wavelengths (w,), nm, chosen for the baseline's spectra. OTFs at them are cached, and serve most changes of the spectrum."""
+        """Wavelengths (w,), nm, chosen for the baseline's spectra. OTFs at them are cached, and serve most changes of
+        the spectrum."""
         grid, _ = self._perfect
         return gauss_rule(grid, wavelength_shares(self._camera, self._lit, grid).mean(axis=0), WAVELENGTHS)[0]
 
@@ -343,7 +350,8 @@ class _Edges:
     # --- what changes a profile beside its transfer ---
 
     def _change(self, effects: tuple[Effect, ...]) -> FloatArray | None:
-        """Change of the profiles (edges, distances) by shading, a nonlinear response, exchanged charge and halos; None where there is none."""
+        """Change of the profiles (edges, distances) by shading, a nonlinear response, exchanged charge and halos; None
+        where there is none."""
         changing = acting(effects, CHANGING)
         return _kept(self._changes, changing, lambda: self._changed(changing))
 
@@ -372,8 +380,8 @@ class _Edges:
         return change
 
     def _exchanged(self, model: Uniform) -> FloatArray:
-        """Change of the profiles (edges, distances) by charge that unequal neighbours exchange, averaged over the places of each edge's
-        channel in the mosaic."""
+        """Change of the profiles (edges, distances) by charge that unequal neighbours exchange, averaged over the
+        places of each edge's channel in the mosaic."""
         change = [
             model.exchanged_e(squares).reshape(-1, len(self._operators.distance)).mean(axis=0) / scale
             for squares, scale in self._squares
@@ -382,8 +390,9 @@ class _Edges:
 
     @cached_property
     def _squares(self) -> list[tuple[FloatArray, float]]:
-        """Of every edge: the electrons of the 3 x 3 pixels about each distance, (places in the mosaic x distances, 3, 3), and those of the
-        edge's contrast. Neighbours of other colours have the same profile, at the level of their rate in this light."""
+        """Of every edge: the electrons of the 3 x 3 pixels about each distance, (places in the mosaic x distances, 3,
+        3), and those of the edge's contrast. Neighbours of other colours have the same profile, at the level of their
+        rate in this light."""
         cfa, distance, found = self._camera.cfa, self._operators.distance, []
         step, places = mosaic.step(cfa), mosaic.phases(cfa)
         channel = {place: c for c, mine in places.items() for place in mine}
@@ -422,8 +431,9 @@ class _Edges:
 
     @cached_property
     def _lighting(self) -> list[tuple[FloatArray, ...]]:
-        """Of every edge: x and y of points around it (points,), um from the optical axis; the baseline's illumination there; and the
-        matrix (terms, points) that fits a polynomial in the distance from the edge to the illumination by least squares."""
+        """Of every edge: x and y of points around it (points,), um from the optical axis; the baseline's illumination
+        there; and the matrix (terms, points) that fits a polynomial in the distance from the edge to the illumination
+        by least squares."""
         camera = self._camera
         axis, pitch = optical_axis_px(camera), camera.pixel_pitch_um
         found: list[tuple[FloatArray, ...]] = []
@@ -443,8 +453,8 @@ class _Edges:
 
     @cached_property
     def jacobian(self) -> dict[str, FloatArray]:
-        """Name of a nuisance parameter -> derivative (n,) per prior standard deviation: curvature of the illumination, for each region,
-        direction and light; and spectra that aren't stated."""
+        """Name of a nuisance parameter -> derivative (n,) per prior standard deviation: curvature of the illumination,
+        for each region, direction and light; and spectra that aren't stated."""
         base = self.predict(())
         bend = self._light_profile * np.square(self._operators.distance / UNEVEN_PX) * UNEVEN_STD
         moved = self._numbers(self._reported((), bend))
@@ -459,7 +469,8 @@ class _Edges:
         return found
 
     def _other_colours(self) -> FloatArray:
-        """Changes (ways, sights, directions, nodes) of the OTFs of sights whose light isn't stated, one prior standard deviation each.
+        """Changes (ways, sights, directions, nodes) of the OTFs of sights whose light isn't stated, one prior standard
+        deviation each.
 
         An equal-energy spectrum stands for such light. It may be tilted, and differ by triangles along the wavelength.
         """
@@ -480,7 +491,8 @@ class _Edges:
 
 
 def _clusters(angle_deg: FloatArray, width: float) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Clusters of angles with gaps of more than `width` (deg) between them: mean angles (clusters,), and the cluster (angles,) of each."""
+    """Clusters of angles with gaps of more than `width` (deg) between them: mean angles (clusters,), and the cluster
+    (angles,) of each."""
     order = np.argsort(angle_deg)
     start = np.concatenate([[True], np.diff(angle_deg[order]) > width])
     label = np.cumsum(start) - 1

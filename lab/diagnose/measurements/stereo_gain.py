@@ -1,7 +1,7 @@
 """The signal ratio of the two cameras in a scene that both see, against their ratio in uniform light.
 
-Dividing by the ratio in uniform light removes the difference of the two sensitivities. The measurement belongs to the right side.
-"""
+Dividing by the ratio in uniform light removes the difference of the two sensitivities. The measurement belongs to the
+right side."""
 
 from __future__ import annotations
 
@@ -74,11 +74,11 @@ class _Darks:
 def scene_gain_block(study: Study) -> Block:
     """ln(right / left) of the signals in every scene that both cameras see, less that in uniform light, by channel.
 
-    Veiling glare, which scatters a share g of a camera's light evenly over the frame, changes a region's signal by the factor
-    1 + g (mean of the frame / mean of the region - 1). The right camera's g is predicted by effects. The left camera's g is estimated from
-    the dark squares of its screens and corrected for; its uncertainty is a nuisance parameter. Raises NotDetermined without unclipped
-    flats of one lamp on both sides, and without a scene that both saw in that lamp's light.
-    """
+    Veiling glare, which scatters a share g of a camera's light evenly over the frame, changes a region's signal by the
+    factor 1 + g (mean of the frame / mean of the region - 1). The right camera's g is predicted by effects. The left
+    camera's g is estimated from the dark squares of its screens and corrected for; its uncertainty is a nuisance
+    parameter. Raises NotDetermined without unclipped flats of one lamp on both sides, and without a scene that both saw
+    in that lamp's light."""
     needs_both_sides(study, "stereo_gain")
     darks = {side: _Darks(study, side) for side in SIDES}
     uniform = [_uniform(study, side, darks[side]) for side in SIDES]
@@ -131,15 +131,16 @@ def scene_gain_block(study: Study) -> Block:
 
     return Block(
         measurement=STEREO_GAIN, reach=1e9, value=np.array(values), covariance=covariance,
-        labels=tuple(labels), reads=frozenset({"light.pair_gain", "image.veils"}), scattered_by=ROW_LIGHT, predict=predict, scale=np.ones(len(values)),
+        labels=tuple(labels), reads=frozenset({"light.pair_gain", "image.veils"}), scattered_by=ROW_LIGHT,
+        predict=predict, scale=np.ones(len(values)),
     )  # fmt: skip
 
 
 def _row_light(
     model: Uniform, rows: int, scenes: np.ndarray, exposures: Sequence[tuple[float, ...]]
 ) -> dict[str, FloatArray]:
-    """Jacobian of the scenes' ratios by a light that varies while a frame is taken. Regions are taken as the frame's middle half; the
-    frames of both sides begin at times of their own. `exposures`: of a scene's frames, by number."""
+    """Jacobian of the scenes' ratios by a light that varies while a frame is taken. Regions are taken as the frame's
+    middle half; the frames of both sides begin at times of their own. `exposures`: of a scene's frames, by number."""
     if not model.varies_by_row:
         return {}
     middle = slice(rows // 4, rows - rows // 4)
@@ -239,8 +240,8 @@ def _rates(
 
 
 def _scenes(study: Study) -> dict[str, list[tuple[list[Any], np.ndarray | None]]]:
-    """Scenes that both sides saw, by name: for each side its captures, and the mask of the pixels that show the same part of the scene (None:
-    the middle of the frame)."""
+    """Scenes that both sides saw, by name: for each side its captures, and the mask of the pixels that show the same
+    part of the scene (None: the middle of the frame)."""
     found: dict[str, list[tuple[list[Any], np.ndarray | None]]] = {}
     views = [{v.capture.pose: v for v in views_of(study, side)[0]} for side in SIDES]
     for pose in views[0]:

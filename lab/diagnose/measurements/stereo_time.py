@@ -27,12 +27,12 @@ POINTING_STD_PX = 2.0  # prior standard deviation of the displacement by the rig
 
 
 def time_block(study: Study) -> Block:
-    """Displacement (px) of a moving board in the right image from where the left camera's pose puts it, perpendicular to the rig's
-    baseline.
+    """Displacement (px) of a moving board in the right image from where the left camera's pose puts it, perpendicular
+    to the rig's baseline.
 
-    A delay t of the right camera displaces it by speed x t. Nuisance parameters: a common displacement, and its gradients over the
-    frame. Raises NotDetermined where the cameras can't be calibrated, and for fewer than `FEWEST_PAIRS` pairs of a moving board.
-    """
+    A delay t of the right camera displaces it by speed x t. Nuisance parameters: a common displacement, and its
+    gradients over the frame. Raises NotDetermined where the cameras can't be calibrated, and for fewer than
+    `FEWEST_PAIRS` pairs of a moving board."""
     needs_both_sides(study, "stereo_time")
     moving = _moving(study)
     views = [{v.capture.pose: v for v in views_of(study, side)[0]} for side in SIDES]
@@ -63,7 +63,8 @@ def time_block(study: Study) -> Block:
     return Block(
         measurement=STEREO_TIME, reach=1e9, value=gaps, covariance=np.diag(noise + SHIFT_STD_PX**2),
         labels=tuple(
-            Label(float(v), "Y", pose, (a.capture.id, b.capture.id), i % 3 == 1) for i, (v, (pose, a, b)) in enumerate(zip(speed, pairs, strict=True))
+            Label(float(v), "Y", pose, (a.capture.id, b.capture.id), i % 3 == 1) for i, (v, (pose, a,
+            b)) in enumerate(zip(speed, pairs, strict=True))
         ),
         reads=frozenset({"light.pair_delay_s"}), predict=predict, scale=np.ones(len(pairs)),
     )  # fmt: skip
@@ -89,7 +90,8 @@ def _moving(study: Study) -> dict[str, FloatArray]:
     if fastest < SLOWEST_PX_PER_S:
         raise NotDetermined(
             "stereo_time",
-            f"no board moves between captures less than {LONGEST_GAP_S:g} s apart: only what moves shows whether both sides capture at the same time",
+            f"no board moves between captures less than {LONGEST_GAP_S:g} s apart: only what moves shows whether both "
+            "sides capture at the same time",
         )
     return found
 
@@ -97,8 +99,8 @@ def _moving(study: Study) -> dict[str, FloatArray]:
 def _gaps(
     pairs: Sequence[tuple[str, BoardView, BoardView]], left: Calibration, right: Calibration
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean displacement (pairs,), px, of each pair's corners in the right image, perpendicular to the rig's baseline there; and the unit
-    vector (x, y) of that direction. The rig's pose is the median over pairs."""
+    """Mean displacement (pairs,), px, of each pair's corners in the right image, perpendicular to the rig's baseline
+    there; and the unit vector (x, y) of that direction. The rig's pose is the median over pairs."""
     turns, shifts = [], []
     poses = []
     for _, one, two in pairs:

@@ -44,10 +44,11 @@ class Levels:
 class Study:
     """One side of a recording set, from which measurements are made. What they share is computed once.
 
-    `camera`: the baseline; its gain, black level, dark current, read noise and full well are those of the noise fit, or first estimates
-    where there is none (`noise_guess`). `saturation_dn`: code from which on pixels clip (None: estimated). `misstated`: ids of flats whose stated number of photons contradicts
-    the others. `fitted`: the side's noise fit, None where its recordings don't determine one. `noise`: known figures in the place of all
-    estimates; the baseline then is `camera` as it is.
+    `camera`: the baseline; its gain, black level, dark current, read noise and full well are those of the noise fit, or
+    first estimates where there is none (`noise_guess`). `saturation_dn`: code from which on pixels clip (None:
+    estimated). `misstated`: ids of flats whose stated number of photons contradicts the others. `fitted`: the side's
+    noise fit, None where its recordings don't determine one. `noise`: known figures in the place of all estimates; the
+    baseline then is `camera` as it is.
     """
 
     def __init__(
@@ -149,16 +150,16 @@ class Study:
 
     @property
     def tail_std(self) -> float:
-        """Relative standard deviation of the light that the baseline's point spread function sends far; 1 where f-number or pixel
-        pitch isn't stated."""
+        """Relative standard deviation of the light that the baseline's point spread function sends far; 1 where
+        f-number or pixel pitch isn't stated."""
         return TAIL_STD if self.diffraction_is_known else 1.0
 
     @cached_property
     def lamps(self) -> dict[str, int]:
         """Radiance file of flats -> number of its lamp.
 
-        Files that differ by less than 1 % in spectral shape and 5 % in level are readings of one lamp, taken anew before every pass.
-        """
+        Files that differ by less than 1 % in spectral shape and 5 % in level are readings of one lamp, taken anew
+        before every pass."""
         found: list[tuple[FloatArray, FloatArray]] = []
         lamps: dict[str, int] = {}
         for capture in self.recordings.captures(FlatCapture, self.side):
@@ -206,15 +207,16 @@ class Study:
 
     @cached_property
     def _before(self) -> dict[str, Capture]:
-        """Id of a capture -> the capture whose frame was read before its own: by time where all have one, else in the manifest's order. After
-        dummy frames that is a frame of the same capture."""
+        """Id of a capture -> the capture whose frame was read before its own: by time where all have one, else in the
+        manifest's order. After dummy frames that is a frame of the same capture."""
         order: list[Capture] = list(self.recordings.captures(side=self.side))
         if all(c.time is not None for c in order):
             order.sort(key=self.elapsed_s)
         return {c.id: before for before, c in pairwise(order)} | {c.id: c for c in order if c.dummy_frames}
 
     def settled(self, group: Sequence[C]) -> list[C]:
-        """Repeats that follow another of the group, and so hold no image lag of another level; all, where these are fewer than two."""
+        """Repeats that follow another of the group, and so hold no image lag of another level; all, where these are
+        fewer than two."""
         names = {c.id for c in group}
         found = [c for c in group if c.id in self._before and self._before[c.id].id in names]
         return found if len(found) > 1 else list(group)
@@ -222,9 +224,8 @@ class Study:
     def carried_e(self, effects: Effects) -> Callable[[Capture, str], float]:
         """Function of a capture and a channel: change of the mean by image lag, electrons.
 
-        Lag of share q reads y_t = (1 - q) x_t + q y_(t-1) for the charge x_t. The change is taken as q (y_(t-1) - y_t) from the measured
-        levels, generally lag_e(y_(t-1)) - lag_e(y_t). Before the first capture pixels are empty.
-        """
+        Lag of share q reads y_t = (1 - q) x_t + q y_(t-1) for the charge x_t. The change is taken as q (y_(t-1) - y_t)
+        from the measured levels, generally lag_e(y_(t-1)) - lag_e(y_t). Before the first capture pixels are empty."""
         if not acting(effects, LAG):
             return lambda capture, channel: 0.0
         model = Uniform(self.camera, effects)
@@ -245,7 +246,8 @@ class Study:
         return lambda capture: model.offset_dn(self.elapsed_s(capture), capture.temperature_c)
 
     def free_offsets(self, exposures: FloatArray) -> dict[str, FloatArray]:
-        """Jacobian by black level and dark current, for n exposures: name -> (n,), DN per standard deviation of the first estimate."""
+        """Jacobian by black level and dark current, for n exposures: name -> (n,), DN per standard deviation of the
+        first estimate."""
         return {
             "black": np.full(len(exposures), self.noise.black_std),
             "dark": exposures * self.noise.dark_std,
@@ -254,8 +256,8 @@ class Study:
     def free_warmth(self, captures: Sequence[Capture]) -> dict[str, FloatArray]:
         """Jacobian by the change of dark current per degree C: name -> (n,), DN per prior standard deviation.
 
-        It is for captures at another temperature than the dark frames. Measurements of dark frames don't use it: they measure the change.
-        """
+        It is for captures at another temperature than the dark frames. Measurements of dark frames don't use it: they
+        measure the change."""
         if self.noise.dark_c is None:
             return {}
         warmer = [0.0 if c.temperature_c is None else c.temperature_c - self.noise.dark_c for c in captures]

@@ -1,9 +1,10 @@
-"""Temporal noise of repeated frames: its variance by plane of the mosaic, and the correlation between neighbouring pixels.
+"""Temporal noise of repeated frames: its variance by plane of the mosaic, and the correlation between neighbouring
+pixels.
 
-Noise is the departure of a frame from the mean of its repeats. Before, the frame's level is removed in each plane of the mosaic (as a
-factor for flats, so that shading and PRNU cancel where the lamp varies), and afterwards the mean of every row and column (row and
-column noise, flicker). The variance that this takes from the pixels is restored. Pixels beyond `OUTLIER` standard deviations are left
-out of the correlation.
+Noise is the departure of a frame from the mean of its repeats. Before, the frame's level is removed in each plane of
+the mosaic (as a factor for flats, so that shading and PRNU cancel where the lamp varies), and afterwards the mean of
+every row and column (row and column noise, flicker). The variance that this takes from the pixels is restored. Pixels
+beyond `OUTLIER` standard deviations are left out of the correlation.
 """
 
 from __future__ import annotations
@@ -84,7 +85,8 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
     if min(first.shape) < least_px:
         raise NotDetermined(
             "temporal_noise",
-            f"frames of {first.shape[0]} x {first.shape[1]} px: after the means of rows and columns are removed, too few values are left; {least_px} px a side are enough",
+            f"frames of {first.shape[0]} x {first.shape[1]} px: after the means of rows and columns are removed, too "
+            f"few values are left; {least_px} px a side are enough",
         )
     use = list(captures)[: max(2, int(np.ceil(ENOUGH / first.size)) + 1)]
     frames = [np.array(study.recordings.frame(c), np.float32) for c in use]
@@ -131,8 +133,8 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
 
 
 def _level_out(frames: Sequence[Any], cfa: Cfa, black_dn: float | None) -> None:
-    """Reduce frames, in place, to departures from their mean frame without row and column means. Levels are matched by factors above
-    `black_dn`, or by subtraction where that is None."""
+    """Reduce frames, in place, to departures from their mean frame without row and column means. Levels are matched by
+    factors above `black_dn`, or by subtraction where that is None."""
     for name in mosaic.planes(frames[0], cfa):
         planes = [mosaic.planes(f, cfa)[name] for f in frames]
         means = [float(p.mean(dtype=float)) for p in planes]
@@ -167,15 +169,15 @@ def _correlations(frames: Sequence[Any], freedom: int, cfa: Cfa) -> FloatArray:
 
 @cache
 def independent_correlations(shape: tuple[int, int], freedom: int, cfa: Cfa) -> tuple[FloatArray, FloatArray]:
-    """Expectation (k,) and covariance (k, k), by `PAIRS`, of the correlations of normal, independent pixels of `shape` after the means of rows and
-    columns were taken out of each plane of the mosaic.
+    """Expectation (k,) and covariance (k, k), by `PAIRS`, of the correlations of normal, independent pixels of `shape`
+    after the means of rows and columns were taken out of each plane of the mosaic.
 
-    The departures are P z with P = G_rows x G_cols and G = 1 - sum_a u_a u_a' / n_a, where u_a marks the n_a places of phase a of the
-    mosaic. A number is z'PAPz / count with A the sum of shifts S_down x S_right: its expectation is tr(PA), the covariance of two
-    tr(PAPB) + tr(PAPB'), and these traces factor by rows and columns. Pairs within a plane are divided by the plane's measured variance with
-    M = freedom (rows - 1) (columns - 1) degrees of freedom. Direction and length of a normal vector are independent, so that the
-    expectation stays and the second moments take the factor M / (M + 2): exact for planes of one size.
-    """
+    The departures are P z with P = G_rows x G_cols and G = 1 - sum_a u_a u_a' / n_a, where u_a marks the n_a places of
+    phase a of the mosaic. A number is z'PAPz / count with A the sum of shifts S_down x S_right: its expectation is
+    tr(PA), the covariance of two tr(PAPB) + tr(PAPB'), and these traces factor by rows and columns. Pairs within a
+    plane are divided by the plane's measured variance with M = freedom (rows - 1) (columns - 1) degrees of freedom.
+    Direction and length of a normal vector are independent, so that the expectation stays and the second moments take
+    the factor M / (M + 2): exact for planes of one size."""
     period = mosaic.step(cfa)
     pairs = list(PAIRS.values())
     count = np.array([_count(shape, lags) for lags in pairs], float)

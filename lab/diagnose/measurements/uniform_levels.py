@@ -31,7 +31,8 @@ class UniformLevels:
         self.lines = LineMeans(study, points)
 
     def of_light_dn(self, effects: Effects, rates: Mapping[str, FloatArray]) -> FloatArray:
-        """DN (n,) by light and the baseline's dark current, after read-out. `rates`: channel -> electrons a second on axis, (captures,)."""
+        """DN (n,) by light and the baseline's dark current, after read-out. `rates`: channel -> electrons a second on
+        axis, (captures,)."""
         model = Uniform(self._study.camera, effects)
         field = model.field(self._study.field)
         electrons = model.electrons(rates, self._exposure_s, field=field, elapsed_s=self._elapsed_s)

@@ -1,7 +1,7 @@
 """Misstated metadata: statements about a camera or its captures that the recordings contradict.
 
-They are looked for before any effect, as a wrong statement would be taken for physics. A finding is reported with the value that the
-recordings fit, and the diagnosis continues with that value.
+They are looked for before any effect, as a wrong statement would be taken for physics. A finding is reported with the
+value that the recordings fit, and the diagnosis continues with that value.
 """
 
 from __future__ import annotations

@@ -15,11 +15,12 @@ LEAST_BITS = 6  # of fewer bits, the highest code is too likely to be any level
 
 
 def misstated_bit_depth(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """A bit depth that is stated too large: no frame has a code above 2^k - 1, k less than the stated bits, and pixels are clipped there.
+    """A bit depth that is stated too large: no frame has a code above 2^k - 1, k less than the stated bits, and pixels
+    are clipped there.
 
-    Pixels at a full well below the converter's range are spread over codes by read noise, and that well is 2^k - 1 with a probability
-    of one in thousands. A bit depth that is stated too small is refused when the recording set is read. None where nothing is found.
-    """
+    Pixels at a full well below the converter's range are spread over codes by read noise, and that well is 2^k - 1 with
+    a probability of one in thousands. A bit depth that is stated too small is refused when the recording set is read.
+    None where nothing is found."""
     camera = recordings.camera(side)
     piled: dict[str, int] = {}
     highest = 0
@@ -48,8 +49,10 @@ def misstated_bit_depth(recordings: RecordingSet, side: Side) -> Misstatement | 
         measurement=PHOTON_TRANSFER,
         where=f"code {highest}",
         shape="the stated bit depth contradicts the code at which pixels are clipped",
-        check=f"The frames of the {side} camera are clipped at {highest} DN ({count} pixels in {len(piled)} captures), the highest code of {bits} "
-        f"bits, but bit_depth = {camera.bit_depth} and a white level of {camera.saturation_dn:g} DN are stated: correct bit_depth to {bits} and "
+        check=f"The frames of the {side} camera are clipped at {highest} DN ({count} pixels in {len(piled)} "
+        f"captures), the highest code of {bits} "
+        f"bits, but bit_depth = {camera.bit_depth} and a white level of {camera.saturation_dn:g} DN are stated: "
+        f"correct bit_depth to {bits} and "
         f"white_level_dn to {highest}.",
         # noise would put about as many pixels above that code, and none is there
         chi2_stated=float(count),

@@ -10,7 +10,8 @@ from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
-#: Tolerance of a stated black level, as a share of the converter's range (5 DN of 12 bits): data sheets round it, and it depends on temperature.
+#: Tolerance of a stated black level, as a share of the converter's range (5 DN of 12 bits): data sheets round it, and
+#: it depends on temperature.
 TOLERANCE = 5.0 / 4096.0
 LEAST_TOLERANCE_DN = 1.0
 SIGMA = 5.0  # standard deviations of the measured black level beyond the tolerance
@@ -19,8 +20,8 @@ SIGMA = 5.0  # standard deviations of the measured black level beyond the tolera
 def misstated_black_level(recordings: RecordingSet, side: Side) -> Misstatement | None:
     """A black level that differs from the dark frames' mean, extrapolated to zero exposure, by more than `TOLERANCE`.
 
-    A line is fitted to the means by exposure, of the frames at the gain and temperature of the shortest. With a single exposure, dark
-    current can't be told from black level. None where nothing is found.
+    A line is fitted to the means by exposure, of the frames at the gain and temperature of the shortest. With a single
+    exposure, dark current can't be told from black level. None where nothing is found.
     """
     stated = recordings.camera(side).black_level_dn
     darks = recordings.captures(DarkCapture, side)
@@ -46,7 +47,8 @@ def misstated_black_level(recordings: RecordingSet, side: Side) -> Misstatement 
         measurement=BLACK_LEVEL,
         where="dark frames, extrapolated to zero exposure",
         shape="the stated black level contradicts the dark frames",
-        check=f"The dark frames of the {side} camera have a black level of {black:.2f} ± {std:.2g} DN, but black_level_dn = {stated:g} is stated: "
+        check=f"The dark frames of the {side} camera have a black level of {black:.2f} ± {std:.2g} DN, but "
+        f"black_level_dn = {stated:g} is stated: "
         f"correct it to {black:.1f}, or the darks are of another camera or setting.",
         chi2_stated=(off / np.hypot(std, tolerance / SIGMA)) ** 2,
         chi2_corrected=0.0,

@@ -17,8 +17,8 @@ TOLERANCE = 0.05  # relative: the stated size is nominal, and cells of a tilted 
 
 
 def misstated_cell_size(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """A `cell_camera_px` that differs by more than `TOLERANCE` from the size of the cells in the middle of the pattern; None
-    where it fits.
+    """A `cell_camera_px` that differs by more than `TOLERANCE` from the size of the cells in the middle of the pattern;
+    None where it fits.
 
     The registration finds the size by itself: the stated one is only its start.
     """
@@ -61,7 +61,8 @@ def misstated_cell_size(recordings: RecordingSet, side: Side) -> Misstatement | 
 
 
 def _cell_px(pictures: ScreenPictures, stated: float) -> float | None:
-    """Side of a cell in camera px: the square root of its area in the middle of the pattern; None where the pattern isn't found."""
+    """Side of a cell in camera px: the square root of its area in the middle of the pattern; None where the pattern
+    isn't found."""
     try:
         warp = register(
             pictures.checkerboard, pictures.bernoulli, pictures.checkerboard_target, pictures.bernoulli_target, stated

@@ -31,7 +31,8 @@ LEAST_PROBABILITY = 1e-3  # of what the others leave, where a wrong exposure is 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """One exposure that may be wrong: what is stated, the factor on it that fits, its standard deviation, and both chi2."""
+    """One exposure that may be wrong: what is stated, the factor on it that fits, its standard deviation, and both
+    chi2."""
 
     stated_s: float
     factor: float
@@ -43,9 +44,9 @@ class _Candidate:
 def misstated_dark_exposure(recordings: RecordingSet, side: Side) -> Misstatement | None:
     """One exposure of dark frames whose mean level lies off the line of the others, as that of another exposure would.
 
-    At one temperature the mean of dark frames is b + r t, beside a drift with time and a dark current that changes with time; both are
-    fitted, as repeats show them within every exposure. Of three exposures either of two may be wrong: both are told. None where nothing
-    is found, with fewer than `LEAST_EXPOSURES`, and without repeats.
+    At one temperature the mean of dark frames is b + r t, beside a drift with time and a dark current that changes with
+    time; both are fitted, as repeats show them within every exposure. Of three exposures either of two may be wrong:
+    both are told. None where nothing is found, with fewer than `LEAST_EXPOSURES`, and without repeats.
     """
     darks = recordings.captures(DarkCapture, side)
     warm = [c.temperature_c for c in darks if c.temperature_c is not None]
@@ -66,7 +67,8 @@ def misstated_dark_exposure(recordings: RecordingSet, side: Side) -> Misstatemen
     in_question = tuple(c for c in alike if c.exposure_s in {one.stated_s for one in found})
     wrong = {c.id for c in in_question if c.exposure_s == nearest.stated_s}
     told = ", or ".join(
-        f"those stated with {one.stated_s:.6g} s have the level of {one.stated_s * one.factor:.6g} ± {one.stated_s * one.std:.2g} s"
+        f"those stated with {one.stated_s:.6g} s have the level of {one.stated_s * one.factor:.6g} ± "
+        f"{one.stated_s * one.std:.2g} s"
         for one in sorted(found, key=lambda one: abs(np.log(one.factor)))
     )
     which = "correct it" if len(found) == 1 else "one of the two is wrong: correct it"
@@ -78,7 +80,8 @@ def misstated_dark_exposure(recordings: RecordingSet, side: Side) -> Misstatemen
         measurement=DARK,
         where=" or ".join(f"{one.stated_s:.4g} s" for one in found),
         shape="a stated exposure contradicts the dark frames of the others",
-        check=f"Dark frames of the {side} camera don't lie on one line over their exposures: {told}; {which}, or take these frames again.",
+        check=f"Dark frames of the {side} camera don't lie on one line over their exposures: {told}; {which}, or take "
+        "these frames again.",
         chi2_stated=nearest.chi2,
         chi2_corrected=nearest.chi2_left,
         n=len(levels),
@@ -97,8 +100,8 @@ def _mean_and_variance(frame: Frame) -> tuple[float, float]:
 
 
 def _floor_dn(recordings: RecordingSet, darks: Sequence[DarkCapture]) -> FloatArray:
-    """Standard deviation (exposures,) of a mean level beside the scatter of its repeats: rounding, where the temporal noise of two repeats
-    is too small to dither, and `FLOOR_DN`."""
+    """Standard deviation (exposures,) of a mean level beside the scatter of its repeats: rounding, where the temporal
+    noise of two repeats is too small to dither, and `FLOOR_DN`."""
     before_rounding = []
     for exposure_s in sorted({c.exposure_s for c in darks}):
         one, other = [recordings.frame(c) for c in [c for c in darks if c.exposure_s == exposure_s][:2]]
@@ -108,7 +111,8 @@ def _floor_dn(recordings: RecordingSet, darks: Sequence[DarkCapture]) -> FloatAr
 
 
 def _drifts(exposure: FloatArray, times: list[float | None]) -> FloatArray:
-    """Columns (n, 0 or 2) of an offset and of a dark current in proportion to the time; none where times aren't stated."""
+    """Columns (n, 0 or 2) of an offset and of a dark current in proportion to the time; none where times aren't
+    stated."""
     stated = np.array([t for t in times if t is not None])
     if len(stated) < len(times) or np.ptp(stated) == 0.0:
         return np.zeros((len(exposure), 0))
@@ -119,8 +123,9 @@ def _drifts(exposure: FloatArray, times: list[float | None]) -> FloatArray:
 def _candidates(
     exposure: FloatArray, mean: FloatArray, noise: FloatArray, drifts: FloatArray, floor_dn: FloatArray
 ) -> list[_Candidate]:
-    """The exposures that may be the one that is wrong. `noise` (n,): variance of each mean by its pixels' noise; `floor_dn` (exposures,). Frames scatter by as much
-    more as their residuals about the means of their exposures and the drifts do."""
+    """The exposures that may be the one that is wrong. `noise` (n,): variance of each mean by its pixels' noise;
+    `floor_dn` (exposures,). Frames scatter by as much more as their residuals about the means of their exposures and
+    the drifts do."""
     levels = np.unique(exposure)
     of = (exposure[:, None] == levels).astype(float)
     own = np.column_stack([of, drifts])

@@ -37,9 +37,9 @@ def misplaced_frames(recordings: RecordingSet, side: Side) -> Misstatement | Non
 
 
 def exchanged_kinds(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """All flats darker than the darks, which grow with their exposure, by more than `DARKER_SHARE` of the range: the two kinds are stated for
-    each other. Both are left out, as the light of those that are stated as darks isn't known. None where nothing is found.
-    """
+    """All flats darker than the darks, which grow with their exposure, by more than `DARKER_SHARE` of the range: the
+    two kinds are stated for each other. Both are left out, as the light of those that are stated as darks isn't known.
+    None where nothing is found."""
     darks, flats = recordings.captures(DarkCapture, side), recordings.captures(FlatCapture, side)
     if min(len(darks), len(flats)) < FEWEST:
         return None
@@ -56,8 +56,10 @@ def exchanged_kinds(recordings: RecordingSet, side: Side) -> Misstatement | None
         measurement=DARK,
         where=f"{len(darks)} darks and {len(flats)} flats",
         shape="darks and flats contradict their kinds",
-        check=f"The darks of the {side} camera have {level.min():.4g} to {level.max():.4g} DN and grow with the exposure, its flats {lit.min():.4g} to "
-        f"{lit.max():.4g} DN: darks and flats are stated for each other. Both are left out: exchange their kinds, and state the flats' light.",
+        check=f"The darks of the {side} camera have {level.min():.4g} to {level.max():.4g} DN and grow with the "
+        f"exposure, its flats {lit.min():.4g} to "
+        f"{lit.max():.4g} DN: darks and flats are stated for each other. Both are left out: exchange their kinds, and "
+        "state the flats' light.",
         chi2_stated=((float(np.median(level)) - float(lit.max())) / least) ** 2,
         chi2_corrected=0.0,
         n=1,

@@ -32,7 +32,8 @@ class ExchangeRule:
 
 
 FEWEST_LIGHTS = 4
-#: Share of a light's brightest channel that is added to all rates: low rates count little, as low sensitivities may differ by any factor.
+#: Share of a light's brightest channel that is added to all rates: low rates count little, as low sensitivities may
+#: differ by any factor.
 DIM = 0.02
 LEAST_ERROR = 0.005  # of ln(rate)
 SURER = 0.7  # largest ratio of the error of the best exchange to that of the next best
@@ -45,8 +46,8 @@ CURVE_ORDER = 2  # degree in the wavelength of a channel's departure from the ma
 
 
 def exchanged_lights(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Two lights whose captures fit each other's statement and not their own: narrowband lights, else lights of a chart. None where none
-    is found."""
+    """Two lights whose captures fit each other's statement and not their own: narrowband lights, else lights of a
+    chart. None where none is found."""
     if not recordings.captures("narrowband", side) and not recordings.captures("chart", side):
         return None
     camera = camera_model(recordings, side, maker_curves=True)
@@ -54,8 +55,8 @@ def exchanged_lights(recordings: RecordingSet, side: Side) -> Misstatement | Non
 
 
 def _narrowband(recordings: RecordingSet, side: Side, camera: CameraModel) -> Misstatement | None:
-    """Two narrowband lights, by the channels' rates against the sensitivity curves. A channel may depart from its curve by a polynomial in
-    the wavelength."""
+    """Two narrowband lights, by the channels' rates against the sensitivity curves. A channel may depart from its curve
+    by a polynomial in the wavelength."""
     seen = [one for one in narrowband_planes(recordings, side) if np.any(np.isfinite(one.rate))]
     if len(seen) < FEWEST_LIGHTS or recordings.camera(side).quantum_efficiency is None:
         return None
@@ -89,8 +90,8 @@ def _narrowband(recordings: RecordingSet, side: Side, camera: CameraModel) -> Mi
 
 
 def _chart(recordings: RecordingSet, side: Side, camera: CameraModel) -> Misstatement | None:
-    """Two lights of a chart, by the ratios of the patches' rates in every channel, which don't depend on the light's level or the channel's
-    sensitivity."""
+    """Two lights of a chart, by the ratios of the patches' rates in every channel, which don't depend on the light's
+    level or the channel's sensitivity."""
     lights = chart_planes(recordings, side)
     if len(lights) < FEWEST_LIGHTS:
         return None
@@ -141,7 +142,8 @@ def _pattern_error(rate: FloatArray, expected: FloatArray, place: FloatArray, of
 
 
 def _smooth(x: FloatArray, y: FloatArray, order: int) -> FloatArray:
-    """Polynomial (n,) through the finite points with the least sum of absolute residuals, by iteratively reweighted least squares."""
+    """Polynomial (n,) through the finite points with the least sum of absolute residuals, by iteratively reweighted
+    least squares."""
     scaled = (x - x.mean()) / max(float(np.ptp(x)), 1e-9)
     table = np.vander(scaled, order + 1)
     known = np.isfinite(y)
@@ -172,8 +174,8 @@ def _told(
     measurement: Measurement,
     rule: ExchangeRule,
 ) -> Misstatement | None:
-    """The exchange of two lights that fits, None where none passes `rule`. `errors` (n, n): of the captures of light i with the
-    statement of light j."""
+    """The exchange of two lights that fits, None where none passes `rule`. `errors` (n, n): of the captures of light i
+    with the statement of light j."""
     typical = max(float(np.median(np.diag(errors))), LEAST_ERROR)
     every = [
         _Exchange(i, j, _rms(errors[i, i], errors[j, j]), _rms(errors[i, j], errors[j, i]))
@@ -198,8 +200,10 @@ def _told(
         measurement=measurement,
         where=" and ".join(names),
         shape="two stated lights contradict their captures, and each fits the other's",
-        check=f"The captures {of[0]} of the {side} camera, stated with {names[0]}, fit {names[1]}, and {of[1]}, stated with {names[1]}, fit {names[0]} "
-        f"(rms {100 * best.before:.1f} % as stated, {100 * best.after:.1f} % exchanged): exchange the two lights, or the frames.",
+        check=f"The captures {of[0]} of the {side} camera, stated with {names[0]}, fit {names[1]}, and {of[1]}, "
+        f"stated with {names[1]}, fit {names[0]} "
+        f"(rms {100 * best.before:.1f} % as stated, {100 * best.after:.1f} % exchanged): exchange the two lights, or "
+        "the frames.",
         chi2_stated=(best.before / typical) ** 2,
         chi2_corrected=(best.after / typical) ** 2,
         n=2,

@@ -13,10 +13,11 @@ USUAL_S = 60.0  # longest exposure that is likely in a unit
 
 
 def misstated_exposure_unit(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Exposures above `LONGEST_EXPOSURE_S`, read in the larger unit in which none is above `USUAL_S`. None where they fit.
+    """Exposures above `LONGEST_EXPOSURE_S`, read in the larger unit in which none is above `USUAL_S`. None where they
+    fit.
 
-    The times of captures tell nothing of it: they may be those of copying, or of a clock that runs fast, as the mock bench's does.
-    """
+    The times of captures tell nothing of it: they may be those of copying, or of a clock that runs fast, as the mock
+    bench's does."""
     captures = [c for c in recordings.captures(side=side) if c.exposure_s is not None]  # boards may state none
     longest = max((c.exposure_s for c in captures), default=0.0)
     if longest <= LONGEST_EXPOSURE_S:
@@ -32,7 +33,8 @@ def misstated_exposure_unit(recordings: RecordingSet, side: Side) -> Misstatemen
         measurement=DARK,
         where=f"{len(captures)} captures",
         shape="the stated exposures are too long for seconds",
-        check=f"The exposures of the {side} camera aren't in seconds: the longest is {longest:.6g} s, above {LONGEST_EXPOSURE_S:g} s. They are "
+        check=f"The exposures of the {side} camera aren't in seconds: the longest is {longest:.6g} s, above "
+        f"{LONGEST_EXPOSURE_S:g} s. They are "
         f"read as {unit}, the longest as {UNITS[unit] * longest:.4g} s: state exposure_s in seconds.",
         chi2_stated=(longest / LONGEST_EXPOSURE_S) ** 2,
         chi2_corrected=0.0,

@@ -1,4 +1,5 @@
-"""Signal rates of the planes of a mosaic in lights of stated spectra, and the rates that sensitivity curves predict for them."""
+"""Signal rates of the planes of a mosaic in lights of stated spectra, and the rates that sensitivity curves predict for
+them."""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ def narrowband_planes(recordings: RecordingSet, side: Side) -> list[LitPlanes]:
         rates = [_rates(recordings, side, capture, recordings.frame(capture), darks) for capture in group]
         found.append(
             LitPlanes(
-                tuple(c.id for c in group), group[0].kind, group[0].radiance, wavelength_nm, None, np.mean(rates, axis=0),
+                tuple(c.id for c in group), group[0].kind, group[0].radiance, wavelength_nm, None, np.mean(rates,
+                axis=0),
                 OFFSET_DN / min(c.exposure_s for c in group),
             )
         )  # fmt: skip
@@ -58,7 +60,8 @@ def narrowband_planes(recordings: RecordingSet, side: Side) -> list[LitPlanes]:
 
 
 def chart_planes(recordings: RecordingSet, side: Side) -> list[list[LitPlanes]]:
-    """The planes of each patch, in every light of a chart. Each plane is taken from the longest exposure that doesn't clip it."""
+    """The planes of each patch, in every light of a chart. Each plane is taken from the longest exposure that doesn't
+    clip it."""
     darks = _dark_levels(recordings, side)
     groups: dict[str, list[ChartCapture]] = {}
     for capture in _exposed(recordings.captures(ChartCapture, side)):

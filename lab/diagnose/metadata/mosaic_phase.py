@@ -1,5 +1,5 @@
-"""A stated arrangement of the mosaic's colours that the recordings contradict: planes respond to lights as another channel's sensitivity
-predicts."""
+"""A stated arrangement of the mosaic's colours that the recordings contradict: planes respond to lights as another
+channel's sensitivity predicts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ MOSAICS: tuple[Cfa, ...] = ("RGGB", "BGGR", "GRBG", "GBRG")
 # Errors are rms departures of ln(rate) from its prediction.
 FEWEST_LIGHTS = 3
 BRIGHT = 10.0  # least signal over the uncertainty of the dark level
-#: Share of a light's brightest plane that is added to all rates: low rates count little, as low sensitivities may differ by any factor.
+#: Share of a light's brightest plane that is added to all rates: low rates count little, as low sensitivities may
+#: differ by any factor.
 DIM = 0.05
 LEAST_ERROR = 0.15  # of the stated mosaic: errors of the curves and crosstalk are smaller
 BETTER = 0.5  # largest ratio of the best mosaic's error to that of the stated one
@@ -30,9 +31,9 @@ ROUNDS = 6
 def misstated_mosaic_phase(recordings: RecordingSet, side: Side) -> Misstatement | None:
     """A stated mosaic that fits the planes' rates worse than another one; None where it fits.
 
-    r = ln(rate of a plane) - ln(predicted rate of its channel) - level of the light - gain of the channel, over narrowband lights and
-    patches of a chart. The mosaic with the least rms of r is the best. Where no sensitivity curves are stated, typical ones are used: wrong
-    colours are wrong by factors.
+    r = ln(rate of a plane) - ln(predicted rate of its channel) - level of the light - gain of the channel, over
+    narrowband lights and patches of a chart. The mosaic with the least rms of r is the best. Where no sensitivity
+    curves are stated, typical ones are used: wrong colours are wrong by factors.
     """
     stated = recordings.camera(side).cfa
     if stated == "MONO":
@@ -58,8 +59,10 @@ def misstated_mosaic_phase(recordings: RecordingSet, side: Side) -> Misstatement
         measurement=NARROWBAND if narrow else CHART,
         where="all lights",
         shape="the stated mosaic contradicts the colours that its planes see",
-        check=f"The planes of the {side} camera answer the lights as a mosaic {best} does (rms {100 * errors[best]:.0f} %), but cfa = {stated} is "
-        f"stated (rms {100 * errors[stated]:.0f} %): correct cfa to {best}, or crop or turn the frames by even numbers of pixels, and fit again.",
+        check=f"The planes of the {side} camera answer the lights as a mosaic {best} does (rms "
+        f"{100 * errors[best]:.0f} %), but cfa = {stated} is "
+        f"stated (rms {100 * errors[stated]:.0f} %): correct cfa to {best}, or crop or turn the frames by even "
+        "numbers of pixels, and fit again.",
         chi2_stated=n * (errors[stated] / std) ** 2,
         chi2_corrected=n * (errors[best] / std) ** 2,
         n=n,

@@ -23,7 +23,8 @@ def unchecked(recordings: RecordingSet, side: Side) -> Iterator[Skipped]:
             yield Skipped(
                 step="bit_depth",
                 side=side,
-                reason=f"no pixel is above {highest} DN, so that bit_depth = {camera.bit_depth} and a white level of {camera.saturation_dn:g} DN are "
+                reason=f"no pixel is above {highest} DN, so that bit_depth = {camera.bit_depth} and a white level of "
+                f"{camera.saturation_dn:g} DN are "
                 "taken as stated: they decide full well and saturation; a flat that clips would check them",
             )
     boards = recordings.captures(CharucoCapture, side)
@@ -32,6 +33,7 @@ def unchecked(recordings: RecordingSet, side: Side) -> Iterator[Skipped]:
         yield Skipped(
             step="square_mm",
             side=side,
-            reason=f"squares of {sizes} mm are taken as stated: a board twice as large at twice the distance has the same picture. Distances and a "
+            reason=f"squares of {sizes} mm are taken as stated: a board twice as large at twice the distance has the "
+            "same picture. Distances and a "
             "pair's baseline grow in proportion; a baseline, or a board, that was measured would check it",
         )

@@ -94,8 +94,10 @@ def board_departure(
     worst = max(departing, key=lambda part: part.departure_px)
     return Unexplained(
         side=side, measurement=BOARDS.name, axis=BOARDS.axis, where=_where(bad_views, bad_cells, len(views)),
-        shape=f"the corners of boards depart from the camera's geometry by {worst.found_px:.2f} px (standard deviation of a "
-        f"coordinate), noise explains {worst.noise_px:.2f} px; a bent board, an unflat print or a distortion beyond the "
+        shape=f"the corners of boards depart from the camera's geometry by {worst.found_px:.2f} px (standard "
+            "deviation of a "
+        f"coordinate), noise explains {worst.noise_px:.2f} px; a bent board, an unflat print or a distortion beyond "
+        "the "
         "fitted terms does that",
         significance_sigma=round(worst.sigma(policy.covariance_slack), 2),
         chi2_before=worst.chi2, chi2_after=worst.n, n=round(worst.n), captures=tuple(sorted(bad_views or by_view)),

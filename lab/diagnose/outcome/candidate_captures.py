@@ -248,7 +248,8 @@ def _darks(camera: CameraModel) -> Iterator[CandidateCapture]:
 
 
 def _again(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Iterator[CandidateCapture]:
-    """Every measurement again with the same captures. Those of dark frames with few repeats get more, which reduces their covariance."""
+    """Every measurement again with the same captures. Those of dark frames with few repeats get more, which reduces
+    their covariance."""
     darks = {c.id: c for c in recordings.captures(DarkCapture, side)}
     repeats = repeats_of(darks.values())
     for block, at in zip(model.blocks, model.slices, strict=True):

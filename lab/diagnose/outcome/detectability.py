@@ -64,8 +64,8 @@ def detectability(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Itera
 def _smallest(
     effect: type[Effect], members: list[tuple[tuple[Effect, ...], FloatArray]], needed: float
 ) -> dict[str, float]:
-    """Parameter -> least departure from `absent` at which the non-centrality is `needed`. Empty for effects with prototypes of shape, whose
-    signature isn't a power of the size."""
+    """Parameter -> least departure from `absent` at which the non-centrality is `needed`. Empty for effects with
+    prototypes of shape, whose signature isn't a power of the size."""
     found: dict[str, float] = {}
     if effect.shapes:
         return found

@@ -30,8 +30,8 @@ def set_sentences(
     unexplained: Sequence[Unexplained],
     policy: DecisionPolicy,
 ) -> Iterator[str]:
-    """Sentences about effects that may be present, though they are neither named nor rivals of a name; and about sets that the budget left
-    unweighed.
+    """Sentences about effects that may be present, though they are neither named nor rivals of a name; and about sets
+    that the budget left unweighed.
 
     The former are given only where the names explain everything: listed effects fit an unlisted cause badly.
     """
@@ -44,14 +44,16 @@ def set_sentences(
             sets = ", ".join(f"{_words(s.effects)} ({100 * s.probability:.0f} %)" for s in one.sets[:LISTED_SETS])
             more = f" and {len(one.sets) - LISTED_SETS} more" if len(one.sets) > LISTED_SETS else ""
             yield (
-                f"For the {one.side} camera, if every cause is a listed effect, these sets of effects hold {100 * one.share:.0f} % together: "
+                f"For the {one.side} camera, if every cause is a listed effect, these sets of effects hold "
+                f"{100 * one.share:.0f} % together: "
                 f"{sets}{more}."
             )
         if one.not_weighed:
             sets = "; ".join(_words(s) for s in one.not_weighed[:LISTED_SETS])
             more = f"; and {len(one.not_weighed) - LISTED_SETS} more" if len(one.not_weighed) > LISTED_SETS else ""
             yield (
-                f"The search for the {one.side} camera ended when its {policy.search_cpu_s:g} s of CPU time were spent. Not weighed: {sets}{more}; "
+                f"The search for the {one.side} camera ended when its {policy.search_cpu_s:g} s of CPU time were "
+                f"spent. Not weighed: {sets}{more}; "
                 "a name may have rivals among these."
             )
 

@@ -91,10 +91,11 @@ def held_out(verdict: Verdict) -> HeldOut | None:
 
 
 def residual_curves(side: Side, verdict: Verdict) -> Iterator[ResidualCurve]:
-    """Curves of every measurement by condition and channel, seen and held out apart: measured values, and predictions before and after.
+    """Curves of every measurement by condition and channel, seen and held out apart: measured values, and predictions
+    before and after.
 
-    Before is the stated baseline at the nuisance parameters that were fitted with the effects. Levels are limited to 0..white level.
-    """
+    Before is the stated baseline at the nuisance parameters that were fitted with the effects. Levels are limited to
+    0..white level."""
     model = verdict.model
     before = model.stated_mean(model.nuisance_estimates(verdict.effects, verdict.kernels))
     after = model.fitted_mean(verdict.effects, verdict.kernels)

@@ -112,7 +112,8 @@ def improved_model(
 
 
 def _nearest_form(effect: Effect, estimates: Mapping[str, float]) -> Effect:
-    """Return the effect by that form of its law whose coefficient in `estimates` is nearest to 1, if it is nearer to 1 than to 0."""
+    """Return the effect by that form of its law whose coefficient in `estimates` is nearest to 1, if it is nearer to 1
+    than to 0."""
     found = {number: estimates.get(form_name(effect, number), 0.0) for number in range(len(effect.other_forms()))}
     near = min(found, key=lambda number: abs(found[number] - 1.0), default=None)
     return effect if near is None or found[near] < 0.5 else effect.other_forms()[near]
@@ -184,7 +185,11 @@ def _correction(
     return _of("signal_e", (x - camera.black_level_dn) / gain, factor)
 
 
-def _of(along: Literal["frequency_cy_per_um", "radius_um", "signal_e", "variance_signal_e"], x: FloatArray, factor: FloatArray) -> ModelDiscrepancy:  # fmt: skip
+def _of(
+    along: Literal["frequency_cy_per_um", "radius_um", "signal_e", "variance_signal_e"],
+    x: FloatArray,
+    factor: FloatArray,
+) -> ModelDiscrepancy:
     return ModelDiscrepancy(along=along, at=tuple(x.tolist()), factor=tuple(factor.tolist()), strength=1.0)
 
 

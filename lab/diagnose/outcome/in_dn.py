@@ -6,7 +6,8 @@ from sim.parameters import Quantity
 
 
 def told_as(field: str, quantity: Quantity, *, gain_is_known: bool) -> tuple[str, str]:
-    """Name and unit of an effect's parameter in a result. Without a known gain the baseline has 1 DN/e, so that its electrons are DN."""
+    """Name and unit of an effect's parameter in a result. Without a known gain the baseline has 1 DN/e, so that its
+    electrons are DN."""
     if gain_is_known or quantity.unit not in ("e", "e/s"):
         return field, quantity.unit
     stem, _, more = field.rpartition("_e")

@@ -37,7 +37,10 @@ from sim.effects.library import effects as library
 #: Members of a named family that its sentence lists.
 TOLD_MEMBERS = 4
 #: What to capture where no measurement is determined.
-LEAST_CAPTURES = "Add dark frames at two exposures, and flat frames at three levels or more with the light's radiance: the measurements begin with these."
+LEAST_CAPTURES = (
+    "Add dark frames at two exposures, and flat frames at three levels or more with the light's radiance: the "
+    "measurements begin with these."
+)
 
 
 def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -> DiagnosisResult:
@@ -195,7 +198,8 @@ def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:
 def _family_statement(
     family: Family, members: Sequence[Member], is_exact: bool, seen: str, values: str, corrections: Sequence[str]
 ) -> str:
-    """The sentences about a named family: how well its laws hold, which they are, and the capture that tells them apart."""
+    """The sentences about a named family: how well its laws hold, which they are, and the capture that tells them
+    apart."""
     names = [f"{effect_title(m.name)} ({100 * m.probability:.0f} %)" for m in members[:TOLD_MEMBERS]]
     told = [family.sentence, f"{seen}."]
     if is_exact:
@@ -233,9 +237,9 @@ def _mean(values: list[tuple[float, float | None]], is_shared: bool) -> tuple[fl
     """Mean of (value, standard deviation), weighted by 1 / variance; the first value where a standard deviation isn't
     known.
 
-    `is_shared`: the values hold the same light, read by the same radiometer, so that their errors are taken as fully correlated: the mean's
-    standard deviation is the weighted mean of theirs, the largest that any correlation allows. Else they are independent.
-    """
+    `is_shared`: the values hold the same light, read by the same radiometer, so that their errors are taken as fully
+    correlated: the mean's standard deviation is the weighted mean of theirs, the largest that any correlation allows.
+    Else they are independent."""
     known = [(v, s) for v, s in values if s]
     if len(known) != len(values) or len(values) == 1:
         return values[0]
@@ -277,10 +281,12 @@ def _summary(
     if verdict == "no_mismatch":
         agree = ", and held-out captures agree" if held_out is not None else "; no captures are held out"
         lines.append(
-            f"The baseline explains everything that could be judged, at a false-alarm rate of {100 * policy.false_alarm_rate:.0f} %{agree}."
+            "The baseline explains everything that could be judged, at a false-alarm rate of "
+            f"{100 * policy.false_alarm_rate:.0f} %{agree}."
         )
     lines += [
-        f"{measurement_title(m.measurement)} of the {m.side} camera departs from the baseline: {m.where} ({m.significance_sigma:.1f} sigma)."
+        f"{measurement_title(m.measurement)} of the {m.side} camera departs from the baseline: {m.where} "
+        f"({m.significance_sigma:.1f} sigma)."
         for m in mismatches
     ]
     lines += [e.statement for e in effects]

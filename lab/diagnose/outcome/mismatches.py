@@ -83,8 +83,10 @@ def vetoed_names(side: Side, verdict: Verdict) -> list[VetoedName]:
             chi2_before=one.chi2_without,
             chi2_after=one.chi2_with,
             n=one.n,
-            statement=f"{one.candidate.told_name} is not named for the {side} camera: the captures that the choice used suggest it, but on "
-            f"held-out captures chi2 rises by it from {one.chi2_without:.0f} to {one.chi2_with:.0f} for {one.n} numbers, more than chance allows"
+            statement=f"{one.candidate.told_name} is not named for the {side} camera: the captures that the choice "
+            "used suggest it, but on "
+            f"held-out captures chi2 rises by it from {one.chi2_without:.0f} to {one.chi2_with:.0f} for {one.n} "
+            "numbers, more than chance allows"
             f"{', with a discrepancy beside its nearest law or in its place' if one.candidate.members else ''}.",
         )
         for one in verdict.vetoed
@@ -107,7 +109,8 @@ def family_corrections(
 
 
 def shown_in(verdict: Verdict, candidate: Candidate, policy: DecisionPolicy) -> tuple[str, ...]:
-    """Measurements in which an effect's change stands out of the noise, the strongest change first; only that, where none does."""
+    """Measurements in which an effect's change stands out of the noise, the strongest change first; only that, where
+    none does."""
     model = verdict.model
     changes = {
         b.measurement.name: _change_chi2(verdict, candidate.effect, b)
@@ -131,11 +134,12 @@ def unexplained(
     corrections: Sequence[Correction],
     policy: DecisionPolicy,
 ) -> list[Unexplained]:
-    """Every mismatch that no name explains: where it is, the shape of its discrepancy, the nearest law, captures, and what to check.
+    """Every mismatch that no name explains: where it is, the shape of its discrepancy, the nearest law, captures, and
+    what to check.
 
-    chi2 is of the seen numbers, without and with the discrepancy's covariance; of a mismatch that only held-out captures show, it is
-    theirs. `corrections`: one for each discrepancy. What the nearest law of a named family leaves isn't listed.
-    """
+    chi2 is of the seen numbers, without and with the discrepancy's covariance; of a mismatch that only held-out
+    captures show, it is theirs. `corrections`: one for each discrepancy. What the nearest law of a named family leaves
+    isn't listed."""
     model = verdict.model
     gaussian = model.gaussian(verdict.effects)
     held = held_by_families(verdict, policy)
@@ -199,8 +203,10 @@ def _level_check(recordings: RecordingSet, level: OutlyingLevel) -> str:
     exposure_s = float(np.mean(list(stated.values())))
     many = len(level.captures) > 1
     return (
-        f"Capture{'s' if many else ''} {', '.join(level.captures)}: stated with {exposure_s:.6g} s, but {'their' if many else 'its'} level is "
-        f"that of {exposure_s * level.factor:.6g} ± {exposure_s * level.factor_std:.2g} s, or of {level.factor:.4f} ± {level.factor_std:.1g} "
+        f"Capture{'s' if many else ''} {', '.join(level.captures)}: stated with {exposure_s:.6g} s, but "
+        f"{'their' if many else 'its'} level is "
+        f"that of {exposure_s * level.factor:.6g} ± {exposure_s * level.factor_std:.2g} s, or of {level.factor:.4f} ± "
+        f"{level.factor_std:.1g} "
         "times the stated light: check both."
     )
 
@@ -236,8 +242,8 @@ def _shape(
 def _nearest(
     one: Discrepancy, verdict: Verdict, near: Sequence[Candidate], chi2_without: float, policy: DecisionPolicy
 ) -> str:
-    """Return the nearest law of the library, and why it isn't named, in words: it leaves too much, or others fit as well. Empty where no law
-    explains `near_share` of the excess of chi2 here."""
+    """Return the nearest law of the library, and why it isn't named, in words: it leaves too much, or others fit as
+    well. Empty where no law explains `near_share` of the excess of chi2 here."""
     model, at = verdict.model, verdict.model.slices[one.index]
     nearest = max(near, key=lambda c: c.log_odds, default=None)
     if nearest is None:
@@ -261,5 +267,11 @@ def _nearest(
         return f"the nearest law is {name}, and it doesn't hold exactly: {told}"
     rivals = [f"{n} ({100 * p:.0f} %)" for n, p in nearest.rivals[:LISTED_RIVALS] if n != UNKNOWN and p >= LEAST_TOLD]
     if rivals:
-        return f"the nearest law is {name} ({100 * nearest.probability:.0f} %), which these recordings can't tell from {', '.join(rivals)}"
-    return f"the nearest law is {name}; what it leaves beside it in the same captures has no name, so that both may be one unknown cause"
+        return (
+            f"the nearest law is {name} ({100 * nearest.probability:.0f} %), which these recordings can't tell from "
+            f"{', '.join(rivals)}"
+        )
+    return (
+        f"the nearest law is {name}; what it leaves beside it in the same captures has no name, so that both may be "
+        "one unknown cause"
+    )

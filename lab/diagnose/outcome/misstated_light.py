@@ -1,4 +1,5 @@
-"""Flat levels whose stated light contradicts the others, which the noise fit left out, reported as misstated metadata."""
+"""Flat levels whose stated light contradicts the others, which the noise fit left out, reported as misstated
+metadata."""
 
 from __future__ import annotations
 
@@ -9,8 +10,8 @@ from sim.camera import Side
 
 
 def misstated_light(side: Side, fit: CameraFit | None, *, levels_are_judged: bool) -> tuple[Unexplained, ...]:
-    """One item for each level that the noise fit finds: of a number of photons, and of an exposure where no measurement of levels judges it
-    (`levels_are_judged`). Its significance is against the tolerance of a reading of the light."""
+    """One item for each level that the noise fit finds: of a number of photons, and of an exposure where no measurement
+    of levels judges it (`levels_are_judged`). Its significance is against the tolerance of a reading of the light."""
     exposures = () if levels_are_judged or fit is None or fit.noise is None else fit.noise.inconsistent_levels
     wrong = (*misstated_levels(fit), *(one for one in exposures if one.light_unit == "s" and one.captures))
     return tuple(_told(side, level) for level in wrong)
@@ -33,6 +34,7 @@ def _told(side: Side, level: InconsistentLevel) -> Unexplained:
         n=1,
         captures=level.captures,
         correction="none: the level is left out",
-        check=f"{named}: stated with {level.light:.6g} {unit}, but the others have this level at {level.expected_light:.6g} "
+        check=f"{named}: stated with {level.light:.6g} {unit}, but the others have this level at "
+        f"{level.expected_light:.6g} "
         f"{unit.split()[0]}: correct the {what.split()[0]}, or the frames are of another level.",
     )

@@ -1,6 +1,7 @@
 """How well the seen numbers determine the parameters of an improved model, all together.
 
-With A the Jacobian (n, k) by all parameters, P their prior covariance, C that of the n seen numbers with everything marginalised:
+With A the Jacobian (n, k) by all parameters, P their prior covariance, C that of the n seen numbers with everything
+marginalised:
 
     mean = P A' C^-1 (y - m),   covariance = P - P A' C^-1 A P
 
@@ -25,8 +26,8 @@ from sim.effects.base import Effect
 from sim.sensor.electrons import gain_dn_per_e
 from sim.spectrum import FloatArray
 
-#: Nuisance parameters, and beginnings of their names, that stay with the camera and its place before the chart from session to session.
-#: Others belong to one session: its edges' light, its lamp's flicker.
+#: Nuisance parameters, and beginnings of their names, that stay with the camera and its place before the chart from
+#: session to session. Others belong to one session: its edges' light, its lamp's flicker.
 LASTING = ("gain", "black", "dark", "chart:scale", "chart:x", "chart:y")
 LASTING_PREFIXES = ("curve:", "read", "level:", "form ")
 #: Step of a difference by an effect's parameter, as a share of its typical size.
@@ -103,7 +104,8 @@ def _first(noise: NoiseGuess) -> FirstEstimates:
 
 
 def _from_first(noise: NoiseGuess, camera: CameraModel, gain_db: float) -> dict[str, float]:
-    """What the first estimates differ by from what `camera` states, in prior standard deviations, by the nuisance parameter's name."""
+    """What the first estimates differ by from what `camera` states, in prior standard deviations, by the nuisance
+    parameter's name."""
     gain = gain_dn_per_e(camera, gain_db)
     return {
         "gain": (noise.gain / gain - 1.0) / GAIN_STD,
@@ -118,7 +120,8 @@ def coordinate_name(effects: Sequence[Effect], coordinate: Coordinate) -> str:
 
 
 def effect_jacobian(model: MeasurementModel, effects: Sequence[Effect], coords: Sequence[Coordinate]) -> FloatArray:
-    """Derivatives (n, p) of the predicted numbers by the coordinates of the effects' parameters, by differences within the bounds."""
+    """Derivatives (n, p) of the predicted numbers by the coordinates of the effects' parameters, by differences within
+    the bounds."""
     columns = [np.zeros((len(model.value), 0))]
     for c in coords:
         value = float(getattr(effects[c.index], c.name))
@@ -131,7 +134,8 @@ def effect_jacobian(model: MeasurementModel, effects: Sequence[Effect], coords: 
 
 
 def _patches(model: MeasurementModel) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
-    """Names (q,) of the chart's reflectances, the Jacobian (n, q) by their relative errors, and the prior covariance (q, q) of these."""
+    """Names (q,) of the chart's reflectances, the Jacobian (n, q) by their relative errors, and the prior covariance
+    (q, q) of these."""
     for block, at in zip(model.blocks, model.slices, strict=True):
         if block.measurement is CHART:
             key = [f"{PATCH}{label.condition}:{label.channel}" for label in block.labels]

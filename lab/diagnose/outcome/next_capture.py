@@ -132,17 +132,23 @@ def _hypothesis(model: MeasurementModel, name: str, effects: tuple[Effect, ...])
 
 
 def next_sentence(found: Sequence[NextCapture], settling: str | None, policy: DecisionPolicy) -> str | None:
-    """The best capture of all sides as a sentence. `settling`: what to capture for a mismatch that is left without a name."""
+    """The best capture of all sides as a sentence. `settling`: what to capture for a mismatch that is left without a
+    name."""
     if not found:
         return settling
     best = max(found, key=lambda one: one.distance)
     one, other = best.rivals
     if best.distance >= policy.next_capture_distance:
         return (
-            f"{best.capture[0].upper()}{best.capture[1:]} would tell {one} from {other}: their predictions lie {np.sqrt(2.0 * best.distance):.1f} "
-            f"standard deviations apart there, which decides rightly in {100 * min(best.told_apart, 0.999):.3g} % of all cases."
+            f"{best.capture[0].upper()}{best.capture[1:]} would tell {one} from {other}: their predictions lie "
+            f"{np.sqrt(2.0 * best.distance):.1f} "
+            f"standard deviations apart there, which decides rightly in {100 * min(best.told_apart, 0.999):.3g} % of "
+            "all cases."
         )
-    beyond = f"no capture that can be predicted tells {one} from {other} by more than {np.sqrt(2.0 * best.distance):.1f} standard deviations"
+    beyond = (
+        f"no capture that can be predicted tells {one} from {other} by more than {np.sqrt(2.0 * best.distance):.1f} "
+        "standard deviations"
+    )
     differs = library()[one].invariances ^ library()[other].invariances
     for thing, (capture, kind) in SETTLING.items():
         if thing in differs:

@@ -51,7 +51,8 @@ def residual_pictures(
             continue
         before, after = (drawn[effects] for effects in both)
         yield ResidualPicture(
-            side=side, kind=kind, capture=capture.id, held_out=capture.id in held_out, before=_rows(before), after=_rows(after)
+            side=side, kind=kind, capture=capture.id, held_out=capture.id in held_out, before=_rows(before),
+            after=_rows(after)
         )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """What to capture where a mismatch has no name: captures of the same kind under another condition.
 
-Only conditions that can change the measurement are proposed: without light, no lens, lamp or wavelength acts on dark frames. Where there
-are few repeats, more of them are proposed first.
+Only conditions that can change the measurement are proposed: without light, no lens, lamp or wavelength acts on dark
+frames. Where there are few repeats, more of them are proposed first.
 """
 
 from __future__ import annotations
@@ -17,16 +17,24 @@ from sim.camera import Side
 FEW_REPEATS, MORE_REPEATS = 8, 16
 #: What to vary, by the kind of all captures of a measurement; else by its axis, which says what it follows.
 BY_KIND = {
-    "dark": "at another exposure and another sensor temperature: dark current grows with both, row and column noise with neither",
-    "narrowband": "at half the exposure, and at the wavelengths between: a nonlinear response depends on the level, a filter on the wavelength",
-    "chart": "at half the exposure, and with the chart rotated by 180 degrees: a nonlinear response depends on the level, uneven light on the place",
-    "charuco": "with the board rotated by 90 degrees, and nearer: errors of the lens stay with the frame, errors of the board rotate with it",
+    "dark": "at another exposure and another sensor temperature: dark current grows with both, row and column noise "
+    "with neither",
+    "narrowband": "at half the exposure, and at the wavelengths between: a nonlinear response depends on the level, a "
+    "filter on the wavelength",
+    "chart": "at half the exposure, and with the chart rotated by 180 degrees: a nonlinear response depends on the "
+    "level, uneven light on the place",
+    "charuco": "with the board rotated by 90 degrees, and nearer: errors of the lens stay with the frame, errors of "
+    "the board rotate with it",
 }
 BY_AXIS = {
-    "spatial_frequency": "at another f-number and in light of another wavelength: diffraction and aberrations depend on these, the sensor doesn't",
-    "field": "at another f-number, and with the camera rotated by 180 degrees: lens and sensor stay with the frame, uneven light rotates",
-    "level": "at other levels of the light and the same exposure: a nonlinear response depends on the level, the dark signal on the exposure",
-    "row_frequency": "at another exposure: flicker of the source depends on the time of each row, row noise of the read-out doesn't",
+    "spatial_frequency": "at another f-number and in light of another wavelength: diffraction and aberrations depend "
+    "on these, the sensor doesn't",
+    "field": "at another f-number, and with the camera rotated by 180 degrees: lens and sensor stay with the frame, "
+    "uneven light rotates",
+    "level": "at other levels of the light and the same exposure: a nonlinear response depends on the level, the dark "
+    "signal on the exposure",
+    "row_frequency": "at another exposure: flicker of the source depends on the time of each row, row noise of the "
+    "read-out doesn't",
 }
 ELSE = "again after a break, in the reverse order: a drift with time differs then"
 
@@ -60,7 +68,8 @@ def settling_sentence(recordings: RecordingSet, side: Side, left: Sequence[Unexp
         what = "dark frames"
         if repeats < FEW_REPEATS:
             return (
-                f"Take {MORE_REPEATS} {what} at each setting (there are {repeats}): their noise hides the shape of the mismatch of the {side} "
+                f"Take {MORE_REPEATS} {what} at each setting (there are {repeats}): their noise hides the shape of "
+                f"the mismatch of the {side} "
                 "camera. Then take them at another exposure."
             )
     (kind,) = kinds if len(kinds) == 1 else ("",)

@@ -21,14 +21,16 @@ from sim.parameters import Frozen
 
 BOLTZMANN_EV_PER_K = 8.617333262e-5
 ZERO_C_K = 273.15
-#: Rise in temperature that doubles the dark current of silicon, where no fit tells it: ln 2 k T^2 / E at 300 K with an activation energy
-#: between that of diffusion, 1.12 eV, and that of generation amid the band gap, 0.56 eV (Widenhorn et al. 2002, Proc. SPIE 4669, 193):
+#: Rise in temperature that doubles the dark current of silicon, where no fit tells it: ln 2 k T^2 / E at 300 K with an
+#: activation energy between that of diffusion, 1.12 eV, and that of generation amid the band gap, 0.56 eV (Widenhorn et
+#: al. 2002, Proc. SPIE 4669, 193):
 #: 4.8 to 9.6 K, of uniform probability.
 DOUBLING_C, DOUBLING_C_STD = 7.2, 1.4
-#: Standard deviation of the temperature of a sensor that states none: a laboratory's air of 18 to 26 degrees, and a camera that is
-#: between cold and warmed up by 12 degrees, both of uniform probability: hypot(8, 12) / sqrt(12).
+#: Standard deviation of the temperature of a sensor that states none: a laboratory's air of 18 to 26 degrees, and a
+#: camera that is between cold and warmed up by 12 degrees, both of uniform probability: hypot(8, 12) / sqrt(12).
 UNKNOWN_C_STD = 4.2
-#: Standard deviation of a reading of the sensor's own thermometer against itself: a resolution of 0.125 degrees, and its noise.
+#: Standard deviation of a reading of the sensor's own thermometer against itself: a resolution of 0.125 degrees, and
+#: its noise.
 THERMOMETER_C_STD = 0.1
 
 
@@ -45,10 +47,11 @@ class SensorTemperature(Frozen):
         return "at an unknown temperature" if self.temperature_c is None else f"at {self.temperature_c:.1f} °C"
 
     def doublings(self, reference: SensorTemperature) -> tuple[float, float]:
-        """By how many times 2 a dark current at the reference's temperature is larger than at this one, and the standard deviation.
+        """By how many times 2 a dark current at the reference's temperature is larger than at this one, and the
+        standard deviation.
 
-        The doubling temperature is the better known of both. Where a temperature isn't known, the number is 0 and its standard deviation
-        that of the temperatures that a laboratory's sensors have.
+        The doubling temperature is the better known of both. Where a temperature isn't known, the number is 0 and its
+        standard deviation that of the temperatures that a laboratory's sensors have.
         """
         law = min(self, reference, key=lambda one: one.doubling_c_std)
         if self.temperature_c is None or reference.temperature_c is None:
@@ -115,7 +118,8 @@ def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
     if not any(level.lamp == "dark" for level, _ in e.points):
         if any(level.repeats > 1 for level in e.levels.darks):
             e.remarks.add(
-                f"repeated dark frames are all alike: rounding hides the read noise, which is below {0.4 / t.gain:.2f} e"
+                "repeated dark frames are all alike: rounding hides the read noise, which is below "
+                f"{0.4 / t.gain:.2f} e"
             )
         return None, None
     count = t.floor.size
@@ -125,7 +129,8 @@ def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
     floor = float(weight @ t.floor)
     if floor < HIDDEN_DN2:
         e.remarks.add(
-            f"the temporal noise of dark frames is {np.sqrt(max(floor, 0)):.2f} DN, where rounding hides it: the read noise is below "
+            f"the temporal noise of dark frames is {np.sqrt(max(floor, 0)):.2f} DN, where rounding hides it: the read "
+            "noise is below "
             f"{0.4 / t.gain:.2f} e; a higher gain would show it"
         )
         return None, None
@@ -163,7 +168,8 @@ def dark_signal_hidden(e: Evaluation) -> bool:
     if spread >= HIDDEN_DN2:
         return False
     e.remarks.add(
-        f"noise and pattern of the darks spread over {np.sqrt(spread):.2f} DN only, so rounding decides their means: dark current "
+        f"noise and pattern of the darks spread over {np.sqrt(spread):.2f} DN only, so rounding decides their means: "
+        "dark current "
         "and DSNU aren't determined, and the black level to its rounding; a higher gain would show them"
     )
     return True
@@ -226,8 +232,8 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
 def dark_temperature_c(e: Evaluation) -> float | None:
     """Sensor temperature (deg C) at which the dark currents were measured; None where the darks don't state it.
 
-    It is the mean over the darks, weighted by exposure: a dark moves the slope of signal against exposure the more, the longer it is.
-    """
+    It is the mean over the darks, weighted by exposure: a dark moves the slope of signal against exposure the more, the
+    longer it is."""
     darks = [
         (level.exposure_s, level.temperature_c if level.sensor_c is None else level.sensor_c)
         for level in e.levels.darks

@@ -185,14 +185,18 @@ Figures = dict[str, Measured]
 def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
     """The figures of one plane, or the reason why there are none."""
     if not any(level.repeats > 1 for level in given.darks):
-        return "no repeated darks: EMVA 1288 compares bright with dark pairs; capture two darks at each of the flats' exposures"
+        return (
+            "no repeated darks: EMVA 1288 compares bright with dark pairs; capture two darks at each of the flats' "
+            "exposures"
+        )
     at = EmvaLevels(given)
     remarks: list[str] = []
     saturation, top = _saturation(at, given, remarks)
     used = at.signal <= LINE_LIMIT * saturation
     if np.count_nonzero(used) < 3:
         return (
-            f"{np.count_nonzero(used)} levels of one lamp with repeats up to 70 % of saturation: EMVA 1288 needs three at least and "
+            f"{np.count_nonzero(used)} levels of one lamp with repeats up to 70 % of saturation: EMVA 1288 needs "
+            "three at least and "
             "asks for fifty; capture more"
         )
     gain = at.gain(used)
@@ -204,7 +208,8 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
     missing = sum(source is None for source in at.source)
     if missing:
         remarks.append(
-            f"{missing} of {at.signal.size} levels have no dark of their exposure: a line through the darks stands for it"
+            f"{missing} of {at.signal.size} levels have no dark of their exposure: a line through the darks stands "
+            "for it"
         )
     found: Figures = {}
     if given.in_photons:
@@ -237,7 +242,8 @@ def _calibration(at: EmvaLevels, found: Figures, remarks: list[str]) -> dict[str
     if not relative or "quantum_efficiency" not in found:
         return {}
     remarks.append(
-        f"the photodiode's calibration has a standard uncertainty of {100.0 * relative:.2g} %: it is a factor common to all numbers of photons, "
+        f"the photodiode's calibration has a standard uncertainty of {100.0 * relative:.2g} %: it is a factor common "
+        "to all numbers of photons, "
         "and in none of the standard deviations beside them"
     )
     return {
@@ -261,7 +267,8 @@ def _saturation(at: EmvaLevels, given: EmvaInput, remarks: list[str]) -> tuple[f
     if beyond.size and beyond.min() < at.variance[index] - 3.0 * at.variance_std[index]:
         return float(at.signal[index]), index
     remarks.append(
-        "no flat lies beyond the largest temporal variance: the saturation capacity isn't determined, and the ranges are of "
+        "no flat lies beyond the largest temporal variance: the saturation capacity isn't determined, and the ranges "
+        "are of "
         f"{given.saturation_dn:.4g} DN above dark"
     )
     return given.saturation_dn, None
@@ -274,8 +281,10 @@ def _widened_gain(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list
     if ratio is None:
         return gain
     remarks.append(
-        f"the temporal variances don't lie on the standard's straight line by more than noise: the line has {gain.value:.4g} DN/e, the "
-        f"mean of variance over signal {ratio:.4g} DN/e; the difference is in the uncertainties of K and of what is divided by it"
+        "the temporal variances don't lie on the standard's straight line by more than noise: the line has "
+        f"{gain.value:.4g} DN/e, the "
+        f"mean of variance over signal {ratio:.4g} DN/e; the difference is in the uncertainties of K and of what is "
+        "divided by it"
     )
     return Measured(gain.value, math.hypot(gain.std, ratio - gain.value))
 
@@ -290,8 +299,10 @@ def _responsivity(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list
     ratio = mean_ratio(at.light[used], at.signal[used], at.signal_std[used], responsivity)
     if ratio is not None:
         remarks.append(
-            f"the signals aren't proportional to the light within noise: the standard's line has {responsivity.value:.5g} DN/photon, the "
-            f"mean of signal over light {ratio:.5g} DN/photon; the difference is in the uncertainties of R and of the quantum efficiency"
+            "the signals aren't proportional to the light within noise: the standard's line has "
+            f"{responsivity.value:.5g} DN/photon, the "
+            f"mean of signal over light {ratio:.5g} DN/photon; the difference is in the uncertainties of R and of the "
+            "quantum efficiency"
         )
         responsivity = Measured(responsivity.value, math.hypot(std, ratio - responsivity.value))
     return {"responsivity_dn_per_photon": responsivity, "quantum_efficiency": responsivity.over(gain)}
@@ -307,7 +318,8 @@ def _dark_noise(at: EmvaLevels, gain: Measured, remarks: list[str]) -> tuple[Fig
     if square.value < HIDDEN_DN2:
         limit_e = HIDDEN_DN / gain.value
         remarks.append(
-            f"the dark variance is {max(square.value, 0.0):.2g} DN^2, below 0.24, where rounding hides it: the temporal dark noise is "
+            f"the dark variance is {max(square.value, 0.0):.2g} DN^2, below 0.24, where rounding hides it: the "
+            "temporal dark noise is "
             f"below {limit_e:.3g} e"
         )
         return {}, limit_e
@@ -422,11 +434,13 @@ def _stacks(given: EmvaInput, at: EmvaLevels, saturation: float, remarks: list[s
     least = min((level.repeats for level in (dark, bright) if level is not None), default=0)
     if least < SPATIAL_IMAGES:
         remarks.append(
-            f"the spatial stacks have {least} images: the rows' and columns' parts carry more temporal noise than the standard means"
+            f"the spatial stacks have {least} images: the rows' and columns' parts carry more temporal noise than the "
+            "standard means"
         )
     if dark is not None and bright is not None and abs(dark.exposure_s - exposure_s) > 1e-3 * exposure_s:
         remarks.append(
-            f"the dark stack was exposed for {1e3 * dark.exposure_s:.3g} ms, the bright one for {1e3 * exposure_s:.3g} ms; the standard "
+            f"the dark stack was exposed for {1e3 * dark.exposure_s:.3g} ms, the bright one for "
+            f"{1e3 * exposure_s:.3g} ms; the standard "
             "asks for the same"
         )
     return _Stacks(dark, bright)

@@ -1,4 +1,5 @@
-"""The evaluation of the levels: which serve the lines, what their means scatter, and the state that this leaves for all figures."""
+"""The evaluation of the levels: which serve the lines, what their means scatter, and the state that this leaves for all
+figures."""
 
 from __future__ import annotations
 
@@ -29,8 +30,8 @@ from lab.measure.rounding import QUANTISATION_DN2
 # --- level consistency ---------------------------------------------------------------------------------------------
 # Which flats serve the lines of responsivity, linearity and gain: the level series without what contradicts it.
 #
-# A level whose stated light (photon number or exposure) contradicts the others is left out of the lines and named. So is
-# a spatial stack, of which EMVA 1288 asks for many images at one level: it serves PRNU and DSNU.
+# A level whose stated light (photon number or exposure) contradicts the others is left out of the lines and named. So
+# is a spatial stack, of which EMVA 1288 asks for many images at one level: it serves PRNU and DSNU.
 
 
 STACK_REPEATS = 4  # times the median number of repeats, from which a level is a spatial stack
@@ -164,8 +165,10 @@ def _sentence(level: InconsistentLevel, source: str) -> str:
     named = ", ".join(level.captures[:1]) + (f" .. {level.captures[-1]}" if len(level.captures) > 1 else "")
     which = f"{len(level.captures)} captures {named}" if level.captures else f"exposure {level.exposure_s:g} s"
     return (
-        f"one level contradicts the others and is left out of responsivity, linearity and gain: {which}, stated {level.light:.6g} {unit}, "
-        f"has {level.signal_dn:.4g} DN above dark, where the others have {level.expected_signal_dn:.4g} DN; they have its signal at "
+        f"one level contradicts the others and is left out of responsivity, linearity and gain: {which}, stated "
+        f"{level.light:.6g} {unit}, "
+        f"has {level.signal_dn:.4g} DN above dark, where the others have {level.expected_signal_dn:.4g} DN; they have "
+        "its signal at "
         f"{level.expected_light:.6g} {unit}; {source}: correct it"
     )
 
@@ -283,7 +286,8 @@ class Evaluation:
 
     @property
     def light_scatter(self) -> float:
-        """Relative standard deviation of a level's mean beyond noise: between its repeats, or about a smooth response."""
+        """Relative standard deviation of a level's mean beyond noise: between its repeats, or about a smooth
+        response."""
         return max(self.drift.relative, self.consistency.scatter)
 
 
@@ -347,12 +351,14 @@ def transfer_of(
         if len(alike) == repeated > 0:
             raise NotDetermined(
                 "noise",
-                f"the repeats of all {repeated} flat levels are alike, pixel by pixel: give frames that were captured one by one, not "
+                f"the repeats of all {repeated} flat levels are alike, pixel by pixel: give frames that were captured "
+                "one by one, not "
                 "copies, or raise the gain until noise shows",
             )
         raise NotDetermined(
             "noise",
-            f"{len(bright_levels)} unsaturated flat levels with repeats (of {len(recorded.flats)} levels, {repeated} with repeats), "
+            f"{len(bright_levels)} unsaturated flat levels with repeats (of {len(recorded.flats)} levels, {repeated} "
+            "with repeats), "
             f"{MIN_LEVELS} needed: capture two frames or more at each of several exposures below saturation",
         )
     # Planes without points (all flats clip, no darks) have no floor
@@ -364,7 +370,8 @@ def transfer_of(
     if transfer.gain <= 0 or transfer.gain < 3.0 * transfer.gain_std:
         raise NotDetermined(
             "noise",
-            "the temporal variance doesn't grow with the signal: capture repeats of flats that are steady and unprocessed",
+            "the temporal variance doesn't grow with the signal: capture repeats of flats that are steady and "
+            "unprocessed",
         )
     return transfer, points
 
@@ -374,7 +381,8 @@ def _remark_on_transfer(e: Evaluation) -> None:
     t = e.transfer
     if t.model_error > 0:
         e.remarks.add(
-            f"the variances of the flats depart from their curve by {100 * t.model_error:.2g} % (rms) beyond what sampling explains "
+            f"the variances of the flats depart from their curve by {100 * t.model_error:.2g} % (rms) beyond what "
+            "sampling explains "
             "(an uneven converter does that): it is in the uncertainties"
         )
     share = 1.0 if e.reaches_saturation else e.reach
@@ -382,13 +390,15 @@ def _remark_on_transfer(e: Evaluation) -> None:
     bend, bend_std = 100 * share * t.relative_curvature, 100 * share * t.relative_curvature_std
     if not e.reaches_saturation:
         e.remarks.add(
-            f"the highest level of the photon transfer is {100 * e.reach:.2g} % of saturation, {100 * LEAST_REACH:.0f} % are needed: curvatures at "
+            f"the highest level of the photon transfer is {100 * e.reach:.2g} % of saturation, "
+            f"{100 * LEAST_REACH:.0f} % are needed: curvatures at "
             "saturation aren't given; expose longer, or correct bit_depth or white_level_dn"
         )
     if t.by_line:
         e.remarks.add(
             f"the bend of the variances ({bend:+.1f} +- {bend_std:.1f} % {at}) isn't "
-            "significant against that: the conversion gain is EMVA's straight line to 70 % of saturation; at zero signal "
+            "significant against that: the conversion gain is EMVA's straight line to 70 % of saturation; at zero "
+            "signal "
             f"the curve has {t.curve_gain:.4g} +- {t.curve_gain_std:.2g} DN/e"
         )
     elif abs(t.relative_curvature) > 4.0 * t.relative_curvature_std:

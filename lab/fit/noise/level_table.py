@@ -1,9 +1,9 @@
 """The noise fit on a table of channel means and variances, for recordings whose frames aren't at hand.
 
-One row a level and channel, CSV with a header. Columns: `kind` (dark, flat), `exposure_s`, `mean_dn`, `variance_dn2` (temporal, of single
-pixels), `pixels` (of the channel, over which both were taken), `repeats` (frames); where known `channel` (Y, R, G, B), `photons_per_pixel`,
-`wavelength_nm`, `temperature_c`. A table holds no pattern: DSNU, PRNU and what needs frames stay unknown.
-"""
+One row a level and channel, CSV with a header. Columns: `kind` (dark, flat), `exposure_s`, `mean_dn`, `variance_dn2`
+(temporal, of single pixels), `pixels` (of the channel, over which both were taken), `repeats` (frames); where known
+`channel` (Y, R, G, B), `photons_per_pixel`, `wavelength_nm`, `temperature_c`. A table holds no pattern: DSNU, PRNU and
+what needs frames stay unknown."""
 
 from __future__ import annotations
 
@@ -31,15 +31,16 @@ Setting = tuple[str, float, float | None, float | None, float | None]
 def fit_level_table(file: Path, camera: DataSheet) -> FitResult:
     """Photon transfer from the table `file`, of a camera whose `cfa`, `bit_depth` and levels `camera` states.
 
-    Raises InputError with one line where a column is missing or unknown (another unit, above all) or a cell is no number, and `NotDetermined`
-    where the levels don't determine the conversion gain.
+    Raises InputError with one line where a column is missing or unknown (another unit, above all) or a cell is no
+    number, and `NotDetermined` where the levels don't determine the conversion gain.
     """
     groups: dict[Setting, dict[str, PlaneStatistics]] = {}
     for row in table_rows(file, NEEDED, KNOWN):
         channel = row.cells.get("channel") or ("Y" if camera.cfa == "MONO" else "")
         if channel not in camera.channels:
             raise InputError(
-                f"{file}: row {row.number}: channel '{channel}' of a {camera.cfa} sensor; write {', '.join(camera.channels)}"
+                f"{file}: row {row.number}: channel '{channel}' of a {camera.cfa} sensor; write "
+                f"{', '.join(camera.channels)}"
             )
         setting, plane = _level(row, camera)
         if channel in groups.setdefault(setting, {}):
@@ -52,7 +53,8 @@ def fit_level_table(file: Path, camera: DataSheet) -> FitResult:
     for (kind, exposure_s, photons, wavelength_nm, temperature_c), planes in groups.items():
         if set(planes) != set(camera.channels):
             raise InputError(
-                f"{file}: {kind} of {exposure_s:g} s: channels {', '.join(planes)}; give all of {', '.join(camera.channels)}"
+                f"{file}: {kind} of {exposure_s:g} s: channels {', '.join(planes)}; give all of "
+                f"{', '.join(camera.channels)}"
             )
         dark = kind == "dark"
         light = 0.0 if dark else exposure_s if photons is None else photons
@@ -73,16 +75,20 @@ def _level(row: TableRow, camera: DataSheet) -> tuple[Setting, PlaneStatistics]:
     mean, variance = row.value("mean_dn"), row.value("variance_dn2")
     if mean > camera.saturation_dn:
         raise InputError(
-            f"{row.file}: row {row.number}: mean_dn = {mean:g} is above the highest code {camera.saturation_dn:g}; correct one"
+            f"{row.file}: row {row.number}: mean_dn = {mean:g} is above the highest code {camera.saturation_dn:g}; "
+            "correct one"
         )
     pixels, repeats = int(row.value("pixels", 1.0)), int(row.value("repeats", 1.0))
     is_clipped = mean > camera.saturation_dn - CLIPPED_SIGMA * math.sqrt(variance) - 0.5
     std = variance * math.sqrt(2.0 / (max(repeats - 1, 1) * pixels))
     side = max(round(math.sqrt(pixels)), 2)
     plane = PlaneStatistics(
-        pixels=pixels, mean=mean, frame_means=(mean,) * repeats, temporal_variance=variance if repeats > 1 else math.nan,
-        temporal_variance_std=std, spatial_variance=0.0, spatial_variance_std=0.0, pattern_variance=0.0, pattern_variance_std=0.0, defects=0,
-        clipped_share=1.0 if is_clipped else 0.0, piled_share=0.0, zero_share=0.0, highest=mean, shape=(side, side), mean_of_all=mean,
+        pixels=pixels, mean=mean, frame_means=(mean,) * repeats,
+        temporal_variance=variance if repeats > 1 else math.nan,
+        temporal_variance_std=std, spatial_variance=0.0, spatial_variance_std=0.0, pattern_variance=0.0,
+        pattern_variance_std=0.0, defects=0,
+        clipped_share=1.0 if is_clipped else 0.0, piled_share=0.0, zero_share=0.0, highest=mean, shape=(side, side),
+        mean_of_all=mean,
         temporal_variance_of_all=variance,
     )  # fmt: skip
     setting = (

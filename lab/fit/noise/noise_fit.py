@@ -1,4 +1,5 @@
-"""The noise fit of one camera: its darks and flats grouped into levels, all figures, by channel too, and the points of its plots."""
+"""The noise fit of one camera: its darks and flats grouped into levels, all figures, by channel too, and the points of
+its plots."""
 
 from __future__ import annotations
 
@@ -258,7 +259,8 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     if min(camera.rows, camera.cols) < MIN_SIZE_PX:
         raise NotDetermined(
             "noise",
-            f"{camera.rows} x {camera.cols} px are too few for a variance: give frames of {MIN_SIZE_PX} x {MIN_SIZE_PX} or more",
+            f"{camera.rows} x {camera.cols} px are too few for a variance: give frames of {MIN_SIZE_PX} x "
+            f"{MIN_SIZE_PX} or more",
         )
     copies = copied_frames(recordings, side, [*recordings.captures(DarkCapture, side), *flats])
     if copies.ids:
@@ -313,8 +315,8 @@ def _grouped(captures: Sequence[C], key: Callable[[C], Hashable]) -> list[list[C
 def _lamps_of(
     recordings: RecordingSet, flats: Sequence[FlatCapture], light: Mapping[str, StatedLight]
 ) -> dict[str, Hashable]:
-    """The lamp of each flat, by its id. A lamp that is measured before every pass over the levels is one lamp; measured photons
-    compare whatever the lamp."""
+    """The lamp of each flat, by its id. A lamp that is measured before every pass over the levels is one lamp; measured
+    photons compare whatever the lamp."""
     seen: list[tuple[str, Spectrum]] = []
     names: dict[str | None, str | None] = {None: None}
     for path in dict.fromkeys(flat.radiance for flat in flats):

@@ -16,9 +16,9 @@ LINE_LIMIT = 0.7  # of saturation: range of the straight line of EMVA 1288
 CURVE_LIMIT = 0.9  # of saturation: range of the curve, whose top levels determine the curvature
 CURVATURE_PRIOR = 0.1  # standard deviation of c x_saturation / K; three levels are solvable, twenty don't see it
 EXCESS_CHANCE = 1e-3  # probability below which residuals of variances aren't sampling noise
-#: Degrees of freedom of the flats below which the test of their scatter misses an error of the model of three times the sampling's (with six it
-#: sees that in nine of ten series): the error is then taken as the usual one of real converters, a share of the variance beside the unevenness of
-#: the codes over the noise, DN.
+#: Degrees of freedom of the flats below which the test of their scatter misses an error of the model of three times the
+#: sampling's (with six it sees that in nine of ten series): the error is then taken as the usual one of real
+#: converters, a share of the variance beside the unevenness of the codes over the noise, DN.
 LEAST_FREEDOM, USUAL_ERROR, USUAL_CODE_ERROR_DN = 6.0, 0.01, 0.04
 SIGNIFICANT_SIGMA = 2.0  # standard deviations, with the error of the model, above which a curvature is used
 SECOND_DIFFERENCE_RMS = 12.0**-0.5  # rms of x about its mean over 0..1
@@ -205,7 +205,8 @@ class TransferPoints:
 
     def model_errors(self, used: NDArray[np.bool_], curve: TransferCurve) -> tuple[float, float]:
         """Relative errors of the model in darks and in flats: those for which chi2 has its expected value; 0 where
-        sampling explains the residuals, for the flats the usual error where these are too few to tell (`LEAST_FREEDOM`).
+        sampling explains the residuals, for the flats the usual error where these are too few to tell
+        (`LEAST_FREEDOM`).
 
         Source: Paule and Mandel, J. Res. Natl. Bur. Stand. 87, 377 (1982).
         """

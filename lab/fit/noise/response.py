@@ -101,14 +101,16 @@ def full_well(e: Evaluation) -> tuple[float | None, float | None]:
             level.plane[name].mean - e.dark.lines[name].black for level in e.levels.flats for name in e.levels.names
         ) / (e.levels.white_dn - e.dark.lines[None].black)
         e.remarks.add(
-            f"no flat saturates (the brightest reaches {100 * highest:.0f} % of the range): the full well isn't determined; expose longer"
+            f"no flat saturates (the brightest reaches {100 * highest:.0f} % of the range): the full well isn't "
+            "determined; expose longer"
         )
         return None, None
     value, name = max(seen)
     limit = e.levels.white_dn - e.dark.lines[name].black
     if value >= limit - 0.5:
         e.remarks.add(
-            f"saturation is the converter's limit ({e.levels.white_dn:g} DN): full_well_e is the signal there, and the pixel may hold more"
+            f"saturation is the converter's limit ({e.levels.white_dn:g} DN): full_well_e is the signal there, and "
+            "the pixel may hold more"
         )
     # The saturated value is rounded to whole DN
     return in_electrons(e, value, np.sqrt(QUANTISATION_DN2))
@@ -159,8 +161,10 @@ def remark_on_scatter(e: Evaluation) -> None:
         )
     if scatter > 1.5 * drift.relative:
         e.remarks.add(
-            f"the means of the levels scatter by {100 * scatter:.2g} % of the signal about a smooth response, where noise explains "
-            f"{100 * e.consistency.noise:.1g} %: it is in the uncertainties; a light that varies, exposures or photon numbers that are "
+            f"the means of the levels scatter by {100 * scatter:.2g} % of the signal about a smooth response, where "
+            "noise explains "
+            f"{100 * e.consistency.noise:.1g} %: it is in the uncertainties; a light that varies, exposures or photon "
+            "numbers that are "
             "stated wrong and a response with steps all do that"
         )
 
@@ -211,7 +215,8 @@ def variance_curvature_figures(e: Evaluation) -> dict[str, float]:
             "and it is seen in the neighbours' covariances" if seen else "which the neighbours' covariances don't show"
         )
         causes.append(
-            f"{100 * missing:.2g} +- {100 * missing_std:.1g} % of the noise that is missing beyond that (brighter-fatter, {where})"
+            f"{100 * missing:.2g} +- {100 * missing_std:.1g} % of the noise that is missing beyond that "
+            f"(brighter-fatter, {where})"
         )
     if causes and abs(t.relative_curvature) > 2.0 * t.relative_curvature_std:
         e.remarks.add(f"at saturation, the variance bends by {' and '.join(causes)}")
@@ -227,7 +232,8 @@ def response_curvature(e: Evaluation) -> tuple[float, float] | None:
     """
     if e.consistency.scatter > LARGEST_SCATTER:
         e.remarks.add(
-            f"the levels scatter by {100.0 * e.consistency.scatter:.2g} % of the signal about every smooth response: the curvature of the "
+            f"the levels scatter by {100.0 * e.consistency.scatter:.2g} % of the signal about every smooth response: "
+            "the curvature of the "
             "response isn't given"
         )
         return None
@@ -253,7 +259,8 @@ def response_curvature(e: Evaluation) -> tuple[float, float] | None:
         covariance *= factor
         if factor > 1.0 and rest > LARGEST_MISFIT * brought:
             e.remarks.add(
-                f"the means of the levels don't follow a response that bends like a parabola: they depart from it by {rest:.2g} times "
+                "the means of the levels don't follow a response that bends like a parabola: they depart from it by "
+                f"{rest:.2g} times "
                 f"their noise, its bend brings {brought:.2g} times; no curvature of the response is given"
             )
             return None
@@ -268,7 +275,8 @@ def response_curvature(e: Evaluation) -> tuple[float, float] | None:
     mean_std = float(np.sqrt(chi2_factor(chi2, len(values) - 1) / np.sum(weights)))
     if mean_std > LARGEST_BEND_STD:
         e.remarks.add(
-            f"the levels leave the curvature of the response uncertain to {100.0 * mean_std:.2g} % at saturation: it isn't given"
+            f"the levels leave the curvature of the response uncertain to {100.0 * mean_std:.2g} % at saturation: it "
+            "isn't given"
         )
         return None
     return mean, mean_std

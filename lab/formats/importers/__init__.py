@@ -1,6 +1,7 @@
-"""Importers: other formats as recording sets. Each turns a path into a `RecordingSet` whose frames are decoded when asked for;
-`lab.formats.recording_set.write` checks it and puts it on disk, completely or not at all. The set's `warnings` say what an importer left out,
-assumed or didn't find; the manifest's `notes` keep them. What can't be known is asked for: on the command line (`ImportOptions`), or in a descriptor."""
+"""Importers: other formats as recording sets. Each turns a path into a `RecordingSet` whose frames are decoded when
+asked for; `lab.formats.recording_set.write` checks it and puts it on disk, completely or not at all. The set's
+`warnings` say what an importer left out, assumed or didn't find; the manifest's `notes` keep them. What can't be known
+is asked for: on the command line (`ImportOptions`), or in a descriptor."""
 
 from __future__ import annotations
 
@@ -60,7 +61,8 @@ def _dot_grids(path: Path, options: ImportOptions) -> RecordingSet:
 def _checkerboards(path: Path, options: ImportOptions) -> RecordingSet:
     if options.checkerboard is None or not options.square_mm:
         raise InputError(
-            "--from checkerboard: state --checkerboard ROWSxCOLS, its inner corners, and --square-mm, the side of its squares, as in 6x9 and 25"
+            "--from checkerboard: state --checkerboard ROWSxCOLS, its inner corners, and --square-mm, the side of its "
+            "squares, as in 6x9 and 25"
         )
     return read_boards(path, "none", options.checkerboard, options.square_mm)
 
@@ -81,8 +83,8 @@ KINDS: dict[str, Importer] = {
 
 
 def read_foreign(kind: str, path: Path, options: ImportOptions | None = None) -> RecordingSet:
-    """The recordings at `path`, which are of `kind`; InputError where there is no such kind, it doesn't take one of the options, or the
-    recordings can't be used."""
+    """The recordings at `path`, which are of `kind`; InputError where there is no such kind, it doesn't take one of the
+    options, or the recordings can't be used."""
     options = options or ImportOptions()
     if kind not in KINDS:
         raise InputError(f"--from {kind}: no such format; choose {', '.join(KINDS)}")

@@ -1,13 +1,13 @@
 """Recordings for EMVA 1288: a folder with images and a descriptor, a text file that says what each image is.
 
-The descriptor's lines, in the form that the reference sets of the EMVA 1288 working group share: `v` release of the standard;
-`n` bits, width, height; `b` exposure (ns), photons a pixel: a bright level; `d` exposure (ns): a dark level; `i` path: one
-image of the level above it; `#` a comment. The file may have any name. Paths may have either slash and any
-case of letters. The spatial stacks are levels like the others, with more images.
+The descriptor's lines, in the form that the reference sets of the EMVA 1288 working group share: `v` release of the
+standard; `n` bits, width, height; `b` exposure (ns), photons a pixel: a bright level; `d` exposure (ns): a dark level;
+`i` path: one image of the level above it; `#` a comment. The file may have any name. Paths may have either slash and
+any case of letters. The spatial stacks are levels like the others, with more images.
 
-A descriptor doesn't give the wavelength of the light, the pixel pitch and the lens. A `camera.toml` beside it can: it has the
-keys of a recording set's camera, and `wavelength_nm`. Without it they stay unknown, and the warnings say what that prevents.
-"""
+A descriptor doesn't give the wavelength of the light, the pixel pitch and the lens. A `camera.toml` beside it can: it
+has the keys of a recording set's camera, and `wavelength_nm`. Without it they stay unknown, and the warnings say what
+that prevents."""
 
 from __future__ import annotations
 
@@ -101,7 +101,8 @@ def _numbers(words: list[str], least: int, line: int, what: str) -> list[float]:
 
 
 def find_descriptor(path: Path) -> Path:
-    """The descriptor: `path` itself, or the only descriptor among the text files in the folder, else one folder deeper."""
+    """The descriptor: `path` itself, or the only descriptor among the text files in the folder, else one folder
+    deeper."""
     if path.is_file():
         return path
 
@@ -195,7 +196,7 @@ def read_emva1288(path: Path) -> RecordingSet:
             "format": "calibench-recording",
             "version": 1,
             "name": path.resolve().name if path.is_dir() else file.stem,
-            "notes": f"imported from the EMVA 1288 descriptor {file.name}, release {descriptor.release or 'not stated'}",
+            "notes": f"imported from the EMVA 1288 descriptor {file.name}, release {descriptor.release or 'not stated'}",  # noqa: E501
             "cameras": {"left": keys},
             "captures": captures,
         }
@@ -216,7 +217,8 @@ def _shape_and_shift(
     rows, cols = frame.shape
     if (descriptor.height, descriptor.width) not in ((rows, cols), (None, None)):
         warnings.append(
-            f"{file}: line 'n' says {descriptor.height} x {descriptor.width}, the images are {rows} x {cols} (rows x cols): "
+            f"{file}: line 'n' says {descriptor.height} x {descriptor.width}, the images are {rows} x {cols} (rows x "
+            "cols): "
             "the images are believed; correct the line"
         )
     shift = 0
@@ -224,7 +226,8 @@ def _shape_and_shift(
         padding = 16 - descriptor.bits
         if np.any(frame & ((1 << padding) - 1)):
             raise InputError(
-                f"{first}: {int(frame.max())} DN is above the {descriptor.bits} bits of line 'n' in {file.name}; correct it"
+                f"{first}: {int(frame.max())} DN is above the {descriptor.bits} bits of line 'n' in {file.name}; "
+                "correct it"
             )
         shift = padding
         warnings.append(

@@ -20,7 +20,8 @@ import numpy as np
 from lab.errors import InputError, one_line
 from lab.formats.recording_set import Frame
 
-#: Endings of FITS files, and of what gzip makes of them; bytes that one may hold, at most: 32768 x 32768 pixels of 16 bit.
+#: Endings of FITS files, and of what gzip makes of them; bytes that one may hold, at most: 32768 x 32768 pixels of 16
+#: bit.
 FITS = (".fits", ".fit", ".fts")
 GZIP = ".gz"
 LARGEST_BYTES = 2 << 30
@@ -32,8 +33,8 @@ IMAGE_TYPES = {"dark": "dark", "bias": "dark", "zero": "dark", "flat": "flat"}
 class FitsHeader:
     """What a header states; None where it has no such keyword.
 
-    `kind` of IMAGETYP or OBSTYPE; `exposure_s` of EXPTIME or EXPOSURE; `temperature_c` of CCD-TEMP; `time` of DATE-OBS (UTC).
-    """
+    `kind` of IMAGETYP or OBSTYPE; `exposure_s` of EXPTIME or EXPOSURE; `temperature_c` of CCD-TEMP; `time` of DATE-OBS
+    (UTC)."""
 
     image_type: str | None
     kind: str | None
@@ -62,7 +63,8 @@ def load_fits(file: Path) -> Frame:
 
 
 def fits_header(file: Path, *, with_image: bool = True) -> FitsHeader:
-    """What the header says; InputError without the path. Without `with_image`, the image isn't read, and damage in it stays unseen."""
+    """What the header says; InputError without the path. Without `with_image`, the image isn't read, and damage in it
+    stays unseen."""
     header = _opened(file)[1] if with_image else _header(file)
     stated = header.get("IMAGETYP", header.get("OBSTYPE"))
     words = str(stated).lower() if stated is not None else ""

@@ -1,8 +1,9 @@
-"""A folder of FITS frames. The header of each says what it shows, or an `index.csv` beside them, as in a folder of raws.
+"""A folder of FITS frames. The header of each says what it shows, or an `index.csv` beside them, as in a folder of
+raws.
 
-Used of the header: IMAGETYP or OBSTYPE (dark, bias, zero, flat), EXPTIME or EXPOSURE (s), CCD-TEMP, DATE-OBS. An index has one row a frame;
-its empty cells of exposure, temperature and time are taken from the header. GAIN and BAYERPAT have no common meaning: state these values in
-`camera.toml`, which has the camera's keys, `cfa` and `bit_depth` at least.
+Used of the header: IMAGETYP or OBSTYPE (dark, bias, zero, flat), EXPTIME or EXPOSURE (s), CCD-TEMP, DATE-OBS. An index
+has one row a frame; its empty cells of exposure, temperature and time are taken from the header. GAIN and BAYERPAT have
+no common meaning: state these values in `camera.toml`, which has the camera's keys, `cfa` and `bit_depth` at least.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from lab.formats.recording_set import RecordingError, RecordingSet
 def read_fits_folder(path: Path, tap: str = "") -> RecordingSet:
     """The FITS frames in the folder `path` as a recording set. `tap`: that tap of the sensor alone.
 
-    Raises RecordingError with one line for every frame that can't be used: damaged, without an exposure. Frames whose image type is neither
-    dark nor flat need an `index.csv`; without one they are left out with a warning.
+    Raises RecordingError with one line for every frame that can't be used: damaged, without an exposure. Frames whose
+    image type is neither dark nor flat need an `index.csv`; without one they are left out with a warning.
     """
     if (path / INDEX).is_file():
         return recordings_of_index(path, _with_headers(path), str(path / INDEX), tap)

@@ -1,8 +1,9 @@
-"""What a frame's own file says of how it was taken: EXIF of JPEG, PNG and TIFF, the metadata of camera raws, the header of FITS frames.
+"""What a frame's own file says of how it was taken: EXIF of JPEG, PNG and TIFF, the metadata of camera raws, the header
+of FITS frames.
 
-EXIF (CIPA DC-008) has `ExposureTime`, `FNumber` and `PhotographicSensitivity`; a file that states one of them as 0 doesn't know it. Only headers
-are read. What can't be read is unknown here: that the frame itself is damaged is told where it is decoded.
-"""
+EXIF (CIPA DC-008) has `ExposureTime`, `FNumber` and `PhotographicSensitivity`; a file that states one of them as 0
+doesn't know it. Only headers are read. What can't be read is unknown here: that the frame itself is damaged is told
+where it is decoded."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, FITS, camera raws, .npy. They are decoded on access.
+"""Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, FITS, camera raws, .npy. They are decoded on
+access.
 
-A channel of transparency (RGBA) is dropped, and `has_alpha` says so. Spectra beside them may have semicolons and decimal commas.
-"""
+A channel of transparency (RGBA) is dropped, and `has_alpha` says so. Spectra beside them may have semicolons and
+decimal commas."""
 
 from __future__ import annotations
 
@@ -92,7 +93,8 @@ def _damage(data: bytes) -> str | None:
 
 
 def grey(image: NDArray[Any]) -> Frame:
-    """The grey values (rows, cols) of a decoded image; a channel of transparency is dropped. InputError for colours and other numbers."""
+    """The grey values (rows, cols) of a decoded image; a channel of transparency is dropped. InputError for colours and
+    other numbers."""
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"its values are {image.dtype}; save grey values of 8 or 16 bit")
     if image.ndim == 3:
@@ -106,8 +108,8 @@ def grey(image: NDArray[Any]) -> Frame:
 class ImageFiles(FolderFiles):
     """A folder whose frames are images. `images`: the file of each frame by its path in the recording set.
 
-    Values are shifted down by `shift` bits. The files are decoded on access and, as spectra, aren't copied byte by byte.
-    """
+    Values are shifted down by `shift` bits. The files are decoded on access and, as spectra, aren't copied byte by
+    byte."""
 
     def __init__(self, root: Path, images: Mapping[str, Path], shift: int = 0) -> None:
         super().__init__(root)
@@ -127,8 +129,8 @@ class ImageFiles(FolderFiles):
 
 
 def described_sides(file: Path) -> dict[Side, dict[str, Any]]:
-    """What `camera.toml` says of each side: its keys at the top are of a single (left) camera, or of every side where it has the tables
-    `[left]` and `[right]`. A missing file says nothing of the left one."""
+    """What `camera.toml` says of each side: its keys at the top are of a single (left) camera, or of every side where
+    it has the tables `[left]` and `[right]`. A missing file says nothing of the left one."""
     written: dict[str, Any] = {}
     if file.is_file():
         try:
@@ -147,8 +149,8 @@ def described_sides(file: Path) -> dict[Side, dict[str, Any]]:
 
 
 def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> dict[Side, DataSheet]:
-    """The cameras that `camera.toml` describes, by the keys of a recording set's camera. Keys that it leaves out come from that side's
-    `defaults`; a missing file is an empty one."""
+    """The cameras that `camera.toml` describes, by the keys of a recording set's camera. Keys that it leaves out come
+    from that side's `defaults`; a missing file is an empty one."""
     cameras = {}
     for side, keys in described_sides(file).items():
         known = {key: value for key, value in keys.items() if key != "taps"}  # of the readout, not of the data sheet

@@ -14,11 +14,11 @@ from lab.errors import InputError
 class ImportOptions:
     """Statements that a format doesn't hold. None: not stated.
 
-    `checkerboard`, `dots`: inner corners or dots (rows, cols), `square_mm` their spacing. `camera`: a camera file, in place of the
-    `camera.toml` beside the picture. `channel`: of a colour picture, R, G or B. `transfer`: what the picture's codes are, proportional to
-    the light or sRGB. `corners`: of a chart's 24 patches, [row, col] of dark skin, bluish green, black, white. `light`, `white_patch`: CSV of
-    the radiance of a perfect diffuser, or of the chart's white patch, in the chart's place. `tap`: one tap of the sensor alone.
-    """
+    `checkerboard`, `dots`: inner corners or dots (rows, cols), `square_mm` their spacing. `camera`: a camera file, in
+    place of the `camera.toml` beside the picture. `channel`: of a colour picture, R, G or B. `transfer`: what the
+    picture's codes are, proportional to the light or sRGB. `corners`: of a chart's 24 patches, [row, col] of dark skin,
+    bluish green, black, white. `light`, `white_patch`: CSV of the radiance of a perfect diffuser, or of the chart's
+    white patch, in the chart's place. `tap`: one tap of the sensor alone."""
 
     checkerboard: tuple[int, int] | None = None
     dots: tuple[int, int] | None = None
@@ -49,7 +49,8 @@ def grid(option: str, text: str) -> tuple[int, int] | None:
 
 
 def chart_corners(option: str, text: str) -> tuple[tuple[float, float], ...] | None:
-    """Eight numbers with commas as four corners (row, col); None where `text` is empty. Raises InputError, with the option's name."""
+    """Eight numbers with commas as four corners (row, col); None where `text` is empty. Raises InputError, with the
+    option's name."""
     if not text:
         return None
     try:

@@ -1,8 +1,9 @@
-"""`index.csv`: one row a capture, the columns a capture's keys in the recording set, the members of `screen` as `screen.pose`, ...
+"""`index.csv`: one row a capture, the columns a capture's keys in the recording set, the members of `screen` as
+`screen.pose`, ...
 
-Lists are written with spaces (`region`: `92 156 292 356`; `corners`: eight numbers). An empty cell is an unknown value. A row of kind
-`checkerboard` that has `squares` and `square_mm` is a printed board without markers, not a pattern on the screen.
-"""
+Lists are written with spaces (`region`: `92 156 292 356`; `corners`: eight numbers). An empty cell is an unknown value.
+A row of kind `checkerboard` that has `squares` and `square_mm` is a printed board without markers, not a pattern on the
+screen."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from lab.formats.foreign_text import in_its_unit, nearest_name, read_foreign_csv
 
 @dataclass(frozen=True)
 class Index:
-    """The rows of an index, (row number in the file, column -> cell) each, and in sentences what was found in reading it."""
+    """The rows of an index, (row number in the file, column -> cell) each, and in sentences what was found in reading
+    it."""
 
     rows: list[tuple[int, dict[str, str]]]
     remarks: tuple[str, ...] = ()
@@ -28,8 +30,8 @@ class Index:
 def read_index(file: Path, needed: tuple[str, ...] = ("frame", "kind")) -> Index:
     """The rows of `file`, whose header has the columns `needed`; cells without blanks, empty ones left out.
 
-    Raises InputError with one line where it can't be read, a column is missing, or one that isn't known is a known one in another unit or
-    misspelled. Other unknown columns are left out with a remark.
+    Raises InputError with one line where it can't be read, a column is missing, or one that isn't known is a known one
+    in another unit or misspelled. Other unknown columns are left out with a remark.
     """
     wanted = ",".join(dict.fromkeys((*needed, "side", "exposure_s")))
     if not file.is_file():
@@ -61,7 +63,8 @@ def read_index(file: Path, needed: tuple[str, ...] = ("frame", "kind")) -> Index
 
 
 def _check_header(file: Path, header: list[str], needed: tuple[str, ...]) -> list[str]:
-    """The columns that aren't used. Raises InputError for one that is missing, stands twice, or is meant to be a known one."""
+    """The columns that aren't used. Raises InputError for one that is missing, stands twice, or is meant to be a known
+    one."""
     known = _columns()
     unknown = [name for name in header if name and name not in known]
     meant = [(name, near) for name in unknown if (near := nearest_name(name, known)) is not None and near not in header]
@@ -71,7 +74,8 @@ def _check_header(file: Path, header: list[str], needed: tuple[str, ...]) -> lis
     missing = [f"'{name}'" for name in needed if name not in header]
     if missing:
         raise InputError(
-            f"{file}: the header has no columns {' and '.join(missing)} (it is '{' '.join(','.join(header).split())[:60]}'); "
+            f"{file}: the header has no columns {' and '.join(missing)} (it is "
+            f"'{' '.join(','.join(header).split())[:60]}'); "
             "name the columns as the capture's keys"
         )
     if twice := sorted({name for name in header if name and header.count(name) > 1}):
@@ -91,7 +95,8 @@ def _columns() -> list[str]:
 
 
 def capture_of_row(row: dict[str, str]) -> dict[str, Any]:
-    """A row as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`. Raises InputError without the row."""
+    """A row as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`. Raises InputError
+    without the row."""
     if "frame" not in row or "kind" not in row:
         raise InputError("the frame or its kind is missing; write both")
     if row["kind"] == "checkerboard" and "squares" in row and "square_mm" in row:

@@ -1,15 +1,15 @@
 """A folder of camera raws or grey images with an `index.csv` that says what each is, and a `camera.toml`.
 
-`index.csv` is that of `lab.formats.importers.index_file`. `side` may be left out (left), and `id` too (the file's name). Spectra (CSV) and
-targets (.npy) are named as in a recording set, relative to the folder.
+`index.csv` is that of `lab.formats.importers.index_file`. `side` may be left out (left), and `id` too (the file's
+name). Spectra (CSV) and targets (.npy) are named as in a recording set, relative to the folder.
 
-`camera.toml` has the keys of a recording set's camera, at the top for one camera, or in `[left]` and `[right]`. Without `rows`
-and `cols` these are taken from the images, and without `bit_depth` where the files themselves have 8 bit. Its `[[taps]]` are those of
-`lab.formats.importers.readout`.
+`camera.toml` has the keys of a recording set's camera, at the top for one camera, or in `[left]` and `[right]`. Without
+`rows` and `cols` these are taken from the images, and without `bit_depth` where the files themselves have 8 bit. Its
+`[[taps]]` are those of `lab.formats.importers.readout`.
 
-`read_checkerboard_pairs` (`calibench import --from raw-folder --checkerboard 6x9 --square-mm 25`) needs neither of the two files: it takes a
-folder of images named `leftNN` and `rightNN` of a plain checkerboard. `read_boards` takes the pictures of one camera, of a plain checkerboard or
-of a grid of dots; an `index.csv` may say what differs between them.
+`read_checkerboard_pairs` (`calibench import --from raw-folder --checkerboard 6x9 --square-mm 25`) needs neither of the
+two files: it takes a folder of images named `leftNN` and `rightNN` of a plain checkerboard. `read_boards` takes the
+pictures of one camera, of a plain checkerboard or of a grid of dots; an `index.csv` may say what differs between them.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ INDEX, CAMERA = "index.csv", "camera.toml"
 
 
 def read_raw_folder(path: Path, tap: str = "") -> RecordingSet:
-    """The captures that `index.csv` in the folder `path` lists, as a recording set. `tap`: that tap of the sensor alone.
+    """The captures that `index.csv` in the folder `path` lists, as a recording set. `tap`: that tap of the sensor
+    alone.
 
     Raises RecordingError with one line for every row that can't be used.
     """
@@ -56,7 +57,8 @@ def read_raw_folder(path: Path, tap: str = "") -> RecordingSet:
 
 
 def recordings_of_index(path: Path, index: Index, where: str, tap: str = "") -> RecordingSet:
-    """The captures of the rows of `index`, with the `camera.toml` of the folder `path`. `where`: what lists them, for messages."""
+    """The captures of the rows of `index`, with the `camera.toml` of the folder `path`. `where`: what lists them, for
+    messages."""
     cameras = path / CAMERA
     if not cameras.is_file():
         raise InputError(f"{cameras}: missing; write the camera's keys, `cfa` at least")
@@ -75,8 +77,8 @@ def recordings_of_index(path: Path, index: Index, where: str, tap: str = "") -> 
 def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: float) -> RecordingSet:
     """Pairs of images `leftNN` and `rightNN` of a plain checkerboard as a recording set of two grey cameras.
 
-    `corners`: inner corners of the board, (rows, cols), one less than its squares. Only whole pairs are taken; the warnings say
-    which images were left out.
+    `corners`: inner corners of the board, (rows, cols), one less than its squares. Only whole pairs are taken; the
+    warnings say which images were left out.
     """
     pairs: dict[str, dict[str, str]] = {}
     for file in sorted(path.iterdir()):
@@ -85,7 +87,8 @@ def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: flo
     whole = {pose: names for pose, names in pairs.items() if len(names) == 2}
     if not whole:
         raise InputError(
-            f"{path}: no pairs of images leftNN and rightNN; name them so, or give a single camera's to --from checkerboard"
+            f"{path}: no pairs of images leftNN and rightNN; name them so, or give a single camera's to --from "
+            "checkerboard"
         )
     board = {"dictionary": "none", "squares": f"{corners[0] + 1} {corners[1] + 1}", "square_mm": f"{square_mm:g}"}
     rows = [
@@ -110,8 +113,9 @@ def read_boards(
 ) -> RecordingSet:
     """Pictures of a plane board, each in another pose, as a recording set of one camera.
 
-    `points`: inner corners of a plain checkerboard (`dictionary` none) or dots, (rows, cols). `path`: a folder of images in the order of their
-    names, or one image; `camera.toml` beside them has the camera's keys, `cfa` at least. An `index.csv` there lists the pictures in place of the
+    `points`: inner corners of a plain checkerboard (`dictionary` none) or dots, (rows, cols). `path`: a folder of
+    images in the order of their names, or one image; `camera.toml` beside them has the camera's keys, `cfa` at least.
+    An `index.csv` there lists the pictures in place of the
     folder: its column `frame`, and where known `pose`, `exposure_s`, `wavelength_nm` (light of one wavelength), ...
     """
     board = {
@@ -226,8 +230,8 @@ def _spectra(manifest: Manifest) -> list[str]:
 
 
 def _measured(captures: list[dict[str, Any]], images: dict[str, Path]) -> tuple[dict[Side, dict[str, Any]], list[str]]:
-    """Rows and columns of each side's first image, and the bit depth of files of 8 bit: what `camera.toml` may leave out. And what is dropped
-    of the images, in sentences."""
+    """Rows and columns of each side's first image, and the bit depth of files of 8 bit: what `camera.toml` may leave
+    out. And what is dropped of the images, in sentences."""
     measured: dict[Side, dict[str, Any]] = {}
     remarks = []
     for side in get_args(Side):

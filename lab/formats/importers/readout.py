@@ -6,10 +6,10 @@
     overscan = [0, 1024, 1024, 1056]    # what the same tap reads without pixels: its bias
     black_level_dn = 100                # in place of an overscan
 
-The regions tile a rectangle once the rows and columns that no region has are cut out: what lies between two taps has to be overscan, that around
-them may be anything. `rows`, `cols` and `cfa` of the camera are those of the joined frame.
-Each tap's black level is the mean of its overscan over the frames. Taps are shifted by whole DN to one black level; codes stay codes. What is
-left, and unequal gains, is in the frames: `--tap NAME` imports one tap alone.
+The regions tile a rectangle once the rows and columns that no region has are cut out: what lies between two taps has to
+be overscan, that around them may be anything. `rows`, `cols` and `cfa` of the camera are those of the joined frame.
+Each tap's black level is the mean of its overscan over the frames. Taps are shifted by whole DN to one black level;
+codes stay codes. What is left, and unequal gains, is in the frames: `--tap NAME` imports one tap alone.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class Tap(Frozen):
 
 @dataclass(frozen=True)
 class Readout:
-    """The taps of a sensor as they are imported: the rows and columns of the frame that are kept, and what is added to each tap's codes.
+    """The taps of a sensor as they are imported: the rows and columns of the frame that are kept, and what is added to
+    each tap's codes.
 
     `black_level_dn`: of the frames that come out. `remarks`: what was measured, in sentences.
     """
@@ -100,8 +101,8 @@ def parse_taps(listed: Any, where: str) -> tuple[Tap, ...]:
 
 
 def readout(taps: Sequence[Tap], files: Sequence[Path], shape: tuple[int, int], where: str) -> Readout:
-    """How frames of `shape` (rows, cols) are cropped and levelled. Raises InputError where a region isn't inside the frame, the regions
-    don't tile a rectangle, or a black level isn't known."""
+    """How frames of `shape` (rows, cols) are cropped and levelled. Raises InputError where a region isn't inside the
+    frame, the regions don't tile a rectangle, or a black level isn't known."""
     for tap in taps:
         _check_inside(tap, shape, where)
     kept_rows, kept_cols, cut = _tiled(taps, shape, where)
@@ -122,7 +123,8 @@ def readout(taps: Sequence[Tap], files: Sequence[Path], shape: tuple[int, int], 
         std = float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
         drift = f", which changes by {np.ptp(means):.2g} DN over the frames" if np.ptp(means) > DRIFT_DN else ""
         remarks.append(
-            f"{where}: tap {tap.name}: overscan of {len(means)} frames {levels[-1]:.2f} +- {std / np.sqrt(len(means)):.2g} DN{drift}"
+            f"{where}: tap {tap.name}: overscan of {len(means)} frames {levels[-1]:.2f} +- "
+            f"{std / np.sqrt(len(means)):.2g} DN{drift}"
         )
     common = min(levels)
     shift = tuple(-round(level - common) for level in levels)
@@ -130,7 +132,8 @@ def readout(taps: Sequence[Tap], files: Sequence[Path], shape: tuple[int, int], 
     if len(taps) > 1:
         said = ", ".join(f"{tap.name} {moved:+d}" for tap, moved in zip(taps, shift, strict=True))
         remarks.append(
-            f"{where}: taps shifted by whole DN to one black level ({said}); they still differ by {np.ptp(left):.2g} DN, and by their "
+            f"{where}: taps shifted by whole DN to one black level ({said}); they still differ by {np.ptp(left):.2g} "
+            "DN, and by their "
             "gains: --tap NAME imports one alone"
         )
     return Readout(tuple(taps), kept_rows, kept_cols, shift, float(np.mean(left)), tuple(remarks))
@@ -165,7 +168,8 @@ def _tiled(
     for tap in taps:
         if tap.overscan is not None and count[_box(tap.overscan)].any():
             raise InputError(
-                f"{where}: tap {tap.name}: overscan {list(tap.overscan)} holds pixels of a tap's region; correct one of them"
+                f"{where}: tap {tap.name}: overscan {list(tap.overscan)} holds pixels of a tap's region; correct one "
+                "of them"
             )
     cut = []
     for name, kept, blank in (
@@ -176,7 +180,8 @@ def _tiled(
         for run in np.split(between, np.flatnonzero(np.diff(between) > 1) + 1) if between.size else ():
             if not blank[run].all():
                 raise InputError(
-                    f"{where}: the taps' regions leave gaps: {name} {run[0]}..{run[-1]} belongs to no region, and isn't all overscan; "
+                    f"{where}: the taps' regions leave gaps: {name} {run[0]}..{run[-1]} belongs to no region, and "
+                    "isn't all overscan; "
                     "correct the regions, or state the overscan"
                 )
             cut.append(f"{name} {run[0]}..{run[-1]}")

@@ -1,8 +1,9 @@
 """One picture of a slanted edge, or of a ColorChecker: PNG, TIFF, JPEG, FITS, .npy or a camera raw.
 
-`camera.toml` beside it (or `--camera FILE`) has the camera's keys: `cfa`, `bit_depth` and `black_level_dn` have to be stated, and everything
-else that is known helps. A colour picture is no mosaic: of an edge one channel is taken as that of a monochrome camera, a chart is sampled like
-an RGGB mosaic of the same size. Its noise is that of a demosaiced picture.
+`camera.toml` beside it (or `--camera FILE`) has the camera's keys: `cfa`, `bit_depth` and `black_level_dn` have to be
+stated, and everything else that is known helps. A colour picture is no mosaic: of an edge one channel is taken as that
+of a monochrome camera, a chart is sampled like an RGGB mosaic of the same size. Its noise is that of a demosaiced
+picture.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ CHART = "ColorChecker24"
 PATCH_ROWS, PATCH_COLS = 4, 6
 #: Enlargements of the picture in which a chart is looked for, in turn: the detector finds patches of some sizes only.
 SCALES = (1, 2, 3, 4, 6)
-#: Grey rim laid about the picture, over its shorter side, and its code: a chart that fills the frame isn't found without.
+#: Grey rim laid about the picture, over its shorter side, and its code: a chart that fills the frame isn't found
+#: without.
 PADS, RIM_CODE = (0.0, 0.125), 110
 
 Corners = tuple[tuple[float, float], ...]
@@ -63,7 +65,8 @@ def read_slanted_edge(path: Path, options: ImportOptions) -> RecordingSet:
 
 
 def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
-    """A picture of a ColorChecker of 24 patches as a recording set of one capture; the patches are located, or given by their corners.
+    """A picture of a ColorChecker of 24 patches as a recording set of one capture; the patches are located, or given by
+    their corners.
 
     Raises InputError with all that isn't stated, in one line, or where no chart is found.
     """
@@ -84,10 +87,11 @@ def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
 
 
 def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
-    """Corners of the grid of patches, [row, col] of dark skin, bluish green, black, white; None where no chart is found.
+    """Corners of the grid of patches, [row, col] of dark skin, bluish green, black, white; None where no chart is
+    found.
 
-    Patches are found by OpenCV's MCC detector in the mosaic binned to its period; a homography through the 24 centres gives the corners.
-    """
+    Patches are found by OpenCV's MCC detector in the mosaic binned to its period; a homography through the 24 centres
+    gives the corners."""
     step = mosaic.step(camera.cfa)
     picture = _small_colours(frame, camera)
     for pad, scale in ((pad, scale) for pad in PADS for scale in SCALES):
@@ -113,8 +117,8 @@ def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
 
 
 def _upright(frame: Frame, camera: DataSheet, corners: Corners) -> Corners:
-    """The corners in the order of a chart that isn't mirrored, of whose two the grey row falls: the detector may take it turned or
-    mirrored where light has one colour."""
+    """The corners in the order of a chart that isn't mirrored, of whose two the grey row falls: the detector may take
+    it turned or mirrored where light has one colour."""
     orders = ((0, 1, 2, 3), (2, 3, 0, 1), (1, 0, 3, 2), (3, 2, 1, 0))
     found = [tuple(corners[k] for k in order) for order in orders]
 
@@ -132,8 +136,8 @@ def _picture(
     plane_of: Callable[[NDArray[Any]], tuple[Frame, str]],
     missing: tuple[str, ...],
 ) -> tuple[Frame, DataSheet, tuple[str, ...]]:
-    """The frame, its camera, and what was done to it. Raises InputError that names everything that isn't stated. `plane_of`: frame and
-    mosaic of a colour picture (rows, cols, 3) in R, G, B."""
+    """The frame, its camera, and what was done to it. Raises InputError that names everything that isn't stated.
+    `plane_of`: frame and mosaic of a colour picture (rows, cols, 3) in R, G, B."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give one picture")
     file, keys = _stated_camera(path, options)
@@ -219,7 +223,8 @@ def _remosaiced(image: NDArray[Any]) -> tuple[Frame, str]:
 
 
 def _small_colours(frame: Frame, camera: DataSheet) -> NDArray[np.uint8]:
-    """The mosaic binned to its period as a picture for a screen, (rows, cols, 3) in B, G, R: each channel over its brightest per mille."""
+    """The mosaic binned to its period as a picture for a screen, (rows, cols, 3) in B, G, R: each channel over its
+    brightest per mille."""
     step = mosaic.step(camera.cfa)
     black = camera.black_level_dn or 0.0
     rows, cols = (n // step for n in frame.shape)
@@ -236,13 +241,15 @@ def _check_grey_row(path: Path, frame: Frame, camera: DataSheet, corners: Corner
     corner = np.array(corners, float)
     if not np.all((corner >= -0.5) & (corner <= np.array(frame.shape) - 0.5)):
         raise InputError(
-            f"{path}: a corner of the chart is outside the frame of {frame.shape[0]} x {frame.shape[1]}; give [row, col]"
+            f"{path}: a corner of the chart is outside the frame of {frame.shape[0]} x {frame.shape[1]}; give [row, "
+            "col]"
         )
     level = grey_levels(frame, corners) - (camera.black_level_dn or 0.0)
     if np.any(np.diff(level) >= 0) or level[0] < WHITE_OVER_BLACK * max(level[-1], 1e-9):
         said = ", ".join(f"{value:.4g}" for value in level)
         raise InputError(
-            f"{path}: the grey row doesn't fall from white to black between these corners ({said} DN above black); give --corners as "
+            f"{path}: the grey row doesn't fall from white to black between these corners ({said} DN above black); "
+            "give --corners as "
             "row and column of dark skin, bluish green, black, white"
         )
 

@@ -1,7 +1,7 @@
 """What is stated of the frames' settings, held against limits, the frames' own files and the times between them.
 
-A contradiction is one line with the file and both values. Three of them can't be anything but a slip and are refused: an exposure that no frame
-has, one that is off by a unit, and rows that fit their frames when all are moved by one.
+A contradiction is one line with the file and both values. Three of them can't be anything but a slip and are refused:
+an exposure that no frame has, one that is off by a unit, and rows that fit their frames when all are moved by one.
 """
 
 from __future__ import annotations
@@ -17,13 +17,16 @@ from lab.errors import InputError
 from lab.formats.importers.frame_header import FrameHeader, frame_header
 from lab.formats.recording_set import Manifest
 
-#: Longest exposure that is taken without a header that says it (that of a sequence's darks), and of one with light that isn't told, s.
+#: Longest exposure that is taken without a header that says it (that of a sequence's darks), and of one with light that
+#: isn't told, s.
 LONGEST_S, LONGEST_LIT_S = 3600.0, 60.0
-#: Factor within which a shutter that is marked in thirds of a stop is meant, half of a third: 1/60 s is 1/64 s. Others are measured: relative.
+#: Factor within which a shutter that is marked in thirds of a stop is meant, half of a third: 1/60 s is 1/64 s. Others
+#: are measured: relative.
 MARKED_FACTOR, MEASURED_SHARE = 2.0 ** (1.0 / 6.0), 0.02
 #: Factor within which two f-numbers are one marking: half of a third of a stop, by the square root. f/5.6 is 5.66.
 F_NUMBER_FACTOR = 2.0 ** (1.0 / 12.0)
-#: Difference of two gains that ISO speeds, marked in thirds of a stop (2 dB), leave open, dB; and of temperatures, degree C.
+#: Difference of two gains that ISO speeds, marked in thirds of a stop (2 dB), leave open, dB; and of temperatures,
+#: degree C.
 GAIN_DB, TEMPERATURE_C = 1.0, 1.0
 #: What a time that is written to the second leaves open, s.
 CLOCK_S = 1.0
@@ -34,10 +37,11 @@ FEWEST_ROWS, FEWEST_OFF = 4, 2
 
 
 def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -> list[str]:
-    """One line for each quantity of `manifest` that the frames' own files contradict, and for exposures that are hardly meant in seconds.
+    """One line for each quantity of `manifest` that the frames' own files contradict, and for exposures that are hardly
+    meant in seconds.
 
-    `images`: the file of each frame by its path. Raises InputError where the exposures can't be right: `where` names what lists them.
-    """
+    `images`: the file of each frame by its path. Raises InputError where the exposures can't be right: `where` names
+    what lists them."""
     headers = {path: frame_header(file) for path, file in images.items()}
     seen = [
         _HeaderSeen(capture, images[capture.frame], header)
@@ -49,7 +53,8 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
     if off and (unit := _unit(off)):
         one = off[0]
         raise InputError(
-            f"{one.file}: exposure_s = {one.capture.exposure_s:g} s, its {one.header.source} says {one.header.exposure_s:g} s{_and(off)}: "
+            f"{one.file}: exposure_s = {one.capture.exposure_s:g} s, its {one.header.source} says "
+            f"{one.header.exposure_s:g} s{_and(off)}: "
             f"it seems to be in {unit}; write seconds"
         )
     confirmed = {one.capture.id for one in timed} - {one.capture.id for one in off}
@@ -57,8 +62,10 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
     _check_limit([c for c in doubted if c.exposure_s > LONGEST_S], images)
     if moved := _moved(timed, off):
         raise InputError(
-            f"{where}: {len(off)} of {len(timed)} exposures contradict their frames ({off[0].file.name}: {off[0].capture.exposure_s:g} s, its "
-            f"{off[0].header.source} says {off[0].header.exposure_s:g} s), and fit those of the frames of {moved}: move the column of the "
+            f"{where}: {len(off)} of {len(timed)} exposures contradict their frames ({off[0].file.name}: "
+            f"{off[0].capture.exposure_s:g} s, its "
+            f"{off[0].header.source} says {off[0].header.exposure_s:g} s), and fit those of the frames of {moved}: "
+            "move the column of the "
             "frames by one row"
         )
     lines = [_said("exposure_s", "s", [(one, one.capture.exposure_s, one.header.exposure_s) for one in off])]
@@ -90,7 +97,8 @@ def _check_limit(too_long: Sequence[Capture], images: Mapping[str, Path]) -> Non
     if too_long:
         more = f", and {len(too_long) - 1} more" if len(too_long) > 1 else ""
         raise InputError(
-            f"{images[too_long[0].frame]}: exposure_s = {too_long[0].exposure_s:g} is beyond the limit of {LONGEST_S:g} s{more}, and no header says "
+            f"{images[too_long[0].frame]}: exposure_s = {too_long[0].exposure_s:g} is beyond the limit of "
+            f"{LONGEST_S:g} s{more}, and no header says "
             "so; write seconds (microseconds over 1e6)"
         )
 
@@ -140,11 +148,15 @@ def _and(off: Sequence[object]) -> str:
 
 
 def _said(key: str, unit: str, off: Sequence[tuple[_HeaderSeen, float | None, float | None]]) -> str:
-    """The line for a quantity of which frames, what is stated and what their files say differ; empty where none does."""
+    """The line for a quantity of which frames, what is stated and what their files say differ; empty where none
+    does."""
     if not off:
         return ""
     (one, stated, header), of = off[0], f" {unit}" if unit else ""
-    return f"{one.file}: {key} = {stated:g}{of}, its {one.header.source} says {header:g}{of}{_and(off)}; the former is used: correct what is wrong"
+    return (
+        f"{one.file}: {key} = {stated:g}{of}, its {one.header.source} says {header:g}{of}{_and(off)}; the former is "
+        "used: correct what is wrong"
+    )
 
 
 def _uneven_gain(own: Sequence[_HeaderSeen]) -> str:
@@ -165,7 +177,8 @@ def _uneven_gain(own: Sequence[_HeaderSeen]) -> str:
     stated = "unknown" if one.capture.gain_db is None else f"{one.capture.gain_db:g} dB"
     return (
         f"{one.file}: its {one.header.source} says ISO {one.header.iso:g} and that of {first.file.name} ISO {iso:g}, "
-        f"{20.0 * log10((one.header.iso or iso) / iso):+.1f} dB, but gain_db is {stated}{_and(off)}; write the gain of each into the column gain_db"
+        f"{20.0 * log10((one.header.iso or iso) / iso):+.1f} dB, but gain_db is {stated}{_and(off)}; write the gain "
+        "of each into the column gain_db"
     )
 
 
@@ -176,7 +189,8 @@ def _long(doubted: Sequence[Capture], images: Mapping[str, Path]) -> str:
         return ""
     more = f", and {len(long) - 1} more" if len(long) > 1 else ""
     return (
-        f"{images[long[0].frame]}: exposure_s = {long[0].exposure_s:g} of a {long[0].kind}{more}, beyond {LONGEST_LIT_S:g} s of light: "
+        f"{images[long[0].frame]}: exposure_s = {long[0].exposure_s:g} of a {long[0].kind}{more}, beyond "
+        f"{LONGEST_LIT_S:g} s of light: "
         "check that it is in seconds, not in milliseconds or microseconds"
     )
 
@@ -191,7 +205,8 @@ def _overlapping(captures: Sequence[Capture], images: Mapping[str, Path]) -> lis
             shorter_s = min(one.exposure_s, other.exposure_s)  # times are of the beginning or of the end of an exposure
             if one.frame != other.frame and later_s - at_s + CLOCK_S < shorter_s * (1.0 - MEASURED_SHARE):
                 lines.append(
-                    f"{images[one.frame]}: exposure_s = {one.exposure_s:g}, but {images[other.frame].name} of {other.exposure_s:g} s was taken "
+                    f"{images[one.frame]}: exposure_s = {one.exposure_s:g}, but {images[other.frame].name} of "
+                    f"{other.exposure_s:g} s was taken "
                     f"{later_s - at_s:g} s later; check that exposures are in seconds, and the times"
                 )
                 break

@@ -1,7 +1,7 @@
 """The recording set: the folder format in which recordings come in from outside and go out again.
 
-`read` checks a whole folder and reports all problems at once, one line each. `write` writes a folder completely or not at all. The kinds of capture are in `lab.capture_kinds`.
-"""
+`read` checks a whole folder and reports all problems at once, one line each. `write` writes a folder completely or not
+at all. The kinds of capture are in `lab.capture_kinds`."""
 
 from lab.formats.recording_set.archive import ArchiveForm, archive, packed
 from lab.formats.recording_set.checks import inspect

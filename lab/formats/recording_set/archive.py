@@ -36,8 +36,9 @@ class _Sent(io.RawIOBase):
 
 
 def packed(files: Iterable[tuple[str, bytes]], form: ArchiveForm = "zip") -> Iterator[bytes]:
-    """The pieces of an archive of files, (path, content) each: one of them in memory at a time, stored without compression. Where `files` raises,
-    the archive has no end (a .zip: no list of files), so nobody takes it for a whole one."""
+    """The pieces of an archive of files, (path, content) each: one of them in memory at a time, stored without
+    compression. Where `files` raises, the archive has no end (a .zip: no list of files), so nobody takes it for a whole
+    one."""
     sent = _Sent()
     if form == "tar":
         with tarfile.open(fileobj=sent, mode="w|") as tar:
@@ -56,5 +57,6 @@ def packed(files: Iterable[tuple[str, bytes]], form: ArchiveForm = "zip") -> Ite
 
 
 def archive(recordings: RecordingSet, form: ArchiveForm = "zip") -> Iterator[bytes]:
-    """The pieces of an archive of the set, as `packed` makes it. Raises InputError where a frame is missing or damaged."""
+    """The pieces of an archive of the set, as `packed` makes it. Raises InputError where a frame is missing or
+    damaged."""
     return packed(contents(recordings), form)

@@ -30,7 +30,8 @@ from sim.camera import Side
 
 #: Share of a channel's pixels at its highest code from which on a flat's mean isn't in proportion to the light.
 ANY_CLIPPED = 0.01
-#: A warning is given where a narrowband light's centre is off the wavelength set by more than this plus a quarter of its bandwidth.
+#: A warning is given where a narrowband light's centre is off the wavelength set by more than this plus a quarter of
+#: its bandwidth.
 OFF_NAME_NM = 3.0
 
 
@@ -53,9 +54,15 @@ def _unknown_keys(where: str, item: Open) -> Iterator[str]:
 def _camera_problems(camera: DataSheet) -> Iterator[str]:
     limit = 2**camera.bit_depth - 1
     if camera.white_level_dn is not None and camera.white_level_dn > limit:
-        yield f"white_level_dn = {camera.white_level_dn:g} is above what {camera.bit_depth} bits hold ({limit}); correct one"
+        yield (
+            f"white_level_dn = {camera.white_level_dn:g} is above what {camera.bit_depth} bits hold ({limit}); "
+            "correct one"
+        )
     if camera.black_level_dn is not None and camera.black_level_dn >= camera.saturation_dn:
-        yield f"black_level_dn = {camera.black_level_dn:g} isn't below the white level {camera.saturation_dn:g}; correct one"
+        yield (
+            f"black_level_dn = {camera.black_level_dn:g} isn't below the white level {camera.saturation_dn:g}; "
+            "correct one"
+        )
     for channel in camera.quantum_efficiency or {}:
         if channel not in camera.channels:
             yield (
@@ -65,8 +72,8 @@ def _camera_problems(camera: DataSheet) -> Iterator[str]:
 
 
 def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> None:
-    """Load every frame once and hand it to `loaded`; find damaged frames, saturated flats, clipped captures, and darks and flats whose levels
-    contradict their kind or their place."""
+    """Load every frame once and hand it to `loaded`; find damaged frames, saturated flats, clipped captures, and darks
+    and flats whose levels contradict their kind or their place."""
     flats: dict[Side, list[ClippedLevel]] = defaultdict(list)
     levels: dict[Side, list[FrameLevel]] = defaultdict(list)
     clipped_of: dict[tuple[Side, str], list[str]] = defaultdict(list)
@@ -101,7 +108,8 @@ def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> 
         found.warnings += [*warnings, *([] if problems else moved_rows(of_frames))]
     for (side, kind), ids in clipped_of.items():
         found.warnings.append(
-            f"{recordings.source}: {len(ids)} {kind} captures of the {side} camera have a channel clipped ({_some(ids)}); "
+            f"{recordings.source}: {len(ids)} {kind} captures of the {side} camera have a channel clipped "
+            f"({_some(ids)}); "
             "what a clipped channel saw is not used; expose shorter"
         )
 
@@ -217,7 +225,8 @@ def _lights_off_their_names(recordings: RecordingSet) -> Iterator[str]:
                 off[capture.radiance] = f"{capture.wavelength_nm:g} nm: {centre_nm:.1f} nm"
     if off:
         yield (
-            f"{recordings.source}: {len(off)} narrowband lights are centred elsewhere than they are set ({'; '.join(off.values())}); "
+            f"{recordings.source}: {len(off)} narrowband lights are centred elsewhere than they are set "
+            f"({'; '.join(off.values())}); "
             "their measured spectra are used; correct wavelength_nm, or measure again"
         )
 

@@ -19,16 +19,19 @@ CLIPPED_LIMIT = 0.5
 PHOTONS = "photons"
 #: Least number of unsaturated levels below a saturated flat for it to be the top of an exposure series.
 SERIES_LEVELS = 3
-#: Share of the levels of a light whose stated light may contradict the others: these are left out, and a warning names them.
+#: Share of the levels of a light whose stated light may contradict the others: these are left out, and a warning names
+#: them.
 WRONG_SHARE = 0.2
-#: Factor between the stated light of an unsaturated level and that which the others' median slope gives its mean, above which it contradicts them.
+#: Factor between the stated light of an unsaturated level and that which the others' median slope gives its mean, above
+#: which it contradicts them.
 WRONG_FACTOR = 1.5
-#: Scatter of a plane's pixels over the greatest of the dimmer levels, below which the response bends: noise, PRNU and shading grow with the signal
-#: until a full well or a bend of the response holds the pixels together.
+#: Scatter of a plane's pixels over the greatest of the dimmer levels, below which the response bends: noise, PRNU and
+#: shading grow with the signal until a full well or a bend of the response holds the pixels together.
 BENT_SCATTER = 0.8
 #: Relative difference of two lights below which they are one level: readings of a light scatter.
 SAME_LIGHT = 0.01
-#: Least share of the flat's signal that these levels must predict for it. Below 1, as lamps and sensors aren't exactly linear.
+#: Least share of the flat's signal that these levels must predict for it. Below 1, as lamps and sensors aren't exactly
+#: linear.
 LEAST_PREDICTED = 0.85
 
 
@@ -59,11 +62,12 @@ def channel_planes(frame: Frame, camera: DataSheet) -> dict[str, list[Frame]]:
 
 
 def clipped_share(frame: Frame, camera: DataSheet) -> dict[str, float]:
-    """Share of each channel's pixels at the channel's highest code, if that is above half of the range, else at the white level.
+    """Share of each channel's pixels at the channel's highest code, if that is above half of the range, else at the
+    white level.
 
-    The highest code counts because a sensor whose full well lies below the converter's range saturates below `white_level_dn`.
-    Photon noise never puts half of the pixels on one code, so a share above `CLIPPED_LIMIT` means saturation in both cases.
-    """
+    The highest code counts because a sensor whose full well lies below the converter's range saturates below
+    `white_level_dn`. Photon noise never puts half of the pixels on one code, so a share above `CLIPPED_LIMIT` means
+    saturation in both cases."""
     black = camera.black_level_dn or 0.0
     middle = black + (camera.saturation_dn - black) / 2
     shares = {}
@@ -98,9 +102,9 @@ def flat_level(recordings: RecordingSet, flat: FlatCapture, frame: Frame, clippe
 def _why_not_series_end(level: ClippedLevel, channel: str, levels: list[ClippedLevel], black: float) -> str | None:
     """Why the clipped `channel` of a flat isn't the top of an exposure series, with the remedy; None where it is.
 
-    EMVA 1288 asks for exposures up to and beyond saturation. A clipped flat is accepted where at least `SERIES_LEVELS` unclipped
-    levels of the same gain and light lie below it, their slope predicts that it clips, and its repeats clip too.
-    """
+    EMVA 1288 asks for exposures up to and beyond saturation. A clipped flat is accepted where at least `SERIES_LEVELS`
+    unclipped levels of the same gain and light lie below it, their slope predicts that it clips, and its repeats clip
+    too."""
     unclipped = [
         other
         for other in levels
@@ -121,12 +125,14 @@ def _why_not_series_end(level: ClippedLevel, channel: str, levels: list[ClippedL
 
 
 def contradicting_levels(unclipped: list[ClippedLevel], channel: str, black: float) -> list[ClippedLevel]:
-    """Unclipped flats of one gain and light whose stated light contradicts that of the others by more than `WRONG_FACTOR`.
+    """Unclipped flats of one gain and light whose stated light contradicts that of the others by more than
+    `WRONG_FACTOR`.
 
-    The reference is the median slope of signal against light, which holds while fewer than half of the levels are wrong. Empty where more
-    than `WRONG_SHARE` of the levels contradict it: then no majority says what the light is. `black`: DN; if unknown, the offset of a robust
-    line through the levels (Theil and Sen). Levels at the full well or in the bend at the top of the response don't count for the slope,
-    and less signal than the slope predicts is no contradiction there.
+    The reference is the median slope of signal against light, which holds while fewer than half of the levels are
+    wrong. Empty where more than `WRONG_SHARE` of the levels contradict it: then no majority says what the light is.
+    `black`: DN; if unknown, the offset of a robust line through the levels (Theil and Sen). Levels at the full well or
+    in the bend at the top of the response don't count for the slope, and less signal than the slope predicts is no
+    contradiction there.
     """
     bent = _bent_levels(unclipped, channel)
     signals: dict[float, float] = {}
@@ -173,7 +179,8 @@ def wrong_lights(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]
             off = contradicting_levels(unclipped, channel, camera.black_level_dn or 0.0)
             for of in _by_light(off):
                 yield (
-                    f"{of[0].where}: {len(of)} flats of a stated light of {of[0].light:.6g} ({of[0].scale}) have {of[0].mean_dn[channel]:.4g} DN, "
+                    f"{of[0].where}: {len(of)} flats of a stated light of {of[0].light:.6g} ({of[0].scale}) have "
+                    f"{of[0].mean_dn[channel]:.4g} DN, "
                     "which contradicts the other levels; the fits judge that; correct the photon number or the exposure"
                 )
             if off:
@@ -182,7 +189,8 @@ def wrong_lights(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]
     forgiven = _forgiven(misplaced, levels)
     for first, *_ in _by_light([level for level, *_ in misplaced if id(level) in forgiven]):
         yield (
-            f"{first.where}: saturated though its stated {first.light:.6g} photons are fewer than those of levels that aren't: left out by the "
+            f"{first.where}: saturated though its stated {first.light:.6g} photons are fewer than those of levels "
+            "that aren't: left out by the "
             "fits; correct the photon number"
         )
 
@@ -201,7 +209,8 @@ def _by_light(levels: list[ClippedLevel]) -> list[list[ClippedLevel]]:
 
 
 def saturated_flats(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]:
-    """One line for each clipped flat that isn't the top of an exposure series, unless its photon number may be wrong."""
+    """One line for each clipped flat that isn't the top of an exposure series, unless its photon number may be
+    wrong."""
     misplaced = list(_misplaced(levels, camera))
     forgiven = _forgiven(misplaced, levels)
     for level, channel, why in misplaced:
@@ -222,7 +231,8 @@ def _misplaced(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[tuple[
 
 
 def _forgiven(misplaced: list[tuple[ClippedLevel, str, str]], levels: list[ClippedLevel]) -> set[int]:
-    """Ids of misplaced flats that state photon numbers, if they are few enough: a stated number may be wrong, unlike an exposure."""
+    """Ids of misplaced flats that state photon numbers, if they are few enough: a stated number may be wrong, unlike an
+    exposure."""
     photons = [level for level, *_ in misplaced if level.scale.startswith(PHOTONS)]
     lights = {level.light for level in levels if level.scale.startswith(PHOTONS)}
     few = len({level.light for level in photons}) <= WRONG_SHARE * len(lights)

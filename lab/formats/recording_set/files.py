@@ -1,4 +1,5 @@
-"""Where a recording set's frames, spectra and targets come from: a folder, memory, or a combination of other sources."""
+"""Where a recording set's frames, spectra and targets come from: a folder, memory, or a combination of other
+sources."""
 
 from __future__ import annotations
 

@@ -61,7 +61,8 @@ def _load_npy(file: Path, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
 
 
 def _load_tif(file: Path, wanted: tuple[int, int] | None = None) -> NDArray[Any]:
-    """A TIFF of one page, 16 bit, one sample a pixel. One of another shape than `wanted` isn't decoded: it may be far larger than its file."""
+    """A TIFF of one page, 16 bit, one sample a pixel. One of another shape than `wanted` isn't decoded: it may be far
+    larger than its file."""
     frame = None
     try:
         with tifffile.TiffFile(file) as tif:
@@ -100,7 +101,8 @@ def _load_raw(file: Path, shape: tuple[int, int] | None = None) -> NDArray[Any]:
 
 
 def load_frame(file: Path, shape: tuple[int, int] | None = None) -> Frame:
-    """One frame from an .npy, .tif/.tiff or camera-raw file: uint16 (rows, cols) as stored. Its InputError leaves the path to the caller."""
+    """One frame from an .npy, .tif/.tiff or camera-raw file: uint16 (rows, cols) as stored. Its InputError leaves the
+    path to the caller."""
     suffix = file.suffix.lower()
     if suffix == ".npy":
         return _load_npy(file, np.uint16)
@@ -112,7 +114,8 @@ def load_frame(file: Path, shape: tuple[int, int] | None = None) -> Frame:
 
 
 def load_target(file: Path) -> Target:
-    """A screen's pattern from an .npy file: uint8 (rows, cols) of 0 and 1. Its InputError leaves the path to the caller."""
+    """A screen's pattern from an .npy file: uint8 (rows, cols) of 0 and 1. Its InputError leaves the path to the
+    caller."""
     if file.suffix.lower() != ".npy":
         raise InputError(f"a target can't be {file.suffix or 'without an ending'}; give .npy (uint8)")
     return checked_target(_load_npy(file, np.uint8))

@@ -1,4 +1,5 @@
-"""Darks and flats that contradict their own names or places: more light without light than with it, and frames moved against their rows."""
+"""Darks and flats that contradict their own names or places: more light without light than with it, and frames moved
+against their rows."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from lab.formats.recording_set.manifest import DataSheet
 
 Array = NDArray[np.floating]
 
-#: Share of the range above black by which a dark's mean has to be above a flat's to contradict it: drifts of a black level are smaller.
+#: Share of the range above black by which a dark's mean has to be above a flat's to contradict it: drifts of a black
+#: level are smaller.
 ABOVE_SHARE = 0.01
 #: Difference of temperature beyond which a dark says nothing of a flat, degree C: the dark current doubles in 6 to 8.
 ALIKE_C = 5.0
@@ -20,13 +22,15 @@ ALIKE_C = 5.0
 MOST_PAIRS = 0.5
 #: Fewest rows of a series, and fewest of them with another light after a move by one row.
 FEWEST_ROWS, FEWEST_CHANGED = 8, 3
-#: Largest ratio of the departures from a line after the move to those before, and least departure before, a share of the signals' range.
+#: Largest ratio of the departures from a line after the move to those before, and least departure before, a share of
+#: the signals' range.
 BETTER, LEAST_DEPARTURE = 1.0 / 3.0, 0.002
 
 
 @dataclass(frozen=True)
 class FrameLevel:
-    """The mean of a dark or a flat. `light`: proportional to its photons, 0 in the dark; comparable between levels of one `scale`."""
+    """The mean of a dark or a flat. `light`: proportional to its photons, 0 in the dark; comparable between levels of
+    one `scale`."""
 
     id: str
     where: str
@@ -40,10 +44,11 @@ class FrameLevel:
 
 
 def exchanged_kinds(levels: Sequence[FrameLevel], camera: DataSheet) -> tuple[list[str], list[str]]:
-    """(problems, warnings) for darks that are brighter than flats of as long an exposure: light adds, so that none can be.
+    """(problems, warnings) for darks that are brighter than flats of as long an exposure: light adds, so that none can
+    be.
 
-    A problem where that holds of most pairs (the kinds are exchanged), a warning that names the darks where it holds of few of them.
-    """
+    A problem where that holds of most pairs (the kinds are exchanged), a warning that names the darks where it holds of
+    few of them."""
     problems, warnings = [], []
     least_dn = ABOVE_SHARE * (camera.saturation_dn - (camera.black_level_dn or 0.0))
     for gain_db in dict.fromkeys(level.gain_db for level in levels):
@@ -59,12 +64,14 @@ def exchanged_kinds(levels: Sequence[FrameLevel], camera: DataSheet) -> tuple[li
         d, f = np.unravel_index(int(np.argmax(np.where(wrong, above, -np.inf))), above.shape)
         dark, flat = darks[d], flats[f]
         told = (
-            f"{dark.where}: a dark of {dark.exposure_s:g} s has {dark.mean_dn:.4g} DN, and the flat {flat.id} of {flat.exposure_s:g} s has "
+            f"{dark.where}: a dark of {dark.exposure_s:g} s has {dark.mean_dn:.4g} DN, and the flat {flat.id} of "
+            f"{flat.exposure_s:g} s has "
             f"{flat.mean_dn:.4g} DN"
         )
         if wrong.sum() > MOST_PAIRS * alike.sum():
             problems.append(
-                f"{told}, as {wrong.sum()} of {alike.sum()} pairs do: darks and flats are exchanged; correct their kinds"
+                f"{told}, as {wrong.sum()} of {alike.sum()} pairs do: darks and flats are exchanged; correct their "
+                "kinds"
             )
             continue
         lit = wrong.sum(axis=1) > MOST_PAIRS * np.maximum(alike.sum(axis=1), 1)
@@ -72,7 +79,8 @@ def exchanged_kinds(levels: Sequence[FrameLevel], camera: DataSheet) -> tuple[li
             names = [one.id for one, is_lit in zip(darks, lit, strict=True) if is_lit]
             more = f" and {len(names) - 3} more" if len(names) > 3 else ""
             warnings.append(
-                f"{told}: light in {len(names)} of {len(darks)} darks ({', '.join(names[:3])}{more}); correct their kind or take them out"
+                f"{told}: light in {len(names)} of {len(darks)} darks ({', '.join(names[:3])}{more}); correct their "
+                "kind or take them out"
             )
     return problems, warnings
 
@@ -86,11 +94,12 @@ def _comparable(dark: FrameLevel, flat: FrameLevel) -> bool:
 
 
 def moved_rows(levels: Sequence[FrameLevel]) -> Iterator[str]:
-    """One line for each series of darks and flats whose frames fit the lights of the rows beside them, from one row on to the end.
+    """One line for each series of darks and flats whose frames fit the lights of the rows beside them, from one row on
+    to the end.
 
-    `levels` in the order of their rows, darks with a light of 0. Means are fitted by a line in the light, as listed and with the frames of the last
-    rows moved by one. Series whose light grows by equal steps or factors fit either way without darks and repeats; nothing is told of them.
-    """
+    `levels` in the order of their rows, darks with a light of 0. Means are fitted by a line in the light, as listed and
+    with the frames of the last rows moved by one. Series whose light grows by equal steps or factors fit either way
+    without darks and repeats; nothing is told of them."""
     for gain_db, scale in dict.fromkeys((level.gain_db, level.scale) for level in levels if level.scale is not None):
         own = [
             level
@@ -111,14 +120,17 @@ def moved_rows(levels: Sequence[FrameLevel]) -> Iterator[str]:
             if enough[start] and before > LEAST_DEPARTURE and after[start] < BETTER * before:
                 level = own[start + first]
                 yield (
-                    f"{level.where}: from this row on, frames have the levels of the rows {where} theirs (departures from a line in the light "
-                    f"{100 * before:.1f} % of the range as listed, {100 * after[start]:.1f} % moved by one row): correct the order of the frames"
+                    f"{level.where}: from this row on, frames have the levels of the rows {where} theirs (departures "
+                    "from a line in the light "
+                    f"{100 * before:.1f} % of the range as listed, {100 * after[start]:.1f} % moved by one row): "
+                    "correct the order of the frames"
                 )
                 break
 
 
 def _departures(light: Array, mean: Array, moved_light: Array, moved_mean: Array) -> Array:
-    """Rms departure (n + 1,) of means from a line in the light, where the first k pairs are `light` and `mean` and those from k on are moved."""
+    """Rms departure (n + 1,) of means from a line in the light, where the first k pairs are `light` and `mean` and
+    those from k on are moved."""
 
     def sums(x: Array, y: Array) -> Array:
         return np.cumsum(

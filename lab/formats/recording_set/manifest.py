@@ -88,7 +88,7 @@ class Findings:
     warnings: list[str] = field(default_factory=list)
 
 
-# --- JSON --------------------------------------------------------------------------------------------------------------
+# --- JSON -------------------------------------------------------------------------------------------------------------
 
 
 def manifest_json(manifest: Manifest) -> str:
@@ -139,7 +139,8 @@ def _usable_captures(listed: list[Any], where: str, sides: Container[str], found
 
 
 def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
-    """The manifest in JSON `text`, and warnings for what was skipped. Raises RecordingError, one line for each problem."""
+    """The manifest in JSON `text`, and warnings for what was skipped. Raises RecordingError, one line for each
+    problem."""
     try:
         raw = json.loads(text)
     except (json.JSONDecodeError, RecursionError) as error:

@@ -22,10 +22,11 @@ C = TypeVar("C", bound=Capture)
 
 
 class RecordingSet:
-    """A manifest with its frames, spectra and targets. Frames are loaded when asked for, and `cache_bytes` of them are kept.
+    """A manifest with its frames, spectra and targets. Frames are loaded when asked for, and `cache_bytes` of them are
+    kept.
 
-    It comes from a folder by `read`, or from memory: `frames`, `spectra` and `targets` by the paths in the manifest. It can be
-    shared between threads and sent to another process.
+    It comes from a folder by `read`, or from memory: `frames`, `spectra` and `targets` by the paths in the manifest. It
+    can be shared between threads and sent to another process.
     """
 
     def __init__(
@@ -87,7 +88,8 @@ class RecordingSet:
         return self._copy(files=OverlaidFiles(self._files, frames))
 
     def joined(self, later: RecordingSet, folder: str) -> RecordingSet:
-        """This set with the captures of a later one of the same cameras. The later one's ids, paths and poses begin with `folder/`."""
+        """This set with the captures of a later one of the same cameras. The later one's ids, paths and poses begin
+        with `folder/`."""
         captures = (*self.manifest.captures, *(in_folder(capture, folder) for capture in later.manifest.captures))
         return self._copy(
             manifest=self.manifest.model_copy(update={"captures": captures}),
@@ -132,7 +134,8 @@ class RecordingSet:
         raise InputError(f"{self.source}: no capture '{id}'; the manifest lists {len(self.manifest.captures)} others")
 
     def frame(self, capture: Capture) -> Frame:
-        """Raw DN of a capture: uint16 (rows, cols), read-only. Raises InputError where the file contradicts the manifest."""
+        """Raw DN of a capture: uint16 (rows, cols), read-only. Raises InputError where the file contradicts the
+        manifest."""
         with self._lock:
             if capture.frame in self._cache:
                 self._cache.move_to_end(capture.frame)
@@ -191,7 +194,13 @@ def _frame_problem(frame: Frame, camera: DataSheet) -> str | None:
         )
     highest, limit = int(frame.max()), 2**camera.bit_depth - 1
     if highest > limit:
-        return f"{highest} DN is above what {camera.bit_depth} bits hold ({limit} DN); correct bit_depth, or save raw DN unscaled"
+        return (
+            f"{highest} DN is above what {camera.bit_depth} bits hold ({limit} DN); correct bit_depth, or save raw DN "
+            "unscaled"
+        )
     if highest > camera.saturation_dn:
-        return f"{highest} DN is above white_level_dn = {camera.saturation_dn:g} DN; correct white_level_dn, or save raw DN unscaled"
+        return (
+            f"{highest} DN is above white_level_dn = {camera.saturation_dn:g} DN; correct white_level_dn, or save raw "
+            "DN unscaled"
+        )
     return None

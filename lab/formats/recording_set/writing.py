@@ -66,7 +66,8 @@ def _rest(recordings: RecordingSet) -> Iterator[tuple[str, bytes]]:
 
 
 def contents(recordings: RecordingSet) -> Iterator[tuple[str, bytes]]:
-    """Path and content of every file of the set as a folder, frames first, one at a time. Each frame is checked as it is read."""
+    """Path and content of every file of the set as a folder, frames first, one at a time. Each frame is checked as it
+    is read."""
     written: set[str] = set()
     for capture in recordings.manifest.captures:
         if capture.frame not in written:
@@ -83,8 +84,9 @@ def write(
     progress: Callable[[str, float], None] | None = None,
     told: Callable[[list[str]], None] | None = None,
 ) -> Path:
-    """Write a recording set as the folder `path`: completely, or not at all. Frames stay bit-exact; each is read once. `progress` is called
-    after each with its capture's id and the share of them, `told` with the warnings of the checks, which `read` gives again.
+    """Write a recording set as the folder `path`: completely, or not at all. Frames stay bit-exact; each is read once.
+    `progress` is called after each with its capture's id and the share of them, `told` with the warnings of the checks,
+    which `read` gives again.
 
     Raises InputError where `path` exists and isn't an empty folder, and RecordingError where the set itself would be
     refused by `read`.

@@ -36,10 +36,11 @@ class PsfKernel(Frozen):
 
 
 class PsfSymmetry(Frozen):
-    """Test of the rotational symmetry of the blur about the optical axis, on the second moments of kernels over the field.
+    """Test of the rotational symmetry of the blur about the optical axis, on the second moments of kernels over the
+    field.
 
-    The symmetric model: radial variance a0 + a r^2, tangential variance a0 + b r^2, mixed moment 0, with r = 1 at the kernel that
-    is farthest from the axis.
+    The symmetric model: radial variance a0 + a r^2, tangential variance a0 + b r^2, mixed moment 0, with r = 1 at the
+    kernel that is farthest from the axis.
     """
 
     kernels: int

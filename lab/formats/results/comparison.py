@@ -12,9 +12,10 @@ from sim.parameters import Frozen
 class Change(Frozen):
     """One fitted number in two calibrations, or the point of a curve of `n` points at which they differ most.
 
-    `difference` is B less A. `significance_sigma`: two-sided, in standard deviations of a normal distribution, corrected for the
-    number of points. `title`, `unit`: as a lab reads them; "1": a ratio. `temperature_c`: of a dark current, the sensor's temperature in A,
-    to which B is converted; `difference_std` has the uncertainty of that conversion.
+    `difference` is B less A. `significance_sigma`: two-sided, in standard deviations of a normal distribution,
+    corrected for the number of points. `title`, `unit`: as a lab reads them; "1": a ratio. `temperature_c`: of a dark
+    current, the sensor's temperature in A, to which B is converted; `difference_std` has the uncertainty of that
+    conversion.
     """
 
     name: str
@@ -37,8 +38,8 @@ class Change(Frozen):
 class ProjectionChange(Frozen):
     """Difference of the projections of two calibrations of one camera, px rms over the corners that both use.
 
-    `as_stated_px`: by the numbers as they are; `difference_px`: after the implied motion is removed. `vectors_px` [row][column]
-    (x, y): the latter on a grid over the frame.
+    `as_stated_px`: by the numbers as they are; `difference_px`: after the implied motion is removed. `vectors_px`
+    [row][column] (x, y): the latter on a grid over the frame.
     """
 
     side: Side
@@ -61,7 +62,8 @@ class ComparisonResult(Frozen):
     version: Literal[1] = 1
     a: str
     b: str
-    #: Probability that two calibrations of an unchanged camera show any change, and the threshold that follows for one number.
+    #: Probability that two calibrations of an unchanged camera show any change, and the threshold that follows for one
+    #: number.
     false_alarm_rate: float
     threshold_sigma: float
     changes: tuple[Change, ...]

@@ -26,8 +26,8 @@ class Mismatch(Frozen):
 class ParameterValue(Frozen):
     """An estimated parameter of an effect.
 
-    `sign_known`: False where the recordings show its size only, as it acts by its square. `interval`: from low to high, 95 %, of a value
-    whose error no normal distribution describes; it has no standard deviation.
+    `sign_known`: False where the recordings show its size only, as it acts by its square. `interval`: from low to high,
+    95 %, of a value whose error no normal distribution describes; it has no standard deviation.
     """
 
     value: float
@@ -54,10 +54,11 @@ class Member(Frozen):
 class NamedEffect(Frozen):
     """An effect that the diagnosis names, or the family of one, with its posterior probability.
 
-    `law`: `exact` where what the effects leave is within noise and the laws' tolerances, else `inexact`. `members`: where the family is
-    named, its effects, likeliest first; `name` is then the family's identifier, and `parameters` are those of the first member. `choices`:
-    which of its alternatives the law is, by field: the corner of a glow. `modes`: other values of the parameters, in their units, that fit
-    as well. `shown_in`: measurements in which it stands out of the noise,
+    `law`: `exact` where what the effects leave is within noise and the laws' tolerances, else `inexact`. `members`:
+    where the family is named, its effects, likeliest first; `name` is then the family's identifier, and `parameters`
+    are those of the first member. `choices`: which of its alternatives the law is, by field: the corner of a glow.
+    `modes`: other values of the parameters, in their units, that fit as well. `shown_in`: measurements in which it
+    stands out of the noise,
     strongest first.
     """
 
@@ -111,8 +112,8 @@ class DiscoveredLaw(Frozen):
     model as `empirical_law`.
 
     `stage`, `along`, `period` and `table` are those of that effect. `shown_departure` is the shortest table that does
-    nearly as well, by index mod `shown_period` (0: by index): departures from no change, relative or in DN (stage `signal`), with
-    their standard deviations. chi2 is of the `n` numbers along the index
+    nearly as well, by index mod `shown_period` (0: by index): departures from no change, relative or in DN (stage
+    `signal`), with their standard deviations. chi2 is of the `n` numbers along the index
     in held-out captures (in the captures themselves where none are held out), without and with the law. `suspects`:
     what physics may do it; none of them is a name.
     """
@@ -163,9 +164,9 @@ class HeldOut(Frozen):
 class ResidualCurve(Frozen):
     """One measurement as recorded and as predicted, before and after the named effects, for the report's figures.
 
-    `before` has the nuisance parameters that were found with the named effects, within three prior standard deviations of what is stated:
-    what a camera without these effects would show, and not a fit of the baseline to recordings that contradict it.
-    """
+    `before` has the nuisance parameters that were found with the named effects, within three prior standard deviations
+    of what is stated: what a camera without these effects would show, and not a fit of the baseline to recordings that
+    contradict it."""
 
     side: Side
     measurement: str
@@ -183,8 +184,8 @@ class ResidualCurve(Frozen):
 
 
 class EffectSet(Frozen):
-    """A set of effects that may act together, with its posterior probability; the empty set is the baseline. `refitted`: its parameters
-    were fitted; otherwise the probability is of the linear problem about a likely set."""
+    """A set of effects that may act together, with its posterior probability; the empty set is the baseline.
+    `refitted`: its parameters were fitted; otherwise the probability is of the linear problem about a likely set."""
 
     effects: tuple[str, ...]
     probability: float
@@ -201,9 +202,9 @@ class IncludedEffect(Frozen):
 class SideModels(Frozen):
     """What the search says of one side, if every cause is a listed effect.
 
-    `sets`: the fewest sets of effects that together hold `share` of the probability, likeliest first. `inclusion`: of all sets that were
-    fitted, likeliest first. `not_weighed`: sets that promised enough and that the budget of CPU time left without a refit.
-    """
+    `sets`: the fewest sets of effects that together hold `share` of the probability, likeliest first. `inclusion`: of
+    all sets that were fitted, likeliest first. `not_weighed`: sets that promised enough and that the budget of CPU time
+    left without a refit."""
 
     side: Side
     share: float
@@ -215,9 +216,8 @@ class SideModels(Frozen):
 class NextCapture(Frozen):
     """A capture that could be taken to tell rivals apart.
 
-    `distance`: D = 1/2 d' C^-1 d of the two nearest rivals, with d the difference of their predictions and C the covariance of
-    the measurement. `told_apart`: probability Phi(sqrt(D / 2)) of a right decision between them.
-    """
+    `distance`: D = 1/2 d' C^-1 d of the two nearest rivals, with d the difference of their predictions and C the
+    covariance of the measurement. `told_apart`: probability Phi(sqrt(D / 2)) of a right decision between them."""
 
     side: Side
     capture: str
@@ -262,9 +262,9 @@ class MeasurementFit(Frozen):
 class Visibility(Frozen):
     """What the recordings could show of one effect.
 
-    `smallest`: size of each parameter that is detected with a probability of 90 %; a parameter without such a size is left out.
-    `nearest`: the effect with the most similar signature, `cosine`: of the angle between the two signatures, `told_apart`:
-    probability of a right decision between them.
+    `smallest`: size of each parameter that is detected with a probability of 90 %; a parameter without such a size is
+    left out. `nearest`: the effect with the most similar signature, `cosine`: of the angle between the two signatures,
+    `told_apart`: probability of a right decision between them.
     """
 
     side: Side
@@ -276,7 +276,8 @@ class Visibility(Frozen):
 
 
 class ResidualPicture(Frozen):
-    """Residuals of a frame averaged over cells, in standard deviations: under the baseline and with the named effects."""
+    """Residuals of a frame averaged over cells, in standard deviations: under the baseline and with the named
+    effects."""
 
     side: Side
     kind: str
@@ -287,7 +288,8 @@ class ResidualPicture(Frozen):
 
 
 class Resolution(Frozen):
-    """One capture that `run --resolve` took: what it is, the session that holds its frames, and the diagnosis before it."""
+    """One capture that `run --resolve` took: what it is, the session that holds its frames, and the diagnosis before
+    it."""
 
     capture: str
     session: str

@@ -1,7 +1,8 @@
-"""The figures of a calibration as a lab reads them: a plain name and a unit each, for terminal, service and pages alike.
+"""The figures of a calibration as a lab reads them: a plain name and a unit each, for terminal, service and pages
+alike.
 
-A figure is known by the path of its field in the fit (`mtf edge-1 G mtf50_cy_per_px`). Its plain name is declared here by the field; its
-unit is the end of the field's name.
+A figure is known by the path of its field in the fit (`mtf edge-1 G mtf50_cy_per_px`). Its plain name is declared here
+by the field; its unit is the end of the field's name.
 """
 
 from __future__ import annotations
@@ -72,13 +73,15 @@ _UNITS = {
     "camera_matrix": "px",
 }
 #: Words of a path that only say where a field stands.
-_SECTIONS = {"noise", "spectral", "mtf", "psf", "geometry", "stereo", "channels", "board_warp", "read_noise_distribution"} | {
+_SECTIONS = {"noise", "spectral", "mtf", "psf", "geometry", "stereo", "channels", "board_warp",
+"read_noise_distribution"} | {
     "dark_current_temperature"
 }  # fmt: skip
 
 
 def _parts(figure: str) -> tuple[str, list[str]]:
-    """The field of a figure (empty where its path has none that is declared), and what tells it from others of that field."""
+    """The field of a figure (empty where its path has none that is declared), and what tells it from others of that
+    field."""
     words = figure.split()
     at = max((k for k, word in enumerate(words) if word in NAMES), default=-1)
     if at < 0:

@@ -11,8 +11,8 @@ Rows = tuple[tuple[float, ...], ...]
 class BoardWarp(Frozen):
     """Departure of a board from a plane: z = bend_x (x^2 - 1/3) + bend_y (y^2 - 1/3) + twist x y.
 
-    x and y run from -1 to 1 across the board; z points away from the camera. None where the views don't determine it; the other
-    uncertainties include it nevertheless.
+    x and y run from -1 to 1 across the board; z points away from the camera. None where the views don't determine it;
+    the other uncertainties include it nevertheless.
     """
 
     board: str
@@ -36,27 +36,27 @@ class DistortionModel(Frozen):
 class CrossValidation(Frozen):
     """Comparison of two calibrations, each from one half of the views.
 
-    `difference_px`: rms difference of their projections over the frame, after the implied motion is removed. `expected_px`: the
-    same from all that `corner_errors` knows of. `sampling_px`: from the independent noise of the corners alone.
-    `significance_sigma`: of the difference beyond `expected_px`. Above 2.6 (1 %) the covariance of the fit has been multiplied
-    by (difference_px / expected_px)^2.
+    `difference_px`: rms difference of their projections over the frame, after the implied motion is removed.
+    `expected_px`: the same from all that `corner_errors` knows of. `sampling_px`: from the independent noise of the
+    corners alone. `significance_sigma`: of the difference beyond `expected_px`. Above 2.6 (1 %) the covariance of the
+    fit has been multiplied by (difference_px / expected_px)^2.
     """
 
     difference_px: float
     expected_px: float
     sampling_px: float | None = None
     significance_sigma: float
-    #: The error of the model in the projection of one half: what `expected_px`, or the difference where it is significant, has
-    #: beyond `sampling_px`. It is in the standard deviations of the fit.
+    #: The error of the model in the projection of one half: what `expected_px`, or the difference where it is
+    #: significant, has beyond `sampling_px`. It is in the standard deviations of the fit.
     model_error_px: float
 
 
 class CornerErrors(Frozen):
     """Departure of the corners from the model, px, as standard deviations of one coordinate, in two parts.
 
-    `noise_px`: independent from corner to corner, the sampling error. `model_error_px`: correlated between neighbouring corners (board,
-    print, lens, motion), the error of the model; 0 where it isn't significant. Both are in `covariance`.
-    """
+    `noise_px`: independent from corner to corner, the sampling error. `model_error_px`: correlated between neighbouring
+    corners (board, print, lens, motion), the error of the model; 0 where it isn't significant. Both are in
+    `covariance`."""
 
     noise_px: float
     model_error_px: float
@@ -71,8 +71,8 @@ class CornerErrors(Frozen):
 class ViewResiduals(Frozen):
     """Corners of one view, numbered row by row: measured places, residuals (measured less predicted) and depths.
 
-    `noise_px`: standard deviation of a coordinate by the noise of the view's picture, rms over its corners; None where it isn't known.
-    """
+    `noise_px`: standard deviation of a coordinate by the noise of the view's picture, rms over its corners; None where
+    it isn't known."""
 
     capture: str
     corner: tuple[int, ...]
@@ -85,7 +85,8 @@ class ViewResiduals(Frozen):
 
 
 class ProjectionUncertainty(Frozen):
-    """Standard uncertainty (px) of the projection of a point, in its worst direction, on a grid over the frame (rows, columns).
+    """Standard uncertainty (px) of the projection of a point, in its worst direction, on a grid over the frame (rows,
+    columns).
 
     The part that equals a motion of the camera is removed.
     """
@@ -97,7 +98,8 @@ class ProjectionUncertainty(Frozen):
 
 
 class ChannelGeometry(Frozen):
-    """The geometry of one channel, and its radial shift from green (lateral chromatic aberration) over the distance to the axis."""
+    """The geometry of one channel, and its radial shift from green (lateral chromatic aberration) over the distance to
+    the axis."""
 
     channel: str
     camera_matrix: tuple[tuple[float, float, float], ...]
@@ -143,8 +145,8 @@ class GeometryFit(Frozen):
 class DepthUncertainty(Frozen):
     """Standard uncertainty of a triangulated depth over the left camera's frame (rows, columns).
 
-    None where the right camera doesn't see the point. `calibration`: from the calibration alone, common to all frames; `total`:
-    with the matching error of the board's corners added.
+    None where the right camera doesn't see the point. `calibration`: from the calibration alone, common to all frames;
+    `total`: with the matching error of the board's corners added.
     """
 
     depth_mm: float
@@ -155,7 +157,8 @@ class DepthUncertainty(Frozen):
 
 
 class Rectification(Frozen):
-    """OpenCV's rectification of the pair: rotations and projections, from which `lab.fit.stereo.rectification_maps` makes maps.
+    """OpenCV's rectification of the pair: rotations and projections, from which `lab.fit.stereo.rectification_maps`
+    makes maps.
 
     `row_rms_px`: rms difference of the rows of the same corner in the rectified pair.
     """
@@ -184,8 +187,8 @@ class StereoFit(Frozen):
     distortion_left: tuple[float, ...] | None = None
     camera_matrix_right: tuple[tuple[float, float, float], ...] | None = None
     distortion_right: tuple[float, ...] | None = None
-    #: Rows and columns of `covariance`: "left fx" .., "right fx" .., the rotation about the right camera's axes, the translation,
-    #: the boards' warps.
+    #: Rows and columns of `covariance`: "left fx" .., "right fx" .., the rotation about the right camera's axes, the
+    #: translation, the boards' warps.
     parameters: tuple[str, ...] = ()
     covariance: Rows | None = None
     corner_px_std: float | None = None

@@ -18,7 +18,8 @@ def shown_unit(unit: str) -> str:
 
 
 def plain_number(value: float, digits: int) -> str:
-    """Return a number with `digits` significant digits at most, and without a power of ten where it is from 1e-9 to 1e6."""
+    """Return a number with `digits` significant digits at most, and without a power of ten where it is from 1e-9 to
+    1e6."""
     if value == 0.0 or not math.isfinite(value):
         return f"{value:g}"
     size = float(f"{abs(value):.{digits - 1}e}")

@@ -31,21 +31,23 @@ class ChannelNoise(Frozen):
 class NoiseFit(ChannelNoise):
     """Photon transfer of the whole sensor by the definitions of EMVA 1288 release 4.0; `channels`: of each channel."""
 
-    #: EMVA's total quantum efficiency, of a mono camera whose flats state `photons_per_pixel`, or have a photodiode's irradiance.
-    #: `_systematic_std`: by the photodiode's calibration, apart from `_std`.
+    #: EMVA's total quantum efficiency, of a mono camera whose flats state `photons_per_pixel`, or have a photodiode's
+    #: irradiance. `_systematic_std`: by the photodiode's calibration, apart from `_std`.
     quantum_efficiency: float | None = None
     quantum_efficiency_std: float | None = None
     quantum_efficiency_systematic_std: float | None = None
     quantum_efficiency_wavelength_nm: float | None = None
-    #: Slope at zero signal of the curve of variance against mean. `conversion_gain_dn_per_e` is this slope, or that of EMVA's
-    #: line where the bend of the curve isn't significant.
+    #: Slope at zero signal of the curve of variance against mean. `conversion_gain_dn_per_e` is this slope, or that of
+    #: EMVA's line where the bend of the curve isn't significant.
     conversion_gain_at_zero_dn_per_e: float | None = None
     conversion_gain_at_zero_dn_per_e_std: float | None = None
-    #: Standard deviation of the temporal variances about their curve beyond the sampling error, percent of the variance.
+    #: Standard deviation of the temporal variances about their curve beyond the sampling error, percent of the
+    #: variance.
     variance_model_error_percent: float | None = None
-    #: At saturation, in percent. `response_bend`: departure of the mean from its tangent at zero. `variance_bend`: departure of the
-    #: variance from its tangent at zero. `brighter_fatter`: the part of the variance's bend that the response doesn't explain.
-    #: `neighbour_covariance`: covariance with the eight neighbours over the shot noise's variance, where brighter-fatter puts it.
+    #: At saturation, in percent. `response_bend`: departure of the mean from its tangent at zero. `variance_bend`:
+    #: departure of the variance from its tangent at zero. `brighter_fatter`: the part of the variance's bend that the
+    #: response doesn't explain. `neighbour_covariance`: covariance with the eight neighbours over the shot noise's
+    #: variance, where brighter-fatter puts it.
     response_bend_percent: float | None = None
     response_bend_percent_std: float | None = None
     variance_bend_percent: float | None = None
@@ -64,8 +66,8 @@ class NoiseFit(ChannelNoise):
     defects: PixelDefects | None = None
     #: Flats whose stated light contradicts the others: left out of responsivity, linearity and gain.
     inconsistent_levels: tuple[InconsistentLevel, ...] = ()
-    #: Standard deviation of the levels' means about a smooth response beyond noise, percent of the signal; 0 where noise explains
-    #: them. It is part of the uncertainties of responsivity, quantum efficiency and linearity.
+    #: Standard deviation of the levels' means about a smooth response beyond noise, percent of the signal; 0 where
+    #: noise explains them. It is part of the uncertainties of responsivity, quantum efficiency and linearity.
     response_scatter_percent: float | None = None
     channels: dict[str, ChannelNoise] = {}
     #: By plane of the mosaic (`R`, `G1`, `G2`, `B`, or `Y`), by the letter of the standard.
@@ -78,8 +80,8 @@ class NoiseFit(ChannelNoise):
 class InconsistentLevel(Frozen):
     """A flat level whose stated light contradicts the other levels; signals are above dark, means over the planes.
 
-    `light`: as stated, in `light_unit`; `expected_light`: at which the others have its signal; `expected_signal_dn`: that they
-    have at its stated light, at most saturation.
+    `light`: as stated, in `light_unit`; `expected_light`: at which the others have its signal; `expected_signal_dn`:
+    that they have at its stated light, at most saturation.
     """
 
     captures: tuple[str, ...]
@@ -112,9 +114,8 @@ class DarkCurrentLaws(Frozen):
 class ReadNoiseDistribution(Frozen):
     """Temporal noise of single pixels in the dark, with `degrees_of_freedom` per pixel.
 
-    `spread_percent`: standard deviation of the pixels' variances over their mean, less the sampling error of the few repeats.
-    `noisy_pixels`: number of pixels above the level that chance exceeds anywhere on the sensor with 1 %.
-    """
+    `spread_percent`: standard deviation of the pixels' variances over their mean, less the sampling error of the few
+    repeats. `noisy_pixels`: number of pixels above the level that chance exceeds anywhere on the sensor with 1 %."""
 
     degrees_of_freedom: int
     rms_e: float
@@ -138,7 +139,8 @@ class Defect(Frozen):
 
 
 class PixelDefects(Frozen):
-    """Defective pixels: more than 8 standard deviations above (`hot`) or below (`cold`) their plane in the longest dark.
+    """Defective pixels: more than 8 standard deviations above (`hot`) or below (`cold`) their plane in the longest
+    dark.
 
     All fits leave them out; EMVA's own figures include them. `listed`: the strongest.
     """
@@ -157,15 +159,16 @@ class Emva1288(Frozen):
     responsivity_dn_per_photon_std: float | None = None
     quantum_efficiency: float | None = None
     quantum_efficiency_std: float | None = None
-    #: By the calibration of the photodiode that measured the irradiance, apart from `_std`: a factor common to every figure in photons,
-    #: `photons_systematic_std_percent` of it. `None` where the numbers of photons are stated.
+    #: By the calibration of the photodiode that measured the irradiance, apart from `_std`: a factor common to every
+    #: figure in photons, `photons_systematic_std_percent` of it. `None` where the numbers of photons are stated.
     quantum_efficiency_systematic_std: float | None = None
     photons_systematic_std_percent: float | None = None
     wavelength_nm: float | None = None
     #: Slope of the temporal variance against the signal, both less dark, through the origin, up to 70 % of saturation.
     system_gain_dn_per_e: float
     system_gain_dn_per_e_std: float
-    #: At zero exposure. `None` below 0.24 DN^2, where quantisation hides it; `_limit_e` is then the upper limit 0.40 / K.
+    #: At zero exposure. `None` below 0.24 DN^2, where quantisation hides it; `_limit_e` is then the upper limit 0.40 /
+    #: K.
     temporal_dark_noise_dn: float | None = None
     temporal_dark_noise_dn_std: float | None = None
     temporal_dark_noise_e: float | None = None

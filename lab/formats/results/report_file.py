@@ -6,7 +6,8 @@ from sim.parameters import Frozen
 
 
 class ReportFile(Frozen):
-    """A report: its path, relative to the data folder if it lies there, and the ids of the results that it shows, by kind."""
+    """A report: its path, relative to the data folder if it lies there, and the ids of the results that it shows, by
+    kind."""
 
     path: str
     results: dict[str, str] = {}

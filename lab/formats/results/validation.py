@@ -44,7 +44,8 @@ class KernelPair(Frozen):
 
 
 class Check(Frozen):
-    """Predicted against measured for one measurement that the fit didn't use. `passed`: chi2 is within its 99.9 % quantile."""
+    """Predicted against measured for one measurement that the fit didn't use. `passed`: chi2 is within its 99.9 %
+    quantile."""
 
     name: Literal["colorchecker", "mtf", "psf"]
     side: Side

@@ -1,7 +1,7 @@
 """The concealed laws: each written anew from the literature, in variants, one module for each stage of the light.
 
-They share nothing with `sim.effects`. Some variants follow the formula of the library's effect, others deliberately don't.
-"""
+They share nothing with `sim.effects`. Some variants follow the formula of the library's effect, others deliberately
+don't."""
 
 from mocks.former.law import Law
 from mocks.former.laws.charge import (

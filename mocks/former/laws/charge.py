@@ -9,7 +9,8 @@ from mocks.former.law import DARK, OPTICAL, Array, Law
 
 
 class ChargeDiffusionLaw(Law):
-    """Lateral diffusion, a Gaussian. Variants: independent of the wavelength; growing with its square; by absorption depth in silicon (Stevens 1992)."""
+    """Lateral diffusion, a Gaussian. Variants: independent of the wavelength; growing with its square; by absorption
+    depth in silicon (Stevens 1992)."""
 
     name = effect = "charge_diffusion"
     variants, unit, nominal, limits, power, shown_by = 3, "um", 0.7, (0.1, 2.5), 2.0, OPTICAL
@@ -60,8 +61,9 @@ class InterPixelCapacitanceLaw(Law):
 
 
 class BrighterFatterLaw(Law):
-    """Charge repels charge. Variants: the variance falls with the signal; neighbours receive what is repelled (Antilogus 2014); every
-    border between two pixels moves in proportion to the difference of their charges, so that means of unequal neighbours move, too."""
+    """Charge repels charge. Variants: the variance falls with the signal; neighbours receive what is repelled
+    (Antilogus 2014); every border between two pixels moves in proportion to the difference of their charges, so that
+    means of unequal neighbours move, too."""
 
     name = effect = "brighter_fatter"
     variants, unit, nominal, limits = 3, "%", 4.0, (0.1, 20.0)
@@ -146,7 +148,8 @@ class ExposureOffsetLaw(Law):
 
 
 class LeakyShutterLaw(Law):
-    """Light is still collected while rows wait for read-out, longer the later the row (related to the exposure offset)."""
+    """Light is still collected while rows wait for read-out, longer the later the row (related to the exposure
+    offset)."""
 
     name, unit, nominal, limits = "leaky_shutter", "us", 60.0, (0.5, 5000.0)
     families = frozenset({"field_of_light", "response_to_light"})
@@ -167,7 +170,8 @@ class SmearLaw(Law):
 
 
 class ImageLagLaw(Law):
-    """Charge of the previous frame that comes with this one. Variants: a constant share; a share that grows with the charge to the power of 0.3."""
+    """Charge of the previous frame that comes with this one. Variants: a constant share; a share that grows with the
+    charge to the power of 0.3."""
 
     name = effect = "image_lag"
     variants, unit, nominal, limits, shown_by = 2, "%", 0.5, (0.01, 5.0), frozenset({"dark", "flat"})
@@ -187,7 +191,8 @@ class ImageLagLaw(Law):
 
 
 class DarkCurrentTemperatureLaw(Law):
-    """Dark current that rises with the temperature. Variants: exponential; Arrhenius. Strength: doublings in 10 degrees."""
+    """Dark current that rises with the temperature. Variants: exponential; Arrhenius. Strength: doublings in 10
+    degrees."""
 
     name = effect = "dark_current_temperature"
     variants, unit, nominal, limits, needs, shown_by = 2, "1/(10 C)", 1.3, (0.02, 3.0), "temperature", DARK

@@ -23,7 +23,8 @@ class SourceDriftLaw(Law):
 
 
 class SourceInstabilityLaw(Law):
-    """The source is unsteady at random. Variants: anew in each frame; correlated from frame to frame; an arc that jumps between two places."""
+    """The source is unsteady at random. Variants: anew in each frame; correlated from frame to frame; an arc that jumps
+    between two places."""
 
     name = effect = "source_instability"
     variants, unit, nominal, limits, power = 3, "%", 0.6, (0.01, 8.0), 2.0
@@ -142,7 +143,8 @@ class StrayLightLaw(Law):
 
 
 class SourceBandwidthLaw(Law):
-    """The line is wider than read; strength: the standard deviation of the convolution. Variants: Gaussian; triangular."""
+    """The line is wider than read; strength: the standard deviation of the convolution. Variants: Gaussian;
+    triangular."""
 
     name = effect = "source_bandwidth"
     variants, unit, nominal, limits, power, shown_by = 2, "nm", 4.0, (0.3, 15.0), 2.0, SPECTRAL
@@ -163,7 +165,8 @@ class SourceBandwidthLaw(Law):
 
 
 class WavelengthOffsetLaw(Law):
-    """Monochromator and radiometer share a wavelength error. Variants: constant; proportional to (wavelength - 300 nm)."""
+    """Monochromator and radiometer share a wavelength error. Variants: constant; proportional to (wavelength - 300
+    nm)."""
 
     name = effect = "wavelength_offset"
     variants, unit, nominal, limits, signed, shown_by = 2, "nm", 1.0, (0.02, 8.0), True, SPECTRAL
@@ -218,7 +221,8 @@ class ScreenPixelStructureLaw(Law):
 
 
 class ScreenGammaLaw(Law):
-    """Grey levels at the borders of cells are shown darker, by a power. Variants: borders as drawn; blurred borders; above a dark offset."""
+    """Grey levels at the borders of cells are shown darker, by a power. Variants: borders as drawn; blurred borders;
+    above a dark offset."""
 
     name = effect = "screen_gamma"
     variants, unit, nominal, limits, shown_by = 3, "1", 1.2, (0.01, 4.0), frozenset({"checkerboard"})

@@ -9,7 +9,8 @@ from mocks.former.law import OPTICAL, REFERENCE_NM, Array, Law
 
 
 class OpticalLowPassFilterLaw(Law):
-    """Two birefringent plates split each point into four. Variants: equal displacements; 0.8 of the displacement along columns; beams of 45 and 55 %."""
+    """Two birefringent plates split each point into four. Variants: equal displacements; 0.8 of the displacement along
+    columns; beams of 45 and 55 %."""
 
     name = effect = "optical_low_pass_filter"
     variants, unit, nominal, limits, power, shown_by = 3, "um", 1.5, (0.1, 3.0), 2.0, OPTICAL
@@ -33,7 +34,8 @@ class OpticalLowPassFilterLaw(Law):
 
 
 class DefocusLaw(Law):
-    """Displaced focus. Variants: path difference of a sphere; its parabola; the parabola and 0.1 of spherical aberration."""
+    """Displaced focus. Variants: path difference of a sphere; its parabola; the parabola and 0.1 of spherical
+    aberration."""
 
     name = effect = "defocus"
     variants, unit, nominal, limits, power, shown_by = 3, "um", 12.0, (0.5, 60.0), 2.0, OPTICAL
@@ -116,7 +118,8 @@ class AxialColourLaw(Law):
 
 
 class LateralColourLaw(Law):
-    """Magnification that depends on the wavelength. Variants: linear; Conrady's dispersion formula; a third of it with the cube of the radius."""
+    """Magnification that depends on the wavelength. Variants: linear; Conrady's dispersion formula; a third of it with
+    the cube of the radius."""
 
     name = effect = "lateral_chromatic_aberration"
     variants, unit, nominal, limits, signed, needs = 3, "um", 1.5, (0.02, 20.0), True, "bayer"
@@ -171,7 +174,8 @@ class LensDecentreLaw(Law):
 
 
 class VibrationBlurLaw(Law):
-    """Oscillation along a random direction, strength its amplitude. Variants: a sine; a third of it at the second harmonic in addition."""
+    """Oscillation along a random direction, strength its amplitude. Variants: a sine; a third of it at the second
+    harmonic in addition."""
 
     name = effect = "vibration_blur"
     variants, unit, nominal, limits, power, shown_by = 2, "um", 1.2, (0.1, 5.0), 2.0, OPTICAL
@@ -204,8 +208,8 @@ class MotionLaw(Law):
 
 
 class DoubleImageLaw(Law):
-    """A second image, by reflection between the faces of a plate. Variants: 2.5 px aside; aside and up by 4 to 20 px, as by a thick or
-    tilted plate."""
+    """A second image, by reflection between the faces of a plate. Variants: 2.5 px aside; aside and up by 4 to 20 px,
+    as by a thick or tilted plate."""
 
     name = effect = "double_image"
     variants, unit, nominal, limits, shown_by = 2, "%", 3.0, (0.1, 25.0), OPTICAL
@@ -220,7 +224,8 @@ class DoubleImageLaw(Law):
 
 
 class HaloLaw(Law):
-    """Light scattered in the cover glass: an exponential halo of some pixels (related to charge diffusion and to veiling glare)."""
+    """Light scattered in the cover glass: an exponential halo of some pixels (related to charge diffusion and to
+    veiling glare)."""
 
     name, unit, nominal, limits, shown_by = "halo", "%", 3.0, (0.05, 30.0), OPTICAL
     families = frozenset({"copies_and_veils", "isotropic_contrast_loss"})
@@ -231,7 +236,8 @@ class HaloLaw(Law):
 
 
 class PixelApertureLaw(Law):
-    """An aperture of another size than stated. Variants: a square; a disc of the same area; a square with soft borders."""
+    """An aperture of another size than stated. Variants: a square; a disc of the same area; a square with soft
+    borders."""
 
     name = effect = "pixel_aperture"
     variants, unit, nominal, limits, signed, shown_by = 3, "um", 0.3, (0.02, 0.9), True, OPTICAL

@@ -30,8 +30,8 @@ class NonlinearityLaw(Law):
 
 
 class ResponseKneeLaw(Law):
-    """The slope is smaller above a level between 0.3 and 0.6 of full well. Variants: a sharp knee; one that is rounded over 3 % of full
-    well; two knees of half the change, 0.2 of full well apart."""
+    """The slope is smaller above a level between 0.3 and 0.6 of full well. Variants: a sharp knee; one that is rounded
+    over 3 % of full well; two knees of half the change, 0.2 of full well apart."""
 
     name = effect = "response_knee"
     variants, unit, nominal, limits = 3, "%", 3.0, (0.05, 20.0)
@@ -57,8 +57,9 @@ class ResponseKneeLaw(Law):
 
 
 class BitWeightsLaw(Law):
-    """Successive approximation with lowest bits of wrong weight. Variants: of the two lowest; a table of four unequal widths, as of a last
-    stage of two bits; of the third-lowest only. Strength: the largest error of a weight, or departure of a width."""
+    """Successive approximation with lowest bits of wrong weight. Variants: of the two lowest; a table of four unequal
+    widths, as of a last stage of two bits; of the third-lowest only. Strength: the largest error of a weight, or
+    departure of a width."""
 
     name = effect = "bit_weights"
     variants, unit, nominal, limits, signed = 3, "DN", 0.25, (0.01, 0.95), True
@@ -89,9 +90,10 @@ class BitWeightsLaw(Law):
 
 
 class AdcNonlinearityLaw(Law):
-    """The converter's steps are unequal. Variants: the weight of the highest bit; of the two highest; a sine over an eighth of the codes
-    (integral nonlinearity of a folding converter); a saw tooth of a quarter of them (the second stage of a pipeline has another gain); a
-    step at a code that is no power of two (a comparator of a flash stage). Strength in codes of 12 bit."""
+    """The converter's steps are unequal. Variants: the weight of the highest bit; of the two highest; a sine over an
+    eighth of the codes (integral nonlinearity of a folding converter); a saw tooth of a quarter of them (the second
+    stage of a pipeline has another gain); a step at a code that is no power of two (a comparator of a flash stage).
+    Strength in codes of 12 bit."""
 
     name = effect = "adc_nonlinearity"
     variants, unit, nominal, limits, signed = 5, "DN", 3.0, (0.05, 20.0), True
@@ -189,8 +191,8 @@ class RowNoiseLaw(Law):
 
 
 class ColouredLineNoiseLaw(Law):
-    """Noise of lines by fluctuators of many time constants, the sum of which has a spectrum of about 1/f (Machlup 1954). Variants: rows;
-    columns; rows, the slow fluctuators twice as strong in power (steeper)."""
+    """Noise of lines by fluctuators of many time constants, the sum of which has a spectrum of about 1/f (Machlup
+    1954). Variants: rows; columns; rows, the slow fluctuators twice as strong in power (steeper)."""
 
     name = effect = "coloured_line_noise"
     variants, unit, nominal, limits, power, shown_by = 3, "e", 3.0, (0.2, 40.0), 2.0, DARK
@@ -255,8 +257,8 @@ class ColumnNoiseLaw(Law):
 
 
 class RandomTelegraphNoiseLaw(Law):
-    """Some pixels switch between two levels. Variants: equal amplitudes; exponentially distributed ones; equal ones, high in a quarter of
-    the frames; equal ones that stay for four frames (slow traps)."""
+    """Some pixels switch between two levels. Variants: equal amplitudes; exponentially distributed ones; equal ones,
+    high in a quarter of the frames; equal ones that stay for four frames (slow traps)."""
 
     name = effect = "random_telegraph_noise"
     variants, unit, nominal, limits, power, shown_by = 4, "e", 15.0, (1.0, 200.0), 2.0, DARK

@@ -65,7 +65,8 @@ class RedLeakLaw(Law):
 
 
 class VignettingLaw(Law):
-    """Fall-off towards the corners. Variants: squared radius; overlap of two displaced discs; fourth power of the radius."""
+    """Fall-off towards the corners. Variants: squared radius; overlap of two displaced discs; fourth power of the
+    radius."""
 
     name = effect = "vignetting"
     variants, unit, nominal, limits = 3, "%", 4.0, (0.02, 30.0)
@@ -82,7 +83,8 @@ class VignettingLaw(Law):
 
 
 class VignettingDecentreLaw(Law):
-    """A fall-off of 8 % about a displaced centre, further off than an optical axis may lie. Variants: squared radius; third power."""
+    """A fall-off of 8 % about a displaced centre, further off than an optical axis may lie. Variants: squared radius;
+    third power."""
 
     name = effect = "vignetting_decentre"
     accepts = frozenset({"vignetting"})
@@ -106,7 +108,8 @@ class DustShadowLaw(Law):
 
 
 class VeilingGlareLaw(Law):
-    """A share of the light spread over the frame. Variants: evenly; half of it in a Gaussian of a quarter of the frame's width; falling towards the corners."""
+    """A share of the light spread over the frame. Variants: evenly; half of it in a Gaussian of a quarter of the
+    frame's width; falling towards the corners."""
 
     name = effect = "veiling_glare"
     variants, unit, nominal, limits, shown_by = 3, "%", 1.5, (0.02, 8.0), frozenset({"chart", "checkerboard"})

@@ -43,7 +43,7 @@ def kept(running: Running, session: str, fit: FitResult) -> str:
     return running.store.add_result("fit", session, fit.model_dump(mode="json"))
 
 
-# --- camera models -----------------------------------------------------------------------------------------------------
+# --- camera models ----------------------------------------------------------------------------------------------------
 
 
 def test_a_fit_over_the_network_keeps_its_cameras(
@@ -206,7 +206,7 @@ def test_a_diagnosis_begins_with_a_camera_model(
             assert refused.value.status == status
 
 
-# --- comparisons -------------------------------------------------------------------------------------------------------
+# --- comparisons ------------------------------------------------------------------------------------------------------
 
 
 def test_two_calibrations_are_compared_as_on_the_command_line(shared: Running, session: str) -> None:

@@ -1,5 +1,5 @@
-"""Challenges over the network: made and scored by jobs, their truths out of reach until then. What is drawn and how it is diagnosed have
-tests of their own: here both are stand-ins."""
+"""Challenges over the network: made and scored by jobs, their truths out of reach until then. What is drawn and how it
+is diagnosed have tests of their own: here both are stand-ins."""
 
 from __future__ import annotations
 

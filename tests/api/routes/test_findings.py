@@ -15,7 +15,8 @@ def diagnosis(probability: float = 0.99) -> DiagnosisResult:
     """A mismatch that a filter explains: two measurements with both predictions, and pictures of two frames."""
     x = tuple(float(n) for n in range(5))
     curve = {
-        "side": "left", "measurement": "narrowband", "label": "flat", "channel": "R", "axis": "wavelength, nm", "quantity": "mean level, DN",
+        "side": "left", "measurement": "narrowband", "label": "flat", "channel": "R", "axis": "wavelength, nm",
+        "quantity": "mean level, DN",
         "x": x, "measured": (1.0,) * 5, "measured_std": (0.1,) * 5, "after": (1.0,) * 5, "held_out": True,
     }  # fmt: skip
     picture = {"kind": "flat", "capture": "f", "held_out": True, "before": ((4.0, -4.0),), "after": ((1.0, -1.0),)}
@@ -26,8 +27,10 @@ def diagnosis(probability: float = 0.99) -> DiagnosisResult:
             "verdict": "explained",
             "effects": [
                 {
-                    "name": "infrared_cut_filter", "family": "infrared_cut_filter", "law": "exact", "probability": probability, "sides": ["left"],
-                    "parameters": {"edge_nm": {"value": 650.0, "std": 0.2, "unit": "nm"}}, "statement": "A filter stands before the sensor.",
+                    "name": "infrared_cut_filter", "family": "infrared_cut_filter", "law": "exact",
+                    "probability": probability, "sides": ["left"],
+                    "parameters": {"edge_nm": {"value": 650.0, "std": 0.2, "unit": "nm"}},
+                    "statement": "A filter stands before the sensor.",
                 }
             ],
             "curves": [

@@ -161,7 +161,7 @@ def test_a_job_on_a_session_that_is_not_finished_is_refused_and_nothing_changes(
         assert client.get("/api/v1/jobs").json() == []
 
 
-# --- pipelines -----------------------------------------------------------------------------------------------------------
+# --- pipelines --------------------------------------------------------------------------------------------------------
 
 
 def test_a_pipeline_captures_and_brings_all_results_and_the_report(running: Running, quick_steps: None) -> None:

@@ -143,7 +143,7 @@ def test_sessions_that_cannot_be_queued_are_refused(shared: Running) -> None:
         assert client.get("/api/v1/queue").json() == []
 
 
-# --- fetched and deleted -----------------------------------------------------------------------------------------------
+# --- fetched and deleted ----------------------------------------------------------------------------------------------
 
 
 def test_a_session_is_fetched_as_a_recording_set(shared: Running, tmp_path: Path) -> None:

@@ -260,7 +260,8 @@ def test_a_stated_size_beyond_the_cap_is_refused_before_it_is_sent(tmp_path: Pat
         address = urlsplit(running.url)
         with socket.create_connection((address.hostname, address.port), timeout=10) as line:
             line.sendall(
-                f"POST /api/v1/recordings HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/zip\r\nContent-Length: 30000\r\n"
+                "POST /api/v1/recordings HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: "
+                "application/zip\r\nContent-Length: 30000\r\n"
                 f"Authorization: Bearer {running.keys['calibrate']}\r\n\r\nPK".encode()
             )
             assert line.recv(1000).startswith(b"HTTP/1.1 413")  # after two bytes of 30,000
@@ -275,7 +276,8 @@ def test_an_upload_that_breaks_off_leaves_nothing_and_is_no_defect(
     address = urlsplit(running.url)
     with socket.create_connection((address.hostname, address.port), timeout=10) as line:
         line.sendall(
-            f"POST /api/v1/{path} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/zip\r\nContent-Length: 30000\r\n"
+            f"POST /api/v1/{path} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/zip\r\nContent-Length: "
+            "30000\r\n"
             f"Idempotency-Key: once\r\nAuthorization: Bearer {running.keys['calibrate']}\r\n\r\nPK".encode()
         )
     until = time.monotonic() + 30.0
@@ -370,7 +372,7 @@ def test_unknown_recordings_are_404(shared: Running) -> None:
         assert client.post("/api/v1/recordings/" + "0" * 16 + "/jobs", json={"kind": "fit"}).status_code == 404
 
 
-# --- listed, fetched, imported, deleted --------------------------------------------------------------------------------
+# --- listed, fetched, imported, deleted -------------------------------------------------------------------------------
 
 
 def test_what_was_sent_in_is_fetched_again_and_deleted(

@@ -34,7 +34,7 @@ def only_session(shared: Running) -> str:
     return shared.store.sessions()[0].id
 
 
-# --- stations ----------------------------------------------------------------------------------------------------------
+# --- stations ---------------------------------------------------------------------------------------------------------
 
 
 def test_stations_are_the_files_of_the_folder(running: Running) -> None:
@@ -76,7 +76,7 @@ def test_a_session_that_cannot_start_is_refused_in_one_line(
     assert len(shared.store.sessions()) == before
 
 
-# --- sessions ----------------------------------------------------------------------------------------------------------
+# --- sessions ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_session_from_its_start_to_its_captures(running: Running) -> None:
@@ -215,7 +215,7 @@ def test_one_of_two_followers_may_disconnect(tmp_path: Path) -> None:
     assert heard[-1] == "end"
 
 
-# --- once --------------------------------------------------------------------------------------------------------------
+# --- once -------------------------------------------------------------------------------------------------------------
 
 
 def test_a_request_that_is_sent_twice_is_carried_out_once(running: Running) -> None:
@@ -246,7 +246,7 @@ def test_a_request_that_is_sent_twice_is_carried_out_once(running: Running) -> N
         assert len(running.store.sessions()) == 3
 
 
-# --- captures ----------------------------------------------------------------------------------------------------------
+# --- captures ---------------------------------------------------------------------------------------------------------
 
 
 def test_captures_by_kind_and_side(shared: Running) -> None:

@@ -159,7 +159,7 @@ def test_missing_stations_and_devices_are_refused_in_one_line(
     assert said in response.json()["detail"] and "\n" not in response.json()["detail"]
 
 
-# --- the catalogue -----------------------------------------------------------------------------------------------------
+# --- the catalogue ----------------------------------------------------------------------------------------------------
 
 
 def test_the_catalogue_is_told(shared: Running) -> None:

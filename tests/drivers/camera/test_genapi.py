@@ -151,7 +151,8 @@ def test_bits_leave_their_neighbours_alone(one: int, two: int, big: bool, before
 
 CONVERTER = (
     '<Float Name="T"><pValue>C</pValue><Min>10</Min><Max>1e7</Max></Float>'
-    '<Converter Name="C"><pVariable Name="K">K</pVariable><FormulaTo>FROM * K</FormulaTo><FormulaFrom>TO / K</FormulaFrom>'
+    '<Converter Name="C"><pVariable Name="K">K</pVariable><FormulaTo>FROM * K</FormulaTo><FormulaFrom>TO / '
+    "K</FormulaFrom>"
     '<pValue>R</pValue></Converter><Float Name="K"><Value>10</Value></Float>'
     '<IntReg Name="R"><Address>4</Address><Length>4</Length><Endianess>LittleEndian</Endianess></IntReg>'
 )
@@ -187,10 +188,11 @@ def test_enumeration_boolean_command_text_and_float() -> None:
         + '<Command Name="Go"><pValue>GoR</pValue><CommandValue>7</CommandValue></Command>'
         + reg.format(n="Go", a=2)
         + '<StringReg Name="Text"><Address>32</Address><Length>16</Length></StringReg>'
-        + '<FloatReg Name="F"><Address>0</Address><pAddress>Base</pAddress><Length>4</Length><Endianess>BigEndian</Endianess></FloatReg>'
+        + '<FloatReg Name="F"><Address>0</Address><pAddress>Base</pAddress><Length>4</Length><Endianess>BigEndian</Endianess></FloatReg>'  # noqa: E501
         + '<Integer Name="Base"><Value>16</Value></Integer>'
         + '<SwissKnife Name="Twice"><pVariable Name="X">F</pVariable><Constant Name="TWO">2</Constant>'
-        + '<Expression Name="XX">X * TWO</Expression><Formula>XX + Y.Max</Formula><pVariable Name="Y.Max">Lim.Max</pVariable></SwissKnife>'
+        + '<Expression Name="XX">X * TWO</Expression><Formula>XX + Y.Max</Formula><pVariable '
+        'Name="Y.Max">Lim.Max</pVariable></SwissKnife>'
         + '<Integer Name="Lim"><Value>1</Value><Max>100</Max></Integer>',
         memory,
     )
@@ -221,7 +223,8 @@ def test_a_feature_that_refers_to_itself_is_refused() -> None:
 
 def test_availability() -> None:
     camera = nodes(
-        '<Integer Name="A"><pIsAvailable>No</pIsAvailable><Value>1</Value></Integer><Integer Name="No"><Value>0</Value></Integer>'
+        '<Integer Name="A"><pIsAvailable>No</pIsAvailable><Value>1</Value></Integer><Integer '
+        'Name="No"><Value>0</Value></Integer>'
     )
     assert not camera.has("A")
     assert camera.has("No")
@@ -232,8 +235,10 @@ def test_struct_register_and_index() -> None:
     memory = Memory()
     memory.data[8:12] = bytes([0, 0, 0x50, 0x01])
     camera = nodes(
-        '<StructReg><Address>0</Address><Length>4</Length><Endianess>LittleEndian</Endianess><pIndex Offset="8">Sel</pIndex>'
-        '<StructEntry Name="Low"><LSB>16</LSB><MSB>19</MSB></StructEntry><StructEntry Name="High"><LSB>20</LSB><MSB>23</MSB></StructEntry>'
+        "<StructReg><Address>0</Address><Length>4</Length><Endianess>LittleEndian</Endianess><pIndex "
+        'Offset="8">Sel</pIndex>'
+        '<StructEntry Name="Low"><LSB>16</LSB><MSB>19</MSB></StructEntry><StructEntry '
+        'Name="High"><LSB>20</LSB><MSB>23</MSB></StructEntry>'
         '<StructEntry Name="Bit"><Bit>24</Bit></StructEntry></StructReg><Integer Name="Sel"><Value>1</Value></Integer>',
         memory,
     )

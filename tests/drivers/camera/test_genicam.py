@@ -1,4 +1,5 @@
-"""Cameras through the makers' libraries, on cameras that these libraries bring along: pypylon's emulation, Aravis' fake GigE camera."""
+"""Cameras through the makers' libraries, on cameras that these libraries bring along: pypylon's emulation, Aravis' fake
+GigE camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Processing in the camera: what changes codes is set neutral and read back; what stays on is told, or refused where frames mean nothing then."""
+"""Processing in the camera: what changes codes is set neutral and read back; what stays on is told, or refused where
+frames mean nothing then."""
 
 from __future__ import annotations
 

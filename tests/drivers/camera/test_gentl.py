@@ -1,4 +1,5 @@
-"""Cameras through GenTL, on the producer that GenICam's package brings: three cameras, in this process, described as triggered ones."""
+"""Cameras through GenTL, on the producer that GenICam's package brings: three cameras, in this process, described as
+triggered ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Series of frame pairs on mock cameras with prepared frames: the frames of a trigger stay together, and lost frames are taken again."""
+"""Series of frame pairs on mock cameras with prepared frames: the frames of a trigger stay together, and lost frames
+are taken again."""
 
 from __future__ import annotations
 

@@ -454,7 +454,8 @@ def test_no_answer_breaks_the_control_channel(answer: bytes) -> None:
 
 
 class _Slow:
-    """A pyusb device that gives a leader and nothing more until its time-outs have passed; then the parts that are left in `parts`."""
+    """A pyusb device that gives a leader and nothing more until its time-outs have passed; then the parts that are left
+    in `parts`."""
 
     def __init__(self, parts: Sequence[bytes] = ()) -> None:
         self.leader, self.waits, self.parts = True, threading.Event(), list(parts)
@@ -493,7 +494,8 @@ def test_a_transfer_that_comes_while_a_wait_ends_is_taken_whole(monkeypatch: pyt
 
 
 def test_codes_are_the_converters(bench: Bench) -> None:
-    """The mock powers up with a preset for daylight and a white balance; a second camera without either has the same codes."""
+    """The mock powers up with a preset for daylight and a white balance; a second camera without either has the same
+    codes."""
     balanced, plain = U3vDevice(bench, "left", "CB-8"), U3vDevice(bench, "left", "CB-9")
     for at, register in enumerate((BALANCE_RED, BALANCE_GREEN, BALANCE_BLUE)):
         balanced._put(register, int.from_bytes(struct.pack("<f", 1.8 + at), "little"))

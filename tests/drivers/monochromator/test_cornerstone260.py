@@ -1,4 +1,5 @@
-"""The Cornerstone 260's driver: against the golden transcript, against the mock on a real line, and when things go wrong."""
+"""The Cornerstone 260's driver: against the golden transcript, against the mock on a real line, and when things go
+wrong."""
 
 from __future__ import annotations
 
@@ -172,7 +173,8 @@ def test_a_host_before_that_left_half_a_statement_does_no_harm(served: Callable[
     mono.close()
 
 
-# When the driver connects, answers 1..6 are those to INFO?, ERROR?, IDLE?, ERROR?, UNITS? and UNITS NM (the mock's HANDSHAKE 1 answers, too).
+# When the driver connects, answers 1..6 are those to INFO?, ERROR?, IDLE?, ERROR?, UNITS? and UNITS NM (the mock's
+# HANDSHAKE 1 answers, too).
 @pytest.mark.parametrize(
     ("fault", "error", "message"),
     [

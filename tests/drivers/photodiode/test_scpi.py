@@ -74,7 +74,8 @@ def test_irradiance_is_radiance_times_solid_angle(served: Callable[..., str], ca
         assert diode.measure_dark() == pytest.approx(DARK_A, abs=4 * NOISE_A / np.sqrt(10))
         light.level = 2.0
         measured = diode.measure(550.0)
-    # 2 W/sr/m2 under 0.1 sr; the calibration is a line through points 10 nm apart, and the light is 2 nm wide: below 1e-4.
+    # 2 W/sr/m2 under 0.1 sr; the calibration is a line through points 10 nm apart, and the light is 2 nm wide: below
+    # 1e-4.
     assert measured.irradiance_w_m2 == pytest.approx(0.2, rel=2e-4)
     assert measured.sd_irradiance_w_m2 == pytest.approx(0.005 * 0.2, rel=0.01)
 
@@ -85,11 +86,13 @@ def test_the_uncertainty_of_weak_light_is_that_of_the_readings(served: Callable[
         diode.measure_dark()
         light.level = 1e-6
         found = [diode.measure(550.0) for _ in range(20)]
-    # Without the dark's own error, which all share, 20 means of 5 scatter as sigma / sqrt(5); their sd is known to 1 / sqrt(38).
+    # Without the dark's own error, which all share, 20 means of 5 scatter as sigma / sqrt(5); their sd is known to 1 /
+    # sqrt(38).
     factor = found[0].irradiance_w_m2 / found[0].current_a
     scatter = np.std([one.irradiance_w_m2 for one in found], ddof=1)
     assert scatter == pytest.approx(NOISE_A / np.sqrt(5) * factor, rel=4 / np.sqrt(38))
-    # Each says that, and the dark's: sqrt(2) of it; a sd from 4 + 4 degrees of freedom is good to 1 / sqrt(16), their root mean square better.
+    # Each says that, and the dark's: sqrt(2) of it; a sd from 4 + 4 degrees of freedom is good to 1 / sqrt(16), their
+    # root mean square better.
     told = np.sqrt(np.mean([one.sd_irradiance_w_m2**2 for one in found]))
     assert told == pytest.approx(np.sqrt(2) * NOISE_A / np.sqrt(5) * factor, rel=0.75)
 

@@ -1,4 +1,5 @@
-"""The CR-250's and CR-300's driver: against the golden transcript, against the mock on a real line, and when things go wrong."""
+"""The CR-250's and CR-300's driver: against the golden transcript, against the mock on a real line, and when things go
+wrong."""
 
 from __future__ import annotations
 

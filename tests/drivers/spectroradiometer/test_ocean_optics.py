@@ -1,4 +1,5 @@
-"""The USB2000+'s driver on its mock: the radiance of the light in front, whatever the instrument's dark, bend and response."""
+"""The USB2000+'s driver on its mock: the radiance of the light in front, whatever the instrument's dark, bend and
+response."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ def test_radiance_of_white_light(bench: Bench, calibration: str) -> None:
         assert (identity.model, identity.serial_number) == ("USB2000+", "USB2+F00001")
         found = meter.measure()
     at = np.arange(400.0, 721.0, 5.0)
-    # The bench gives each call 0.15 % of noise, which 1.5 nm of slit and 4 scans average to under 0.1 %; counts have 22 of noise.
+    # The bench gives each call 0.15 % of noise, which 1.5 nm of slit and 4 scans average to under 0.1 %; counts have 22
+    # of noise.
     counts = found.radiance_w_sr_m2_nm.at(at) * response(at) * (found.integration_time_s or np.nan)
     sigma = np.hypot(0.0015, NOISE_COUNTS / np.sqrt(4 * 2.7) / counts)
     truth = np.mean([bench.radiance().at(at) for _ in range(50)], axis=0)

@@ -1,4 +1,5 @@
-"""The PR-655's and PR-670's driver: against the golden transcript, against the mock on a real line, and when things go wrong."""
+"""The PR-655's and PR-670's driver: against the golden transcript, against the mock on a real line, and when things go
+wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The specbos 1211's driver: against the golden transcript, against the mock on a real line, and when things go wrong."""
+"""The specbos 1211's driver: against the golden transcript, against the mock on a real line, and when things go
+wrong."""
 
 from __future__ import annotations
 
@@ -119,8 +120,8 @@ def test_enq_inside_replies_is_passed_over(served: Callable[..., str]) -> None:
         assert len(radiometer.measure().radiance_w_sr_m2_nm.value) == 651
 
 
-# Connecting takes 13 answers (*idn?, *para:spnum?, *vers?, 7 settings, both ends of the range, the range); then *init (14), its end (15),
-# the fetch (16).
+# Connecting takes 13 answers (*idn?, *para:spnum?, *vers?, 7 settings, both ends of the range, the range); then *init
+# (14), its end (15), the fetch (16).
 @pytest.mark.parametrize("fault", ["half@16", "drop@16", "wrong@16", "never@16", "half@16,half@17,half@18,half@19"])
 def test_a_broken_fetch_is_asked_for_again(served: Callable[..., str], fault: str) -> None:
     radiometer = Specbos1211(served(Mock(Lamp()), Pty(), fault), timeout_s=1.0, fetch_timeout_s=1.0)

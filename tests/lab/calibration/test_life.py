@@ -1,4 +1,5 @@
-"""A calibration's life: candidate, certified, superseded, expired; bands, drift, and sessions that demand a certified one."""
+"""A calibration's life: candidate, certified, superseded, expired; bands, drift, and sessions that demand a certified
+one."""
 
 from __future__ import annotations
 
@@ -180,7 +181,8 @@ def test_drift_is_told_as_compare_tells_it(store: Store) -> None:
 
 
 def test_a_warmer_sensor_is_no_drift_and_a_figure_is_entered_once(store: Store) -> None:
-    """Dark currents are compared at the temperature of the reference; a session that is fitted again is one calibration of the history."""
+    """Dark currents are compared at the temperature of the reference; a session that is fitted again is one calibration
+    of the history."""
     for dark_e_per_s, temperature_c in ((5.0, 31.0), (5.05, 31.1), (5.5, 32.0), (6.5, 31.0)):
         noise = NoiseFit(
             dark_current_e_per_s=dark_e_per_s, dark_current_e_per_s_std=0.005, dark_temperature_c=temperature_c
@@ -221,14 +223,16 @@ def test_every_figure_has_a_plain_name_and_its_unit() -> None:
 
 
 def _models_in(annotation: object) -> list[type]:
-    """The models that a field's type names, but those of its dictionaries: their figures are by channel, and not compared."""
+    """The models that a field's type names, but those of its dictionaries: their figures are by channel, and not
+    compared."""
     if isinstance(annotation, type) and issubclass(annotation, Frozen):
         return [annotation]
     return [] if get_origin(annotation) is dict else [one for part in get_args(annotation) for one in _models_in(part)]
 
 
 def test_an_unchanged_camera_rarely_drifts(store: Store) -> None:
-    """Over a history of 20, an alarm in one of a hundred cameras. 400 cameras of the binomial law: 4 +- 2 expected, 3 sigma = 10."""
+    """Over a history of 20, an alarm in one of a hundred cameras. 400 cameras of the binomial law: 4 +- 2 expected, 3
+    sigma = 10."""
     rng = np.random.default_rng(5)
     alarms = 0
     threshold = life.sigma_of_probability(life.sidak_part(FALSE_ALARM_RATE, 19))

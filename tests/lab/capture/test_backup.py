@@ -55,7 +55,8 @@ def test_a_backup_is_a_data_folder(store: Store, tmp_path: Path, capsys: pytest.
 def test_a_session_that_is_packed_meanwhile_is_whole_in_the_backup(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is packed between the registry's copy and the copy of its frames: what was taken first names frames that are gone."""
+    """It is packed between the registry's copy and the copy of its frames: what was taken first names frames that are
+    gone."""
     closed = Store.close_session
     monkeypatch.setattr(Store, "close_session", lambda *_, **__: None)
     session = captured(store)

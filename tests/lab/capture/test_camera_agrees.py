@@ -45,7 +45,8 @@ def test_what_the_data_sheet_contradicts_is_told_in_one_line(sensor: SensorInfo,
 
 
 def test_a_session_waits_longer_than_its_cameras_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mock bench's own station file gives its cameras 60 s, longer than a session waited: a dropped frame was never taken again."""
+    """The mock bench's own station file gives its cameras 60 s, longer than a session waited: a dropped frame was never
+    taken again."""
     waits: list[float] = []
     monkeypatch.setattr(devices, "Status", lambda who, call, timeout_s: waits.append(timeout_s))
     camera = U3vCamera("usb://1", timeout_s=60.0)

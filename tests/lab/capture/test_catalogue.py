@@ -1,4 +1,5 @@
-"""The catalogue of sequences says what is declared, and a plan's estimate is what its steps and the station's own sessions give."""
+"""The catalogue of sequences says what is declared, and a plan's estimate is what its steps and the station's own
+sessions give."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Sessions whose process died: the station is made safe, the reason recorded, and the session resumed where that is allowed."""
+"""Sessions whose process died: the station is made safe, the reason recorded, and the session resumed where that is
+allowed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The registry on a real PostgreSQL: sessions, jobs and keys as on SQLite, writers at the same time, and what can't be reached."""
+"""The registry on a real PostgreSQL: sessions, jobs and keys as on SQLite, writers at the same time, and what can't be
+reached."""
 
 from __future__ import annotations
 

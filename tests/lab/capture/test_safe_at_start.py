@@ -1,4 +1,5 @@
-"""The first thing of a start makes the stations safe that a crash left: the shutter first, for which it needs next to nothing."""
+"""The first thing of a start makes the stations safe that a crash left: the shutter first, for which it needs next to
+nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Series of frames: steps that repeat an exposure become one series of streaming cameras, and lost frames are recorded in the journal."""
+"""Series of frames: steps that repeat an exposure become one series of streaming cameras, and lost frames are recorded
+in the journal."""
 
 from __future__ import annotations
 

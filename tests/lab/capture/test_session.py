@@ -67,7 +67,7 @@ def assert_whole(store: Store, session: str) -> None:
     assert problems == []
 
 
-# --- a whole run ---------------------------------------------------------------------------------------------------------
+# --- a whole run ------------------------------------------------------------------------------------------------------
 
 
 def test_a_whole_calibration(store: Store) -> None:
@@ -110,7 +110,8 @@ def test_exposures_are_found_for_each_camera(store: Store) -> None:
         exposure_s = results["flat/exposure"]["exposure_s"][side]
         level = slope * exposure_s / (4095 - BLACK)
         assert level == pytest.approx(0.75, abs=0.05)
-        # Flats are shares of saturation: the mean of the frame at 0.5 is half of the range, to 5 % (the search's tolerance).
+        # Flats are shares of saturation: the mean of the frame at 0.5 is half of the range, to 5 % (the search's
+        # tolerance).
         recordings = store.recording_set(session.id)
         flat = next(c for c in recordings.captures("flat", side) if "level-02" in c.id)  # type: ignore[arg-type]
         assert recordings.frame(flat).mean() == pytest.approx(BLACK + 0.5 * (4095 - BLACK), rel=0.08)
@@ -171,7 +172,7 @@ def test_a_wavelength_that_the_radiometer_refuses_is_left_out_with_the_reason(st
         begin(store, bench, LIT).run()
 
 
-# --- interruptions -------------------------------------------------------------------------------------------------------
+# --- interruptions ----------------------------------------------------------------------------------------------------
 
 
 def test_an_unplugged_camera_is_one_clear_line_and_the_rest_is_kept(store: Store) -> None:
@@ -264,7 +265,8 @@ def test_an_abort_ends_the_packing_which_goes_on_later(store: Store, monkeypatch
 
 
 def test_a_run_that_failed_frees_its_journal(store: Store) -> None:
-    """At once, without Python's search for cycles: of a session of 20,000 captures it is 70 MB, and a day has many such runs."""
+    """At once, without Python's search for cycles: of a session of 20,000 captures it is 70 MB, and a day has many such
+    runs."""
     bench = Bench()
 
     def unplug(progress: Progress) -> None:
@@ -342,7 +344,10 @@ def _refusing(of: type, method: str, message: str, when: Callable[..., bool]) ->
         ),
         (
             lambda patch: patch.setattr(fake_bench.FakeDisplay, "screen_px", lambda display: (540, 960)),
-            r"display: its screen has 540 x 960 px, \[targets.screen\] in the station file says 1080 x 1920: the system scales",
+            (
+                r"display: its screen has 540 x 960 px, \[targets.screen\] in the station file says 1080 x 1920: the "
+                r"system scales"
+            ),
         ),
     ],
 )
@@ -532,7 +537,7 @@ def test_a_full_disk_is_said_and_the_session_resumes(store: Store, monkeypatch: 
     assert_whole(store, session.id)
 
 
-# --- kills ---------------------------------------------------------------------------------------------------------------
+# --- kills ------------------------------------------------------------------------------------------------------------
 
 
 def _spawn(store: Store, session: str, delay_s: float) -> subprocess.Popen[str]:

@@ -99,7 +99,8 @@ def test_a_session_on_the_wires_survives_kill_9_and_says_when_the_bench_dies(
         assert camera.black_level_dn is not None
         darks = [recordings.frame(c).mean() for c in recordings.captures("dark", side)]
         assert max(darks) < camera.black_level_dn + 50
-        # Flats at a quarter, a half, three quarters of saturation: equal steps of the mean, to 3 % (linearity, dark current).
+        # Flats at a quarter, a half, three quarters of saturation: equal steps of the mean, to 3 % (linearity, dark
+        # current).
         mean = {c.id.split("-")[2]: recordings.frame(c).mean() for c in recordings.captures("flat", side)}
         assert (mean["03"] - mean["02"]) / (mean["02"] - mean["01"]) == pytest.approx(1.0, abs=0.03)
         # The screen with half of its cells lit is half as bright, to 10 % (the border of the pattern).

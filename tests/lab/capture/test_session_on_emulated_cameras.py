@@ -1,4 +1,5 @@
-"""Short sessions on cameras that no mock of ours stands behind: the pair that pypylon emulates, and Aravis' fake GigE camera."""
+"""Short sessions on cameras that no mock of ours stands behind: the pair that pypylon emulates, and Aravis' fake GigE
+camera."""
 
 from __future__ import annotations
 

@@ -137,7 +137,10 @@ def test_a_setting_that_the_driver_does_not_know_is_named(tmp_path: Path) -> Non
 
 
 def test_a_person_at_a_prompt_needs_no_address(tmp_path: Path) -> None:
-    camera = '[cameras.left]\ndriver = "u3v"\naddress = "usb://1"\n[cameras.left.datasheet]\nrows = 2\ncols = 2\nbit_depth = 12\ncfa = "RGGB"\n'
+    camera = (
+        '[cameras.left]\ndriver = "u3v"\naddress = "usb://1"\n[cameras.left.datasheet]\nrows = 2\ncols = 2\nbit_depth '
+        '= 12\ncfa = "RGGB"\n'
+    )
     file = tmp_path / "station.toml"
     file.write_text(f'{camera}[stage]\ndriver = "prompt"\n')
     stage = read_station(file).stage

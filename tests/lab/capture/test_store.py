@@ -52,7 +52,7 @@ def take_all(store: Store, session: str) -> None:
         assert store.finish_step(session, step.id, now(), {"at": at}, files, captures)
 
 
-# --- the registry --------------------------------------------------------------------------------------------------------
+# --- the registry -----------------------------------------------------------------------------------------------------
 
 
 def test_migrations_make_the_tables_that_the_code_has(store: Store) -> None:
@@ -95,7 +95,7 @@ def test_sqlite_writes_ahead_and_flushes(store: Store) -> None:
         assert db.execute(sa.text("PRAGMA foreign_keys")).scalar() == 1
 
 
-# --- files ---------------------------------------------------------------------------------------------------------------
+# --- files ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,7 +122,7 @@ def test_locks_exclude_and_let_go(tmp_path: Path) -> None:
     other.release()
 
 
-# --- sessions and the journal --------------------------------------------------------------------------------------------
+# --- sessions and the journal -----------------------------------------------------------------------------------------
 
 
 def test_a_session_starts_with_all_its_steps_to_do(store: Store) -> None:
@@ -214,7 +214,7 @@ def test_a_process_that_ends_while_it_is_looked_at_is_believed(store: Store, mon
     assert (found.state, found.error) == ("interrupted", "aborted by the operator")
 
 
-# --- as a recording set --------------------------------------------------------------------------------------------------
+# --- as a recording set -----------------------------------------------------------------------------------------------
 
 SCREEN = CapturePlan(
     (

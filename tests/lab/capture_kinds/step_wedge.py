@@ -1,4 +1,5 @@
-"""A kind of capture that calibench doesn't have, written after `docs/how-to/add-a-capture-kind.md`: a transmissive step wedge."""
+"""A kind of capture that calibench doesn't have, written after `docs/how-to/add-a-capture-kind.md`: a transmissive step
+wedge."""
 
 from __future__ import annotations
 

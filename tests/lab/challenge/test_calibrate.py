@@ -46,7 +46,8 @@ def test_a_rule_is_changed_by_its_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rule", "said"), [("luck=1", "no such rule"), ("most_effects=few", "give NAME=VALUE"), ("most_effects", "give NAME=VALUE")]
+    ("rule", "said"), [("luck=1", "no such rule"), ("most_effects=few", "give NAME=VALUE"), ("most_effects",
+    "give NAME=VALUE")]
 )  # fmt: skip
 def test_an_unknown_rule_is_refused(rule: str, said: str) -> None:
     with pytest.raises(InputError, match=said):

@@ -1,4 +1,5 @@
-"""Sealed challenges: nothing in a set reveals its truth, seals can't be changed, a run can be resumed, seeds are kept apart."""
+"""Sealed challenges: nothing in a set reveals its truth, seals can't be changed, a run can be resumed, seeds are kept
+apart."""
 
 from __future__ import annotations
 

@@ -21,8 +21,9 @@ NAMES = [f"effect_{k}" for k in range(45)]
 
 
 def tolerance(parameters: int, strength: float) -> float:
-    """Tolerance of the oracle's share of right names: four standard deviations over DRAWS; the change of the power if the share of false
-    alarms is off by 40 %, four times the price's error of 10 %; and the share of draws in which another effect exceeds its price."""
+    """Tolerance of the oracle's share of right names: four standard deviations over DRAWS; the change of the power if
+    the share of false alarms is off by 40 %, four times the price's error of 10 %; and the share of draws in which
+    another effect exceeds its price."""
     low, power, high = (
         float(ncx2.sf(chi2.isf(FALSE_ALARMS * factor / len(NAMES), parameters), parameters, strength))
         for factor in (0.6, 1.0, 1.4)
@@ -40,8 +41,8 @@ def orthogonal(parameters: int, size: int = 150) -> list[Directions]:
 @pytest.mark.parametrize("parameters", [1, 3])
 @pytest.mark.parametrize("strength", [10.0, 15.0, 25.0, 30.0, 40.0])
 def test_the_oracle_has_the_power_of_the_chi2_test(parameters: int, strength: float) -> None:
-    """One effect among 45 that are orthogonal to it is named where its non-central chi2 exceeds the threshold; a false name comes first as
-    rarely as false alarms do."""
+    """One effect among 45 that are orthogonal to it is named where its non-central chi2 exceeds the threshold; a false
+    name comes first as rarely as false alarms do."""
     candidates = orthogonal(parameters)
     mean = candidates[0].basis @ np.full(parameters, np.sqrt(strength / parameters))
     found = oracle_share(mean, candidates, NAMES[:1], np.random.default_rng(1), DRAWS)
@@ -57,8 +58,8 @@ def test_the_table_of_the_specification() -> None:
 
 
 def test_the_oracle_keeps_its_false_alarms() -> None:
-    """Nothing concealed: all names together have a share of 1 %, within the 10 % of the price's own error; twenty copies of each effect
-    change nothing."""
+    """Nothing concealed: all names together have a share of 1 %, within the 10 % of the price's own error; twenty
+    copies of each effect change nothing."""
     candidates, rng = orthogonal(1), np.random.default_rng(2)
     few = [Directions(one.name, one.basis) for one in candidates[:3] for _ in range(20)]
     named = sum(oracle_share(np.zeros(150), few, [name], rng, 5000) for name in NAMES[:3])
@@ -66,7 +67,8 @@ def test_the_oracle_keeps_its_false_alarms() -> None:
 
 
 def test_effects_with_one_direction_are_named_by_chance() -> None:
-    """Two effects with the same direction: together they come first in at most all draws, and neither is told from the other."""
+    """Two effects with the same direction: together they come first in at most all draws, and neither is told from the
+    other."""
     axes = np.eye(20)
     twins = [Directions("one", axes[:, :1]), Directions("two", axes[:, :1]), Directions("other", axes[:, 1:2])]
     mean = 10.0 * axes[:, 0]
@@ -90,7 +92,8 @@ def test_conditional_and_separable_parts_of_oblique_directions() -> None:
 
 
 def test_the_noise_of_a_measured_change_cancels() -> None:
-    """With two draws of the noise, the mean of d1' P d2 is |P d|^2; the square of one draw would add the noise of n numbers."""
+    """With two draws of the noise, the mean of d1' P d2 is |P d|^2; the square of one draw would add the noise of n
+    numbers."""
     rng, basis = np.random.default_rng(4), span(np.random.default_rng(5).normal(size=(50, 3)))
     change = rng.normal(size=50)
     true = beyond(change, change, basis)
@@ -103,8 +106,8 @@ def test_the_noise_of_a_measured_change_cancels() -> None:
 
 @pytest.mark.parametrize("conditional", [15.0, 25.0, 50.0])
 def test_a_pair_is_told_as_its_weaker_member_allows(conditional: float) -> None:
-    """Its partner at 1000 and at an angle of 60 degrees to it: both are named as often as the part beyond the partner is above the threshold, but
-    for the false third, which can't be named, and the few rivals that noise prefers."""
+    """Its partner at 1000 and at an angle of 60 degrees to it: both are named as often as the part beyond the partner
+    is above the threshold, but for the false third, which can't be named, and the few rivals that noise prefers."""
     candidates = orthogonal(1)
     axes, angle = np.eye(150), np.radians(60.0)
     oblique = np.cos(angle) * axes[:, 1] + np.sin(angle) * axes[:, 50]

@@ -32,7 +32,8 @@ def library(**directions: np.ndarray) -> LibraryChanges:
 
 
 def test_a_single_effect_beside_its_nearest_rival() -> None:
-    """6 sigma along the first axis; beside a rival at 30 degrees 36 sin^2 = 9 is left, beside one at right angles everything."""
+    """6 sigma along the first axis; beside a rival at 30 degrees 36 sin^2 = 9 is left, beside one at right angles
+    everything."""
     absent, present = summaries(0.0 * AXES[0]), summaries(6.0 * AXES[0])
     rivals = library(mine=AXES[0], near=np.cos(np.pi / 6) * AXES[0] + np.sin(np.pi / 6) * AXES[1], far=AXES[2])
     whole, without = [present, present], [[absent, absent]]
@@ -48,7 +49,8 @@ def test_a_single_effect_beside_its_nearest_rival() -> None:
 
 
 def test_a_pair_of_which_one_imitates_the_other() -> None:
-    """The second law lies at 30 degrees to the first: a quarter of the squared length of each is left beyond the other."""
+    """The second law lies at 30 degrees to the first: a quarter of the squared length of each is left beyond the
+    other."""
     oblique = np.cos(np.pi / 6) * AXES[0] + np.sin(np.pi / 6) * AXES[1]
     one, two = 10.0 * AXES[0], 4.0 * oblique
     whole, without = [summaries(one + two)] * 2, [[summaries(two)] * 2, [summaries(one)] * 2]

@@ -28,7 +28,8 @@ from sim.effects.library import effects as library
 def truth(kind: Kind, *hidden: tuple[str, float], fault: str | None = None, accepts: tuple[str, ...] = ()) -> CaseTruth:
     concealed = tuple(
         Concealed(
-            name=name, effect=None if kind == "outside" else name, strength=1.0, noncentrality=size, parameters={"size_um": 2.0}
+            name=name, effect=None if kind == "outside" else name, strength=1.0, noncentrality=size,
+            parameters={"size_um": 2.0}
         )
         for name, size in hidden
     )  # fmt: skip
@@ -40,10 +41,12 @@ def truth(kind: Kind, *hidden: tuple[str, float], fault: str | None = None, acce
 def named(
     *names: str, rivals: tuple[str, ...] = (), value: float = 2.0, held: tuple[float, float, int] | None = None
 ) -> DiagnosisResult:
-    """Names with probabilities that fall from the first on; the first has the rivals. All names are the one set of models."""
+    """Names with probabilities that fall from the first on; the first has the rivals. All names are the one set of
+    models."""
     effects = tuple(
         NamedEffect(
-            name=name, family=library()[name].family.value, law="exact", probability=0.99 - 0.1 * i, sides=("left",), statement="",
+            name=name, family=library()[name].family.value, law="exact", probability=0.99 - 0.1 * i, sides=("left",),
+            statement="",
             parameters={"size_um": ParameterValue(value=value, std=0.1, unit="um")},
             rivals=tuple(Rival(name=r, probability=0.1) for r in rivals) if i == 0 else (),
         )
@@ -89,7 +92,8 @@ def scored(broken: tuple[str, ...] = ()) -> ChallengeScore:
     kept = {name: salted(t) for name, (t, _) in zip(names, CASES, strict=True)}
     truths = Truths(purpose="tuning", seed=3, size="small", cases=len(CASES), truths=kept)
     runs = {
-        name: CaseRun(case=name, wall_s=2.0, cpu_s=float(i), memory_mib=100.0 + i, diagnosis=d, error=None if d else "ValueError: x")
+        name: CaseRun(case=name, wall_s=2.0, cpu_s=float(i), memory_mib=100.0 + i, diagnosis=d,
+        error=None if d else "ValueError: x")
         for i, (name, (_, d)) in enumerate(zip(names, CASES, strict=True))
     }  # fmt: skip
     return score(truths, Seals(seals={n: seal(s) for n, s in kept.items()}), runs, broken)
@@ -100,7 +104,8 @@ def counts(rate: Rate) -> tuple[int, int]:
 
 
 def test_a_family_is_no_effect_and_may_be_right() -> None:
-    """Two members are listed, neither is named: the family is right, the effect isn't named, and the rival set holds both."""
+    """Two members are listed, neither is named: the family is right, the effect isn't named, and the rival set holds
+    both."""
     told = (
         named("defocus")
         .effects[0]
@@ -142,7 +147,8 @@ def test_every_figure_is_the_one_counted_by_hand() -> None:
     # sets of the named singles: {defocus, crosstalk}, {defocus, crosstalk}, {defocus}, {defocus}
     assert counts(found.rival_sets_cover) == (4, 4)
     assert found.rival_set_mean_size == pytest.approx(1.5)
-    # healthy cameras without a name three, singles the first and the last, compounds the first; of the failed case there is none
+    # healthy cameras without a name three, singles the first and the last, compounds the first; of the failed case
+    # there is none
     assert counts(found.model_sets_hold) == (6, 12)
     assert found.model_sets_mean_size == pytest.approx(11 / 12)
     assert counts(found.false_alarms) == (2, 4)
@@ -153,7 +159,8 @@ def test_every_figure_is_the_one_counted_by_hand() -> None:
     assert counts(found.families.right_families) == (5, 9)
     assert counts(found.families.right_effects) == (3, 6)
     assert counts(found.families.wrong_families) == (3, 16)  # healthy, crosstalk, and vignetting beside defocus
-    # 2.0, 2.19 and 2.21 of the singles, 2.0 twice of the first compound, 2.0 of the second's one; the interval is 2 +- 0.196
+    # 2.0, 2.19 and 2.21 of the singles, 2.0 twice of the first compound, 2.0 of the second's one; the interval is 2 +-
+    # 0.196
     assert counts(found.parameters_covered) == (5, 6)
     assert found.excess_removed == pytest.approx((0.9 + 0.5) / 2)
     assert found.outside_excess_removed_median == pytest.approx(0.75)

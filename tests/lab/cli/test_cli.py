@@ -515,7 +515,8 @@ def test_the_command_itself(tmp_path: Path) -> None:
     ]
 
 
-#: What takes a tenth of a second or more to load, or brings what does along. (typer itself loads pydantic for the help of one command.)
+#: What takes a tenth of a second or more to load, or brings what does along. (typer itself loads pydantic for the help
+#: of one command.)
 SLOW_TO_LOAD = [
     "numpy",
     "scipy",
@@ -549,7 +550,10 @@ SLOW_TO_LOAD = [
 )
 def test_the_help_waits_for_no_numerics(arguments: list[str]) -> None:
     """What a command needs is loaded when it runs, so that the help of all of them needs none of it."""
-    told = f"import sys; from lab.cli import main; code = main({arguments!r}); print(*sys.modules, file=sys.stderr); sys.exit(code)"
+    told = (
+        f"import sys; from lab.cli import main; code = main({arguments!r}); print(*sys.modules, file=sys.stderr); "
+        "sys.exit(code)"
+    )
     done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, timeout=60, check=True)
     assert "Usage:" in done.stdout
     assert sorted(set(SLOW_TO_LOAD) & set(done.stderr.split())) == []
@@ -588,7 +592,8 @@ def test_what_only_reads_makes_no_data_folder(
 def test_a_backup_without_the_database_is_refused(
     store_of_a_server: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The files of a station whose registry is a database server's, and no variable that says so; then with an empty registry from before."""
+    """The files of a station whose registry is a database server's, and no variable that says so; then with an empty
+    registry from before."""
     arguments = ["backup", str(tmp_path / "backup"), "--data", str(store_of_a_server)]
     assert cli.main(arguments) == 2 and "CALIBENCH_DATABASE_URL" in capsys.readouterr().err
     assert not (store_of_a_server / "registry.sqlite").exists()

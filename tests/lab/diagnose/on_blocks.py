@@ -63,7 +63,8 @@ def names(found: Verdict) -> list[str]:
 
 
 def sigmas(found: MeasurementModel, effects: Sequence[Effect] = ()) -> float:
-    """How far chi2 of all numbers under the baseline with `effects` lies from their count, in its standard deviations."""
+    """How far chi2 of all numbers under the baseline with `effects` lies from their count, in its standard
+    deviations."""
     gaussian = found.gaussian(tuple(effects))
     n = len(found.value)
     return (chi2(found.value - gaussian.mean, gaussian.covariance) - n) / float(np.sqrt(2.0 * n))
@@ -75,8 +76,10 @@ def rendered(seed: int, effects: Sequence[Effect] = (), *, sweep_to_nm: int = 0,
     wavelength = np.arange(380.0, max(781.0, sweep_to_nm + 41.0))
     efficiency = Spectrum.of(wavelength, 0.5 * np.exp(-0.5 * ((wavelength - 540.0) / 140.0) ** 2))
     camera = CameraModel(
-        rows=96, cols=128, pixel_pitch_um=3.0, fill_factor=0.9, cfa="MONO", bit_depth=12, black_level_dn=128.0, white_level_dn=4095.0,
-        conversion_gain_dn_per_e=0.4, full_well_e=9900.0, read_noise_e=3.0, dark_current_e_per_s=5.0, dsnu_e=0.0, prnu_percent=0.0,
+        rows=96, cols=128, pixel_pitch_um=3.0, fill_factor=0.9, cfa="MONO", bit_depth=12, black_level_dn=128.0,
+        white_level_dn=4095.0,
+        conversion_gain_dn_per_e=0.4, full_well_e=9900.0, read_noise_e=3.0, dark_current_e_per_s=5.0, dsnu_e=0.0,
+        prnu_percent=0.0,
         quantum_efficiency={"Y": efficiency}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
     )  # fmt: skip
     rng = np.random.default_rng(seed)
@@ -90,7 +93,17 @@ def rendered(seed: int, effects: Sequence[Effect] = (), *, sweep_to_nm: int = 0,
             k = len(captures)
             frames[f"{k}.npy"] = sample(camera, Exposure(scene, exposure_s, elapsed_s=20.0137 * k), rng, effects)
             when = datetime(2026, 3, 2, tzinfo=UTC) + timedelta(seconds=20.0137 * k)
-            captures.append({"id": f"c{k}", "kind": kind, "side": "left", "frame": f"{k}.npy", "exposure_s": exposure_s, "time": when, **more})  # fmt: skip
+            captures.append(
+                {
+                    "id": f"c{k}",
+                    "kind": kind,
+                    "side": "left",
+                    "frame": f"{k}.npy",
+                    "exposure_s": exposure_s,
+                    "time": when,
+                    **more,
+                }
+            )
 
     for t in (0.001, 0.5, 2.0):
         take("dark", None, t, 3)
@@ -105,8 +118,10 @@ def rendered(seed: int, effects: Sequence[Effect] = (), *, sweep_to_nm: int = 0,
         exposure = 0.7 * camera.full_well_e / max(electron_rate(camera, "Y", line), 1e4)
         take("narrowband", line, round(exposure, 6), 1, wavelength_nm=w, bandwidth_nm=10, radiance=f"{w}.csv")
     stated = {
-        "rows": 96, "cols": 128, "pixel_pitch_um": 3.0, "fill_factor": 0.9, "cfa": "MONO", "bit_depth": 12, "black_level_dn": 128.0,
-        "white_level_dn": 4095.0, "f_number": 4.0, "focal_length_mm": 8.0, "lens_transmittance": 1.0, "quantum_efficiency": {"Y": "qe.csv"},
+        "rows": 96, "cols": 128, "pixel_pitch_um": 3.0, "fill_factor": 0.9, "cfa": "MONO", "bit_depth": 12,
+        "black_level_dn": 128.0,
+        "white_level_dn": 4095.0, "f_number": 4.0, "focal_length_mm": 8.0, "lens_transmittance": 1.0,
+        "quantum_efficiency": {"Y": "qe.csv"},
     }  # fmt: skip
     manifest = Manifest.model_validate({"name": "sim", "cameras": {"left": stated}, "captures": captures})
     return RecordingSet(manifest, frames, spectra, source="sim")

@@ -105,7 +105,8 @@ def test_dim_rows_are_found_with_period_and_size() -> None:
 
 
 def test_offsets_of_columns_are_told_from_gains() -> None:
-    """Four interleaved converters with offsets of +-2 DN, dark or lit: found in the dark, in electrons of the camera."""
+    """Four interleaved converters with offsets of +-2 DN, dark or lit: found in the dark, in electrons of the
+    camera."""
     offset = np.array([2.0, -2.0, 1.0, -1.0])
 
     def shifted(frame: Frame, kind: str, black_dn: float) -> Frame:

@@ -82,7 +82,8 @@ def test_a_wrong_shutter_is_told_and_not_named(place: str) -> None:
 
 
 def test_a_wrong_shutter_disturbs_no_other_measurement() -> None:
-    """The level pulls at the black level that darks share with it: held-out darks contradict the others for that, until it has a factor."""
+    """The level pulls at the black level that darks share with it: held-out darks contradict the others for that, until
+    it has a factor."""
     frames, shuttle = PLACES["a seen level"]
     model = measured_model(_recorded(3, 1.25, frames, shuttle=shuttle, cfa="RGGB"), linearity_block, dark_level_block)
     policy = DecisionPolicy()
@@ -103,8 +104,8 @@ def test_healthy_levels_have_no_outlier() -> None:
 
 @pytest.mark.slow
 def test_factors_of_a_wrong_shutter_have_true_uncertainties() -> None:
-    """20 cameras, one level off by 10 %: (factor - truth) / std has a variance of 1 +- 3 sqrt(2 / 20), and the covariance has floors that
-    these cameras lack, so that it may be less."""
+    """20 cameras, one level off by 10 %: (factor - truth) / std has a variance of 1 +- 3 sqrt(2 / 20), and the
+    covariance has floors that these cameras lack, so that it may be less."""
     pulls = []
     for seed in range(20, 40):
         (level,) = verdict(

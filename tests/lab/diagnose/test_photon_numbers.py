@@ -25,7 +25,8 @@ WAVELENGTH_NM = 540.0
 
 
 def _by_photons(recordings: RecordingSet, *, misstated: float = 1.0, level: int = 3) -> RecordingSet:
-    """The same frames; each flat states photons in place of a radiance, those of one level `misstated` times as many."""
+    """The same frames; each flat states photons in place of a radiance, those of one level `misstated` times as
+    many."""
     content = recordings.manifest.model_dump(mode="json")
     exposures = sorted({c["exposure_s"] for c in content["captures"] if c["kind"] == "flat"})
     for capture in content["captures"]:

@@ -73,7 +73,8 @@ def test_missing_metadata_are_no_mismatch(change: Change) -> None:
 
 
 def test_edges_in_unknown_light_are_not_called_defocus() -> None:
-    """A monochrome camera: predicted with equal-energy light its edges scored 52 over a threshold of 17, and were called 'defocus'."""
+    """A monochrome camera: predicted with equal-energy light its edges scored 52 over a threshold of 17, and were
+    called 'defocus'."""
 
     def unlit(content: dict[str, Any]) -> None:
         _only("dark", "flat", "slanted_edge")(content)

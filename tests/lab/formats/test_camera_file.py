@@ -26,14 +26,19 @@ LENSES = Path(__file__).parents[3].parent / "shared" / "data" / "lenses"
 
 def _with_lens(**changes: object) -> CameraFile:
     camera = default_camera().camera
-    return CameraFile("one", camera.model_copy(update={"lens": Lens(**{**camera.lens.model_dump(exclude={"imaging"}), **changes})}))  # fmt: skip
+    return CameraFile(
+        "one", camera.model_copy(update={"lens": Lens(**{**camera.lens.model_dump(exclude={"imaging"}), **changes})})
+    )
 
 
 def _table() -> LensTable:
     return LensTable(
-        wavelength_nm=np.array([500.0, 600.0]), field_deg=np.array([[0.0, 0.0], [0.0, 10.0]]), grid_shape=(2,), symmetric=True, reference_wavelength_nm=550.0,
-        focal_length_mm=8.0, f_number=4.0, entrance_pupil_mm=2.0, chief_mm=np.array([[0.0, 0.0], [0.0, 1.4]]), relative_illumination=np.ones((2, 2)),
-        psf=np.full((2, 2, 4, 4), 1 / 16), window_um=np.zeros((2, 2)), sample_pitch_um=0.5, encircled_share=np.ones((2, 2)), centroid_um=np.zeros((2, 2, 2)),
+        wavelength_nm=np.array([500.0, 600.0]), field_deg=np.array([[0.0, 0.0], [0.0, 10.0]]), grid_shape=(2,),
+        symmetric=True, reference_wavelength_nm=550.0,
+        focal_length_mm=8.0, f_number=4.0, entrance_pupil_mm=2.0, chief_mm=np.array([[0.0, 0.0], [0.0, 1.4]]),
+        relative_illumination=np.ones((2, 2)),
+        psf=np.full((2, 2, 4, 4), 1 / 16), window_um=np.zeros((2, 2)), sample_pitch_um=0.5, encircled_share=np.ones((2,
+        2)), centroid_um=np.zeros((2, 2, 2)),
         warnings=("a warning",), content_hash="abc",
     )  # fmt: skip
 
@@ -43,7 +48,8 @@ def _files() -> list[CameraFile]:
     psf /= psf.sum(axis=(1, 2), keepdims=True)
     full = default_camera().camera.model_copy(
         update={
-            "geometry": Geometry(camera_matrix=((2318.8, 0.0, 640.1), (0.0, 2318.8, 479.7), (0.0, 0.0, 1.0)), distortion=(-0.1, 0.02, 1e-4, 0.0, 0.0)),
+            "geometry": Geometry(camera_matrix=((2318.8, 0.0, 640.1), (0.0, 2318.8, 479.7), (0.0, 0.0, 1.0)),
+            distortion=(-0.1, 0.02, 1e-4, 0.0, 0.0)),
             "std": {"read_noise_e": 0.1, "full_well_e": 12.3},
             "quantum_efficiency_std": {"R": default_camera().camera.quantum_efficiency["R"].scale(0.01)},
             "dark_current_doubling_c": None,
@@ -51,11 +57,15 @@ def _files() -> list[CameraFile]:
     )  # fmt: skip
     return [
         default_camera(),
-        CameraFile('quotes " and \\ and µ', full, (effect("veiling_glare")(share_percent=1.7), effect("defocus")(defocus_um=3.3))),
-        _with_lens(imaging=ZernikePupil(coefficients=(0.0, 0.01, -0.02, 1 / 3), index="noll", unit="waves", reference_wavelength_nm=550.0)),
-        _with_lens(imaging=ZernikePupil(coefficients=tuple(np.linspace(0, 0.05, 15).tolist()), index="osa", unit="um", colour_wavelength_nm=(450.0, 650.0), image_shift_um=((0.0, 0.1), (0.3, -0.1)))),
+        CameraFile('quotes " and \\ and µ', full, (effect("veiling_glare")(share_percent=1.7),
+        effect("defocus")(defocus_um=3.3))),
+        _with_lens(imaging=ZernikePupil(coefficients=(0.0, 0.01, -0.02, 1 / 3), index="noll", unit="waves",
+        reference_wavelength_nm=550.0)),
+        _with_lens(imaging=ZernikePupil(coefficients=tuple(np.linspace(0, 0.05, 15).tolist()), index="osa", unit="um",
+        colour_wavelength_nm=(450.0, 650.0), image_shift_um=((0.0, 0.1), (0.3, -0.1)))),
         _with_lens(imaging=MeasuredPsf(wavelength_nm=(450.0, 650.0), psf=psf.tolist(), sample_pitch_um=0.8)),
-        _with_lens(imaging=MeasuredOtf(wavelength_nm=(550.0,), frequency_x_cy_per_um=(0.0, 0.1, 0.4), modulus=(((1.0, 0.7, 0.0),),))),
+        _with_lens(imaging=MeasuredOtf(wavelength_nm=(550.0,), frequency_x_cy_per_um=(0.0, 0.1, 0.4), modulus=(((1.0,
+        0.7, 0.0),),))),
         _with_lens(imaging=TracedLens(table=_table())),
     ]  # fmt: skip
 
@@ -71,7 +81,8 @@ def test_what_is_written_is_read(tmp_path: Path, content: CameraFile) -> None:
 
 
 @given(
-    st.floats(0.5, 64.0), st.floats(0.0, 1e5), st.floats(1e-6, 1e3), st.integers(1, 5000), st.text(max_size=20).filter(str.isprintable)
+    st.floats(0.5, 64.0), st.floats(0.0, 1e5), st.floats(1e-6, 1e3), st.integers(1, 5000),
+    st.text(max_size=20).filter(str.isprintable)
 )  # fmt: skip
 @settings(max_examples=25)
 def test_any_number_comes_back_to_the_last_bit(
@@ -94,7 +105,10 @@ def test_every_parameter_has_its_unit_and_meaning_beside_it(tmp_path: Path) -> N
     text = file.read_text()
     for model in (CameraModel, Lens):
         for key, quantity in read_quantities(model).items():
-            assert any(line.startswith((f"{key} = ", f"# {key} ")) and line.endswith(f"# {said_of(quantity)}") for line in text.splitlines())  # fmt: skip
+            assert any(
+                line.startswith((f"{key} = ", f"# {key} ")) and line.endswith(f"# {said_of(quantity)}")
+                for line in text.splitlines()
+            )
 
 
 def test_curves_may_lie_beside(tmp_path: Path) -> None:
@@ -128,7 +142,8 @@ def test_a_measured_psf_may_be_a_plain_array(tmp_path: Path) -> None:
 
 
 def test_a_lens_is_traced_from_its_prescription(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tracer is called with the path as seen from the camera file; the path, not the table, is what is written back."""
+    """The tracer is called with the path as seen from the camera file; the path, not the table, is what is written
+    back."""
     monkeypatch.setattr(
         "lab.formats.camera_file.traced_table",
         lambda path, cache, progress: _table() if path.name == "a.zmx" else 1 / 0,
@@ -162,28 +177,40 @@ def _changed(folder: Path, old: str, new: str) -> Path:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("read_noise_e = 2.4", "read_noise_e = -2.4", r"read_noise_e: .*: -2.4 e is below the lower limit 0.0 e; give a value within the limits$"),
+        ("read_noise_e = 2.4", "read_noise_e = -2.4", (r"read_noise_e: .*: -2.4 e is below the lower limit 0.0 e; give "
+            r"a value within the limits$")),
         ("read_noise_e = 2.4", 'read_noise_e = "low"', r"read_noise_e is 'low': .*number"),
         ("read_noise_e = 2.4", "read_noise_e = nan", r"read_noise_e is nan: .*finite"),
         ("read_noise_e = 2.4", "", r"read_noise_e is missing; add it \(e: temporal noise of a dark pixel"),
-        ("read_noise_e = 2.4", "read_noise = 2.4\nread_noise_e = 2.4", r"read_noise isn't a key of a camera file; leave it out, or take one of format, "),
+        ("read_noise_e = 2.4", "read_noise = 2.4\nread_noise_e = 2.4", (r"read_noise isn't a key of a camera file; "
+            r"leave it out, or take one of format, ")),
         ("f_number = 4.0", "f_number = 0.0", r"lens.f_number: .*: 0.0 is below the lower limit 0.5"),
-        ("f_number = 4.0", "f_number = 4.0\nzoom = 2", r"lens.zoom isn't a key .* take one of f_number, focal_length_mm"),
-        ("focal_length_mm = 8.0", "focal_length_mm = -8.0", r"lens.focal_length_mm: focal length: -8.0 mm is below the lower limit 0.1 mm"),
+        ("f_number = 4.0", "f_number = 4.0\nzoom = 2", r"lens.zoom isn't a key .* take one of f_number, focal_length_mm"),  # noqa: E501
+        ("focal_length_mm = 8.0", "focal_length_mm = -8.0", (r"lens.focal_length_mm: focal length: -8.0 mm is below "
+            r"the lower limit 0.1 mm")),
         ('cfa = "RGGB"', 'cfa = "RGBG"', r"cfa is 'RGBG': .*RGGB"),
-        ('cfa = "RGGB"', 'cfa = "MONO"', r"quantum_efficiency has the channels R, G, B; a MONO camera's are Y, give those"),
-        ("white_level_dn = 4095.0", "white_level_dn = 5000.0", r"white_level_dn is 5000 DN, above the limit of 4095 DN of 12 bit"),
-        ("black_level_dn = 64.0", "black_level_dn = 4095.0", r"black_level_dn is 4095 DN, not below the limit of white_level_dn"),
-        ("380.0, 390.0", "390.0, 380.0", r"quantum_efficiency.R.*wavelengths must ascend: 380.0 nm follows 390.0 nm; sort the rows"),
+        ('cfa = "RGGB"', 'cfa = "MONO"', (r"quantum_efficiency has the channels R, G, B; a MONO camera's are Y, give "
+            r"those")),
+        ("white_level_dn = 4095.0", "white_level_dn = 5000.0", (r"white_level_dn is 5000 DN, above the limit of 4095 "
+            r"DN of 12 bit")),
+        ("black_level_dn = 64.0", "black_level_dn = 4095.0", (r"black_level_dn is 4095 DN, not below the limit of "
+            r"white_level_dn")),
+        ("380.0, 390.0", "390.0, 380.0", (r"quantum_efficiency.R.*wavelengths must ascend: 380.0 nm follows 390.0 nm; "
+            r"sort the rows")),
         ("0.00013, 0.00091", "1.5, 0.00091", r"quantum_efficiency.R runs from .* to 1.5, beyond the limits of 0 and 1"),
         ('kind = "diffraction_limited"', 'kind = "perfect"', r"lens.imaging.*'perfect'.*diffraction_limited"),
-        ('kind = "diffraction_limited"', 'kind = "traced_lens"', r"lens.imaging of a traced lens has the keys kind; give kind and either prescription"),
-        ('kind = "diffraction_limited"', 'kind = "measured_psf"\nsamples = "none.npz"', r"lens.imaging.samples: .*none.npz can't be read"),
+        ('kind = "diffraction_limited"', 'kind = "traced_lens"', (r"lens.imaging of a traced lens has the keys kind; "
+            r"give kind and either prescription")),
+        ('kind = "diffraction_limited"', 'kind = "measured_psf"\nsamples = "none.npz"', (r"lens.imaging.samples: "
+            r".*none.npz can't be read")),
         ("version = 1", "version = 2", r"format 'calibench-camera' version 2 is not 'calibench-camera' 1"),
         ("[lens]", "[lens", r"isn't TOML"),
-        ("[lens]", '[[effects]]\nname = "glare"\n[lens]', r"effects\[0\].name is 'glare', which isn't an effect; take one of .*veiling_glare"),
-        ("[lens]", '[[effects]]\nname = "veiling_glare"\nshare_percent = 200\n[lens]', r"effects\[0\].share_percent: .*: 200.0 % is above the upper limit"),
-        ("[lens]", '[[effects]]\nname = "veiling_glare"\nshare = 2\n[lens]', r"effects\[0\].share isn't a key .*one of share_percent"),
+        ("[lens]", '[[effects]]\nname = "glare"\n[lens]', (r"effects\[0\].name is 'glare', which isn't an effect; take "
+            r"one of .*veiling_glare")),
+        ("[lens]", '[[effects]]\nname = "veiling_glare"\nshare_percent = 200\n[lens]', (r"effects\[0\].share_percent: "
+            r".*: 200.0 % is above the upper limit")),
+        ("[lens]", '[[effects]]\nname = "veiling_glare"\nshare = 2\n[lens]', (r"effects\[0\].share isn't a key .*one "
+            r"of share_percent")),
     ],
 )  # fmt: skip
 def test_errors_name_key_value_limit_and_remedy(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -208,7 +235,16 @@ def test_a_fitted_camera_is_a_camera_file(tmp_path: Path, capsys: pytest.Capture
         electrons = rng.poisson(photons, (60, 80)) + rng.normal(0, 4, (60, 80))
         frames[f"frames/{number}.npy"] = np.clip(100 + 0.5 * electrons, 0, 4095).round().astype(np.uint16)
         light = {"photons_per_pixel": 2 * photons, "wavelength_nm": 530} if kind == "flat" else {}
-        captures.append({"id": f"{kind}-{number}", "kind": kind, "side": "left", "frame": f"frames/{number}.npy", "exposure_s": 0.01} | light)  # fmt: skip
+        captures.append(
+            {
+                "id": f"{kind}-{number}",
+                "kind": kind,
+                "side": "left",
+                "frame": f"frames/{number}.npy",
+                "exposure_s": 0.01,
+            }
+            | light
+        )
     maker = {"rows": 60, "cols": 80, "cfa": "MONO", "bit_depth": 12, "black_level_dn": 100}
     manifest = Manifest.model_validate({"name": "flats", "cameras": {"left": maker}, "captures": captures})
     folder = recording.write(RecordingSet(manifest, frames), tmp_path / "flats")

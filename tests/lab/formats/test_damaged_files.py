@@ -13,7 +13,7 @@ import tifffile
 from lab.formats.recording_set import read
 from tests.lab.formats.damaged_sets import edit, only, problems
 
-# --- what is refused: damaged files -------------------------------------------------------------------------------------
+# --- what is refused: damaged files -----------------------------------------------------------------------------------
 
 
 def test_truncated_frame(folder: Path) -> None:

@@ -83,7 +83,8 @@ def test_a_mark_that_may_be_either_is_refused(cells: str, words: str) -> None:
 
 @given(st.lists(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=2, max_size=2), min_size=1))
 def test_numbers_are_the_same_in_either_form(rows: list[list[float]]) -> None:
-    """`repr` gives shortest numbers; those with three digits after a comma may be thousands, so one that isn't stands first."""
+    """`repr` gives shortest numbers; those with three digits after a comma may be thousands, so one that isn't stands
+    first."""
     plain = "a,b\n0.5,0.5\n" + "".join(f"{a!r},{b!r}\n" for a, b in rows)
     text, _ = plain_csv(plain.replace(",", ";").replace(".", ","))
     assert text == plain

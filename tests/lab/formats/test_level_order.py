@@ -14,7 +14,8 @@ FLATS_S = (0.01, 0.015, 0.02, 0.03, 0.04, 0.06)
 def _set(
     order: list[int], *, darks_s: tuple[float, ...] = (0.01, 0.01), swap: tuple[str, str] | None = None
 ) -> RecordingSet:
-    """Two darks and two flats of each exposure. `order`: the frame of each row, by the place at which it was taken. `swap`: kinds to exchange."""
+    """Two darks and two flats of each exposure. `order`: the frame of each row, by the place at which it was taken.
+    `swap`: kinds to exchange."""
     rng = np.random.default_rng(5)
     rows = [("dark", exposure_s) for exposure_s in darks_s] + [("flat", s) for s in FLATS_S for _ in range(2)]
     levels = [BLACK_DN + (DN_PER_S * exposure_s if kind == "flat" else 0.0) for kind, exposure_s in rows]
@@ -61,7 +62,8 @@ def test_exchanged_kinds_are_refused(tmp_path: object) -> None:
 
 
 def test_light_in_a_dark_is_told() -> None:
-    """The second dark is a flat of 0.06 s: 2464 DN, more than any other. 13 of 26 pairs contradict at most, of its own all."""
+    """The second dark is a flat of 0.06 s: 2464 DN, more than any other. 13 of 26 pairs contradict at most, of its own
+    all."""
     problems, (line,) = _told(_set([0, ROWS - 1, *IN_ORDER[2:]]))
     assert problems == []
     assert "light in 1 of 2 darks (c1); correct their kind or take them out" in line
@@ -76,7 +78,8 @@ def test_light_in_a_dark_is_told() -> None:
     ],
 )
 def test_frames_moved_by_one_row_are_told(order: list[int], row: str, where: str) -> None:
-    """By all rows, and from one row on: a frame was lost. Rows whose neighbour has the same light don't tell where it begins."""
+    """By all rows, and from one row on: a frame was lost. Rows whose neighbour has the same light don't tell where it
+    begins."""
     problems, (line,) = _told(_set(order))
     assert problems == []
     assert f"({row})" in line

@@ -37,8 +37,10 @@ def _bell(peak_nm: float) -> Spectrum:
 def _camera(cfa: Cfa = "RGGB", rows: int = 48, cols: int = 64, bits: int = 12, black: float = 64.0) -> CameraModel:
     curves = {"Y": _bell(550)} if cfa == "MONO" else {"R": _bell(600), "G": _bell(535), "B": _bell(460)}
     return CameraModel(
-        rows=rows, cols=cols, pixel_pitch_um=3.45, fill_factor=1.0, cfa=cfa, bit_depth=bits, black_level_dn=black, white_level_dn=2.0**bits - 1,
-        conversion_gain_dn_per_e=0.4, full_well_e=10000.0, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=0.0, prnu_percent=0.0,
+        rows=rows, cols=cols, pixel_pitch_um=3.45, fill_factor=1.0, cfa=cfa, bit_depth=bits, black_level_dn=black,
+        white_level_dn=2.0**bits - 1,
+        conversion_gain_dn_per_e=0.4, full_well_e=10000.0, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=0.0,
+        prnu_percent=0.0,
         quantum_efficiency=curves, lens=Lens(f_number=4.0, focal_length_mm=8.0),
     )  # fmt: skip
 

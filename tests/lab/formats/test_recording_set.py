@@ -25,7 +25,7 @@ from tests.lab.formats.damaged_sets import edit, only, problems
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 
-# --- what is fine -------------------------------------------------------------------------------------------------------
+# --- what is fine -----------------------------------------------------------------------------------------------------
 
 
 def test_written_set_reads_back_bit_for_bit(small_set: Callable[..., RecordingSet], folder: Path) -> None:
@@ -156,7 +156,7 @@ def test_byte_order_and_memory_order_of_a_frame_do_not_matter(folder: Path) -> N
     assert loaded.flags.c_contiguous
 
 
-# --- what is refused: paths ---------------------------------------------------------------------------------------------
+# --- what is refused: paths -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -201,7 +201,7 @@ def test_link_within_the_folder_is_fine_and_so_is_a_linked_set(folder: Path) -> 
     assert read(folder.parent / "link").warnings == ()
 
 
-# --- what is refused: the manifest --------------------------------------------------------------------------------------
+# --- what is refused: the manifest ------------------------------------------------------------------------------------
 
 
 def test_folder_or_manifest_missing_or_no_json(folder: Path) -> None:
@@ -300,7 +300,7 @@ def test_channel_that_the_sensor_has_not(folder: Path) -> None:
     only(folder, "channel 'Y'", "RGGB")
 
 
-# --- writing ------------------------------------------------------------------------------------------------------------
+# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_refused_set_is_not_written(small_set: Callable[..., RecordingSet], tmp_path: Path) -> None:
@@ -340,7 +340,7 @@ def test_a_set_whose_paths_leave_the_folder_is_not_written(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-# --- sets that others made ----------------------------------------------------------------------------------------------
+# --- sets that others made --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["foreign_healthy", "foreign_two_effects"])

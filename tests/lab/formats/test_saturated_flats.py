@@ -13,7 +13,7 @@ import tifffile
 from lab.formats.recording_set import read
 from tests.lab.formats.damaged_sets import edit, only, problems
 
-# --- saturated flats ----------------------------------------------------------------------------------------------------
+# --- saturated flats --------------------------------------------------------------------------------------------------
 
 
 def flats_of(folder: Path, side: str) -> list[dict[str, Any]]:
@@ -87,13 +87,14 @@ def test_clipped_channel_of_another_kind_is_only_remarked(folder: Path) -> None:
     assert "1 narrowband captures of the left camera have a channel clipped" in line
 
 
-# --- full well below the converter's range, whose read noise spreads the pixels over codes ---------------------------------
+# --- full well below the converter's range, whose read noise spreads the pixels over codes ----------------------------
 
 
 def ladder(
     folder: Path, exposures_s: tuple[float, ...], full_well_dn: float, stated: dict[float, float] | None = None
 ) -> None:
-    """Replaces the left camera's flats by three repeats of each exposure: 200 DN a ms, photon noise, a full well, 2 DN of read noise.
+    """Replaces the left camera's flats by three repeats of each exposure: 200 DN a ms, photon noise, a full well, 2 DN
+    of read noise.
 
     Red has twice the light of the others. The lamp's radiance is read anew, within 0.03 %, with each repeat.
     `stated`: exposure that the manifest states for one of the exposures.

@@ -51,14 +51,14 @@ def one_line(error: pytest.ExceptionInfo[InputError]) -> str:
     return text
 
 
-# --- lights ------------------------------------------------------------------------------------------------------------
+# --- lights -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_measured_light_is_taken_in_its_unit(tmp_path: Path) -> None:
     energy, photons, relative = (tmp_path / name for name in ("energy.csv", "photons.csv", "relative.csv"))
     energy.write_text("wavelength_nm,radiance_w_sr_m2_nm\n500,0.2\n600,0.1\n")
     photons.write_text(
-        f"wavelength_nm,photons_s_sr_m2_nm\n500,{0.2 * 500 / PHOTON_ENERGY_J_NM!r}\n600,{0.1 * 600 / PHOTON_ENERGY_J_NM!r}\n"
+        f"wavelength_nm,photons_s_sr_m2_nm\n500,{0.2 * 500 / PHOTON_ENERGY_J_NM!r}\n600,{0.1 * 600 / PHOTON_ENERGY_J_NM!r}\n"  # noqa: E501
     )
     relative.write_text("wavelength_nm,relative\n500,2\n600,1\n")
     assert read_light(energy).value == (0.2, 0.1)
@@ -117,7 +117,7 @@ def test_any_text_is_a_light_or_an_input_error(text: str, headed: bool) -> None:
             assert np.all(np.diff(found.wavelength_nm) > 0)
 
 
-# --- pictures ----------------------------------------------------------------------------------------------------------
+# --- pictures ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_picture_is_its_codes(tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_a_damaged_picture_is_refused(tmp_path: Path) -> None:
         read_picture(tmp_path / "none.png")
 
 
-# --- cubes -------------------------------------------------------------------------------------------------------------
+# --- cubes ------------------------------------------------------------------------------------------------------------
 
 
 def values(dtype: type = float) -> np.ndarray:
@@ -308,7 +308,7 @@ def test_a_damaged_envi_header_is_a_cube_or_an_input_error(data: st.DataObject) 
             assert "\n" not in str(error)
 
 
-# --- scenes ------------------------------------------------------------------------------------------------------------
+# --- scenes -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_scene_is_a_name_a_picture_or_a_cube(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""Captures predicted by a model: against recordings of the second image former, and against frames drawn by the model itself."""
+"""Captures predicted by a model: against recordings of the second image former, and against frames drawn by the model
+itself."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ def replay(recordings: RecordingSet) -> Replay:
 
 
 def test_edges_come_out_where_they_were_recorded(replay: Replay, recordings: RecordingSet) -> None:
-    """Residuals within the noise (photon noise, PRNU) but for a tenth: an edge that were off by 0.1 px alone would add a third."""
+    """Residuals within the noise (photon noise, PRNU) but for a tenth: an edge that were off by 0.1 px alone would add
+    a third."""
     camera = replay.camera
     for capture in recordings.captures(SlantedEdgeCapture)[:3]:
         assert capture.region is not None
@@ -55,8 +57,8 @@ def test_uniform_light_has_the_level_that_the_maker_promises(replay: Replay, rec
 
 
 def test_drawn_frames_vary_about_the_expected_one(replay: Replay) -> None:
-    """The mean of a frame of n pixels within 5 sigma: photon noise and PRNU over sqrt(n), and what rounding leaves. Repeats are drawn
-    of the first one's scene: another's edge lies some hundredths of a pixel beside it."""
+    """The mean of a frame of n pixels within 5 sigma: photon noise and PRNU over sqrt(n), and what rounding leaves.
+    Repeats are drawn of the first one's scene: another's edge lies some hundredths of a pixel beside it."""
     again = replay.drawn(np.random.default_rng(3))
     camera = replay.camera
     of_scene: dict[object, FloatArray] = {}

@@ -76,7 +76,8 @@ def test_the_automatic_exposure_is_what_it_says(small: Path) -> None:
 
 
 def test_frames_can_be_made_again(small: Path, tmp_path: Path) -> None:
-    """From the record's own options: to the last code, at the exposure found; another seed is another frame of the same camera."""
+    """From the record's own options: to the last code, at the exposure found; another seed is another frame of the same
+    camera."""
     file = tmp_path / "a.npy"
     assert _run("slanted-edge", "--camera", small, "--out", file, "--seed", 5, "--set", "contrast=0.4") == 0
     record = json.loads((tmp_path / "a.json").read_text())
@@ -90,8 +91,8 @@ def test_frames_can_be_made_again(small: Path, tmp_path: Path) -> None:
 
 
 def test_noise_has_the_size_that_the_model_says(small: Path) -> None:
-    """Frames of one camera differ by temporal noise alone: half the variance of their difference is the model's, of two frames
-    at one level within 4.5 sqrt(2 / n); fixed patterns cancel. Against `--expected` they don't."""
+    """Frames of one camera differ by temporal noise alone: half the variance of their difference is the model's, of two
+    frames at one level within 4.5 sqrt(2 / n); fixed patterns cancel. Against `--expected` they don't."""
     from sim.sensor.electrons import dn_moments
 
     camera = read_camera(small)
@@ -248,11 +249,14 @@ ERRORS: list[tuple[tuple[str, ...], str]] = [
     (("uniform", "--out", "{}/a.npy", "--illuminant", "{}/bad.csv"), "bad.csv: "),
     (("uniform", "--out", "{}/a.npy", "--illuminant", "{}/down.csv"), "700 nm"),
     (("uniform", "--out", "{}/a.npy", "--illuminant", "{}/negative.csv"), "is -1 at 500 nm, below the limit of 0"),
-    (("uniform", "--out", "{}/a.npy", "--illuminant", "{}/infrared.csv"), "the scene's light lies at 900 to 1000 nm, outside the limits"),
-    (("uniform", "--out", "{}/a.npy", "--exposure-s", "100"), "exposure 100 s saturates all pixels: the darkest collects"),
+    (("uniform", "--out", "{}/a.npy", "--illuminant", "{}/infrared.csv"), ("the scene's light lies at 900 to 1000 nm, "
+        "outside the limits")),
+    (("uniform", "--out", "{}/a.npy", "--exposure-s", "100"), ("exposure 100 s saturates all pixels: the darkest "
+        "collects")),
     (("uniform", "--out", "{}/a.npy", "--exposure-s", "-1"), ": -1.0 s is below the lower limit 0.0 s"),
     (("uniform", "--out", "{}/a.npy", "--luminance-cd-m2", "1e9"), "beyond the limits of 1e-06 and 3600 s"),
-    (("uniform", "--out", "{}/a.npy", "--distance-mm", "5"), "distance 5.0 mm is not above the limit of the focal length"),
+    (("uniform", "--out", "{}/a.npy", "--distance-mm", "5"), ("distance 5.0 mm is not above the limit of the focal "
+        "length")),
     (("slanted-edge", "--out", "{}/a.npy", "--set", "contrast=2"), ": 2.0 is above the upper limit"),
     (("slanted-edge", "--out", "{}/a.npy", "--set", "size=2"), "has no parameter 'size': it has angle_deg"),
     (("slanted-edge", "--out", "{}/a.npy", "--set", "contrast"), "isn't KEY=VALUE"),

@@ -1,4 +1,5 @@
-"""Validation on recordings of the second image former: a healthy camera passes, a concealed filter fails, and passes with its model."""
+"""Validation on recordings of the second image former: a healthy camera passes, a concealed filter fails, and passes
+with its model."""
 
 from __future__ import annotations
 
@@ -80,8 +81,9 @@ def test_what_isn_t_there_is_skipped_with_its_reason() -> None:
 
 
 def test_the_expected_kernel_of_a_soft_lens_is_the_forward_models() -> None:
-    """Without detail that half a pixel's samples can't hold, least squares on any pattern find the transfer's own kernel: five taps
-    leave some 1e-3 of the maximum in the core. Of a sharp one the rims of the cells make it another."""
+    """Without detail that half a pixel's samples can't hold, least squares on any pattern find the transfer's own
+    kernel: five taps leave some 1e-3 of the maximum in the core. Of a sharp one the rims of the cells make it
+    another."""
     for f_number, apart in ((8.0, (0.0, 6e-3)), (1.8, (2e-2, 0.2))):
         model = camera_model(
             recordings_of(ConcealedCamera(931, cfa="MONO", f_number=f_number, rows=32, cols=32), Plan(("dark",))),

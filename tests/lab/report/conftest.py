@@ -279,20 +279,27 @@ def _made_up(seed: int = 3, verdict: str = "explained", sides: tuple[Side, ...] 
         threshold=4.4,
         false_alarm_rate=0.01,
         mismatches=(
-            Mismatch(side="left", measurement="slanted_edge", axis="spatial_frequency", where="0.18..0.41 cy/px, all channels", significance_sigma=54.2, captures=("edge-1", "edge-2")),
-            Mismatch(side="left", measurement="narrowband", axis="wavelength", where="640..700 nm, R", significance_sigma=31.0, captures=("nb-640",)),
-            Mismatch(side="left", measurement="chart", axis="patch", where="red, orange", significance_sigma=6.8, captures=("chart-1",)),
+            Mismatch(side="left", measurement="slanted_edge", axis="spatial_frequency", where="0.18..0.41 cy/px, all "
+                "channels", significance_sigma=54.2, captures=("edge-1", "edge-2")),
+            Mismatch(side="left", measurement="narrowband", axis="wavelength", where="640..700 nm, R",
+            significance_sigma=31.0, captures=("nb-640",)),
+            Mismatch(side="left", measurement="chart", axis="patch", where="red, orange", significance_sigma=6.8,
+            captures=("chart-1",)),
         ),
         effects=(
             NamedEffect(
-                name="optical_low_pass_filter", family="isotropic_contrast_loss", law="exact", probability=0.994, sides=("left",), rivals=(Rival(name="defocus", probability=0.006),),
-                parameters={"displacement_x_um": ParameterValue(value=2.104, std=0.051, unit="um"), "displacement_y_um": ParameterValue(value=2.08, std=0.05, unit="um")},
-                statement="A birefringent plate before the sensor splits each ray in two; contrast falls as the cosine of the displacement.",
+                name="optical_low_pass_filter", family="isotropic_contrast_loss", law="exact", probability=0.994,
+                sides=("left",), rivals=(Rival(name="defocus", probability=0.006),),
+                parameters={"displacement_x_um": ParameterValue(value=2.104, std=0.051, unit="um"),
+                "displacement_y_um": ParameterValue(value=2.08, std=0.05, unit="um")},
+                statement="A birefringent plate before the sensor splits each ray in two; contrast falls as the "
+                    "cosine of the displacement.",
                 reference="Greivenkamp, Appl. Opt. 29, 676 (1990)",
             ),
             NamedEffect(
                 name="infrared_cut_filter", family="spectral_filter", law="exact", probability=0.999, sides=("left",),
-                parameters={"cut_nm": ParameterValue(value=655.2, std=0.8, unit="nm")}, statement="A filter cuts off the long waves.",
+                parameters={"cut_nm": ParameterValue(value=655.2, std=0.8, unit="nm")},
+                statement="A filter cuts off the long waves.",
             ),
         ),
         held_out=HeldOut(captures=("edge-3", "edge-4"), chi2_before=9120.0, chi2_after=480.0, n=468),

@@ -8,7 +8,8 @@ from lab.report.charts import residual_curve
 from lab.report.diagnosis import context, mood, place_maps, worst_of_each
 
 PLACES = tuple(
-    ExaminedPlace(side="left", measurement=m, axis=axis, where=where, n=10, chi2_before=before, chi2_after=9.0, sigma_before=sigma, sigma_after=0.0)
+    ExaminedPlace(side="left", measurement=m, axis=axis, where=where, n=10, chi2_before=before, chi2_after=9.0,
+    sigma_before=sigma, sigma_after=0.0)
     for m, axis, where, before, sigma in (
         ("a_new_one", "somewhere", "here", 9.0, 0.0),
         ("slanted_edge", "spatial_frequency", "0.1..0.2", 80.0, 5.5),
@@ -71,7 +72,8 @@ def test_the_first_screen_shows_each_effect_in_its_own_measurement() -> None:
 
     def named(name: str, *shown_in: str) -> NamedEffect:
         return NamedEffect(
-            name=name, family="isotropic_contrast_loss", law="exact", probability=1.0, sides=("left",), parameters={}, statement="",
+            name=name, family="isotropic_contrast_loss", law="exact", probability=1.0, sides=("left",), parameters={},
+            statement="",
             shown_in=shown_in,
         )  # fmt: skip
 

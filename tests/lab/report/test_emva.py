@@ -101,7 +101,8 @@ def test_spectra_are_flat_for_white_patterns_and_peak_for_lines() -> None:
     rng = np.random.default_rng(2)
     white = 3.0 * rng.standard_normal((400, 256))
     frequency, amplitude = spectrogram(white)
-    # 400 rows: each frequency's power is known to 1 / sqrt(400) (twice that at the last); four of these, halved by the root.
+    # 400 rows: each frequency's power is known to 1 / sqrt(400) (twice that at the last); four of these, halved by the
+    # root.
     assert np.all(np.abs(amplitude[:-1] / 3.0 - 1.0) < 0.11)
     assert frequency[0] == pytest.approx(1 / 256)
     assert frequency[-1] == 0.5

@@ -207,8 +207,10 @@ def test_a_law_without_a_name_is_told_and_drawn(small_set: Callable[..., Recordi
     recordings = small_set()
     fit, validation, diagnosis = made_up()
     law = DiscoveredLaw(
-        side="left", stage="codes", along="code", period=2, table=(1.04, 0.96), shown_period=2, shown_departure=(0.04, -0.04),
-        shown_std=(0.01, 0.01), chi2_before=900.0, chi2_after=120.0, n=100, suspects="a heavy bit", statement="Codes repeat.",
+        side="left", stage="codes", along="code", period=2, table=(1.04, 0.96), shown_period=2, shown_departure=(0.04,
+        -0.04),
+        shown_std=(0.01, 0.01), chi2_before=900.0, chi2_after=120.0, n=100, suspects="a heavy bit",
+        statement="Codes repeat.",
     )  # fmt: skip
     changed = diagnosis.model_copy(update={"verdict": "partly_explained", "discovered": (law,)})
     page = Page(render_report(recordings, fit, validation, changed, provenance_of(recordings)))
@@ -313,7 +315,7 @@ def test_provenance_has_a_digest_of_every_frame(small_set: Callable[..., Recordi
     assert {"python", "calibench", "numpy"} <= set(first.versions)
 
 
-# --- figures and pictures -----------------------------------------------------------------------------------------------
+# --- figures and pictures ---------------------------------------------------------------------------------------------
 
 
 def test_what_one_side_lacks_keeps_its_place(made_up: MadeUp) -> None:
@@ -373,7 +375,8 @@ def test_patch_colours_are_balanced_on_the_measured_white() -> None:
         for c, v in values.items()
     ]
     red = [
-        PatchComparison(patch="red", channel=c, predicted_dn=0.5 * v, predicted_dn_std=1, measured_dn=v * (0.5 if c == "R" else 0.0), measured_dn_std=1)
+        PatchComparison(patch="red", channel=c, predicted_dn=0.5 * v, predicted_dn_std=1,
+        measured_dn=v * (0.5 if c == "R" else 0.0), measured_dn_std=1)
         for c, v in values.items()
     ]  # fmt: skip
     colours = patch_colours((*white, *red))

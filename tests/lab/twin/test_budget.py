@@ -1,4 +1,5 @@
-"""The budget of uncertainty: what is uncertain alone adds everything, and its standard deviation is what linear propagation says."""
+"""The budget of uncertainty: what is uncertain alone adds everything, and its standard deviation is what linear
+propagation says."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from sim.effects.defocus import Defocus
 from tests.lab.twin.test_twin import TRUTH
 
 FIRST = FirstEstimates(
-    dark_temperature_c=25.0, read_noise_dn=1.5, black_level_std_dn=0.1, dark_current_std_dn_per_s=0.1, level_jitter_dn=0.02, lamp_jitter=1e-3
+    dark_temperature_c=25.0, read_noise_dn=1.5, black_level_std_dn=0.1, dark_current_std_dn_per_s=0.1,
+    level_jitter_dn=0.02, lamp_jitter=1e-3
 )  # fmt: skip
 
 

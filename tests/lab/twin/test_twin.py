@@ -47,8 +47,10 @@ def _curve(centre_nm: float) -> Spectrum:
 TRUTH = CameraFile(
     "truth",
     CameraModel(
-        rows=ROWS, cols=COLS, pixel_pitch_um=4.0, fill_factor=0.9, cfa="RGGB", bit_depth=12, black_level_dn=64.0, white_level_dn=4095.0,
-        conversion_gain_dn_per_e=0.38, full_well_e=10500.0, read_noise_e=4.0, dark_current_e_per_s=20.0, dark_current_doubling_c=7.0, dsnu_e=0.8,
+        rows=ROWS, cols=COLS, pixel_pitch_um=4.0, fill_factor=0.9, cfa="RGGB", bit_depth=12, black_level_dn=64.0,
+        white_level_dn=4095.0,
+        conversion_gain_dn_per_e=0.38, full_well_e=10500.0, read_noise_e=4.0, dark_current_e_per_s=20.0,
+        dark_current_doubling_c=7.0, dsnu_e=0.8,
         prnu_percent=0.6, quantum_efficiency={"R": _curve(605.0), "G": _curve(530.0), "B": _curve(455.0)},
         lens=Lens(f_number=4.0, focal_length_mm=8.0),
     ),
@@ -66,7 +68,8 @@ def _plan() -> RecordingSet:
             k = len(captures)
             time = f"2026-03-02T09:{k // 60:02d}:{k % 60:02d}Z"
             captures.append(
-                {"id": f"c{k:03d}", "kind": kind, "side": "left", "frame": f"frames/{k:03d}.npy", "exposure_s": exposure_s,
+                {"id": f"c{k:03d}", "kind": kind, "side": "left", "frame": f"frames/{k:03d}.npy",
+                "exposure_s": exposure_s,
                  "temperature_c": temperature_c, "time": time} | more
             )  # fmt: skip
 
@@ -127,7 +130,8 @@ def test_intervals_hold_in_a_configuration_that_nobody_has_seen(content: CameraF
     found = score(predict({"left": content}, PLAN, TRANSFERS[name], light_std=0.0), captured(TRANSFERS[name], 7))
     assert {q.quantity for q in found.quantities} == {"chart", "noise", "slanted_edge", "dark"} and found.missing == 0
     inside = sum(q.n * q.within_95_percent_interval for q in found.quantities) / found.n
-    # 95 % of some 300 numbers, of which errors of the parameters are common to many: 100 effectively, 4 standard deviations
+    # 95 % of some 300 numbers, of which errors of the parameters are common to many: 100 effectively, 4 standard
+    # deviations
     assert inside > 0.95 - 4.0 * np.sqrt(0.95 * 0.05 / 100.0)
     assert found.chi2 < 1.5 * found.n
 

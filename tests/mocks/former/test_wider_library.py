@@ -1,5 +1,5 @@
-"""Effects of the wider library are named where the former conceals them strongly, by its own form of the law, and not on
-healthy cameras.
+"""Effects of the wider library are named where the former conceals them strongly, by its own form of the law, and not
+on healthy cameras.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""What makes lists of a thousand sessions quick: how many steps each has, and indexes of their order and of their states."""
+"""What makes lists of a thousand sessions quick: how many steps each has, and indexes of their order and of their
+states."""
 
 from __future__ import annotations
 

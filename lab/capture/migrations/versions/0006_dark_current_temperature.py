@@ -16,12 +16,14 @@ _COLUMNS = ("temperature_c", "doubling_c", "doubling_c_std")
 def upgrade() -> None:
     for column in _COLUMNS:
         op.add_column("figures", sa.Column(column, sa.Double(), nullable=True))
-    # Figures that no two calibrations have alike: bands that are chosen anew in each, dark currents at a session's own temperatures.
+    # Figures that no two calibrations have alike: bands that are chosen anew in each, dark currents at a session's own
+    # temperatures.
     op.execute(
         "DELETE FROM figures WHERE name LIKE '% maker_departures %' OR name LIKE '% dark_current_temperature %e_per_s'"
     )
     op.execute(
-        "DELETE FROM figures WHERE id NOT IN (SELECT max(id) FROM figures GROUP BY calibration_id, camera, side, name, place)"
+        "DELETE FROM figures WHERE id NOT IN (SELECT max(id) FROM figures GROUP BY calibration_id, camera, side, "
+        "name, place)"
     )
     # The temperature of earlier ones isn't known; silicon's law is as in lab/fit/noise/dark_current.py.
     op.execute("UPDATE figures SET doubling_c = 7.2, doubling_c_std = 1.4 WHERE name LIKE 'noise dark_current%e_per_s'")

@@ -21,9 +21,12 @@ NOISE = 0.004
 def _camera() -> CameraModel:
     grid = np.arange(380.0, 781.0, 10.0)
     return CameraModel(
-        rows=64, cols=64, pixel_pitch_um=3.0, fill_factor=0.9, cfa="MONO", bit_depth=12, black_level_dn=64.0, white_level_dn=4095.0,
-        conversion_gain_dn_per_e=0.4, full_well_e=10000.0, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=0.0, prnu_percent=0.0,
-        quantum_efficiency={"Y": Spectrum.of(grid, np.full(grid.shape, 0.5))}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
+        rows=64, cols=64, pixel_pitch_um=3.0, fill_factor=0.9, cfa="MONO", bit_depth=12, black_level_dn=64.0,
+        white_level_dn=4095.0,
+        conversion_gain_dn_per_e=0.4, full_well_e=10000.0, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=0.0,
+        prnu_percent=0.0,
+        quantum_efficiency={"Y": Spectrum.of(grid, np.full(grid.shape, 0.5))}, lens=Lens(f_number=4.0,
+        focal_length_mm=8.0),
     )  # fmt: skip
 
 
@@ -47,7 +50,8 @@ def contrast_model(
     n = len(labels)
     value = np.concatenate([_transfer(truth, a) + extra for a in angles]) + NOISE * rng.standard_normal(n)
     block = Block(
-        measurement=declared("slanted_edge", "spatial_frequency", "cy/px"), reach=0.2, value=value, covariance=NOISE**2 * np.eye(n),
+        measurement=declared("slanted_edge", "spatial_frequency", "cy/px"), reach=0.2, value=value,
+        covariance=NOISE**2 * np.eye(n),
         labels=labels, reads=TRANSFER, scale=np.ones(n),
         predict=lambda acting: Prediction(np.concatenate([_transfer(acting, a) for a in angles]), {}),
     )  # fmt: skip
@@ -60,8 +64,10 @@ def spectral_model(rng: np.random.Generator, extra: Callable[[np.ndarray], np.nd
     labels = tuple(Label(float(w), "Y", "", (f"narrow-{i}",), i % 3 == 1) for i, w in enumerate(x))
     n = len(x)
     block = Block(
-        measurement=declared("narrowband", "wavelength", "nm"), reach=40.0, value=extra(x) + NOISE * rng.standard_normal(n),
-        covariance=NOISE**2 * np.eye(n), labels=labels, reads=frozenset({"image.transmittance"}), predict=lambda _: Prediction(np.zeros(n), {}),
+        measurement=declared("narrowband", "wavelength", "nm"), reach=40.0,
+        value=extra(x) + NOISE * rng.standard_normal(n),
+        covariance=NOISE**2 * np.eye(n), labels=labels, reads=frozenset({"image.transmittance"}),
+        predict=lambda _: Prediction(np.zeros(n), {}),
         scale=np.ones(n),
     )  # fmt: skip
     return MeasurementModel((block,), CAMERA)

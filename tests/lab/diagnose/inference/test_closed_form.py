@@ -30,7 +30,8 @@ def _names(problem: LinearProblem, one: LinearSet) -> set[str]:
 
 
 def test_scores_are_those_of_least_squares_with_signs() -> None:
-    """S = |r|^2 - min |r - G u|^2, of one column, of both signs of one, and of an effect with three; to the ridge of 1e-8."""
+    """S = |r|^2 - min |r - G u|^2, of one column, of both signs of one, and of an effect with three; to the ridge of
+    1e-8."""
     rng = np.random.default_rng(1)
     table = _columns(rng, 40, 5, 0.8)
     tables = [table[:, [0]], np.column_stack([table[:, 1], -table[:, 1]]), 3.0 * table[:, 2:]]
@@ -56,8 +57,8 @@ def test_a_parameter_of_one_sign_takes_nothing_of_the_other() -> None:
 
 
 def test_a_pair_that_one_rival_absorbs_is_the_best() -> None:
-    """The rival has a cosine of 0.96 with what a and b do together, so that it alone scores 0.92 of the pair's 800, and each of
-    these about half."""
+    """The rival has a cosine of 0.96 with what a and b do together, so that it alone scores 0.92 of the pair's 800, and
+    each of these about half."""
     rng = np.random.default_rng(3)
     table = _columns(rng, 60, 6, 0.0)
     together = table[:, 0] + table[:, 1]
@@ -73,7 +74,8 @@ def test_a_pair_that_one_rival_absorbs_is_the_best() -> None:
 
 
 def test_of_alternatives_a_pair_has_those_that_are_best_together() -> None:
-    """Of 200, the first alternative of a takes 191 alone, the second one 100; beside b, which takes 99 of the rest, 192 and 199."""
+    """Of 200, the first alternative of a takes 191 alone, the second one 100; beside b, which takes 99 of the rest, 192
+    and 199."""
     e = np.eye(4)
     first, second = e[0] + e[1] + 0.3 * e[3], e[0]
     white = 10.0 * e[0] + 10.0 * e[1]
@@ -97,12 +99,13 @@ def test_the_best_triples_extend_the_best_pairs() -> None:
 
 
 def test_sets_that_hold_95_percent_hold_the_truth_as_often() -> None:
-    """Ten effects of cosines about 0.8, each present with probability 0.15 (none, one or two are), of a size from a half normal of 20.
+    """Ten effects of cosines about 0.8, each present with probability 0.15 (none, one or two are), of a size from a
+    half normal of 20.
 
-    Over an amplitude u >= 0 with that prior, the likelihood's integral is about exp(S / 2) x 2 / 20: a cost of ln 10 beside the prior
-    odds. Over 200 draws, 95 % may come out 3 sqrt(0.95 x 0.05 / 200) = 4.6 % lower; and the likeliest set's probability is how often
-    it is right, to 3 sqrt(p (1 - p) / 200) <= 10.6 % and what Laplace's method leaves out (cosines: ln sqrt(1 - 0.8^2) = 0.5 in a
-    pair's log odds, of which 3 % are allowed for).
+    Over an amplitude u >= 0 with that prior, the likelihood's integral is about exp(S / 2) x 2 / 20: a cost of ln 10
+    beside the prior odds. Over 200 draws, 95 % may come out 3 sqrt(0.95 x 0.05 / 200) = 4.6 % lower; and the likeliest
+    set's probability is how often it is right, to 3 sqrt(p (1 - p) / 200) <= 10.6 % and what Laplace's method leaves
+    out (cosines: ln sqrt(1 - 0.8^2) = 0.5 in a pair's log odds, of which 3 % are allowed for).
     """
     rng = np.random.default_rng(5)
     present, width, draws = 0.15, 20.0, 200

@@ -39,7 +39,11 @@ def test_what_nobody_lists_gets_no_name() -> None:
 def test_a_name_beside_a_strong_remainder_is_a_family() -> None:
     """A filter, and a ripple that no law has: the nearest name takes 96 % of the excess, and what it leaves isn't
     within its tolerance. The family is named, with the nearest law and a discrepancy beside it."""
-    model = contrast_model(np.random.default_rng(23), (effect("optical_low_pass_filter")(displacement_x_um=1.6, displacement_y_um=1.6),), 0.03 * np.sin(14.0 * FREQUENCY))  # fmt: skip
+    model = contrast_model(
+        np.random.default_rng(23),
+        (effect("optical_low_pass_filter")(displacement_x_um=1.6, displacement_y_um=1.6),),
+        0.03 * np.sin(14.0 * FREQUENCY),
+    )
     verdict = decide(model, np.random.default_rng(0), DecisionPolicy())
     assert [c.told_name for c in verdict.named] == ["isotropic_contrast_loss"]
     assert verdict.named[0].holds_a_remainder

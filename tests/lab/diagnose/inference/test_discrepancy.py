@@ -49,7 +49,9 @@ def test_repeats_of_what_is_irregular_are_predicted() -> None:
     rng = np.random.default_rng(33)
     ragged = [0.05 * rng.standard_normal(len(FREQUENCY)) for _ in range(2)]
     model = contrast_model(rng)
-    model = MeasurementModel((replace(model.blocks[0], value=model.value + np.concatenate([ragged[0]] * 2 + [ragged[1]] * 2)),), CAMERA)  # fmt: skip
+    model = MeasurementModel(
+        (replace(model.blocks[0], value=model.value + np.concatenate([ragged[0]] * 2 + [ragged[1]] * 2)),), CAMERA
+    )
     gap = predictive_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy())
     before, n = model.held_out()
     after, _ = model.held_out(discrepancies={0: gap.kernel})

@@ -25,7 +25,9 @@ def test_gaussians_agree_with_their_formulas() -> None:
     solved = np.linalg.solve(dense, r)
     np.testing.assert_allclose(gaussian.solve(r), solved, rtol=1e-4, atol=1e-6)
     white = gaussian.whiten(np.column_stack([r, free]))
-    np.testing.assert_allclose(white.T @ white, np.column_stack([r, free]).T @ gaussian.solve(np.column_stack([r, free])), rtol=1e-6, atol=1e-9)  # fmt: skip
+    np.testing.assert_allclose(
+        white.T @ white, np.column_stack([r, free]).T @ gaussian.solve(np.column_stack([r, free])), rtol=1e-6, atol=1e-9
+    )
     assert gaussian.chi2(y) == pytest.approx(r @ solved, rel=1e-4)
     assert chi2(r, dense) == pytest.approx(r @ solved, rel=1e-4)
     assert gaussian.log_likelihood(y) == pytest.approx(-0.5 * r @ solved - 0.5 * np.linalg.slogdet(dense)[1], rel=1e-4)

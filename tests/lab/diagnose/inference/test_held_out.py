@@ -59,7 +59,8 @@ def test_a_name_that_held_out_captures_contradict_is_a_remark() -> None:
 
 
 def test_a_right_name_is_seldom_vetoed() -> None:
-    """A weak diffusion, fitted to the seen edges of 60 draws: at 1 % a draw, 4 or more vetoes have a probability of 0.3 %."""
+    """A weak diffusion, fitted to the seen edges of 60 draws: at 1 % a draw, 4 or more vetoes have a probability of 0.3
+    %."""
     policy, rng = DecisionPolicy(), np.random.default_rng(4)
     vetoes = 0
     for _ in range(60):
@@ -73,8 +74,8 @@ def test_a_right_name_is_seldom_vetoed() -> None:
 
 @pytest.mark.parametrize(("over", "is_vetoed"), [(1.0, False), (1.8, True)])
 def test_a_familys_nearest_law_has_to_predict_as_well_as_a_discrepancy(over: float, is_vetoed: bool) -> None:
-    """A law that fits the seen edges, and changes the held-out ones `over` times as much as they do: by 1.8, chi2 still falls to
-    (1.8 - 1)^2 = 64 % of what it is without, but a discrepancy alone predicts them within their noise."""
+    """A law that fits the seen edges, and changes the held-out ones `over` times as much as they do: by 1.8, chi2 still
+    falls to (1.8 - 1)^2 = 64 % of what it is without, but a discrepancy alone predicts them within their noise."""
     policy, law = DecisionPolicy(), ChargeDiffusion(length_um=0.8)
     model = contrast_model(np.random.default_rng(8), (law,))
     block = model.blocks[0]

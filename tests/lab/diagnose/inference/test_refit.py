@@ -33,9 +33,9 @@ from tests.lab.diagnose.on_blocks import declared
 def test_refit_covers_the_truth() -> None:
     """40 draws: pulls have mean 0 within 3 / sqrt(40) and a standard deviation in 0.6..1.35.
 
-    The plate's dispersion is drawn from its prior: a standard normal multiple of quartz's, from 589 nm to the model's 550 nm. The form
-    tolerance (0.2 %) is in the intervals and not in the draws, so that they may be too wide and not too narrow.
-    """
+    The plate's dispersion is drawn from its prior: a standard normal multiple of quartz's, from 589 nm to the model's
+    550 nm. The form tolerance (0.2 %) is in the intervals and not in the draws, so that they may be too wide and not
+    too narrow."""
     kind = effect("optical_low_pass_filter")
     quartz = float(birefringent_displacement_um(1.0, 550.0) / birefringent_displacement_um(1.0)) - 1.0
     pulls = []
@@ -54,9 +54,9 @@ def test_refit_covers_the_truth() -> None:
 
 @pytest.mark.parametrize(("departure", "is_exact"), [(0.0, True), (0.02, False)])
 def test_a_law_that_holds_better_than_declared_is_no_less_likely(departure: float, is_exact: bool) -> None:
-    """Of a sinusoidal movement (5 % declared), a part of the tolerance is likelier; where the numbers leave the law's form, the whole is
-    kept. The amplitude's standard deviation holds the whole either way: the change goes as its square, and half of 2.5 % is left by
-    averaging over frequencies at most.
+    """Of a sinusoidal movement (5 % declared), a part of the tolerance is likelier; where the numbers leave the law's
+    form, the whole is kept. The amplitude's standard deviation holds the whole either way: the change goes as its
+    square, and half of 2.5 % is left by averaging over frequencies at most.
     """
     kind = effect("vibration_blur")
     shape = departure * np.sin(20.0 * FREQUENCY)
@@ -95,15 +95,17 @@ def _timed_model(rng: np.random.Generator, drift: float, noise: float) -> Measur
 
     value = levels((SourceDrift(drift_percent_per_min=drift),)) + noise * rng.standard_normal(len(minutes))
     block = Block(
-        measurement=declared("photon_transfer", "level", "DN"), reach=1.0, value=value, covariance=noise**2 * np.eye(len(minutes)),
-        labels=labels, reads=frozenset({"light.level"}), predict=lambda acting: Prediction(levels(acting), {}), scale=np.ones(len(minutes)),
+        measurement=declared("photon_transfer", "level", "DN"), reach=1.0, value=value,
+        covariance=noise**2 * np.eye(len(minutes)),
+        labels=labels, reads=frozenset({"light.level"}), predict=lambda acting: Prediction(levels(acting), {}),
+        scale=np.ones(len(minutes)),
     )  # fmt: skip
     return MeasurementModel((block,), CAMERA)
 
 
 def test_a_size_far_from_the_usual_is_recovered() -> None:
-    """A drift of 5 %/min, usual 0.3, that the numbers tell to s = 0.5: 20 draws, pulls of mean 0 within 3 / sqrt(20) + s / 5, which the slope
-    of -ln(size) leaves. A normal prior of 0.9 would pull by 5 s / (s^2 + 0.81) = 2.4."""
+    """A drift of 5 %/min, usual 0.3, that the numbers tell to s = 0.5: 20 draws, pulls of mean 0 within 3 / sqrt(20) +
+    s / 5, which the slope of -ln(size) leaves. A normal prior of 0.9 would pull by 5 s / (s^2 + 0.81) = 2.4."""
     drift, noise = 5.0, 0.5e-2 * np.sqrt(np.sum(np.linspace(0.0, 1.0, 30) ** 2))
     start, pulls = (SourceDrift(drift_percent_per_min=0.1),), []
     for seed in range(20):
@@ -138,7 +140,8 @@ def test_what_the_numbers_do_not_tell_has_no_standard_deviation() -> None:
 
 
 def test_an_aperture_stays_within_the_pitch() -> None:
-    """Contrast that falls further than a wider aperture than the pitch explains, at a fill factor of 0.9: the fit ends at the pitch."""
+    """Contrast that falls further than a wider aperture than the pitch explains, at a fill factor of 0.9: the fit ends
+    at the pitch."""
     wider = effect("pixel_aperture")(side_change_um=1.0)
     fit = refit(
         contrast_model(np.random.default_rng(7), (wider,)), (type(wider)(side_change_um=0.05),), DecisionPolicy()
@@ -148,8 +151,8 @@ def test_an_aperture_stays_within_the_pitch() -> None:
 
 
 def test_a_profile_interval_is_that_of_a_normal_likelihood() -> None:
-    """A drift in white noise is linear in its size: four standard deviations, within 10 % as the law's tolerance grows with the size. By noise
-    alone the deviation is s / sqrt(sum(t^2))."""
+    """A drift in white noise is linear in its size: four standard deviations, within 10 % as the law's tolerance grows
+    with the size. By noise alone the deviation is s / sqrt(sum(t^2))."""
     minutes, noise = np.linspace(0.0, 1.0, 30), 0.004
     model = _timed_model(np.random.default_rng(5), 2.0, noise)
     fit = refit(model, (SourceDrift(drift_percent_per_min=2.0),), DecisionPolicy(), tolerance=0.0)
@@ -161,8 +164,8 @@ def test_a_profile_interval_is_that_of_a_normal_likelihood() -> None:
 
 
 def test_profile_intervals_cover_a_weak_blur() -> None:
-    """40 draws of a diffusion whose square is some two standard deviations from absence: at least 34 of the 95 % intervals hold it, which
-    fewer do with a probability of 0.3 %, and some but not all reach absence."""
+    """40 draws of a diffusion whose square is some two standard deviations from absence: at least 34 of the 95 %
+    intervals hold it, which fewer do with a probability of 0.3 %, and some but not all reach absence."""
     kind = effect("charge_diffusion")
     intervals = []
     for seed in range(40):

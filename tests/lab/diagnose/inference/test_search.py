@@ -100,8 +100,10 @@ KINDS: tuple[type[Effect], ...] = (_Up, _Bend, _Wave, _Ripple, _Arch)
 def _camera() -> CameraModel:
     flat = Spectrum.of([400.0, 700.0], [0.5, 0.5])
     return CameraModel(
-        rows=8, cols=8, pixel_pitch_um=3.0, fill_factor=1.0, cfa="MONO", bit_depth=12, black_level_dn=64.0, white_level_dn=4095.0,
-        conversion_gain_dn_per_e=0.5, full_well_e=8000.0, read_noise_e=2.0, dark_current_e_per_s=1.0, dsnu_e=0.0, prnu_percent=0.0,
+        rows=8, cols=8, pixel_pitch_um=3.0, fill_factor=1.0, cfa="MONO", bit_depth=12, black_level_dn=64.0,
+        white_level_dn=4095.0,
+        conversion_gain_dn_per_e=0.5, full_well_e=8000.0, read_noise_e=2.0, dark_current_e_per_s=1.0, dsnu_e=0.0,
+        prnu_percent=0.0,
         quantum_efficiency={"Y": flat}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
     )  # fmt: skip
 
@@ -114,8 +116,10 @@ def _model(truth: Sequence[Effect], rng: np.random.Generator) -> MeasurementMode
 
     block = Block(
         measurement=declared("dark", "time", "s"), reach=0.2, value=line(truth) + NOISE * rng.standard_normal(X.size),
-        covariance=NOISE**2 * np.eye(X.size), labels=tuple(Label(float(x), "all", "", (f"c{i}",), False) for i, x in enumerate(X)),
-        reads=frozenset({"signal.offset_dn"}), predict=lambda acting: Prediction(line(acting), {}), scale=np.ones(X.size),
+        covariance=NOISE**2 * np.eye(X.size), labels=tuple(Label(float(x), "all", "", (f"c{i}",), False) for i,
+        x in enumerate(X)),
+        reads=frozenset({"signal.offset_dn"}), predict=lambda acting: Prediction(line(acting), {}),
+        scale=np.ones(X.size),
     )  # fmt: skip
     return MeasurementModel((block,), camera)
 
@@ -153,7 +157,8 @@ def test_two_effects_of_different_shapes_are_both_found() -> None:
 
 
 def test_scores_beside_a_law_that_holds_are_by_the_tolerance_that_it_needs() -> None:
-    """A line of 5 DN may be wrong by 0.05 DN, smoothly: with the whole of that, a bend of 0.04 DN beside it scores nothing."""
+    """A line of 5 DN may be wrong by 0.05 DN, smoothly: with the whole of that, a bend of 0.04 DN beside it scores
+    nothing."""
     search = _search((_Up(size_dn=5.0), _Bend(size_dn=0.04)), 60)
     fit = search.fitted((_Up(size_dn=5.0),), converged=True)
     assert fit.tolerated < 1.0
@@ -163,8 +168,8 @@ def test_scores_beside_a_law_that_holds_are_by_the_tolerance_that_it_needs() -> 
 
 
 def test_what_a_strong_law_may_lack_is_no_second_effect() -> None:
-    """A line of 5 DN and an arch of 0.1 DN, where a law may lack 5 % of its own change: the arch fits, and isn't told. Without the strong line
-    beside it, the same arch is."""
+    """A line of 5 DN and an arch of 0.1 DN, where a law may lack 5 % of its own change: the arch fits, and isn't told.
+    Without the strong line beside it, the same arch is."""
     truth, policy = (_Up(size_dn=5.0), _Arch(size_dn=0.1)), DecisionPolicy(beside_tolerance=0.05)
     search = _search(truth, 60, policy)
     fit = search.fitted(truth, converged=True)
@@ -195,8 +200,9 @@ def test_a_set_that_was_vetoed_is_not_returned_to() -> None:
 
 
 def test_sets_that_the_numbers_cannot_tell_apart_share_the_probability() -> None:
-    """A ripple is the wave and a fainter one of another frequency, sqrt(60 / 2) x 0.4 x 0.004 / 0.01 = 0.9 standard deviations off at
-    this size: either may be it, and the set that holds 95 % has both. Beside it nothing else is a part."""
+    """A ripple is the wave and a fainter one of another frequency, sqrt(60 / 2) x 0.4 x 0.004 / 0.01 = 0.9 standard
+    deviations off at this size: either may be it, and the set that holds 95 % has both. Beside it nothing else is a
+    part."""
     for seed in range(8):
         search = _search((_Up(size_dn=0.1), _Wave(size_dn=0.012)), 30 + seed)
         search.best()
@@ -263,7 +269,8 @@ class _Lopsided(_Squared):
 
 
 def test_a_sign_is_unknown_where_only_the_square_acts() -> None:
-    """The size keeps its own standard deviation, and is told positive. A sign that the numbers tell stays as it is known."""
+    """The size keeps its own standard deviation, and is told positive. A sign that the numbers tell stays as it is
+    known."""
     for kind, is_unsigned in ((_Squared, True), (_Lopsided, False)):
         truth = kind(size_dn=0.5)
         model = _model((truth,), np.random.default_rng(6))
@@ -277,7 +284,8 @@ def test_a_sign_is_unknown_where_only_the_square_acts() -> None:
 
 
 class _Either(_Curve):
-    """As a bowed and a tilted image in two opposite places: the parameters may be exchanged, and turn their signs together."""
+    """As a bowed and a tilted image in two opposite places: the parameters may be exchanged, and turn their signs
+    together."""
 
     name: ClassVar[str] = "either"
     size_dn: Annotated[
@@ -292,7 +300,8 @@ class _Either(_Curve):
 
 
 def test_other_modes_are_told_beside_the_size() -> None:
-    """Modes (v, 0), (0, v), (-v, 0) and (0, -v), as likely: the second is told beside the first, and the signs are unknown."""
+    """Modes (v, 0), (0, v), (-v, 0) and (0, -v), as likely: the second is told beside the first, and the signs are
+    unknown."""
     truth = _Either(size_dn=0.5)
     model = _model((truth,), np.random.default_rng(6))
     candidate = Candidate(truth, {"size_dn": 0.01, "other_dn": 0.01}, 1.0, (), 50.0)
@@ -305,7 +314,8 @@ def test_other_modes_are_told_beside_the_size() -> None:
 
 
 def test_a_size_that_may_be_absent_is_none() -> None:
-    """Within two standard deviations of absence in every parameter that sizes the effect; shapes and unknown deviations don't count."""
+    """Within two standard deviations of absence in every parameter that sizes the effect; shapes and unknown deviations
+    don't count."""
     known = Candidate(_Either(size_dn=0.5, other_dn=0.1), {"size_dn": 0.2, "other_dn": 0.1}, 1.0, (), 50.0)
     assert not known.is_compatible_with_absence(2.0)
     assert replace(known, std={"size_dn": 0.3, "other_dn": 0.1}).is_compatible_with_absence(2.0)
@@ -322,8 +332,8 @@ def test_a_covariance_that_came_out_negative_somewhere_still_has_a_factor() -> N
 
 
 def test_what_a_name_needs_is_a_probability() -> None:
-    """Odds of 9 to 1 against its absence, of which the prior takes 45; and half of what drawn healthy cameras have raised the threshold
-    by."""
+    """Odds of 9 to 1 against its absence, of which the prior takes 45; and half of what drawn healthy cameras have
+    raised the threshold by."""
     model, policy = contrast_model(np.random.default_rng(24)), DecisionPolicy()
     search = Search(model, candidates(), (), 16.0)
     odds = np.exp(search.needed_log_odds - policy.included_log_odds)

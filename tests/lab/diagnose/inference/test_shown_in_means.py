@@ -34,9 +34,14 @@ def _bent() -> RecordingSet:
 
 
 def test_which_effects_must_show_in_means_follows_from_what_they_change() -> None:
-    """A response and a converter change levels and variances alike; charge that repels charge changes variances alone."""
+    """A response and a converter change levels and variances alike; charge that repels charge changes variances
+    alone."""
     model = measured_model(_bent(), variance_block, neighbour_block)
-    must = {kind for kind in (Nonlinearity, AdcStep, BrighterFatter, InterPixelCapacitance, RowNoise) if must_show_in_means(model, kind)}  # fmt: skip
+    must = {
+        kind
+        for kind in (Nonlinearity, AdcStep, BrighterFatter, InterPixelCapacitance, RowNoise)
+        if must_show_in_means(model, kind)
+    }
     assert must == {Nonlinearity, AdcStep}
 
 

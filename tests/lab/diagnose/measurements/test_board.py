@@ -1,4 +1,5 @@
-"""Boards and pairs of cameras: geometry that is fitted freely is no finding; what changed since an earlier calibration is."""
+"""Boards and pairs of cameras: geometry that is fitted freely is no finding; what changed since an earlier calibration
+is."""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ def calibrated() -> Geometry:
 
 
 def test_distortion_is_named_beside_an_earlier_calibration_and_never_by_itself() -> None:
-    """2 % of the corner's distance is 3 px there, half a pixel where the boards are; a cell's mean has a standard deviation of 0.006 px."""
+    """2 % of the corner's distance is 3 px there, half a pixel where the boards are; a cell's mean has a standard
+    deviation of 0.006 px."""
     bent = study_of(recorded(concealed.LensDistortionLaw(2.0, 0, 7), noise_draw=1))
     alone = judged(bent, None)
     assert not alone.named

@@ -46,8 +46,8 @@ def test_even_converters_show_nothing(seed: int) -> None:
 
 
 def test_steps_are_measured_where_they_stand() -> None:
-    """A highest bit that is 3 DN too heavy leaves 3 codes out at half scale: within 3.5 of the standard uncertainties and its law's
-    tolerance, seen and held out. Places at 8 DN of 4096 and more beyond it see none of it."""
+    """A highest bit that is 3 DN too heavy leaves 3 codes out at half scale: within 3.5 of the standard uncertainties
+    and its law's tolerance, seen and held out. Places at 8 DN of 4096 and more beyond it see none of it."""
     law = AdcNonlinearityLaw(3.0, 0, 2)
     study = _study(772302, (law,))
     block = code_block(study)
@@ -78,8 +78,9 @@ def test_wrong_bits_are_named(variant: int) -> None:
 
 
 def test_a_step_at_any_code_is_named() -> None:
-    """A comparator that is off by 4 DN at 1664 codes: no bit stands there, and no response to light does that to histograms. Height and
-    place within three standard deviations; the place is looked for from 64 codes apart, and told to a few."""
+    """A comparator that is off by 4 DN at 1664 codes: no bit stands there, and no response to light does that to
+    histograms. Height and place within three standard deviations; the place is looked for from 64 codes apart, and told
+    to a few."""
     law = AdcNonlinearityLaw(4.0, 4, 7)
     place = 4096.0 * (0.15 + 0.6 * law.uniform[1])
     study = _study(772302, (law,))
@@ -102,9 +103,10 @@ def test_other_combs_are_located_and_at_most_their_family_is_named(law: Law) -> 
 
 
 def test_unequal_codes_show_alike_in_seen_and_in_held_out_frames() -> None:
-    """Over the block's scale, which holds the number of counted pixels, the counts' excess variance is the variance of the codes' widths. A
-    gain of 1.1 leaves one code of eleven out and makes the others 1.1 wide: 1.1^2 10 / 11 - 1 = 0.1. Filters and unequal counts add some
-    per cent, which a part of a few hundred codes knows to 3 sqrt(2 / 300) = 25 %."""
+    """Over the block's scale, which holds the number of counted pixels, the counts' excess variance is the variance of
+    the codes' widths. A gain of 1.1 leaves one code of eleven out and makes the others 1.1 wide: 1.1^2 10 / 11 - 1 =
+    0.1. Filters and unequal counts add some per cent, which a part of a few hundred codes knows to 3 sqrt(2 / 300) = 25
+    %."""
     block = code_block(_study(772302, (DigitalGainLaw(10.0),)))
     at = [i for i, label in enumerate(block.labels) if label.channel == "variance"]
     held_out = np.array([block.labels[i].held_out for i in at])
@@ -114,8 +116,8 @@ def test_unequal_codes_show_alike_in_seen_and_in_held_out_frames() -> None:
 
 @pytest.mark.parametrize("variant", [2, 3])
 def test_a_ripple_is_named_and_a_saw_tooth_is_the_converter(variant: int) -> None:
-    """2.5 DN sin(2 pi code / 512 + phase): amplitude and period within three standard deviations. A saw tooth over 1024 codes is off by
-    its converter's gain where a boundary stands: its bits' weights are the nearest law, or hold."""
+    """2.5 DN sin(2 pi code / 512 + phase): amplitude and period within three standard deviations. A saw tooth over 1024
+    codes is off by its converter's gain where a boundary stands: its bits' weights are the nearest law, or hold."""
     law = AdcNonlinearityLaw(2.5 if variant == 2 else 5.0, variant, 3)
     study = _study(772302, (law,))
     blocks = (linearity_block(study), variance_block(study), code_block(study))
@@ -143,8 +145,8 @@ def test_codes_are_averaged_over_noise_in_a_mean() -> None:
 
 
 def test_what_the_converter_does_at_black_moves_darks_as_all_other_levels() -> None:
-    """A ripple of 16 times the range is nearly an offset: of darks and flats alike, so that the black level takes it up. One of a
-    quarter of the range moves darks by its value there, averaged over their noise."""
+    """A ripple of 16 times the range is nearly an offset: of darks and flats alike, so that the black level takes it
+    up. One of a quarter of the range moves darks by its value there, averaged over their noise."""
     study = _study(7)
     white, wide = study.camera.white_level_dn, AdcRipple(cosine_dn=0.5, period_dn=65536.0)
     for make in (dark_level_block, linearity_block):
@@ -161,8 +163,9 @@ def test_what_the_converter_does_at_black_moves_darks_as_all_other_levels() -> N
 
 
 def test_patches_of_a_chart_lie_off_by_what_the_converter_does_at_their_level() -> None:
-    """A ripple of a quarter of the range: its value at each patch, averaged over the noise there. The mean over noise by 48 values is good
-    to 1e-3; levels that shot noise and shading move by less than 1e-3 of a period aren't counted."""
+    """A ripple of a quarter of the range: its value at each patch, averaged over the noise there. The mean over noise
+    by 48 values is good to 1e-3; levels that shot noise and shading move by less than 1e-3 of a period aren't
+    counted."""
     recordings = recordings_of(ConcealedCamera(7, (), cfa="RGGB", rows=96, cols=128), Plan(("dark", "flat", "chart")))
     looked_at = Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
     block, white = chart_block(looked_at), looked_at.camera.white_level_dn
@@ -176,8 +179,9 @@ def test_patches_of_a_chart_lie_off_by_what_the_converter_does_at_their_level() 
 
 
 def testwidths_of_codes_are_what_fine_samples_of_the_input_give() -> None:
-    """A step between two codes, a step of many, a saw tooth of three bits and a ripple with a step, against 512 samples a code: an
-    interval that straddles a step is sampled 8 times, so that a width is off by 1 / 8 of a code at most, and by less than 1e-3 elsewhere."""
+    """A step between two codes, a step of many, a saw tooth of three bits and a ripple with a step, against 512 samples
+    a code: an interval that straddles a step is sampled 8 times, so that a width is off by 1 / 8 of a code at most, and
+    by less than 1e-3 elsewhere."""
     study = _study(7)
     first, size = 300, 3000
     codes = SimpleNamespace(count=np.zeros(size), first=first)

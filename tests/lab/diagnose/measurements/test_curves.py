@@ -1,4 +1,5 @@
-"""Freedom of a maker's sensitivity curve: a constant leak, what lies beyond its ends, and the rounding of its values."""
+"""Freedom of a maker's sensitivity curve: a constant leak, what lies beyond its ends, and the rounding of its
+values."""
 
 from __future__ import annotations
 
@@ -63,7 +64,8 @@ def _short_curves(*laws: Law) -> RecordingSet:
 
 
 def test_what_a_curve_leaves_out_beyond_its_end_is_in_the_uncertainty_of_stray_light() -> None:
-    """A sensor sees more of the stray light than the stated part of its curve does: the share is found too large by as much."""
+    """A sensor sees more of the stray light than the stated part of its curve does: the share is found too large by as
+    much."""
     model = measured_model(_short_curves(StrayLightLaw(1.0)), narrowband_block)
     fit = refit(model, (StrayLight(share_percent=0.5),), DecisionPolicy())
     std = fit.std[0]["share_percent"]
@@ -72,7 +74,8 @@ def test_what_a_curve_leaves_out_beyond_its_end_is_in_the_uncertainty_of_stray_l
 
 
 def test_sensitivity_beyond_a_curve_falls_to_where_silicon_ends() -> None:
-    """The column against the forward model with a curve that falls from the last value to 0 at 1107 nm; light there only by the stray share."""
+    """The column against the forward model with a curve that falls from the last value to 0 at 1107 nm; light there
+    only by the stray share."""
     recordings, stray = _short_curves(), (StrayLight(share_percent=5.0),)
     looked_at = study(recordings)
     capture = recordings.captures("narrowband")[3]

@@ -1,5 +1,5 @@
-"""What read-out does in dark frames, in the predictions for light: coloured noise of rows and fixed offsets of rows and columns aren't flicker, nor
-steps of the sensor's response."""
+"""What read-out does in dark frames, in the predictions for light: coloured noise of rows and fixed offsets of rows and
+columns aren't flicker, nor steps of the sensor's response."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def session(
     shape: tuple[int, int] = (80, 768),
     repeats: int = 10,
 ) -> RecordingSet:
-    """Darks and flats of a camera whose rows share noise of `row_dn2` at low frequencies, in the dark and in light. `flicker`: amplitude
-    of the light's 100 Hz over its mean, in bands of `CYCLES_PER_ROW` from a random phase."""
+    """Darks and flats of a camera whose rows share noise of `row_dn2` at low frequencies, in the dark and in light.
+    `flicker`: amplitude of the light's 100 Hz over its mean, in bands of `CYCLES_PER_ROW` from a random phase."""
     rng = np.random.default_rng(seed)
     rows, cols = shape
     frames: dict[str, np.ndarray] = {}
@@ -61,7 +61,17 @@ def session(
         dn = GAIN_DN_PER_E * rng.poisson(np.broadcast_to(light / GAIN_DN_PER_E, shape)) + own + BLACK_DN
         frames[f"{k}.npy"] = np.round(dn + READ_DN * rng.standard_normal(shape)).clip(0, 4095).astype(np.uint16)
         when = datetime(2026, 3, 2, tzinfo=UTC) + timedelta(seconds=20 * k)
-        captures.append({"id": f"c{k}", "kind": kind, "side": "left", "frame": f"{k}.npy", "exposure_s": exposure_s, "time": when, **more})  # fmt: skip
+        captures.append(
+            {
+                "id": f"c{k}",
+                "kind": kind,
+                "side": "left",
+                "frame": f"{k}.npy",
+                "exposure_s": exposure_s,
+                "time": when,
+                **more,
+            }
+        )
 
     for _ in range(dark_repeats):
         take("dark", 1e-3, 0.0)
@@ -87,8 +97,8 @@ def test_coloured_noise_of_rows_is_no_flicker(seed: int, dark_repeats: int) -> N
 
 
 def test_frames_means_scatter_as_those_of_dark_frames() -> None:
-    """Noise of rows leaves `ROW_DN2` / 80 in a frame's mean: the darkest number's variance is 1 + that over the pixels' noise; ten dark frames
-    know it to sqrt(2 / 9) = 47 %, so within 3 of these."""
+    """Noise of rows leaves `ROW_DN2` / 80 in a frame's mean: the darkest number's variance is 1 + that over the pixels'
+    noise; ten dark frames know it to sqrt(2 / 9) = 47 %, so within 3 of these."""
     block = level_repeats_block(study(session(100, 10, shape=(80, 768))))
     pixels_dn2 = (30.0 * GAIN_DN_PER_E + READ_DN**2 + 1.0 / 12.0) / (80 * 768)
     expected = 1.0 + ROW_DN2 / 80 / pixels_dn2
@@ -108,7 +118,8 @@ def test_flicker_beside_it_is_named(dark_repeats: int) -> None:
 
 
 def test_a_global_shutter_has_no_bands() -> None:
-    """The same rows, of a camera whose sheet says so: flicker changes no prediction for rows, and isn't named for them."""
+    """The same rows, of a camera whose sheet says so: flicker changes no prediction for rows, and isn't named for
+    them."""
     flicker = LightFlicker(modulation_percent=5.0, frequency_hz=100.0, line_time_us=120.0)
     shutters: tuple[Shutter | None, ...] = "global", "rolling", None
     for shutter in shutters:
@@ -119,8 +130,8 @@ def test_a_global_shutter_has_no_bands() -> None:
 
 
 def test_numbers_scatter_about_what_dark_frames_predict() -> None:
-    """Mean pulls over N draws: of a level's numbers within 3 standard errors of the draws' scatter, and 0.1, which moves no decision. chi2
-    is within 3 / sqrt(N) of its standard deviation, and 0.6 for what is free."""
+    """Mean pulls over N draws: of a level's numbers within 3 standard errors of the draws' scatter, and 0.1, which
+    moves no decision. chi2 is within 3 / sqrt(N) of its standard deviation, and 0.6 for what is free."""
     pulls, chi2 = [], []
     for seed in range(8):
         recordings = session(500 + seed, 6, levels_dn=(60.0, 200.0, 1500.0), shape=(64, 256), repeats=3)
@@ -136,8 +147,9 @@ def test_numbers_scatter_about_what_dark_frames_predict() -> None:
 
 @pytest.mark.parametrize("contrasts", [1, 3, 20])
 def test_the_spectrum_of_dark_rows_has_a_true_uncertainty(contrasts: int) -> None:
-    """Of a flat spectrum of power 1, from one difference of repeats on: N = 400 draws of five bands. The cube root's mean is right to 0.08,
-    and intervals of two standard deviations hold the truth in 95 %, in 90 % where a power is small by chance; 3 sqrt(0.09 / N) less."""
+    """Of a flat spectrum of power 1, from one difference of repeats on: N = 400 draws of five bands. The cube root's
+    mean is right to 0.08, and intervals of two standard deviations hold the truth in 95 %, in 90 % where a power is
+    small by chance; 3 sqrt(0.09 / N) less."""
     bands = [range(1, 2), range(2, 3), range(3, 5), range(5, 8), range(8, 12)]
     rng = np.random.default_rng(7)
     root: list[FloatArray] = []
@@ -152,7 +164,8 @@ def test_the_spectrum_of_dark_rows_has_a_true_uncertainty(contrasts: int) -> Non
 
 
 def test_a_step_of_the_dark_is_no_step_of_the_response() -> None:
-    """An offset of half of the columns, 20 e, in dark frames and flats: a step of 0.4 % of the mean signal, which isn't left."""
+    """An offset of half of the columns, 20 e, in dark frames and flats: a step of 0.4 % of the mean signal, which isn't
+    left."""
     camera = ConcealedCamera(771016, (TapOffsetLaw(20.0),), cfa="RGGB", rows=96, cols=128)
     looked_at = study(recordings_of(camera, Plan(("dark", "flat"))))
     model = MeasurementModel((line_block(looked_at),), looked_at.camera)
@@ -160,8 +173,9 @@ def test_a_step_of_the_dark_is_no_step_of_the_response() -> None:
 
 
 def test_a_real_camera_with_noisy_rows() -> None:
-    """Its rows are 3.3 times as noisy in the dark as its pixels allow. Its means scatter by 0.05 DN in the dark, and by as much in light. Even and
-    odd rows differ by 0.09 DN in the dark and not in light, which stays within what offsets may."""
+    """Its rows are 3.3 times as noisy in the dark as its pixels allow. Its means scatter by 0.05 DN in the dark, and by
+    as much in light. Even and odd rows differ by 0.09 DN in the dark and not in light, which stays within what offsets
+    may."""
     if not (folder := DATA / "emva1288_cmos_crop").exists():
         pytest.skip("the shared recordings aren't here")
     looked_at = study(read_emva1288(folder))

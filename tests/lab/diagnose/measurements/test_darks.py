@@ -1,4 +1,5 @@
-"""Measurements of dark frames: their statistics against drawn numbers, no finding on healthy cameras, names of concealed effects."""
+"""Measurements of dark frames: their statistics against drawn numbers, no finding on healthy cameras, names of
+concealed effects."""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ OF_DARK_FRAMES = [one for one in measurements() if one.order < 200]
 
 
 def _sim_darks(
-    seed: int, acting: Sequence[Effect] = (), *, bits: int = 12, cfa: Any = "MONO", plan: Sequence[tuple[float, float]] = (), read_e: float = 3.0, dark: float = 8.0
+    seed: int, acting: Sequence[Effect] = (), *, bits: int = 12, cfa: Any = "MONO", plan: Sequence[tuple[float,
+    float]] = (), read_e: float = 3.0, dark: float = 8.0
 ) -> RecordingSet:  # fmt: skip
     """Dark frames of `sim`'s own camera, (exposure, temperature) each."""
     rng = np.random.default_rng([seed, 1])
@@ -50,9 +52,12 @@ def _sim_darks(
     channels = ("Y",) if cfa == "MONO" else ("R", "G", "B")
     black, gain = 0.03 * white, 0.97 * white / 10000.0
     camera = CameraModel(
-        rows=ROWS, cols=COLS, pixel_pitch_um=3.0, fill_factor=0.8, cfa=cfa, bit_depth=bits, black_level_dn=black, white_level_dn=white,
-        conversion_gain_dn_per_e=gain, full_well_e=10000.0, read_noise_e=read_e, dark_current_e_per_s=dark, dsnu_e=1.0, prnu_percent=0.7,
-        quantum_efficiency={c: Spectrum.of([400.0, 700.0], [0.5, 0.5]) for c in channels}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
+        rows=ROWS, cols=COLS, pixel_pitch_um=3.0, fill_factor=0.8, cfa=cfa, bit_depth=bits, black_level_dn=black,
+        white_level_dn=white,
+        conversion_gain_dn_per_e=gain, full_well_e=10000.0, read_noise_e=read_e, dark_current_e_per_s=dark, dsnu_e=1.0,
+        prnu_percent=0.7,
+        quantum_efficiency={c: Spectrum.of([400.0, 700.0], [0.5, 0.5]) for c in channels}, lens=Lens(f_number=4.0,
+        focal_length_mm=8.0),
     )  # fmt: skip
     pattern = FixedPattern.draw(camera, rng)
     plan = plan or [(t, 25.0) for t in (0.001, 0.5, 2.0) for _ in range(4)]
@@ -65,7 +70,8 @@ def _sim_darks(
         for k, (t, c) in enumerate(plan)
     ]
     stated = {
-        "rows": ROWS, "cols": COLS, "pixel_pitch_um": 3.0, "fill_factor": 0.8, "cfa": cfa, "bit_depth": bits, "black_level_dn": black,
+        "rows": ROWS, "cols": COLS, "pixel_pitch_um": 3.0, "fill_factor": 0.8, "cfa": cfa, "bit_depth": bits,
+        "black_level_dn": black,
         "white_level_dn": white, "conversion_gain_dn_per_e": gain, "f_number": 4.0, "focal_length_mm": 8.0,
     }  # fmt: skip
     return RecordingSet(Manifest.model_validate({"cameras": {"left": stated}, "captures": captures}), frames, {}, {})
@@ -95,11 +101,12 @@ def _names(verdict: Verdict) -> list[str]:
     return [c.effect.name for c in verdict.named]
 
 
-# --- statistics against drawn numbers ----------------------------------------------------------------------------------------
+# --- statistics against drawn numbers ---------------------------------------------------------------------------------
 
 
 def test_shares_of_defective_pixels_are_those_of_drawn_pixels() -> None:
-    """Two kinds of defective pixels in 400 000; each bin's count within 4.5 sigma of a binomial, all of the same draw."""
+    """Two kinds of defective pixels in 400 000; each bin's count within 4.5 sigma of a binomial, all of the same
+    draw."""
     rng = np.random.default_rng(1)
     n, frames, moving, fixed = 400_000, 4, 2.0, 1.0
     kind = rng.choice(3, n, p=[0.98, 0.01, 0.01])
@@ -148,7 +155,8 @@ def test_clipped_square_is_its_integral() -> None:
 
 @pytest.mark.parametrize("spread", [0.0, 0.3, 1.0, 2.0])
 def test_nodes_have_the_distribution_that_is_drawn(spread: float) -> None:
-    """Mean 1; the standard deviation of 24 parts' means falls short by 2 %; drawn sizes agree with both at 4.5 sigma."""
+    """Mean 1; the standard deviation of 24 parts' means falls short by 2 %; drawn sizes agree with both at 4.5
+    sigma."""
     weights, sizes = size_nodes(spread)
     assert weights.sum() == pytest.approx(1.0)
     assert weights @ sizes == pytest.approx(1.0, rel=1e-6)
@@ -159,7 +167,8 @@ def test_nodes_have_the_distribution_that_is_drawn(spread: float) -> None:
 
 
 def test_correlated_rows_have_their_spectrum() -> None:
-    """Mean over all frequencies: the variance. Drawn rows: neighbours have the stated correlation, to 4.5 / sqrt(rows)."""
+    """Mean over all frequencies: the variance. Drawn rows: neighbours have the stated correlation, to 4.5 /
+    sqrt(rows)."""
     (one,) = signal_of(_model(), (RowNoise(noise_e=2.0, correlation=0.6),)).lines
     f = np.linspace(-0.5, 0.5, 4001)[:-1]
     assert np.mean(one.spectrum_e2(f, fixed=False)) == pytest.approx(4.0, rel=1e-3)
@@ -174,11 +183,12 @@ def _model() -> CameraModel:
     return camera_model(recordings, "left")
 
 
-# --- healthy cameras ---------------------------------------------------------------------------------------------------------
+# --- healthy cameras --------------------------------------------------------------------------------------------------
 
 
 def test_healthy_darks_agree_with_their_covariance() -> None:
-    """12 cameras of two generators, 10 to 16 bits: of some 130 blocks none has a chi2 that chance gives one in 30 000 of."""
+    """12 cameras of two generators, 10 to 16 bits: of some 130 blocks none has a chi2 that chance gives one in 30 000
+    of."""
     rare = 1.0
     sets = [_concealed(40 + k, warm=k % 2 == 0) for k in range(4)]
     sets += [
@@ -204,7 +214,7 @@ def test_healthy_darks_get_no_name(seed: int) -> None:
     assert not verdict.after
 
 
-# --- what was put in ---------------------------------------------------------------------------------------------------------
+# --- what was put in --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -227,8 +237,8 @@ def test_a_concealed_law_is_named(law: Law, names: str) -> None:
 
 
 def test_one_hot_pixel_of_a_small_frame_is_named() -> None:
-    """One of 768 pixels collects 150 e/s more, some 60 DN in 2 s where others lie within 3 DN: no tail and no particle does that in every
-    frame. Its healthy twin shows nothing."""
+    """One of 768 pixels collects 150 e/s more, some 60 DN in 2 s where others lie within 3 DN: no tail and no particle
+    does that in every frame. Its healthy twin shows nothing."""
     hot, healthy = (
         _verdict(recordings_of(ConcealedCamera(5000, built_in, rows=24, cols=32), Plan(("dark",))))
         for built_in in ([laws.HotPixelsLaw(150.0, 0, 11)], [])
@@ -236,7 +246,8 @@ def test_one_hot_pixel_of_a_small_frame_is_named() -> None:
     assert _names(hot) == ["hot_pixels"]
     found, std = hot.named[0].effect.model_dump(), hot.named[0].std
     assert abs(found["share_ppm"] - 1e6 / 768.0) < 4.0 * (std["share_ppm"] or 0.0)
-    # one pixel's excess isn't normal: told by its interval of two standard deviations, here four on the logarithmic scale
+    # one pixel's excess isn't normal: told by its interval of two standard deviations, here four on the logarithmic
+    # scale
     assert std["excess_e_per_s"] is None
     low, high = (end**2 / found["excess_e_per_s"] for end in hot.named[0].intervals["excess_e_per_s"])
     assert 0.0 < low < 150.0 < high
@@ -275,13 +286,14 @@ def test_what_sim_renders_is_named_with_its_parameters(one: Effect) -> None:
     ids=["banding", "tap"],
 )
 def test_laws_like_listed_effects_are_located_and_get_no_name(law: Law, measurement: str) -> None:
-    """Laws that the library lacks and that resemble its effects: banding of a fixed period, an offset of one read-out tap."""
+    """Laws that the library lacks and that resemble its effects: banding of a fixed period, an offset of one read-out
+    tap."""
     verdict = _verdict(_concealed(92, law))
     assert not verdict.named
     assert measurement in {part.block.measurement.name for part in verdict.after}
 
 
-# --- what the recordings don't allow, and faults ------------------------------------------------------------------------------
+# --- what the recordings don't allow, and faults ----------------------------------------------------------------------
 
 
 def test_one_dark_frame_is_judged_by_what_it_has() -> None:
@@ -347,8 +359,8 @@ def test_repeats_that_are_all_copies_are_told_in_one_line() -> None:
 
 @pytest.mark.parametrize("seed", [9, 10])
 def test_a_hot_pixel_does_not_move_the_mean_of_a_small_frame(seed: int) -> None:
-    """Two or three of 3072 pixels, 20000 e/s: 200 e of shot noise at 2 s, 0.1 e of the frames' mean, which pixels' noise knows to 0.07 e.
-    chi2 of n numbers, 4 sigma."""
+    """Two or three of 3072 pixels, 20000 e/s: 200 e of shot noise at 2 s, 0.1 e of the frames' mean, which pixels'
+    noise knows to 0.07 e. chi2 of n numbers, 4 sigma."""
     law = laws.HotPixelsLaw(20000.0, 0, 5)
     camera = ConcealedCamera(seed, (law,), cfa="MONO", rows=48, cols=64, bit_depth=16)
     recordings = recordings_of(camera, Plan(("dark",), repeats=6))

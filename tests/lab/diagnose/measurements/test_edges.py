@@ -1,4 +1,5 @@
-"""Slanted edges in the diagnosis: the prediction equals the estimator, the covariance is right, and blurs are told apart."""
+"""Slanted edges in the diagnosis: the prediction equals the estimator, the covariance is right, and blurs are told
+apart."""
 
 from __future__ import annotations
 
@@ -39,8 +40,9 @@ def _recorded(
 
 
 def _misfit(block: Block, *acting: Effect, aside: bool | None = None) -> float:
-    """chi2 of n numbers over its limit 1.1 n + 3 sqrt(2 n): three standard deviations of chi2, and a tenth for errors that edges in the
-    same place share. Above 1 the prediction is wrong. `aside`: of asymmetries (True) or contrasts (False) alone."""
+    """chi2 of n numbers over its limit 1.1 n + 3 sqrt(2 n): three standard deviations of chi2, and a tenth for errors
+    that edges in the same place share. Above 1 the prediction is wrong. `aside`: of asymmetries (True) or contrasts
+    (False) alone."""
     model = block.predict(acting)
     covariance = block.covariance + sum(np.outer(s, s) for s in model.jacobian.values())
     where = np.array([aside is None or label.condition.endswith(ASIDE) == aside for label in block.labels])
@@ -51,9 +53,9 @@ def _misfit(block: Block, *acting: Effect, aside: bool | None = None) -> float:
 
 @pytest.mark.parametrize(("cfa", "f_number"), [("MONO", 2.0), ("RGGB", 2.0), ("MONO", 8.0)])
 def test_a_models_numbers_are_its_transfer_function(cfa: str, f_number: float) -> None:
-    """The estimator's rows applied to a model's profile give its transfer function at the measured frequencies, also of sharp lenses, whose
-    detail lies far beyond the pixels' Nyquist frequency. A cubic between 11 frequencies is good to 3e-3; the highest three depend on
-    what lies beyond."""
+    """The estimator's rows applied to a model's profile give its transfer function at the measured frequencies, also of
+    sharp lenses, whose detail lies far beyond the pixels' Nyquist frequency. A cubic between 11 frequencies is good to
+    3e-3; the highest three depend on what lies beyond."""
     study = _recorded(cfa=cfa, f_number=f_number, pitch=4.5)
     camera, block = study.camera, edge_block(study)
     labels = [label for label in block.labels if label.condition == "5 deg" and label.channel == camera.channels[0]]
@@ -71,8 +73,8 @@ def test_a_models_numbers_are_its_transfer_function(cfa: str, f_number: float) -
 
 
 def test_a_direct_sum_over_the_samples_agrees() -> None:
-    """The estimators' rows on a grid of distances against normal equations with every sample at its own distance: within 1e-5 of the
-    contrast."""
+    """The estimators' rows on a grid of distances against normal equations with every sample at its own distance:
+    within 1e-5 of the contrast."""
     study = _recorded(cfa="MONO", f_number=2.0)
     edges = _Edges(study)
     geometry = edges.edges[0].measured.geometry
@@ -95,8 +97,8 @@ def test_noise_is_what_the_covariance_says() -> None:
 
 
 def test_coma_shows_in_the_asymmetry_with_its_direction() -> None:
-    """Path error W131 r^2 (x cos t + y sin t) at a drawn angle t: the effect of that size and direction explains it. (Path errors are
-    delays in the former, leads in the library.)"""
+    """Path error W131 r^2 (x cos t + y sin t) at a drawn angle t: the effect of that size and direction explains it.
+    (Path errors are delays in the former, leads in the library.)"""
     law = concealed.ComaLaw(0.3, 0)
     block = edge_block(_recorded(law, cfa="MONO", f_number=2.8))
     turn, coma = 2.0 * np.pi * law.uniform[0], effect("coma")
@@ -115,8 +117,8 @@ def test_a_blur_that_is_alike_on_both_sides_has_no_asymmetry() -> None:
 
 
 def test_crosstalk_between_colours_changes_their_edges() -> None:
-    """In light of 460 and 640 nm much of a pixel's charge comes from neighbours of another colour: the transfer of the whole mosaic
-    explains it, that of one channel doesn't."""
+    """In light of 460 and 640 nm much of a pixel's charge comes from neighbours of another colour: the transfer of the
+    whole mosaic explains it, that of one channel doesn't."""
     block = edge_block(
         _recorded(
             concealed.CrosstalkLaw(4.0, 0), cfa="RGGB", f_number=4.0, rows=96, plan=Plan(EDGES.kinds, lights=True)
@@ -127,7 +129,8 @@ def test_crosstalk_between_colours_changes_their_edges() -> None:
 
 
 def test_shading_is_no_blur() -> None:
-    """A fall-off towards the corners curves the light beside an edge; with the fall-off in the model the edges agree with the baseline."""
+    """A fall-off towards the corners curves the light beside an edge; with the fall-off in the model the edges agree
+    with the baseline."""
     block = edge_block(_recorded(concealed.VignettingLaw(15.0, 0), cfa="MONO", f_number=4.0, rows=96))
     shaded = effect("vignetting")(corner_loss_percent=15.0)
     assert _misfit(block, shaded) < 1.0
@@ -169,7 +172,8 @@ def test_field_curvature_needs_more_than_one_place() -> None:
     ("cfa", "rows", "told"), [("MONO", 24, "23 lines are enough"), ("RGGB", 40, "45 lines are enough")]
 )
 def test_an_edge_that_crosses_less_than_a_period_is_left_out(cfa: str, rows: int, told: str) -> None:
-    """At 2.6 deg over the region's lines, which are 8 fewer than the frame's: 0.73 of 1 px, and 1.45 of the 2 px between reds."""
+    """At 2.6 deg over the region's lines, which are 8 fewer than the frame's: 0.73 of 1 px, and 1.45 of the 2 px
+    between reds."""
     study = _recorded(cfa=cfa, rows=rows)
     labels = {(label.condition.removesuffix(ASIDE), label.channel) for label in edge_block(study).labels}
     assert ("5 deg", study.camera.channels[0]) in labels

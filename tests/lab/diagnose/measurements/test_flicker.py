@@ -1,4 +1,5 @@
-"""Flickering light in the rows of flat frames: laws of the second image former and of `sim`, and look-alikes that aren't flicker."""
+"""Flickering light in the rows of flat frames: laws of the second image former and of `sim`, and look-alikes that
+aren't flicker."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ LOOKED_AT = (flicker_block, linearity_block, shading_block)
 
 
 def test_rows_of_healthy_frames_are_noise() -> None:
-    """chi2 of about 60 numbers: its mean over 4 cameras within 3 / sqrt(4) of its standard deviation, and 0.3 for what is free."""
+    """chi2 of about 60 numbers: its mean over 4 cameras within 3 / sqrt(4) of its standard deviation, and 0.3 for what
+    is free."""
     found = [sigmas(measured_model(former(s, cfa=c), flicker_block)) for s in (1, 2) for c in ("MONO", "RGGB")]
     assert abs(np.mean(found)) < 3.0 / np.sqrt(4) + 0.3
     assert max(found) < 4.0
@@ -31,8 +33,8 @@ def test_flicker_of_another_former_is_named(variant: int, cfa: str) -> None:
 
 
 def test_flicker_of_sim_is_named_with_its_bands() -> None:
-    """The bands' frequency, frequency x line time, is what rows show: 2.976 periods a frame. Of the light's frequency only the loss of
-    depth at longer exposures tells."""
+    """The bands' frequency, frequency x line time, is what rows show: 2.976 periods a frame. Of the light's frequency
+    only the loss of depth at longer exposures tells."""
     truth = LightFlicker(modulation_percent=6.0, frequency_hz=100.0, line_time_us=310.0)
     found = verdict(rendered(5, (truth,)), *LOOKED_AT)
     assert names(found) == ["light_flicker"]

@@ -31,7 +31,8 @@ def test_a_steady_source_is_no_finding(seed: int) -> None:
 
 
 def test_an_unsteady_source_is_named_with_its_size() -> None:
-    """1.2 % from frame to frame; with f degrees of freedom a standard deviation is known to sqrt(1 / (2 f)), 25 % for f = 8."""
+    """1.2 % from frame to frame; with f degrees of freedom a standard deviation is known to sqrt(1 / (2 f)), 25 % for f
+    = 8."""
     here = study(former(772521, SourceInstabilityLaw(1.2, 0, 9)))
     verdict = decide(
         MeasurementModel((level_repeats_block(here),), here.camera), np.random.default_rng(0), DecisionPolicy()
@@ -47,8 +48,8 @@ def test_an_unsteady_source_is_named_with_its_size() -> None:
 
 
 def test_flicker_within_frames_moves_whole_frames_too() -> None:
-    """100 Hz over 96 rows of 60 us, 0.58 of a period: whole frames scatter by what the rows' mean leaves of the modulation, and no
-    other light is asked for."""
+    """100 Hz over 96 rows of 60 us, 0.58 of a period: whole frames scatter by what the rows' mean leaves of the
+    modulation, and no other light is asked for."""
     law = LightFlickerLaw(20.0, 0, 4)
     block = level_repeats_block(study(former(772531, law)))
     flicker = LightFlicker(modulation_percent=20.0, frequency_hz=100.0, line_time_us=60.0)
@@ -58,8 +59,9 @@ def test_flicker_within_frames_moves_whole_frames_too() -> None:
 
 @pytest.mark.parametrize("seed", [772551, 772556])
 def test_image_lag_scatters_repeats_by_what_the_frames_before_left(seed: int) -> None:
-    """5 % of the frame before, exposures up and down, the same noise with and without it. Over 4 degrees of freedom, the product of both
-    scatters S / noise by 2 sqrt(R / 4), R the lag's variance over the noise's. It was called source_instability."""
+    """5 % of the frame before, exposures up and down, the same noise with and without it. Over 4 degrees of freedom,
+    the product of both scatters S / noise by 2 sqrt(R / 4), R the lag's variance over the noise's. It was called
+    source_instability."""
     with_lag = level_repeats_block(study(former(seed, ImageLagLaw(5.0, 0, 9), shuttle=True)))
     without = level_repeats_block(study(former(seed, shuttle=True)))
     mean = 1.0 - np.diag(with_lag.covariance)

@@ -38,7 +38,8 @@ def test_means_scatter_as_drawn_rows_do(correlation: float) -> None:
 
 
 def _ends(rows: int) -> float:
-    """First-order correction of a mean over a finite number of correlated rows against the spectrum at 0: 2 / rows for |correlation| = 1/2."""
+    """First-order correction of a mean over a finite number of correlated rows against the spectrum at 0: 2 / rows for
+    |correlation| = 1/2."""
     return 2.0 / rows
 
 

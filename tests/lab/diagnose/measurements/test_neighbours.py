@@ -52,9 +52,12 @@ def _rendered(acting: Sequence[Effect], seed: int = 5, cfa: str = "MONO") -> Stu
     """Darks and flats of `sim`, with PRNU and a lamp that flickers by 0.3 %."""
     channels = ("Y",) if cfa == "MONO" else ("R", "G", "B")
     camera = CameraModel(
-        rows=96, cols=128, pixel_pitch_um=3.45, fill_factor=1.0, cfa=cfa, bit_depth=12, black_level_dn=100.0, white_level_dn=4095.0,
-        conversion_gain_dn_per_e=0.4, full_well_e=1e4, read_noise_e=3.0, dark_current_e_per_s=5.0, dsnu_e=1.0, prnu_percent=0.8,
-        quantum_efficiency={c: Spectrum.of([400.0, 700.0], [0.5, 0.5]) for c in channels}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
+        rows=96, cols=128, pixel_pitch_um=3.45, fill_factor=1.0, cfa=cfa, bit_depth=12, black_level_dn=100.0,
+        white_level_dn=4095.0,
+        conversion_gain_dn_per_e=0.4, full_well_e=1e4, read_noise_e=3.0, dark_current_e_per_s=5.0, dsnu_e=1.0,
+        prnu_percent=0.8,
+        quantum_efficiency={c: Spectrum.of([400.0, 700.0], [0.5, 0.5]) for c in channels}, lens=Lens(f_number=4.0,
+        focal_length_mm=8.0),
     )  # fmt: skip
     rng = np.random.default_rng(seed)
     pattern = FixedPattern.draw(camera, rng)
@@ -74,9 +77,11 @@ def _rendered(acting: Sequence[Effect], seed: int = 5, cfa: str = "MONO") -> Stu
                 frames[path] = sample_from(
                     lit, camera, rng, pattern, dark_electrons=dark, read_out=read_out(camera, exposure, acting)
                 )
-                captures.append({"id": f"c{len(captures)}", "kind": kind, "side": "left", "frame": path, "exposure_s": t}
+                captures.append({"id": f"c{len(captures)}", "kind": kind, "side": "left", "frame": path,
+                "exposure_s": t}
                                 | ({"radiance": "lamp.csv"} if kind == "flat" else {}))  # fmt: skip
-    stated = {"rows": 96, "cols": 128, "pixel_pitch_um": 3.45, "cfa": cfa, "bit_depth": 12, "f_number": 4.0, "focal_length_mm": 8.0,
+    stated = {"rows": 96, "cols": 128, "pixel_pitch_um": 3.45, "cfa": cfa, "bit_depth": 12, "f_number": 4.0,
+    "focal_length_mm": 8.0,
               "quantum_efficiency": dict.fromkeys(channels, "qe.csv")}  # fmt: skip
     manifest = Manifest.model_validate({"cameras": {"left": stated}, "captures": captures})
     return _study(
@@ -93,7 +98,8 @@ def _verdict(study: Study) -> Verdict:
 
 
 def test_correlations_of_a_filter_are_its_autocorrelation() -> None:
-    """White noise through a kernel: correlations computed by hand for every pair; on a mosaic, pixels of a colour are two apart."""
+    """White noise through a kernel: correlations computed by hand for every pair; on a mosaic, pixels of a colour are
+    two apart."""
     kernel = np.array([[0.0, 0.05, 0.0], [0.05, 0.8, 0.05], [0.0, 0.05, 0.0]])
     size = np.sum(kernel**2)
     own = {"1,0": 2 * 0.8 * 0.05 / size, "1,1": 2 * 0.05**2 / size, "2,0": 0.05**2 / size}
@@ -108,7 +114,8 @@ def test_correlations_of_a_filter_are_its_autocorrelation() -> None:
 
 @pytest.mark.parametrize("cfa", ["MONO", "RGGB"])
 def test_noise_of_healthy_cameras_is_what_the_covariances_say(cfa: str) -> None:
-    """chi2 of both formers' cameras over their numbers: 3 sigma of 2 / n is 0.4 for 100 numbers; never above by more."""
+    """chi2 of both formers' cameras over their numbers: 3 sigma of 2 / n is 0.4 for 100 numbers; never above by
+    more."""
     for study in (_concealed(770011, cfa=cfa), _concealed(770012, cfa=cfa, repeats=6), _rendered((), cfa=cfa)):
         for block in (variance_block(study), neighbour_block(study)):
             residual = block.value - block.predict(()).mean
@@ -119,7 +126,8 @@ def test_noise_of_healthy_cameras_is_what_the_covariances_say(cfa: str) -> None:
 
 
 def test_a_lamp_that_flickers_and_rows_with_noise_leave_no_correlation() -> None:
-    """Row noise of 3 e, as large as the pixels': row means are subtracted, and what that subtracts is corrected for. 144 numbers."""
+    """Row noise of 3 e, as large as the pixels': row means are subtracted, and what that subtracts is corrected for.
+    144 numbers."""
     blocks = [neighbour_block(_rendered((effect("row_noise")(noise_e=3.0),), seed)) for seed in (20, 21, 22)]
     pulls = np.concatenate([b.value / np.sqrt(np.diag(b.covariance)) for b in blocks])
     assert np.mean(np.square(pulls)) < 1.0 + 3.0 * np.sqrt(2.0 / len(pulls))
@@ -167,7 +175,8 @@ def test_what_another_former_conceals_is_named(law: Law, name: str) -> None:
 
 
 def test_borders_that_move_between_colours_are_measured_by_their_means() -> None:
-    """A loss of 6 % by borders alone is a mean exchange of 6 / 4 %: all three sizes within 3.5 standard uncertainties."""
+    """A loss of 6 % by borders alone is a mean exchange of 6 / 4 %: all three sizes within 3.5 standard
+    uncertainties."""
     study = _concealed(770041, (BrighterFatterLaw(6.0, 2),), cfa="RGGB")
     verdict = _verdict(study)
     assert [c.told_name for c in verdict.named] == ["brighter_fatter"]
@@ -199,7 +208,8 @@ def test_pairs_are_all_within_two_pixels() -> None:
 def test_correlations_of_independent_pixels_in_small_frames_are_none(
     cfa: str, shape: tuple[int, int], frames: int
 ) -> None:
-    """What taking out the means of rows and columns does to independent pixels is exact: the mean of many sets is 0 and their covariance as stated."""
+    """What taking out the means of rows and columns does to independent pixels is exact: the mean of many sets is 0 and
+    their covariance as stated."""
     rng = np.random.default_rng(8)
     study = _concealed(1, cfa=cfa)
     dark = study.recordings.captures("dark", "left")[:frames]
@@ -223,8 +233,8 @@ def test_correlations_of_independent_pixels_in_small_frames_are_none(
 
 @pytest.mark.parametrize("cfa", ["MONO", pytest.param("RGGB", marks=pytest.mark.slow)])
 def test_charge_that_moves_across_an_edge_is_no_blur(cfa: str) -> None:
-    """Borders between unequal pixels move, so that a quarter of the variance's loss is exchanged: 5 % for 20 %. Edges alone tell it, within
-    three standard deviations."""
+    """Borders between unequal pixels move, so that a quarter of the variance's loss is exchanged: 5 % for 20 %. Edges
+    alone tell it, within three standard deviations."""
     model = measured_model(
         former(6201, BrighterFatterLaw(20.0, 2, 1), cfa=cfa, kinds=("dark", "flat", "slanted_edge")), edge_block
     )

@@ -1,4 +1,5 @@
-"""Fine structure of flat fields: green imbalance, steps between read-out taps, stripes; on cameras of the second image former."""
+"""Fine structure of flat fields: green imbalance, steps between read-out taps, stripes; on cameras of the second image
+former."""
 
 from __future__ import annotations
 
@@ -86,8 +87,8 @@ def test_unlike_greens_are_named_and_measured() -> None:
 
 
 def test_crosstalk_along_rows_is_no_green_imbalance() -> None:
-    """Crosstalk is half as large again along rows: greens differ by wavelength, as their neighbours do. 0.5 % and 0.75 % are 0.625 % +- 20
-    %."""
+    """Crosstalk is half as large again along rows: greens differ by wavelength, as their neighbours do. 0.5 % and 0.75
+    % are 0.625 % +- 20 %."""
     study = _study(771015, (CrosstalkLaw(0.5, 2),))
     blocks = (green_block(study), narrowband_block(study))
     verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())

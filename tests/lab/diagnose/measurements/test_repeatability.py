@@ -39,8 +39,8 @@ def test_one_bad_level_of_ten_does_not_set_the_scatter(by: float) -> None:
 
 
 def test_the_scatter_is_true_and_healthy_settings_count() -> None:
-    """10 settings of 3 repeats, 20 degrees of freedom less one: mean variance over 300 draws within 3 sqrt(2 / (20 300)) of the truth, of
-    which 1.1 s^2 is seen; at most 1 draw in 100 loses a setting (0.1 % declared)."""
+    """10 settings of 3 repeats, 20 degrees of freedom less one: mean variance over 300 draws within 3 sqrt(2 / (20
+    300)) of the truth, of which 1.1 s^2 is seen; at most 1 draw in 100 loses a setting (0.1 % declared)."""
     rng = np.random.default_rng(2)
     draws = [_drawn(rng) for _ in range(300)]
     assert sum(len(steady(d)) < len(d) for d in draws) <= 3

@@ -1,5 +1,5 @@
-"""Flicker as a scatter of single frames, against its analytic covariance over the phase: d^2 / 2 cos(2 pi f t), d the depth, t the time
-between two rows."""
+"""Flicker as a scatter of single frames, against its analytic covariance over the phase: d^2 / 2 cos(2 pi f t), d the
+depth, t the time between two rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Patterns on screens: no finding on healthy cameras, and concealed effects of the second image former in the right measurement."""
+"""Patterns on screens: no finding on healthy cameras, and concealed effects of the second image former in the right
+measurement."""
 
 from __future__ import annotations
 
@@ -108,7 +109,8 @@ def test_what_a_screen_shows_is_named(law: Law, name: str) -> None:
 
 
 def test_a_screen_that_fills_the_frame_lights_dark_squares_from_beyond() -> None:
-    """The former's screen continues beyond the frame; the uncertainty of its light is half of what an endless screen would add."""
+    """The former's screen continues beyond the frame; the uncertainty of its light is half of what an endless screen
+    would add."""
     found = measured_model(shared_study(), screen_block)
     gaussian = found.gaussian()
     away = (found.value - gaussian.mean) / np.sqrt(np.diag(gaussian.block_covariance(0)))
@@ -124,8 +126,8 @@ def test_a_ghost_brightens_dark_squares() -> None:
 
 
 def test_a_steep_gamma_over_wide_borders_is_predicted() -> None:
-    """v^5 on borders of a standard deviation of 0.4 px: lit cells of 4 px lose a quarter of their width. Contrast comes out within noise,
-    the borders' grey levels to 5 %."""
+    """v^5 on borders of a standard deviation of 0.4 px: lit cells of 4 px lose a quarter of their width. Contrast comes
+    out within noise, the borders' grey levels to 5 %."""
     study = shared_study(STEEP_GAMMA)
     effect = ScreenGamma(exponent=5.0, rim_px=0.4)
     contrasts = MeasurementModel((contrast_block(study),), study.camera)
@@ -155,8 +157,8 @@ def test_defocus_changes_the_contrast_as_predicted() -> None:
     [(4.0, 0.04), pytest.param(3.0, 0.0, marks=pytest.mark.slow), pytest.param(5.3, 1.7, marks=pytest.mark.slow)],
 )
 def test_a_filter_is_predicted_on_a_screen_of_any_geometry(cell_px: float, turn_deg: float) -> None:
-    """Cells of 4.0 px, hardly turned: red and blue pixels see f and 1/2 cy/px - f as the same numbers. chi2 of n numbers is at most
-    n + 3 sqrt(2 n), and a filter fits better than what else blurs."""
+    """Cells of 4.0 px, hardly turned: red and blue pixels see f and 1/2 cy/px - f as the same numbers. chi2 of n
+    numbers is at most n + 3 sqrt(2 n), and a filter fits better than what else blurs."""
     law = concealed.OpticalLowPassFilterLaw(1.9, 0)
     plan = Plan(kinds=("dark", "flat", "screen"), screen_cell_px=cell_px, screen_turn_deg=turn_deg)
     camera = ConcealedCamera(61, (law,), cfa="BGGR", f_number=5.6, rows=288, cols=384)
@@ -189,8 +191,8 @@ def test_pattern_fits_are_freed_with_their_study() -> None:
 
 
 def test_a_colours_contrast_is_that_of_its_own_place() -> None:
-    """Red and blue are displaced by half a pixel and more. Drawn at green's place, their contrast would be 2 to 4 % too low below 0.25
-    cy/px."""
+    """Red and blue are displaced by half a pixel and more. Drawn at green's place, their contrast would be 2 to 4 % too
+    low below 0.25 cy/px."""
     plain, moved = (contrast_block(shared_study(*laws)) for laws in ((), (concealed.LateralColourLaw(4.0, 0, 5),)))
     kept = {(k.channel, k.condition, round(k.x, 2)): v for k, v in zip(plain.labels, plain.value, strict=True)}
     lost = [
@@ -204,7 +206,8 @@ def test_a_colours_contrast_is_that_of_its_own_place() -> None:
 
 
 def test_lateral_colour_is_measured_along_the_radius_alone() -> None:
-    """3 um a 100 nm in the corner: what each colour's light is apart from green's, by the block's own prediction at that size."""
+    """3 um a 100 nm in the corner: what each colour's light is apart from green's, by the block's own prediction at
+    that size."""
     from sim.effects.lateral_chromatic_aberration import LateralChromaticAberration
 
     law = LATERAL_COLOUR
@@ -240,9 +243,9 @@ def test_dark_squares_that_the_border_cuts_are_looked_at_inside_only(seed: int) 
 
 @pytest.mark.slow
 def test_a_displaced_colour_before_an_aligned_screen_keeps_its_contrast() -> None:
-    """Cells of 4 px, straight: red and blue are displaced by 0.6 px in the corners. The camera of this former only displaces a channel, so
-    that each band's contrast is 1 but for what the last step leaves, 0.1 px: 1 - cos(2 pi 0.1 0.3) = 2 % up to 0.3 cy/px, and the noise of
-    1 %. Drawn anew once it was 8 %."""
+    """Cells of 4 px, straight: red and blue are displaced by 0.6 px in the corners. The camera of this former only
+    displaces a channel, so that each band's contrast is 1 but for what the last step leaves, 0.1 px: 1 - cos(2 pi 0.1
+    0.3) = 2 % up to 0.3 cy/px, and the noise of 1 %. Drawn anew once it was 8 %."""
     law = concealed.LateralColourLaw(3.5, 0, 7)
     plan = Plan(kinds=("dark", "flat", "screen"), screen_turn_deg=0.0)
     study = study_of(recordings_of(ConcealedCamera(5, (law,), cfa="BGGR", rows=112, cols=144), plan))

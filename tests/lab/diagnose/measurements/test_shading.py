@@ -22,7 +22,8 @@ LOOKED_AT = (shading_block, linearity_block)
 
 
 def test_healthy_cells_scatter_as_they_should() -> None:
-    """4 cameras: the mean of chi2's departures within 3 / sqrt(4) of its standard deviations, and 0.5 for the free axis and level."""
+    """4 cameras: the mean of chi2's departures within 3 / sqrt(4) of its standard deviations, and 0.5 for the free axis
+    and level."""
     found = [sigmas(measured_model(former(s, cfa=c), shading_block)) for s in (1, 2) for c in ("MONO", "BGGR")]
     assert abs(np.mean(found)) < 3.0 / np.sqrt(4) + 0.5
     assert max(found) < 4.0
@@ -67,8 +68,8 @@ def test_what_no_law_fits_is_seen_and_gets_no_name(law: Law) -> None:
 
 
 def test_a_pattern_that_neighbours_share_counts_more() -> None:
-    """White pattern: its own variance, within 3 sqrt(2 / 192) of blocks' differences and the same for the median; common pattern: at most
-    ALIKE times as much."""
+    """White pattern: its own variance, within 3 sqrt(2 / 192) of blocks' differences and the same for the median;
+    common pattern: at most ALIKE times as much."""
     rng = np.random.default_rng(3)
     white = 1.0 + 0.01 * rng.standard_normal((192, 256))
     assert _pattern_variance(white, 0.0) == pytest.approx(1e-4, rel=0.2)

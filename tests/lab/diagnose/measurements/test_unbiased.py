@@ -1,5 +1,6 @@
-"""Every measurement of healthy cameras: its numbers scatter about their prediction as their covariance says, whatever the frames' size, number, mosaic
-and depth. Where frames are too small for that, a measurement is skipped. Measurements are taken from their library: a new one is covered.
+"""Every measurement of healthy cameras: its numbers scatter about their prediction as their covariance says, whatever
+the frames' size, number, mosaic and depth. Where frames are too small for that, a measurement is skipped. Measurements
+are taken from their library: a new one is covered.
 
 Cameras are the second image former's: it shares no code with the measurements.
 """
@@ -25,9 +26,11 @@ from mocks.former import ConcealedCamera, Plan
 
 #: Probability that a healthy measurement fails a whole test, over all its comparisons (Bonferroni).
 CHANCE = 1e-3
-#: Covariances are estimated from the same frames: of about 100 degrees of freedom they are known to 2 / sqrt(200) = 14 %.
+#: Covariances are estimated from the same frames: of about 100 degrees of freedom they are known to 2 / sqrt(200) = 14
+#: %.
 COVARIANCE_SHARE = 0.15
-#: A mean pull of that size moves chi2 of a number by 0.01 and no decision: laws that are linear to first order leave as much.
+#: A mean pull of that size moves chi2 of a number by 0.01 and no decision: laws that are linear to first order leave as
+#: much.
 NEGLIGIBLE_PULL = 0.1
 EVEN = ("dark", "flat")
 SPECTRAL = (*EVEN, "narrowband")
@@ -148,7 +151,8 @@ def _faults(drawn: dict[str, Pulls]) -> list[str]:
         tolerance = limit * max(float(np.sqrt(np.mean(2.0 / numbers))), _spread(share)) / np.sqrt(len(share))
         if share.mean() > 1.0 + COVARIANCE_SHARE + tolerance:
             faults.append(
-                f"{name}: chi2 over its degrees of freedom {share.mean():.2f}, limit {1 + COVARIANCE_SHARE + tolerance:.2f}"
+                f"{name}: chi2 over its degrees of freedom {share.mean():.2f}, limit "
+                f"{1 + COVARIANCE_SHARE + tolerance:.2f}"
             )
     return faults
 

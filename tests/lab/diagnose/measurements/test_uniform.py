@@ -1,4 +1,5 @@
-"""Levels of flat fields and narrowband light: nonlinearity, drift and wrong wavelengths are told apart, with right covariances."""
+"""Levels of flat fields and narrowband light: nonlinearity, drift and wrong wavelengths are told apart, with right
+covariances."""
 
 from __future__ import annotations
 
@@ -91,7 +92,8 @@ def test_effects_on_narrowband_light_are_told_apart(law: Law) -> None:
     ids=lambda law: law.name,
 )
 def test_structure_that_no_law_has_is_located_and_gets_no_name(law: Law) -> None:
-    """The red leak of a MONO sensor isn't told by its colour: the radiometer's law explained a part of it, and left more."""
+    """The red leak of a MONO sensor isn't told by its colour: the radiometer's law explained a part of it, and left
+    more."""
     cfa = "MONO" if isinstance(law, RedLeakLaw) else "RGGB"
     found = verdict(former(33, law, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
     assert not found.named
@@ -99,7 +101,8 @@ def test_structure_that_no_law_has_is_located_and_gets_no_name(law: Law) -> None
 
 
 def test_second_order_light_shows_where_half_the_wavelength_is_seen() -> None:
-    """A sweep to 900 nm: beyond 800 nm a line at half the wavelength is visible. Share within 3 standard uncertainties."""
+    """A sweep to 900 nm: beyond 800 nm a line at half the wavelength is visible. Share within 3 standard
+    uncertainties."""
     truth = SecondOrderLight(share_percent=3.0)
     found = verdict(rendered(6, (truth,), sweep_to_nm=900, repeats=2), linearity_block, narrowband_block)
     assert names(found) == ["second_order_light"]
@@ -116,7 +119,8 @@ def test_healthy_levels_agree_with_their_covariance() -> None:
 
 
 def test_a_drifting_lamp_is_repeatable() -> None:
-    """0.5 % a minute makes repeats differ by 0.17 %; a trend common to all levels leaves the repeatability that there was, 0."""
+    """0.5 % a minute makes repeats differ by 0.17 %; a trend common to all levels leaves the repeatability that there
+    was, 0."""
     for shuttle in (False, True):
         looked_at = study(former(34, SourceDriftLaw(0.5), shuttle=shuttle))
         noise = looked_at.noise
@@ -133,7 +137,8 @@ class _Reading:
 
 @pytest.mark.parametrize("std", [0.0, 1e-3, 0.02])
 def test_standard_deviation_of_readings_is_measured_and_capped(std: float) -> None:
-    """From 60 second differences, the median modulus is good to 20 %; the cap is the largest noise that a radiometer may have."""
+    """From 60 second differences, the median modulus is good to 20 %; the cap is the largest noise that a radiometer
+    may have."""
     rng = np.random.default_rng(7)
     points = [(_Reading(f"c{i}", 400.0 + 5.0 * i), "Y") for i in range(62)]
     signal = 1e4 * (1.0 + std * rng.standard_normal(62))
@@ -191,7 +196,8 @@ def test_after_dummy_frames_image_lag_holds_nothing_of_the_capture_before() -> N
 
 
 def test_a_glow_that_brightens_darks_brightens_light_frames_as_much() -> None:
-    """Dark current is one nuisance parameter of darks, flats and narrowband light: what an effect adds is the same in all."""
+    """Dark current is one nuisance parameter of darks, flats and narrowband light: what an effect adds is the same in
+    all."""
     at = study(rendered(3))
     glow = (AmplifierGlow(glow_e_per_s=40.0, reach_mm=0.3),)
     more = added_dark_dn(at, glow)

@@ -1,4 +1,5 @@
-"""Wrong metadata of healthy cameras of the second image former are reported with the value that fits; right ones aren't reported."""
+"""Wrong metadata of healthy cameras of the second image former are reported with the value that fits; right ones aren't
+reported."""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ def test_a_wrong_mosaic_phase_is_reported_without_the_makers_curves() -> None:
 @pytest.mark.parametrize("cfa", ["RGGB", "MONO"])
 @pytest.mark.parametrize(("first_nm", "second_nm"), [(450.0, 460.0), (500.0, 600.0), (520.0, 540.0)])
 def test_exchanged_narrowband_lights_are_told(cfa: str, first_nm: float, second_nm: float) -> None:
-    """450 and 460 nm differ by 19 % in a grey sensor's signal, where noise and the maker's curves leave less than 1 %."""
+    """450 and 460 nm differ by 19 % in a grey sensor's signal, where noise and the maker's curves leave less than 1
+    %."""
     recordings = _recorded(12, cfa, ("dark", "narrowband"))
     corrected, (found,) = misstatements(with_exchanged_wavelengths(recordings, first_nm, second_nm), "left")
     assert found.where in (f"{first_nm:g} nm and {second_nm:g} nm", f"{second_nm:g} nm and {first_nm:g} nm")
@@ -83,7 +85,8 @@ def test_a_black_level_that_is_not_that_of_the_darks_is_told(off_dn: float) -> N
 
 @pytest.mark.parametrize(("exposure_s", "factor"), [(2.0, 0.8), (2.0, 1.25), (0.5, 0.8), (0.5, 1.25)])
 def test_a_wrong_exposure_of_darks_is_told(exposure_s: float, factor: float) -> None:
-    """Of three exposures, two may be the wrong one: the level of the true one is told within three standard deviations."""
+    """Of three exposures, two may be the wrong one: the level of the true one is told within three standard
+    deviations."""
     recordings = _recorded(11, "RGGB", ("dark", "narrowband"))
     corrected, (found,) = misstatements(with_dark_exposures(recordings, exposure_s, factor), "left")
     stated = f"those stated with {factor * exposure_s:.6g} s have the level of "

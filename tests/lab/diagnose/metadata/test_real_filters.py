@@ -1,4 +1,5 @@
-"""A real ColorChecker behind band-pass filters, two of which are stated for each other's: a Flea3 with a GBRG mosaic, 8 bits."""
+"""A real ColorChecker behind band-pass filters, two of which are stated for each other's: a Flea3 with a GBRG mosaic, 8
+bits."""
 
 from __future__ import annotations
 
@@ -77,8 +78,8 @@ def test_the_filters_and_the_mosaic_as_they_are() -> None:
 
 @pytest.mark.parametrize("exchanged", [(450, 600), (500, 550), (550, 650)])
 def test_two_exchanged_filters_are_told(exchanged: tuple[int, int]) -> None:
-    """By the patches alone: lamp, sensitivities and gain are unknown. 18 of the 21 pairs are told; of the others one filter is 700 nm, whose
-    own patches fit no better than 34 %."""
+    """By the patches alone: lamp, sensitivities and gain are unknown. 18 of the 21 pairs are told; of the others one
+    filter is 700 nm, whose own patches fit no better than 34 %."""
     (line,) = told(_recorded(exchanged))
     assert all(f"stated with {name}nm.csv" in line for name in exchanged)
 

@@ -37,7 +37,8 @@ def filtered_edges(named: tuple[Effect, ...] = ()) -> Verdict:
     )
     value = predict((TRUTH,)).mean + NOISE * np.random.default_rng(8).standard_normal(len(labels))
     block = Block(
-        measurement=declared("slanted_edge", "spatial_frequency", "cy/px", conditions="orientation"), reach=0.2, value=value,
+        measurement=declared("slanted_edge", "spatial_frequency", "cy/px", conditions="orientation"), reach=0.2,
+        value=value,
         covariance=NOISE**2 * np.eye(len(labels)), labels=labels, reads=TRANSFER, predict=predict,
         scale=np.ones(len(labels)),
     )  # fmt: skip

@@ -47,5 +47,6 @@ def test_a_finding_says_which_alternative_it_is() -> None:
         statement="It glows.",
     )
     assert effect_line(named) == (
-        "Amplifier glow, left: electrons a second in that corner 30.0 ± 4.0 e/s (7.5 σ from 0); where the output stage is: bottom right."
+        "Amplifier glow, left: electrons a second in that corner 30.0 ± 4.0 e/s (7.5 σ from 0); where the output "
+        "stage is: bottom right."
     )

@@ -37,7 +37,8 @@ def test_sets_are_reported_where_they_hold_an_effect_without_a_name() -> None:
     unlikely = _models((["defocus"], 0.91), (["defocus", "coma"], 0.03), (["defocus", "ghost"], 0.02))
     assert _told(unlikely, _named("defocus")) == ""
     left = Unexplained(
-        side="left", measurement="slanted_edge", axis="spatial_frequency", where="all", shape="irregular", significance_sigma=9.0,
+        side="left", measurement="slanted_edge", axis="spatial_frequency", where="all", shape="irregular",
+        significance_sigma=9.0,
         chi2_before=300.0, chi2_after=290.0, n=60,
     )  # fmt: skip
     assert _told(both, _named("defocus"), left=[left]) == ""  # an unlisted cause is there

@@ -39,9 +39,9 @@ def test_every_place_has_its_chi2_before_and_after() -> None:
 
 
 def test_the_baseline_is_drawn_as_a_camera_without_the_effect() -> None:
-    """Each line is exposed to 0.7 of the full well of a camera without the filter: 2772 DN above 128 DN. The filter cuts the light from 600
-    nm on, and the level falls; the baseline's curve stays. (The baseline's own fit would follow the filter with its nuisance
-    parameters.)"""
+    """Each line is exposed to 0.7 of the full well of a camera without the filter: 2772 DN above 128 DN. The filter
+    cuts the light from 600 nm on, and the level falls; the baseline's curve stays. (The baseline's own fit would follow
+    the filter with its nuisance parameters.)"""
     truth = InfraredCutFilter(cut_wavelength_nm=600.0, width_nm=5.0)
     model = measured_model(rendered(6, (truth,), sweep_to_nm=720, repeats=2), linearity_block, narrowband_block)
     assert np.ptp(model.fitted_mean()[model.slices[1]]) > 2000.0

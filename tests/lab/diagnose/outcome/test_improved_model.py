@@ -79,7 +79,7 @@ def test_a_saved_model_simulates_with_the_named_effect(
     assert with_it == pytest.approx(passed * without, rel=0.05, abs=1.0)  # codes are whole numbers; a line 5 nm wide
 
 
-# --- what has no name --------------------------------------------------------------------------------------------------------
+# --- what has no name -------------------------------------------------------------------------------------------------
 
 FREQUENCY = np.linspace(0.02, 0.9, 23)
 NOISE = 0.004
@@ -97,15 +97,16 @@ def _edges(departs: np.ndarray) -> tuple[Block, CameraFile]:
 
     value = contrast * np.tile(1.0 + departs, 2) + NOISE * np.random.default_rng(3).standard_normal(46)
     block = Block(
-        measurement=declared("slanted_edge", "spatial_frequency", "cy/px", conditions="orientation"), reach=0.2, value=value, covariance=NOISE**2 * np.eye(46),
+        measurement=declared("slanted_edge", "spatial_frequency", "cy/px", conditions="orientation"), reach=0.2,
+        value=value, covariance=NOISE**2 * np.eye(46),
         labels=labels, reads=TRANSFER, predict=predict, scale=np.ones(46),
     )  # fmt: skip
     return block, content
 
 
 def test_a_mismatch_without_a_name_is_saved_as_a_correction() -> None:
-    """A ripple of 10 % of the contrast: the saved correction follows it within the noise 0.004 / exp(-2 f) of 46 points, and the model with
-    it explains the numbers."""
+    """A ripple of 10 % of the contrast: the saved correction follows it within the noise 0.004 / exp(-2 f) of 46
+    points, and the model with it explains the numbers."""
     ripple = 0.1 * np.sin(9.0 * FREQUENCY)
     block, content = _edges(ripple)
     model = MeasurementModel((block,), content.camera)
@@ -138,7 +139,8 @@ def test_a_discrepancy_that_the_model_cannot_hold_is_reported() -> None:
 
 @pytest.mark.parametrize(
     ("axis", "unit", "quantity", "along"),
-    [("field", "mm", "image.shading", "radius_um"), ("level", "DN", "signal.response", "signal_e"), ("level", "DN", "charge.variance_e2", "variance_signal_e")],
+    [("field", "mm", "image.shading", "radius_um"), ("level", "DN", "signal.response", "signal_e"), ("level", "DN",
+    "charge.variance_e2", "variance_signal_e")],
 )  # fmt: skip
 def test_a_correction_acts_on_the_stage_of_its_measurement(axis: str, unit: str, quantity: str, along: str) -> None:
     block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))

@@ -49,7 +49,8 @@ def _model(acting: Sequence[Effect] = ()) -> MeasurementModel:
         return Prediction(np.exp(-2.0 * FREQUENCY) * np.real(factor), {})
 
     block = Block(
-        measurement=declared("slanted_edge", "spatial_frequency", "cy/px"), reach=0.2, value=predict(acting).mean, covariance=4e-6 * np.eye(16),
+        measurement=declared("slanted_edge", "spatial_frequency", "cy/px"), reach=0.2, value=predict(acting).mean,
+        covariance=4e-6 * np.eye(16),
         labels=tuple(Label(float(f), "G", "5 deg", ("edge-1",), False) for f in FREQUENCY), reads=TRANSFER,
         predict=predict, scale=np.ones(16),
     )  # fmt: skip
@@ -146,7 +147,8 @@ def _capture_told(one: str, other: str) -> str:
 
 
 def test_no_lens_is_proposed_for_what_shows_in_darks_alone() -> None:
-    """Line noise and telegraph noise differ in that one follows the f-number's invariance list and the other doesn't: no edge shows either."""
+    """Line noise and telegraph noise differ in that one follows the f-number's invariance list and the other doesn't:
+    no edge shows either."""
     dark_only = [name for name, seen in visibility().items() if set(seen.capture_kinds) == {"dark"}]
     assert len(dark_only) > 2
     for one, other in combinations(dark_only, 2):

@@ -22,8 +22,10 @@ def test_pictures_show_what_the_model_lacks_and_noise_once_it_has_it() -> None:
     camera = ConcealedCamera(20771, [law], cfa="MONO", f_number=4.0, rows=160, cols=200)
     recordings = recordings_of(camera, Plan(("flat", "slanted_edge")))
     model = camera_model(recordings, "left").model_copy(
-        update={"black_level_dn": camera.black_level_dn, "conversion_gain_dn_per_e": camera.gain_dn_per_e, "read_noise_e": camera.read_noise_e,
-                "prnu_percent": camera.prnu_percent, "dark_current_e_per_s": camera.dark_e_per_s, "full_well_e": camera.full_well_e}
+        update={"black_level_dn": camera.black_level_dn, "conversion_gain_dn_per_e": camera.gain_dn_per_e,
+        "read_noise_e": camera.read_noise_e,
+                "prnu_percent": camera.prnu_percent, "dark_current_e_per_s": camera.dark_e_per_s,
+                "full_well_e": camera.full_well_e}
     )  # fmt: skip
     known = CameraFile("known", model, (OpticalLowPassFilter(displacement_x_um=1.8, displacement_y_um=1.8),))
     found = {p.kind: p for p in residual_pictures(recordings, "left", filtered_edges().model, known)}

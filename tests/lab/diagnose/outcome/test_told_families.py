@@ -1,4 +1,5 @@
-"""A named family in the result: its identifier, members, the nearest law's parameters, and the capture that tells members apart."""
+"""A named family in the result: its identifier, members, the nearest law's parameters, and the capture that tells
+members apart."""
 
 from __future__ import annotations
 
@@ -88,7 +89,8 @@ def _both(effect: Effect, std: dict[str, float | None]) -> DiagnosisResult:
 
 
 def test_what_both_sides_share_is_no_better_told_by_two() -> None:
-    """A drifting lamp is read by one radiometer: both sides hold the same reading's error. Two sensors' hot pixels are independent."""
+    """A drifting lamp is read by one radiometer: both sides hold the same reading's error. Two sensors' hot pixels are
+    independent."""
     drift = _both(SourceDrift(drift_percent_per_min=4.0), {"drift_percent_per_min": 0.5}).effects[0]
     assert drift.parameters["drift_percent_per_min"].std == pytest.approx(0.5)
     assert "settling_min" not in drift.parameters

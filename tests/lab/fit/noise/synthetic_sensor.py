@@ -15,7 +15,8 @@ from sim.sensor.mosaic import planes
 
 @dataclass(frozen=True)
 class Sensor:
-    """The truth of a synthetic camera; electrons unless said. Shot noise is drawn as a normal variable of the same moments."""
+    """The truth of a synthetic camera; electrons unless said. Shot noise is drawn as a normal variable of the same
+    moments."""
 
     shape: tuple[int, int] = (120, 160)
     cfa: str = "RGGB"

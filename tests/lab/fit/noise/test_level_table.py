@@ -28,7 +28,7 @@ def _table(path: Path, seed: int = 0, change: tuple[str, str] = ("", "")) -> Pat
             mean = BLACK + K * electrons + rng.normal(0.0, np.sqrt(variance / PIXELS / REPEATS))
             variance *= 1.0 + rng.normal(0.0, np.sqrt(2.0 / PIXELS / (REPEATS - 1)))
             rows.append(
-                f"{kind},{exposure_s:g},{photons if kind == 'flat' else ''},{mean:.5f},{variance:.5f},{PIXELS},{REPEATS}"
+                f"{kind},{exposure_s:g},{photons if kind == 'flat' else ''},{mean:.5f},{variance:.5f},{PIXELS},{REPEATS}"  # noqa: E501
             )
     file = path / "table.csv"
     file.write_text("\n".join(rows).replace(*change) + "\n" if change[0] else "\n".join(rows) + "\n")

@@ -1,4 +1,5 @@
-"""The noise fit against cameras of known truth: robustness to curvature, shading, drift and saturation, uncertainties."""
+"""The noise fit against cameras of known truth: robustness to curvature, shading, drift and saturation,
+uncertainties."""
 
 from __future__ import annotations
 

@@ -67,7 +67,8 @@ def test_behind_a_lens_or_without_a_pitch_there_are_none() -> None:
 
 
 def recorded(calibration: float, camera: DataSheet = CAMERA) -> RecordingSet:
-    """Flats in light of one wavelength; the photodiode reads `calibration` times its irradiance, and scatters by its readings."""
+    """Flats in light of one wavelength; the photodiode reads `calibration` times its irradiance, and scatters by its
+    readings."""
     rng = np.random.default_rng(5)
     captures: list[dict[str, object]] = []
     frames = {}

@@ -19,7 +19,8 @@ def test_transfer_is_exact_without_noise() -> None:
 
 
 def with_model_error(relative: float, bend: float, seed: int) -> tuple[np.ndarray, ...]:
-    """Points of a camera of K = 0.4 whose flats have a `relative` error beyond their sampling noise of 0.3 %; bend at 4000 DN."""
+    """Points of a camera of K = 0.4 whose flats have a `relative` error beyond their sampling noise of 0.3 %; bend at
+    4000 DN."""
     rng = np.random.default_rng(seed)
     x = np.concatenate([np.zeros(5), np.linspace(100, 3500, 40)])
     v = (2.0 + 0.4 * x * (1.0 + bend * x / 4000.0)) * (1.0 + 0.003 * rng.standard_normal(x.size))
@@ -58,6 +59,7 @@ def test_a_straight_line_starts_below_the_darks_own_shot_noise() -> None:
     v[:5] = (2.0 + 0.4 * x[:5]) * v[:5] / 2.0  # each with the error that it had
     fit = fit_transfer(x, v, 0.003 * v, plane, light, 4000.0)
     assert fit.by_line
-    # Sampling 0.3 % of 2..7 DN^2 over five darks, and the line's gain, off by as much as its uncertainty says, times 3 DN.
+    # Sampling 0.3 % of 2..7 DN^2 over five darks, and the line's gain, off by as much as its uncertainty says, times 3
+    # DN.
     assert abs(float(fit.floor[0]) - 2.0) < 3.0 * float(np.sqrt(fit.covariance[2, 2]))
     assert np.sqrt(fit.covariance[2, 2]) < 0.1

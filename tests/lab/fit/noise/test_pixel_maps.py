@@ -116,6 +116,7 @@ def test_shutter_of_a_real_camera_is_linear() -> None:
             growth = np.median(frames[longer][chosen] / frames[shorter][chosen])
             ratios.append(growth / (longer / shorter))
     assert len(ratios) >= 16
-    # Found by others on these frames: 0.98 to 1.005 of nominal; black clipped near 0 and eight bits leave 2 % more here.
+    # Found by others on these frames: 0.98 to 1.005 of nominal; black clipped near 0 and eight bits leave 2 % more
+    # here.
     assert 0.96 < min(ratios) < max(ratios) < 1.025
     assert np.median(ratios) == pytest.approx(1.0, abs=0.01)

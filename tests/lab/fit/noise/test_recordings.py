@@ -162,8 +162,8 @@ def test_a_frame_of_a_few_pixels_is_refused() -> None:
 
 @pytest.mark.parametrize("seed", range(16))
 def test_poor_recordings_end_in_figures_or_in_a_reason(seed: int) -> None:
-    """Few levels, single frames, all-dark and all-white flats, coarse codes, clipped blacks, temperatures and gains mixed: what comes
-    out is finite, or a reason. Warnings are errors in these tests."""
+    """Few levels, single frames, all-dark and all-white flats, coarse codes, clipped blacks, temperatures and gains
+    mixed: what comes out is finite, or a reason. Warnings are errors in these tests."""
     rng = np.random.default_rng(seed)
     bits = int(rng.choice([8, 12]))
     white = 2**bits - 1
@@ -249,7 +249,8 @@ def test_a_real_spatial_stack_that_contradicts_its_series(name: str, stack: str,
     fit = fit_noise(read_emva1288(folder), "left")
     (level,) = fit.inconsistent_levels
     assert level.captures[0] == stack and len(level.captures) == 8
-    # The simulated stack has the image of the next step; the CMOS series scatters by 0.23 %, 3.5 of these and the law's own
+    # The simulated stack has the image of the next step; the CMOS series scatters by 0.23 %, 3.5 of these and the law's
+    # own
     assert level.expected_light == pytest.approx(expected_photons, rel=0.01)
     assert any(f"8 captures {stack} .. " in remark for remark in fit.remarks)
     assert not any("lamp drifted" in remark for remark in fit.remarks)
@@ -257,8 +258,8 @@ def test_a_real_spatial_stack_that_contradicts_its_series(name: str, stack: str,
     # The stack still serves the spatial figures, and it alone.
     assert own.points.stack_images == 8
     assert max(abs(d) for d in own.points.linearity_deviation_percent if d is not None) < 1.5
-    # CMOS: an independent look, as the mean of variance over signal, which falls from 0.027 to 0.018. Simulated: the truth; its
-    # light falls off by 3 % towards the edges of the full frame, so that the mean is up to 1.5 % lower
+    # CMOS: an independent look, as the mean of variance over signal, which falls from 0.027 to 0.018. Simulated: the
+    # truth; its light falls off by 3 % towards the edges of the full frame, so that the mean is up to 1.5 % lower
     references = (0.0206, 0.55) if name == "emva1288_cmos_crop" else (0.1, 0.4975)
     assert abs(own.system_gain_dn_per_e - references[0]) < 2.5 * own.system_gain_dn_per_e_std
     assert abs(own.quantum_efficiency - references[1]) < 2.5 * own.quantum_efficiency_std
@@ -272,8 +273,9 @@ def test_a_real_spatial_stack_that_contradicts_its_series(name: str, stack: str,
 
 @pytest.mark.parametrize("name", ["emva1288_cmos_crop", "emva1288_simulated_crop"])
 def test_a_part_of_the_levels_is_no_surer_than_all_of_them(name: str) -> None:
-    """Every eighth, and every fourth, level of real and simulated cameras: K agrees with the independent figure within 3 standard deviations, and
-    few levels have at least 0.3 times the standard deviation of all: what both rest on are few values."""
+    """Every eighth, and every fourth, level of real and simulated cameras: K agrees with the independent figure within
+    3 standard deviations, and few levels have at least 0.3 times the standard deviation of all: what both rest on are
+    few values."""
     if not (DATA / name).exists():
         pytest.skip("the shared recordings aren't here")
     recordings = read_emva1288(DATA / name)

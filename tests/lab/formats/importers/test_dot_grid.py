@@ -29,8 +29,8 @@ def _board() -> np.ndarray:
 def _picture(
     rotation: np.ndarray, shift: np.ndarray, rng: np.random.Generator, distortion: np.ndarray = DISTORTION
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A picture, 0..1, of dark dots, and the true images of their centres (n, 2). Each dot's border is blurred by an error function of the
-    distance in the board's plane, over the local scale."""
+    """A picture, 0..1, of dark dots, and the true images of their centres (n, 2). Each dot's border is blurred by an
+    error function of the distance in the board's plane, over the local scale."""
     centres = cv2.projectPoints(_board(), rotation, shift, MATRIX, distortion)[0][:, 0]
     picture = np.full(SHAPE, 0.9)
     turn = cv2.Rodrigues(rotation)[0]
@@ -63,8 +63,9 @@ POSES = [
 
 
 def test_centres_scatter_as_stated() -> None:
-    """Facing the grid through a lens without distortion, so that nothing moves a centroid. 63 dots in 8 pictures: the mean square of pulls
-    is 1 within 3 sqrt(2 / 1008) = 0.13 for normal errors; the pixels at a dot's rim and the threshold take it to 0.6 .. 1.6."""
+    """Facing the grid through a lens without distortion, so that nothing moves a centroid. 63 dots in 8 pictures: the
+    mean square of pulls is 1 within 3 sqrt(2 / 1008) = 0.13 for normal errors; the pixels at a dot's rim and the
+    threshold take it to 0.6 .. 1.6."""
     rng = np.random.default_rng(11)
     pulls = []
     for k in range(8):
@@ -90,8 +91,8 @@ def _folder(path: Path) -> Path:
 
 
 def test_a_cameras_geometry_comes_from_its_dots(tmp_path: Path) -> None:
-    """Centroids of ellipses are off by f (a / z)^2 / 2 x sin 2 tilt, 0.05 px at most here: 3e-3 of the focal length, beside the stated
-    uncertainty."""
+    """Centroids of ellipses are off by f (a / z)^2 / 2 x sin 2 tilt, 0.05 px at most here: 3e-3 of the focal length,
+    beside the stated uncertainty."""
     read = read_dot_grids(_folder(tmp_path / "in"), (ROWS, COLS), SPACING_MM)
     recordings = recording.read(recording.write(read, tmp_path / "out"))
     assert [c.pose for c in recordings.captures("charuco")] == [f"p{k:03d}" for k in range(5)]

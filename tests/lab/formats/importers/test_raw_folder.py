@@ -76,7 +76,8 @@ def test_every_capture_becomes_one_of_the_recording_set(folder: Path, tmp_path: 
 def test_rows_that_cannot_be_used_are_all_named(folder: Path) -> None:
     with (folder / "index.csv").open("a") as file:
         file.write(
-            "missing.png,dark,left,1\n../in/dark.png,dark,left,1\n,dark,left,1\nedge.tif,slanted_edge,left,1,,,1 2 x 4\n"
+            "missing.png,dark,left,1\n../in/dark.png,dark,left,1\n,dark,left,1\nedge.tif,slanted_edge,left,1,,,1 2 x "
+            "4\n"
         )
         file.write("/etc/hostname,dark,left,1\n../../x.png,dark,left,1\n")
     with pytest.raises(InputError) as caught:
@@ -200,7 +201,8 @@ def test_boards_without_markers(folder: Path) -> None:
     for name in "abc":
         cv2.imwrite(str(folder / f"{name}.png"), np.full((12, 16), 90, np.uint8))
     (folder / "index.csv").write_text(
-        "frame,kind,squares,square_mm,marker_mm,dictionary,pose\na.png,checkerboard,7 10,25,,,p\nb.png,charuco,7 10,25,0,DICT_4X4_50,q\n"
+        "frame,kind,squares,square_mm,marker_mm,dictionary,pose\na.png,checkerboard,7 10,25,,,p\nb.png,charuco,7 "
+        "10,25,0,DICT_4X4_50,q\n"
         "c.png,charuco,8 10,10,0,dots,r\n"
     )
     boards = read_raw_folder(folder).captures("charuco")

@@ -41,7 +41,8 @@ def _folder(path: Path, camera: str = TAPS, frames: int = 6) -> Path:
 
 
 def test_taps_are_cropped_and_brought_to_one_black_level(tmp_path: Path) -> None:
-    """Overscan means: sigma sqrt(4 + 1/12) / sqrt(6 x 320) = 0.046 DN each. The difference of 37.5 DN is a whole 37 or 38."""
+    """Overscan means: sigma sqrt(4 + 1/12) / sqrt(6 x 320) = 0.046 DN each. The difference of 37.5 DN is a whole 37 or
+    38."""
     read = read_raw_folder(_folder(tmp_path / "in"))
     recordings = recording.read(recording.write(read, tmp_path / "out"))
     camera = recordings.camera("left")
@@ -71,7 +72,8 @@ overscan = [0, {2 * WIDE + COLS}, {ROWS}, {3 * WIDE + COLS}]
 
 
 def _between(path: Path) -> Path:
-    """The frames of `_folder` with the overscan between the taps, after a margin of no use; their image is its columns, numbered."""
+    """The frames of `_folder` with the overscan between the taps, after a margin of no use; their image is its columns,
+    numbered."""
     path.mkdir()
     lit = 500 + np.tile(np.arange(2 * COLS), (ROWS, 1))
     for k in range(2):
@@ -129,8 +131,10 @@ def test_a_stated_black_level_stands_for_an_overscan(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (f"{2 * COLS + 2 * WIDE}]", f"{2 * COLS + 3 * WIDE}]", "tap B: overscan [0, 72, 40, 88] isn't inside the frame of 40 x 80"),
-        (f"region = [0, {COLS}, ", f"region = [0, {COLS + 2}, ", "leave gaps: column 32..33 belongs to no region, and isn't all overscan"),
+        (f"{2 * COLS + 2 * WIDE}]", f"{2 * COLS + 3 * WIDE}]", ("tap B: overscan [0, 72, 40, 88] isn't inside the "
+            "frame of 40 x 80")),
+        (f"region = [0, {COLS}, ", f"region = [0, {COLS + 2}, ", ("leave gaps: column 32..33 belongs to no region, and "
+            "isn't all overscan")),
         (f"region = [0, {COLS}, ", f"region = [0, {COLS - 2}, ", "leave gaps or overlap"),
         (f"overscan = [0, {2 * COLS}, ", f"overscan = [0, {2 * COLS - 4}, ", "holds pixels of a tap's region"),
         ('name = "B"', 'name = "A"', "two have one name"),

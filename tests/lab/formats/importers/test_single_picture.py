@@ -35,7 +35,8 @@ def _camera(path: Path, text: str = 'cfa = "MONO"\nbit_depth = 12\nblack_level_d
 
 
 def test_an_edge_picture_gives_its_transfer_function(tmp_path: Path) -> None:
-    """Gaussian of s px: MTF(f) = exp(-2 pi^2 s^2 f^2); noise of 4 DN in 2800 moves it by less than 0.01 at 0.25 cy/px."""
+    """Gaussian of s px: MTF(f) = exp(-2 pi^2 s^2 f^2); noise of 4 DN in 2800 moves it by less than 0.01 at 0.25
+    cy/px."""
     rng = np.random.default_rng(0)
     codes = np.rint(4095 * _edge() + rng.normal(0.0, 4.0, (160, 200))).astype(np.uint16)
     assert cv2.imwrite(str(tmp_path / "edge.png"), codes)
@@ -218,7 +219,8 @@ def test_no_chart_and_no_light_are_one_line_each(tmp_path: Path, light: Path) ->
 
 @pytest.mark.skipif(not LLANOS.is_dir(), reason="the ColorChecker's recordings aren't beside the checkout")
 def test_the_chart_of_a_real_camera_is_located() -> None:
-    """Behind the 550 nm filter; the patches' labels were drawn by the authors: each located patch centre lies in one label, in order."""
+    """Behind the 550 nm filter; the patches' labels were drawn by the authors: each located patch centre lies in one
+    label, in order."""
     (file,) = (LLANOS / "frames").glob("*_550nm_2000ms_*.tif")  # which the detector takes mirrored
     labels = cv2.imread(str(LLANOS / "labels_550nm.png"), cv2.IMREAD_UNCHANGED)
     frame = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.uint16)

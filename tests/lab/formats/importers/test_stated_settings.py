@@ -1,4 +1,5 @@
-"""What an index states against the frames' own files: EXIF of JPEG, PNG and TIFF, FITS headers, raws; units, moved rows, and times."""
+"""What an index states against the frames' own files: EXIF of JPEG, PNG and TIFF, FITS headers, raws; units, moved
+rows, and times."""
 
 import struct
 import zlib
@@ -110,7 +111,10 @@ def test_a_marked_shutter_is_half_of_a_third_of_a_stop_wide(tmp_path: Path, stat
     assert bool(said) == contradicts
     if contradicts:
         assert said == [
-            f"{folder}/a.jpg: exposure_s = {float(stated_s):g} s, its EXIF says 0.0166667 s; the former is used: correct what is wrong"
+            (
+                f"{folder}/a.jpg: exposure_s = {float(stated_s):g} s, its EXIF says 0.0166667 s; the former is used: "
+                "correct what is wrong"
+            )
         ]
 
 
@@ -136,7 +140,8 @@ def test_apertures_and_gains_are_held_against_exif(tmp_path: Path) -> None:
     aperture, gain = [line for line in read_raw_folder(folder).warnings if "EXIF" in line]
     assert aperture == f"{folder}/c.jpg: f_number = 2.83, its EXIF says 4; the former is used: correct what is wrong"
     assert gain == (
-        f"{folder}/c.jpg: its EXIF says ISO 400 and that of a.jpg ISO 100, +12.0 dB, but gain_db is unknown; write the gain of each into the "
+        f"{folder}/c.jpg: its EXIF says ISO 400 and that of a.jpg ISO 100, +12.0 dB, but gain_db is unknown; write "
+        "the gain of each into the "
         "column gain_db"
     )
     (folder / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 8\n')
@@ -151,7 +156,8 @@ def test_exposures_in_another_unit_are_refused(tmp_path: Path, factor: float, un
     with pytest.raises(InputError) as caught:
         read_raw_folder(folder)
     assert str(caught.value) == (
-        f"{folder}/a1.jpg: exposure_s = {factor * 0.0001:g} s, its EXIF says 0.0001 s (so do 1 more): it seems to be in {unit}; write seconds"
+        f"{folder}/a1.jpg: exposure_s = {factor * 0.0001:g} s, its EXIF says 0.0001 s (so do 1 more): it seems to be "
+        f"in {unit}; write seconds"
     )
 
 
@@ -166,13 +172,19 @@ def test_exposures_that_no_frame_has_are_refused_or_told(tmp_path: Path) -> None
     _folder(tmp_path, ["a.png,dark,100", "b.png,flat,200"])
     said = [line for line in read_raw_folder(folder).warnings if "exposure_s" in line]
     assert said == [
-        f"{folder}/b.png: exposure_s = 200 of a flat, beyond 60 s of light: check that it is in seconds, not in milliseconds or microseconds"
+        (
+            f"{folder}/b.png: exposure_s = 200 of a flat, beyond 60 s of light: check that it is in seconds, not in "
+            "milliseconds or microseconds"
+        )
     ]
     columns = "frame,kind,exposure_s,time"
     _folder(tmp_path, ["a.png,dark,100,2026-01-01T10:00:00Z", "b.png,dark,50,2026-01-01T10:00:03Z"], columns=columns)
     said = [line for line in read_raw_folder(folder).warnings if "exposure_s" in line]
     assert said == [
-        f"{folder}/a.png: exposure_s = 100, but b.png of 50 s was taken 3 s later; check that exposures are in seconds, and the times"
+        (
+            f"{folder}/a.png: exposure_s = 100, but b.png of 50 s was taken 3 s later; check that exposures are in "
+            "seconds, and the times"
+        )
     ]
     _folder(tmp_path, ["a.png,dark,3.9,2026-01-01T10:00:00Z", "b.png,dark,50,2026-01-01T10:00:03Z"], columns=columns)
     assert not [line for line in read_raw_folder(folder).warnings if "exposure_s" in line]
