@@ -24,8 +24,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
-from mocks.former import WAVELENGTH_NM, ConcealedCamera, DrawnSession
-from mocks.former.unlisted import UnlistedLaw
+from mocks.former import WAVELENGTH_NM, ConcealedCamera, DrawnSession, UnlistedLaw
 from sim.spectrum import FloatArray
 
 #: Relative standard deviations: of a level, common to its repeats; of a reading of narrowband light; of smooth errors

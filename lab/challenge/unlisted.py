@@ -19,8 +19,7 @@ from lab.challenge.noncentrality import noncentrality, summaries
 from lab.challenge.recordings import recording_set
 from lab.challenge.truth import SIZES, CaseTruth, Concealed
 from lab.errors import InputError
-from mocks.former import LISTED, ConcealedCamera, DrawnSession, Law, Plan, record
-from mocks.former.unlisted import UNLISTED, UnlistedLaw
+from mocks.former import LISTED, UNLISTED, ConcealedCamera, DrawnSession, Law, Plan, UnlistedLaw, record
 
 #: Of every block of cases: each law once, as many healthy cameras.
 BLOCK = 2 * len(UNLISTED)

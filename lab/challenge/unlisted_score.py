@@ -23,7 +23,7 @@ from lab.challenge.score import CLASSES, EXCESS_SIGMAS, STRONG, Goal, Rate, at_l
 from lab.challenge.truth import CaseTruth, Purpose, Seals, Truths
 from lab.effect_titles import effect_title
 from lab.formats.results import DiagnosisResult, DiscoveredLaw
-from mocks.former.unlisted import UNLISTED, UnlistedLaw
+from mocks.former import UNLISTED, UnlistedLaw
 from sim.effects.library import effects as library
 from sim.parameters import Frozen
 
