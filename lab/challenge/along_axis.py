@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import groupby
 from math import gcd
 from typing import Any
@@ -143,8 +144,9 @@ def _place(law: UnlistedLaw, camera: ConcealedCamera) -> FloatArray:
     return kind
 
 
-def _signal_dn(camera: ConcealedCamera, frame: FloatArray) -> FloatArray:
-    return np.maximum(frame - camera.black_level_dn, 0.0)
+def _signal_dn(camera: ConcealedCamera, mean_dn: FloatArray) -> FloatArray:
+    """The signal of a mean over many pixels: what noise leaves below black is none."""
+    return np.maximum(mean_dn - camera.black_level_dn, 0.0)
 
 
 def _noise_dn2(camera: ConcealedCamera, signal_dn: FloatArray) -> FloatArray:
@@ -218,7 +220,9 @@ def _levels(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, he
     rows = [(i, g, k) for i, g in enumerate(same) for k in g.numbers]
     n, count = signal.size, len(masks)
     group = np.repeat([i for i, _, _ in rows], count)
-    time = np.repeat([k / 60.0 for _, _, k in rows], count)
+    begun = datetime.fromisoformat(healthy.manifest["captures"][0]["time"])
+    taken = [datetime.fromisoformat(healthy.manifest["captures"][k]["time"]) for _, _, k in rows]
+    time = np.repeat([(t - begun).total_seconds() / 60.0 for t in taken], count)
     exposure = np.repeat([g.exposure_s for _, g, _ in rows], count)
     kind = np.repeat([g.capture["kind"] for _, g, _ in rows], count)
     warm = np.repeat([g.capture["temperature_c"] for _, g, _ in rows], count)
@@ -276,15 +280,15 @@ def _variances(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession,
     for g, same in zip(_groups(session), _groups(healthy), strict=True):
         if len(g.numbers) < 2:
             continue
-        level = _signal_dn(camera, same.frames.mean(0))
-        bin_of = np.minimum(level / scale, LEVEL_BINS - 1).astype(int)
+        mean = same.frames.mean(0)
+        bin_of = np.minimum(_signal_dn(camera, mean) / scale, LEVEL_BINS - 1).astype(int)
         spread = g.frames.var(axis=0, ddof=1)
         for one in np.unique(bin_of):
             inside = bin_of == one
             pixels = np.bincount(places[inside], minlength=classes)
             if pixels.min() < 100:
                 continue
-            signal = np.bincount(places[inside], level[inside], classes) / pixels
+            signal = _signal_dn(camera, np.bincount(places[inside], mean[inside], classes) / pixels)
             noise = _noise_dn2(camera, signal)
             values.append(np.bincount(places[inside], spread[inside], classes) / pixels)
             variances.append(2.0 * noise**2 / (pixels * (len(g.numbers) - 1)))
@@ -307,7 +311,8 @@ def _covariances(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSessio
             continue
         away = g.frames - g.frames.mean(axis=0)
         shared = (away[:, :-1] * away[:, 1:]).sum(axis=0) / (len(g.numbers) - 1)
-        noise = _noise_dn2(camera, _signal_dn(camera, same.frames.mean(0)))
+        # not clipped at black: the products below are averaged
+        noise = _noise_dn2(camera, same.frames.mean(0) - camera.black_level_dn)
         product = noise[:-1] * noise[1:] / (len(g.numbers) - 1)
         rows = np.arange(len(shared)) % period
         values.append([shared[rows == k].mean() for k in range(period)])

@@ -41,6 +41,7 @@ ALSO_CALLED = {
     "channel": "plane",
     "distance from the centre": "radius",
     "azimuth": "angle",
+    "cell": "row x column",
 }
 #: Between the indices of a product.
 BETWEEN = re.compile(r"\s*(?:,|\*|×|\band\b|\bby\b|\s+x\s+)\s*")
@@ -147,14 +148,18 @@ class UnlistedScore(Frozen):
 def axes_of(along: str) -> frozenset[str]:
     """The indices of a discovered law, as the former calls them."""
     parts = (re.sub(r"\s*\bmod\b.*", "", part).strip() for part in BETWEEN.split(along.lower().replace("_", " ")))
-    return frozenset(ALSO_CALLED.get(part, part) for part in parts if part)
+    named = (ALSO_CALLED.get(part, part) for part in parts if part)
+    return frozenset(axis for name in named for axis in BETWEEN.split(name))
 
 
 def axis_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
-    """Whether a discovered law goes along all axes of a law, and no other but those that may stand beside them."""
+    """Whether a discovered law goes along all axes of a law, and no other but those that may stand beside them, and is
+    one of means or one of noise as that is."""
     said = axes_of(told.along)
     right = frozenset(word for alike in law.axes for word in alike)
-    return all(said & set(alike) for alike in law.axes) and said <= right | law.beside
+    # results that tell laws of noise say so in `of`
+    same = (getattr(told, "of", "mean") != "mean") == (law.acts in {"variance", "covariance"})
+    return same and all(said & set(alike) for alike in law.axes) and said <= right | law.beside
 
 
 def stage_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
@@ -175,7 +180,10 @@ def removed(found: DiagnosisResult | None, told: Sequence[DiscoveredLaw], strong
     the rightly `told` laws. 0 where neither has one and the law is `strong`: what is there wasn't found. Else None."""
     pairs = []
     if found is not None and found.held_out is not None:
-        pairs.append((found.held_out.chi2_before, found.held_out.chi2_after, found.held_out.n))
+        held = found.held_out
+        # results that tell chi2 with the discovered laws by itself do so in `chi2_discovered`
+        discovered: float | None = getattr(held, "chi2_discovered", None)
+        pairs.append((held.chi2_before, held.chi2_after if discovered is None else discovered, held.n))
     pairs.append((sum(t.chi2_before for t in told), sum(t.chi2_after for t in told), sum(t.n for t in told)))
     for before, after, n in pairs:
         if n and before - n > EXCESS_SIGMAS * (2.0 * n) ** 0.5:
