@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium names soak kills setup run test serve bench proof proof-live real slow lint clean
+.PHONY: aravis chromium names soak kills setup run test serve bench proof proof-live proof-unlisted real slow lint clean
 
 setup: $(STAMP)
 
@@ -58,6 +58,15 @@ proof: $(STAMP)
 	test -s $(PROOF).seed || $(BIN)/python -c "import random; print($(if $(SEED),$(SEED),random.SystemRandom().randrange(10**6, 2**32)))" > $(PROOF).seed
 	test -f $(PROOF).score.json || $(BIN)/calibench challenge make --proof --out $(PROOF) --cases $(CASES) --seed "$$(cat $(PROOF).seed)"
 	$(BIN)/calibench challenge score $(PROOF) --truths $(PROOF).truths.json --json $(PROOF).score.json --page docs/proof.md
+
+# A blind proof of discovery, of laws that no list has: goes on where it stopped; a new one needs another UNLISTED.
+UNLISTED_CASES ?= 200
+UNLISTED ?= calibench-data/proof-unlisted
+proof-unlisted: $(STAMP)
+	mkdir -p $(dir $(UNLISTED))
+	test -s $(UNLISTED).seed || $(BIN)/python -c "import random; print($(if $(SEED),$(SEED),random.SystemRandom().randrange(10**6, 2**32)))" > $(UNLISTED).seed
+	test -f $(UNLISTED).score.json || $(BIN)/calibench challenge make --unlisted --proof --out $(UNLISTED) --cases $(UNLISTED_CASES) --seed "$$(cat $(UNLISTED).seed)"
+	$(BIN)/calibench challenge score $(UNLISTED) --truths $(UNLISTED).truths.json --json $(UNLISTED).score.json --page docs/proof-unlisted.md
 
 # The live proof: benches that conceal each effect, a session over the wire of each, and the diagnosis. Goes on where it stopped;
 # ARGS="--only CASE" runs one.

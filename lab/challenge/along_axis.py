@@ -47,7 +47,7 @@ SETTING = ("kind", "exposure_s", "temperature_c", "radiance", "light_radiance", 
 
 
 @dataclass(frozen=True)
-class Table:
+class AxisTable:
     """Numbers of one recording in blocks of n that are independent of each other: their values (blocks, n), covariance
     (blocks, n, n), and what else may change them in all blocks alike (blocks, n, m), per prior standard deviation."""
 
@@ -72,7 +72,7 @@ def separability_along(law: UnlistedLaw, camera: ConcealedCamera, draws: Draws) 
     return _beyond(first, second, table(law, camera, healthy, healthy))
 
 
-def _beyond(first: FloatArray, second: FloatArray, healthy: Table) -> float:
+def _beyond(first: FloatArray, second: FloatArray, healthy: AxisTable) -> float:
     """d1' (C + N N')^-1 d2, at least 0, of a change (blocks, n) that was measured twice."""
     lower = [cholesky(c, lower=True) for c in healthy.covariance]
 
@@ -157,7 +157,7 @@ def _noise_dn2(camera: ConcealedCamera, signal_dn: FloatArray) -> FloatArray:
 # --- means over classes of pixels -------------------------------------------------------------------------------------
 
 
-def _means(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, healthy: DrawnSession) -> Table:
+def _means(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, healthy: DrawnSession) -> AxisTable:
     """Means of dark frames and flats over classes of pixels: a block for each class, a number in it for each setting.
 
     Beside the law may stand the level of each setting and place in the mosaic, and what light and lens do: x, y, r^2
@@ -194,13 +194,13 @@ def _means(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, hea
     level = LEVEL_DN * of_colour[:, None, :, None] * np.eye(n)[None, :, None, :]
     field = of_colour[:, None, :, None] * smooth[:, None, None, :] * (signal * light)[:, :, None, None]
     nuisance = np.concatenate([level.reshape(blocks, n, -1), field.reshape(blocks, n, -1)], axis=2)
-    return Table(value, covariance, nuisance)
+    return AxisTable(value, covariance, nuisance)
 
 
 # --- levels of whole frames -------------------------------------------------------------------------------------------
 
 
-def _levels(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, healthy: DrawnSession) -> Table:
+def _levels(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, healthy: DrawnSession) -> AxisTable:
     """Means of whole frames by colour, of dark frames, flats and narrowband light: one block.
 
     Beside the law may stand the black level and its drift, dark current at each temperature, the source's drift, an
@@ -244,7 +244,7 @@ def _levels(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, he
     for k in range(count):
         columns += [GAIN_SHARE * s * (colour == k) * (kind == what) for what in ("flat", "narrowband")]
         columns += _spectral_columns(camera, colours[k], wavelength, s * (colour == k) * narrow)
-    return Table(value.reshape(1, n), covariance[None], np.stack(columns, axis=1)[None])
+    return AxisTable(value.reshape(1, n), covariance[None], np.stack(columns, axis=1)[None])
 
 
 def _spectral_columns(
@@ -268,7 +268,7 @@ def _spectral_columns(
 # --- variances and covariances ----------------------------------------------------------------------------------------
 
 
-def _variances(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, healthy: DrawnSession) -> Table:
+def _variances(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, healthy: DrawnSession) -> AxisTable:
     """Variances of pixels over repeats, by setting, level and class of pixels, and with an axis of place free by
     setting and level: one block a setting and level. Without such an axis a block has one number. Beside the law may
     stand read noise, gain, and what grows with the level's square."""
@@ -298,10 +298,10 @@ def _variances(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession,
     covariance = np.stack([np.diag(v) for v in variances])
     if spatial:
         covariance += FREE * np.stack(variances).max(axis=1)[:, None, None]
-    return Table(np.stack(values), covariance, np.stack(columns))
+    return AxisTable(np.stack(values), covariance, np.stack(columns))
 
 
-def _covariances(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, healthy: DrawnSession) -> Table:
+def _covariances(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, healthy: DrawnSession) -> AxisTable:
     """Covariances over repeats of pixels and those below, by the row's residue: a block of a number for each residue,
     one block for each setting, in which the mean over residues is free."""
     period = law.periods[0]
@@ -319,13 +319,13 @@ def _covariances(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSessio
         variances.append([product[rows == k].mean() / product[rows == k].size for k in range(period)])
     spread = np.array(variances)
     covariance = np.stack([np.diag(v) for v in spread]) + FREE * spread.max(axis=1)[:, None, None]
-    return Table(np.array(values), covariance, np.zeros((*spread.shape, 0)))
+    return AxisTable(np.array(values), covariance, np.zeros((*spread.shape, 0)))
 
 
 # --- codes ------------------------------------------------------------------------------------------------------------
 
 
-def _widths(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, healthy: DrawnSession) -> Table:
+def _widths(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, healthy: DrawnSession) -> AxisTable:
     """Numbers of pixels by residue of their code, below and above three quarters of the range, in all frames with
     light: one block. Beside the law may stand the total below and above, and what repeats with the largest divisor of
     the period that a listed law of bits has (8 codes)."""
@@ -346,9 +346,9 @@ def _widths(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, he
     listed = gcd(period, 8)
     patterns = [top, ~top, *(residue % listed == k for k in range(listed))]
     nuisance = np.stack([GAIN_SHARE * expected * p for p in patterns], axis=1)
-    return Table(value[None].astype(float), np.diag(expected)[None], nuisance[None])
+    return AxisTable(value[None].astype(float), np.diag(expected)[None], nuisance[None])
 
 
-TABLES: dict[str, Callable[[UnlistedLaw, ConcealedCamera, DrawnSession, DrawnSession], Table]] = {
+TABLES: dict[str, Callable[[UnlistedLaw, ConcealedCamera, DrawnSession, DrawnSession], AxisTable]] = {
     "offset": _means, "factor": _means, "variance": _variances, "covariance": _covariances, "widths": _widths,
 }  # fmt: skip

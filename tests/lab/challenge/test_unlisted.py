@@ -364,6 +364,12 @@ def test_the_page_has_a_line_and_a_dot_for_each_case(tmp_path: Path) -> None:
     assert (tmp_path / "proof-unlisted-tuning.svg").read_text(encoding="utf-8") == picture
 
 
+def test_the_page_lists_the_laws_as_they_declare_themselves() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "proof-unlisted.md").read_text(encoding="utf-8")
+    for law in scored().laws:
+        assert f"| `{law.law}` | {law.stage} | {law.axes} | " in page
+
+
 # --- truths stay shut -------------------------------------------------------------------------------------------------
 
 #: Two cases of which the second conceals a law that is quick to size.
