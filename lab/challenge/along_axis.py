@@ -23,6 +23,7 @@ from math import gcd
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 from mocks.former import WAVELENGTH_NM, ConcealedCamera, DrawnSession, UnlistedLaw
@@ -118,16 +119,16 @@ def _groups(session: DrawnSession, kinds: frozenset[str] | None = None) -> list[
     ]
 
 
-def _phase(camera: ConcealedCamera) -> FloatArray:
+def _phase(camera: ConcealedCamera) -> NDArray[np.intp]:
     """Number of a pixel's place in its mosaic's cell; 0 throughout without a mosaic."""
     r, c = np.indices((camera.rows, camera.cols))
-    return np.zeros(r.shape, int) if camera.cfa == "MONO" else 2 * (r % 2) + c % 2
+    return np.asarray(2 * (r % 2) + c % 2 if camera.cfa != "MONO" else np.zeros(r.shape, int))
 
 
 SPATIAL = frozenset({"row", "column", "radius", "angle"})
 
 
-def _place(law: UnlistedLaw, camera: ConcealedCamera) -> FloatArray:
+def _place(law: UnlistedLaw, camera: ConcealedCamera) -> NDArray[np.intp]:
     """Number of each pixel's class along the law's spatial axes."""
     r, c = np.indices((camera.rows, camera.cols))
     x, y = camera.field_position
@@ -339,14 +340,14 @@ def _widths(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, he
         whole = sum(np.bincount(of.frames[f].ravel(), minlength=count) for f in lit)
         # what clips piles up in the last codes
         inner = np.where((codes > 0) & (codes < count - 1), whole, 0)
-        return np.bincount(kind, inner, 2 * period)
+        return np.bincount(kind, inner, 2 * period).astype(float)
 
     value, expected = histogram(session), np.maximum(histogram(healthy), 1.0)
     residue, top = np.arange(2 * period) % period, np.arange(2 * period) >= period
     listed = gcd(period, 8)
     patterns = [top, ~top, *(residue % listed == k for k in range(listed))]
     nuisance = np.stack([GAIN_SHARE * expected * p for p in patterns], axis=1)
-    return AxisTable(value[None].astype(float), np.diag(expected)[None], nuisance[None])
+    return AxisTable(value[None], np.diag(expected)[None], nuisance[None])
 
 
 TABLES: dict[str, Callable[[UnlistedLaw, ConcealedCamera, DrawnSession, DrawnSession], AxisTable]] = {
