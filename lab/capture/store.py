@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import sqlalchemy as sa
@@ -456,8 +456,7 @@ class Store:
             manifest = Manifest(
                 name=row.name or session_id,
                 notes=row.notes,
-                cameras={side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()},
-                # type: ignore[misc]
+                cameras={cast(Side, side): DataSheet.model_validate(camera) for side, camera in row.cameras.items()},
                 captures=tuple(_capture(session_id, one) for one in db.scalars(asked.order_by(CaptureRow.id))),
             )
             where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in db.execute(files)}

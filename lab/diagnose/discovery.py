@@ -21,16 +21,16 @@ from scipy.sparse.linalg import spsolve
 from scipy.stats import chi2 as chi_squared
 from scipy.stats import f as f_distribution
 
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.code_density import CodeCounts, counted, prepared, widths
 from lab.diagnose.measurements.dark_readout import dark_readout
 from lab.diagnose.measurements.even_flats import flats
 from lab.diagnose.measurements.flat_lines import without_dark
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.results import DiscoveredLaw
+from lab.measure.study import Study
 from sim.camera import Side
+from sim.effects.base import Effects
 from sim.effects.empirical_law import Along, EmpiricalLaw, Stage
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray

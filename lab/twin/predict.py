@@ -16,24 +16,26 @@ import numpy as np
 from lab.capture_kinds.base import Capture
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import coordinates
-from lab.diagnose.measurements.block import Block, Effects, Label, Prediction
-from lab.diagnose.measurements.chart import CHART, reflectance_covariance
+from lab.diagnose.measurements.block import Block, Label, Prediction
+from lab.diagnose.measurements.chart import CHART
 from lab.diagnose.measurements.dark_level import DARK, added_dark_e_per_s
 from lab.diagnose.measurements.noise import GAIN_STD, NOISE, READ_STD, shot_variance
-from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, USUAL_LAMP, NoiseGuess
 from lab.diagnose.measurements.slanted_edge import ASIDE, SLANTED_EDGE
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian
 from lab.errors import InputError, NotDetermined
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
+from lab.measure.noise_figures import BLACK_FLOOR_DN, USUAL_LAMP, NoiseFigures
+from lab.measure.patches import reflectance_covariance
+from lab.measure.study import Study
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.changes import Changes, carried, doubling_std_c, reference_temperature_c
 from lab.twin.sealed import PredictedNumber, SealedPrediction, SidePrediction
 from lab.twin.session import future_session
 from sim.camera import CameraModel, Side
+from sim.effects.base import Effects
 from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.sensor.electrons import dark_current_e_per_s, gain_dn_per_e
 from sim.spectrum import FloatArray
@@ -190,7 +192,7 @@ def _study(content: CameraFile, posterior: ModelPosterior, session: RecordingSet
     if now_c is not None and reference_c is not None and camera.dark_current_doubling_c is not None:
         rise = now_c - reference_c
         growth_std = abs(np.log(2.0) * rise / camera.dark_current_doubling_c**2) * doubling_std_c(content)
-    noise = NoiseGuess(
+    noise = NoiseFigures(
         black=camera.black_level_dn, dark_dn_per_s=dark * gain, dark_c=reference_c, gain=gain, gain_is_known=True,
         read_dn=float(np.hypot(np.sqrt(max(first.read_noise_dn**2 - 1.0 / 12.0, 0.0)) * amplified, 12.0**-0.5)),
         prnu=0.01 * camera.prnu_percent, jitter_dn=max(first.level_jitter_dn, BLACK_FLOOR_DN), jitter_freedom=0.0,

@@ -9,12 +9,13 @@ import numpy as np
 from scipy.stats import norm
 
 from lab.capture_kinds.base import Capture
-from lab.diagnose.inference.gaussian import chi2
+from lab.diagnose.measurements.block import Label
 from lab.diagnose.measurements.library import measurement_title
-from lab.diagnose.measurements.study import Study
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
+from lab.measure.gaussian import chi2
+from lab.measure.study import Study
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.predict import is_predicted, measured_blocks
 from lab.twin.sealed import PredictedNumber, SealedPrediction, SidePrediction
@@ -175,10 +176,10 @@ def _with_curves(recordings: RecordingSet, prediction: SidePrediction, camera: C
     return recordings.under(recordings.manifest.model_copy(update={"cameras": cameras}))
 
 
-def _key(quantity: str, label: object) -> tuple[object, ...]:
+def _key(quantity: str, label: Label) -> tuple[object, ...]:
     return PredictedNumber(
         quantity=quantity, captures=label.captures, channel=label.channel, where=label.condition, x=label.x,
-        predicted=0.0, std=0.0  # type: ignore[attr-defined]
+        predicted=0.0, std=0.0,
     ).key  # fmt: skip
 
 

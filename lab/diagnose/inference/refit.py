@@ -12,12 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq, least_squares
 
-from lab.diagnose.inference.gaussian import Gaussian
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
+from lab.measure.gaussian import Gaussian
 from sim.camera import CameraModel
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.diagnose.measurements.held_out import held_out_of
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.measure.edge_finding import Region
 from lab.measure.edge_mtf import EdgeMtf
 from lab.measure.edges import check_phases, find_edges, measure_edge
+from lab.measure.study import Study, held_out_of
 
 PLAIN = np.array([0.25])  # cy/px: where `measure_edge` evaluates its own MTF, which isn't used here
 

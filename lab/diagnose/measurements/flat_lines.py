@@ -10,8 +10,8 @@ import numpy as np
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_readout import OFFSETS_STD, DarkReadOut, dark_readout
 from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, FlatLevel, flats
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.study import Study
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 

@@ -15,7 +15,7 @@ from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.edge_estimator import (
     GRID_PX,
     IMAGINARY_AT,
@@ -30,10 +30,10 @@ from lab.diagnose.measurements.edge_estimator import (
     spread_operator,
 )
 from lab.diagnose.measurements.edge_profiles import MeasuredEdge, measured_edges
-from lab.diagnose.measurements.reads import acting
-from lab.diagnose.measurements.study import Study
+from lab.measure.reads import acting
 from lab.measure.rounding import rounding_waves_dn
-from sim.effects.base import Effect
+from lab.measure.study import Study
+from sim.effects.base import Effect, Effects
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.point import (
     MOST_SHARES,

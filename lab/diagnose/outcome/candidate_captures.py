@@ -16,10 +16,10 @@ from lab.capture_kinds.slanted_edge import EdgeSequence
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.curves import CURVE_ROUGH_STD
 from lab.diagnose.measurements.narrowband import NARROWBAND_FLOOR
-from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN
-from lab.diagnose.measurements.repeatability import LAMP_FLOOR
 from lab.diagnose.outcome.settling_capture import FEW_REPEATS, MORE_REPEATS, repeats_of
 from lab.formats.recording_set import RecordingSet
+from lab.measure.noise_figures import BLACK_FLOOR_DN
+from lab.measure.repeatability import LAMP_FLOOR
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.point import optical_transfer

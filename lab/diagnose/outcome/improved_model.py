@@ -16,10 +16,11 @@ from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.curves import freed_curve
 from lab.diagnose.outcome.model_posterior import model_posterior
 from lab.formats.camera_file import CameraFile
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
+from lab.formats.results.diagnosis import IN_CURVES
 from lab.measure.stated_light import most_frequent_gain_db
-from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.effects.model_discrepancy import ModelDiscrepancy
@@ -35,8 +36,6 @@ PLACES: tuple[tuple[Applied, str, str], ...] = (
     ("noise", "level", "charge.variance_e2"),
     ("response", "level", "signal.response"),
 )
-#: Where a correction of the sensitivities stands, in words.
-IN_CURVES = "in the sensitivity curves"
 #: Share of the largest signal below which the discrepancy's relative size isn't known.
 LEAST_CONTRAST = 0.05
 #: Limits of the factors: a Gaussian process doesn't know that a quantity is positive.

@@ -17,10 +17,11 @@ import numpy as np
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Coordinate, coordinate_prior, coordinates, moved
-from lab.diagnose.measurements.chart import CHART, reflectance_covariance
+from lab.diagnose.measurements.chart import CHART
 from lab.diagnose.measurements.noise import GAIN_STD
-from lab.diagnose.measurements.noise_guess import NoiseGuess
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
+from lab.measure.noise_figures import NoiseFigures
+from lab.measure.patches import reflectance_covariance
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.sensor.electrons import gain_dn_per_e
@@ -92,7 +93,7 @@ def model_posterior(
     return ModelPosterior.of(_first(model.noise), names, mean, covariance)
 
 
-def _first(noise: NoiseGuess) -> FirstEstimates:
+def _first(noise: NoiseFigures) -> FirstEstimates:
     return FirstEstimates(
         dark_temperature_c=noise.dark_c,
         read_noise_dn=noise.read_dn,
@@ -103,7 +104,7 @@ def _first(noise: NoiseGuess) -> FirstEstimates:
     )
 
 
-def _from_first(noise: NoiseGuess, camera: CameraModel, gain_db: float) -> dict[str, float]:
+def _from_first(noise: NoiseFigures, camera: CameraModel, gain_db: float) -> dict[str, float]:
     """What the first estimates differ by from what `camera` states, in prior standard deviations, by the nuisance
     parameter's name."""
     gain = gain_dn_per_e(camera, gain_db)

@@ -10,6 +10,8 @@ from sim.parameters import Frozen
 
 #: `nothing_judged`: the recordings determine no measurement.
 DiagnosisVerdict = Literal["no_mismatch", "explained", "partly_explained", "unexplained", "nothing_judged"]
+#: Where a correction of the sensitivities stands, in words.
+IN_CURVES = "in the sensitivity curves"
 
 
 class Mismatch(Frozen):
@@ -105,6 +107,11 @@ class Unexplained(Frozen):
     captures: tuple[str, ...] = ()  # that show it
     correction: str = ""  # the model discrepancy, in words
     check: str = ""  # stated values, of the camera or of captures, that the recordings contradict, as sentences
+
+    @property
+    def corrects_curves(self) -> bool:
+        """Whether the model discrepancy is a factor on the sensitivity curves."""
+        return IN_CURVES in self.correction
 
 
 class DiscoveredLaw(Frozen):

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from lab.challenge.recordings import recordings_of
-from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.edge_estimator import REAL_AT, profile_interpolation, spread_operator
 from lab.diagnose.measurements.slanted_edge import ASIDE, _Edges, edge_block
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.measure.edges import check_phases
-from lab.predict.camera_model import camera_model
+from lab.measure.gaussian import chi2
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
 from sim.effects.base import Effect
