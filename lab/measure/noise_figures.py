@@ -14,6 +14,7 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.flat import FlatCapture
 from lab.formats.results import NoiseFit
 from lab.measure.pixel_outliers import sound_pixels
+from lab.measure.plane_means import channel_pixels
 from lab.measure.repeatability import (
     LAMP_FLOOR,
     RepeatedMeans,
@@ -201,7 +202,7 @@ def _transfer_points(study: Study, black: float) -> tuple[list[float], list[floa
             total += frame
             even = _even_rows(frame, step)  # without flicker of the light
             for channel, repeats in evened.items():
-                repeats.add(study.pixels_of(even, channel))
+                repeats.add(channel_pixels(even, study.camera.cfa, channel))
         for channel, repeats in evened.items():
             signal.append(float(np.mean([study.levels(c).whole[channel] for c in group])) - black)
             variance.append(repeats.variance_dn2 / (1.0 - step / study.camera.cols))

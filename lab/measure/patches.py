@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lab.capture_kinds.chart import ChartCapture
 from lab.measure.halo_light import Surroundings, harmonics
+from lab.measure.plane_means import channel_pixels
 from lab.measure.rounding import rounding_std_dn
 from lab.measure.study import CLIPPED_SHARE, Study, held_out_of, mean_frame
 from sim.point import optical_transfer
@@ -59,7 +60,7 @@ def patch_levels(study: Study) -> list[Patch]:
                 first_row, first_col = mosaic.phases(study.camera.cfa)[channel][0]
                 plane = frame[first_row::step, first_col::step]
                 spread = _spread(study, plane, channel, part[0].radiance)
-                mean = float(study.pixels_of(frame, channel).mean())
+                mean = float(channel_pixels(frame, study.camera.cfa, channel).mean())
                 low = harmonics(plane - study.noise.black - study.noise.dark_dn_per_s * part[0].exposure_s)
                 mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))
                 for name, rows, cols, row, col in patch_boxes(part[0]):

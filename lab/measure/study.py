@@ -17,8 +17,9 @@ from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
 from lab.measure.mishaps import CopiedFrames, copied_frames
 from lab.measure.noise_figures import NoiseFigures, noise_figures
+from lab.measure.plane_means import plane_means
 from lab.measure.reads import LAG, acting
-from lab.measure.stated_light import most_frequent_gain_db
+from lab.measure.stated_light import lamps_of, most_frequent_gain_db
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effects
 from sim.sensor import mosaic
@@ -117,25 +118,15 @@ class Study:
             mask[row::step, col::step] = True
         return mask
 
-    def pixels_of(self, frame: Any, channel: str) -> FloatArray:
-        """Values (pixels,) of a channel's pixels in a frame."""
-        step = mosaic.step(self.camera.cfa)
-        parts = [frame[row::step, col::step] for row, col in mosaic.phases(self.camera.cfa)[channel]]
-        return np.concatenate([np.asarray(p, float).ravel() for p in parts])
-
     def levels(self, capture: Capture) -> Levels:
         """The means of a capture by channel, computed once. A channel clips where `CLIPPED_SHARE` of its pixels do."""
         if capture.id not in self._levels:
-            frame = self.recordings.frame(capture)
-            mean: dict[str, float | None] = {}
-            pixels, whole = {}, {}
-            for channel in self.channels:
-                values = self.pixels_of(frame, channel)
-                clipped = float(np.mean(values >= self.saturation_dn))
-                whole[channel] = float(values.mean())
-                mean[channel] = whole[channel] if clipped < CLIPPED_SHARE else None
-                pixels[channel] = values.size
-            self._levels[capture.id] = Levels(mean, pixels, whole)
+            found = plane_means(self.recordings.frame(capture), self.camera.cfa, self.saturation_dn)
+            self._levels[capture.id] = Levels(
+                {c: one.mean_dn if one.clipped_share < CLIPPED_SHARE else None for c, one in found.items()},
+                {c: one.pixels for c, one in found.items()},
+                {c: one.mean_dn for c, one in found.items()},
+            )
         return self._levels[capture.id]
 
     @property
@@ -156,27 +147,8 @@ class Study:
 
     @cached_property
     def lamps(self) -> dict[str, int]:
-        """Radiance file of flats -> number of its lamp.
-
-        Files that differ by less than 1 % in spectral shape and 5 % in level are readings of one lamp, taken anew
-        before every pass."""
-        found: list[tuple[FloatArray, FloatArray]] = []
-        lamps: dict[str, int] = {}
-        for capture in self.recordings.captures(FlatCapture, self.side):
-            if capture.radiance is None or capture.radiance in lamps:
-                continue
-            wavelength, value = self.spectrum(capture.radiance).arrays
-            for k, (where, level) in enumerate(found):
-                if len(where) != len(wavelength) or np.any(where != wavelength):
-                    continue
-                ratio = float(value.sum() / level.sum())
-                if abs(ratio - 1.0) < 0.05 and np.abs(value / ratio - level).sum() < 0.01 * np.abs(level).sum():
-                    lamps[capture.radiance] = k
-                    break
-            else:
-                lamps[capture.radiance] = len(found)
-                found.append((wavelength, value))
-        return lamps
+        """Number of the lamp of each radiance file of flats."""
+        return lamps_of(self.recordings, self.recordings.captures(FlatCapture, self.side))
 
     def flat_levels(self) -> list[list[Any]]:
         """Flat captures by what sets their level: exposure, lamp, gain, number of photons."""
