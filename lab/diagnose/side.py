@@ -31,21 +31,7 @@ from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import (
-    DiscoveredLaw,
-    ExaminedPlace,
-    FitResult,
-    HeldOut,
-    MeasurementFit,
-    Mismatch,
-    ResidualCurve,
-    ResidualPicture,
-    SideModels,
-    Skipped,
-    Unexplained,
-    VetoedName,
-    Visibility,
-)
+from lab.formats.results import DiagnosisLists, FitResult, HeldOut, Mismatch
 from lab.workers import Workers
 from sim.camera import Side
 
@@ -68,6 +54,7 @@ class NamedCandidate:
 class SideFindings:
     """The findings on one side.
 
+    lists  what the result lists of this side
     is_judged  whether any measurement is determined
     gain_is_known  whether a conversion gain is stated or measured; else electrons are those of 1 DN/e
     threshold  of an effect's score; None where no effect acts on the measurements
@@ -76,26 +63,16 @@ class SideFindings:
     """
 
     side: Side
-    skipped: tuple[Skipped, ...]
+    lists: DiagnosisLists
     is_judged: bool = False
     gain_is_known: bool = True
     threshold: float | None = None
-    mismatches: tuple[Mismatch, ...] = ()
     named: tuple[NamedCandidate, ...] = ()
     abstained: tuple[Candidate, ...] = ()
-    unexplained: tuple[Unexplained, ...] = ()
-    vetoed: tuple[VetoedName, ...] = ()
-    models: SideModels | None = None
     held_out: HeldOut | None = None
-    curves: tuple[ResidualCurve, ...] = ()
     improved: CameraFile | None = None
     proposals: tuple[CaptureProposal, ...] = ()
     settling: str | None = None
-    discovered: tuple[DiscoveredLaw, ...] = ()
-    places: tuple[ExaminedPlace, ...] = ()
-    measurements: tuple[MeasurementFit, ...] = ()
-    visibility: tuple[Visibility, ...] = ()
-    pictures: tuple[ResidualPicture, ...] = ()
 
 
 def diagnose_side(
@@ -124,7 +101,7 @@ def diagnose_side(
     model, skipped = measurement_model(recordings, side, fit, baseline, study)
     skipped = (*skipped, *unchecked(recordings, side))
     if model is None:
-        return SideFindings(side, skipped, unexplained=wrong)
+        return SideFindings(side, DiagnosisLists(skipped=skipped, unexplained=wrong))
     rng = np.random.default_rng(SEED)
     least = 0.0
     if bootstrap:
@@ -156,29 +133,32 @@ def diagnose_side(
         ),
         *(() if departure is None else (departure,)),
     )
+    models = side_models(side, verdict.models, policy)
     return SideFindings(
         side=side,
-        skipped=skipped,
+        lists=DiagnosisLists(
+            skipped=skipped,
+            mismatches=tuple(found),
+            unexplained=left,
+            vetoed=tuple(vetoed_names(side, verdict)),
+            discovered=told(side, study, discovered),
+            models=() if models is None else (models,),
+            places=tuple(places(side, verdict, policy)),
+            measurements=tuple(measurement_fits(side, verdict)),
+            visibility=tuple(detectability(side, verdict, policy)),
+            pictures=tuple(residual_pictures(recordings, side, model, improved)) if pictures else (),
+            curves=tuple(residual_curves(side, verdict)),
+        ),
         is_judged=True,
         gain_is_known=model.gain_is_known,
         threshold=verdict.threshold if np.isfinite(verdict.threshold) else None,
-        mismatches=tuple(found),
         named=tuple(
             NamedCandidate(c, shown_in(verdict, c, policy), family_corrections(verdict, c, corrections, policy))
             for c in verdict.named
         ),
         abstained=verdict.abstained,
-        unexplained=left,
-        vetoed=tuple(vetoed_names(side, verdict)),
-        models=side_models(side, verdict.models, policy),
         held_out=held_out(verdict),
-        curves=tuple(residual_curves(side, verdict)),
         improved=improved,
         proposals=proposals(recordings, side, verdict, policy),
         settling=settling_sentence(recordings, side, left),
-        discovered=told(side, study, discovered),
-        places=tuple(places(side, verdict, policy)),
-        measurements=tuple(measurement_fits(side, verdict)),
-        visibility=tuple(detectability(side, verdict, policy)),
-        pictures=tuple(residual_pictures(recordings, side, model, improved)) if pictures else (),
     )

@@ -6,6 +6,7 @@
 from lab.formats.results.blur import MtfCurve, PsfKernel, PsfSymmetry
 from lab.formats.results.comparison import Change, ComparisonResult, ProjectionChange
 from lab.formats.results.diagnosis import (
+    DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
     DiscoveredLaw,
@@ -74,6 +75,7 @@ __all__ = [
     "DarkCurrentLaws",
     "Defect",
     "DepthUncertainty",
+    "DiagnosisLists",
     "DiagnosisResult",
     "DiagnosisVerdict",
     "DiscoveredLaw",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 from lab.formats.results.skipped import Skipped
@@ -314,31 +315,43 @@ class PolicyRule(Frozen):
     meaning: str
 
 
-class DiagnosisResult(Frozen):
+class DiagnosisLists(Frozen):
+    """What a diagnosis lists of one side, or of all: each entry names its side."""
+
+    mismatches: tuple[Mismatch, ...] = ()
+    unexplained: tuple[Unexplained, ...] = ()
+    vetoed: tuple[VetoedName, ...] = ()
+    discovered: tuple[DiscoveredLaw, ...] = ()  # the most significant first, for each side
+    models: tuple[SideModels, ...] = ()
+    places: tuple[ExaminedPlace, ...] = ()
+    measurements: tuple[MeasurementFit, ...] = ()
+    visibility: tuple[Visibility, ...] = ()
+    pictures: tuple[ResidualPicture, ...] = ()
+    curves: tuple[ResidualCurve, ...] = ()
+    skipped: tuple[Skipped, ...] = ()
+
+    @staticmethod
+    def joined(parts: Sequence[DiagnosisLists]) -> DiagnosisLists:
+        """Join the lists of several sides. Parts of one measurement are skipped for the same reason, which is listed
+        once."""
+        every = {name: tuple(x for part in parts for x in getattr(part, name)) for name in DiagnosisLists.model_fields}
+        return DiagnosisLists.model_validate(every | {"skipped": tuple(dict.fromkeys(every["skipped"]))})
+
+
+class DiagnosisResult(DiagnosisLists):
     """What the first model left out, and how much better the improved model predicts."""
 
     format: Literal["calibench-diagnosis"] = "calibench-diagnosis"
     version: Literal[1] = 1
     source: str
     verdict: DiagnosisVerdict
-    mismatches: tuple[Mismatch, ...] = ()
     effects: tuple[NamedEffect, ...] = ()
-    unexplained: tuple[Unexplained, ...] = ()
-    vetoed: tuple[VetoedName, ...] = ()
-    discovered: tuple[DiscoveredLaw, ...] = ()  # the most significant first, for each side
-    models: tuple[SideModels, ...] = ()
     held_out: HeldOut | None = None
     next_capture: str | None = None
     next_captures: tuple[NextCapture, ...] = ()  # best first, for each side
     resolutions: tuple[Resolution, ...] = ()  # in the order in which they were taken
-    places: tuple[ExaminedPlace, ...] = ()
-    measurements: tuple[MeasurementFit, ...] = ()
-    visibility: tuple[Visibility, ...] = ()
-    pictures: tuple[ResidualPicture, ...] = ()
     threshold: float | None = None
     false_alarm_rate: float | None = None
-    curves: tuple[ResidualCurve, ...] = ()
-    skipped: tuple[Skipped, ...] = ()
     summary: tuple[str, ...] = ()  # the diagnosis in sentences
     policy: tuple[PolicyRule, ...] = ()  # the rules of decision
     baseline: str | None = None  # names of the camera files that it began with, where not with the fitted cameras
