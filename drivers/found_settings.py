@@ -7,6 +7,7 @@ Whoever connects next finds it there, and restores what it says before anything 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -40,7 +41,7 @@ class Hold:
             return
         taken = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            taken.bind(f"\0calibench:{name}"[:100])
+            taken.bind("\0calibench:" + hashlib.sha256(name.encode()).hexdigest())
         except OSError as error:
             taken.close()
             raise InUse(

@@ -63,6 +63,22 @@ class IndiDevice:
 
     def open(self) -> None:
         """Reach the server, and the device's driver there. Raises `Disconnected`, `NoAnswer`."""
+        self._reach(f"<getProperties version='1.7' device={quoteattr(self.name)}/>")
+        try:
+            self._await("CONNECTION", lambda: "CONNECTION" in self._vectors)
+        except NoAnswer:
+            self._reach("<getProperties version='1.7'/>")  # a server says nothing of a device that it hasn't got
+            until = time.monotonic() + self._left_s()
+            while self._pump(0.2 if self._others else until - time.monotonic()) and time.monotonic() < until:
+                continue
+            if self._others:
+                raise Disconnected(
+                    f"{self._who}: the server has no such device; it has {', '.join(sorted(self._others))}"
+                ) from None
+            raise
+
+    def _reach(self, asked: str) -> None:
+        """A connection of its own, on which something is asked."""
         self.close()
         self._vectors, self._others, self._said = {}, set(), ""
         try:
@@ -75,19 +91,7 @@ class IndiDevice:
         self._parser = XMLPullParser(("start", "end"))
         self._parser.feed("<indi>")  # a document without end, of many roots
         self._root = None
-        self._send(f"<getProperties version='1.7' device={quoteattr(self.name)}/>")
-        try:
-            self._await("CONNECTION", lambda: "CONNECTION" in self._vectors)
-        except NoAnswer:
-            self._send("<getProperties version='1.7'/>")
-            while self._pump(0.2) and not self._others:
-                continue
-            self._pump(0.2)
-            if self._others:
-                raise Disconnected(
-                    f"{self._who}: the server has no such device; it has {', '.join(sorted(self._others))}"
-                ) from None
-            raise
+        self._send(asked)
 
     def close(self) -> None:
         """End the connection; never raises."""

@@ -433,7 +433,10 @@ class IndiSimulator(ProcessPeer):
             line.sendall(b"<getProperties version='1.7' device='CCD Simulator'/>")
             heard = b""
             while b"SIM_YRES" not in heard:
-                heard += line.recv(1 << 16)
+                piece = line.recv(1 << 16)
+                if not piece:
+                    return False
+                heard += piece
             for name, numbers in (
                 ("SIMULATOR_SETTINGS", {"SIM_XRES": 512, "SIM_YRES": 512}),
                 ("POLLING_PERIOD", {"PERIOD_MS": 10}),

@@ -143,8 +143,11 @@ def test_a_configuration_without_a_camera(peer: DemoCamera) -> None:
         MicroManagerCamera(str(file), **peer.settings).connect()
 
 
-def test_gain_has_a_unit_of_its_own(peer: DemoCamera, camera: MicroManagerCamera) -> None:
-    with pytest.raises(InstrumentError, match="3 dB can't be set; state gain_db_per_unit"):
+def test_gain_has_a_unit_of_its_own(peer: DemoCamera) -> None:
+    with (
+        MicroManagerCamera(peer.address, **peer.settings) as camera,
+        pytest.raises(InstrumentError, match="3 dB can't be set; state gain_db_per_unit"),
+    ):
         camera.configure(0.005, 3.0)
     with MicroManagerCamera(peer.address, gain_db_per_unit=0.5, **peer.settings) as other:
         other.configure(0.005, 3.0)
