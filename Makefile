@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium names soak kills setup run test serve bench proof proof-live real slow lint clean
+.PHONY: aravis chromium peers names soak kills setup run test serve bench proof proof-live real slow lint clean
 
 setup: $(STAMP)
 
@@ -33,6 +33,10 @@ kills: $(STAMP)
 # The library for GigE cameras of any maker, from the distribution; tests that need it skip without it.
 aravis:
 	scripts/install-aravis
+
+# Simulators of INDI's and Alpaca's cameras, and Argyll's spotread; tests that need them skip without them.
+peers: $(STAMP)
+	scripts/install-peers $(BIN)/python
 
 # The browser in which the tests drive the operator's page, from the distribution.
 chromium:
