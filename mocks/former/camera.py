@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import ndtr
 
-from mocks.former.law import BIT_DEPTH, WAVELENGTH_NM, Array, Law
+from mocks.former.law import BIT_DEPTH, WAVELENGTH_NM, Array, FrameTaken, Law
 from mocks.former.transfer import Transfer
 
 HC_J_NM = 1.98644586e-16
@@ -146,6 +146,8 @@ class ConcealedCamera:
         """Frame number `k` of images in e-/s by channel (before shading; None: no light), raw DN."""
         laws, shape, elapsed_s = self.laws, (self.rows, self.cols), STEP_S * k
         draw = k + DRAW_STEP * self.noise_draw
+        for law in laws:
+            law.frame = FrameTaken(draw, exposure_s, elapsed_s, temperature_c)
         rng = np.random.default_rng([self.seed, 2, draw])
         z = rng.standard_normal(shape)
         e: Array = np.zeros(shape)
