@@ -416,6 +416,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         codes.convert if codes.codes else None,
         (lambda electrons: np.asarray(charge.neighbour_correlation(electrons))) if charge.correlation else None,
         signal.filter_kernel(),
+        signal.gain_map(shape),
     )
 
 

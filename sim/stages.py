@@ -350,13 +350,15 @@ class Disturbance(Protocol):
 class Signal(State):
     """State of the electrons' read-out, up to the converter.
 
-    `response`: electrons -> electrons, point by point; none stay none. `offset_dn`: (elapsed_s, sensor temperature) ->
-    DN added to the black level. `lines`: noise that rows or columns share. `telegraph`: pixels that jump between two
-    levels. `disturbances`: signals that are added at random. `filters`: kernels (odd, odd) of sum 1 that the chip runs
-    over each colour's plane, signal and noise alike, before rounding.
+    `response`: electrons -> electrons, point by point; none stay none. `gains`: (row, col in px, which broadcast) ->
+    factor on what is read, noise alike, of mean 1 over the frame, as levels don't ask it. `offset_dn`: (elapsed_s,
+    sensor temperature) -> DN added to the black level. `lines`: noise that rows or columns share. `telegraph`: pixels
+    that jump between two levels. `disturbances`: signals that are added at random. `filters`: kernels (odd, odd) of sum
+    1 that the chip runs over each colour's plane, signal and noise alike, before rounding.
     """
 
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    gains: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     offset_dn: tuple[Callable[[float, float | None], float], ...] = ()
     lines: tuple[LineNoise, ...] = ()
     telegraph: tuple[Jumps, ...] = ()
@@ -366,6 +368,13 @@ class Signal(State):
     def read(self, electrons: FloatArray) -> FloatArray:
         """Apply the read-out's responses to signals in electrons, point by point."""
         return reduce(lambda value, law: law(value), self.response, electrons)
+
+    def gain_map(self, shape: tuple[int, int]) -> FloatArray | None:
+        """Factor (rows, cols) on what is read of every pixel; None where no law says one."""
+        if not self.gains:
+            return None
+        row, col = np.arange(float(shape[0]))[:, None], np.arange(float(shape[1]))[None, :]
+        return reduce(lambda value, law: value * law(row, col), self.gains, np.ones(shape))
 
     def shift_dn(self, elapsed_s: float, temperature_c: float | None) -> float:
         """DN added to the black level."""

@@ -311,6 +311,10 @@ class Uniform:
         """Apply the read-out's responses to signals in electrons."""
         return self._signal.read(electrons)
 
+    def gain_map(self) -> FloatArray | None:
+        """Factor (rows, cols) on what is read of every pixel; None where it is the same for all."""
+        return self._signal.gain_map((self.camera.rows, self.camera.cols))
+
     def offset_dn(self, elapsed_s: float, temperature_c: float | None) -> float:
         """DN added to the black level, beside the mean of `added_e`."""
         return self._signal.shift_dn(elapsed_s, temperature_c)

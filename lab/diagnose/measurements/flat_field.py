@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.flat_lines import collect_rows
 from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import ADDED
+from lab.diagnose.measurements.reads import ADDED, COLLECTED, GAINS, acting
 from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
@@ -90,8 +91,8 @@ def shading_block(study: Study) -> Block:
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures),
         p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | ADDED | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT, predict=predict,
-        scale=np.ones(len(planes) * ROWS * COLS),
+        reads=SHADING | ADDED | COLLECTED | GAINS | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT,
+        predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
 
@@ -231,11 +232,28 @@ def _shaded(planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effect
     even = even_share(study.camera, effects)
     light = (1.0 - even) * light + even * light.mean()
     added = _cells(model.added_e - model.added_e.mean()).ravel() if model.adds_signal else 0.0
+    collected, gains = _collected(study, effects), model.gain_map()
+    gain = 1.0 if gains is None else _cells(gains).ravel()
     found = []
     for plane in planes:
-        electrons = model.response(light / light.mean() * plane.level_e)
+        own = light * collected.get(plane.channel, 1.0)
+        electrons = model.response(own / own.mean() * plane.level_e) * gain
         found.append(electrons / electrons.mean() + added * plane.inverse_per_e)
     return np.concatenate(found)
+
+
+def _collected(study: Study, effects: Effects) -> dict[str, FloatArray]:
+    """Factor on the cells (cells,) of each channel by pixels that collect light unlike others of their colour, as rows
+    that repeat fall unevenly into cells."""
+    collecting = acting(effects, COLLECTED)
+    if not collecting:
+        return {}
+    step, rows = mosaic.step(study.camera.cfa), collect_rows(study.camera, collecting)
+    found = {}
+    for channel, phases in mosaic.phases(study.camera.cfa).items():
+        own = np.mean([rows[r::step, c] for r, c in phases], axis=0)
+        found[channel] = _cells(np.tile(own[:, None], COLS)).ravel()
+    return found
 
 
 def _row_light(planes: Sequence[_ChannelCells], base: FloatArray, model: Uniform, rows: int) -> dict[str, FloatArray]:

@@ -17,6 +17,7 @@ from mocks.former.laws.charge import (
     InterPixelCapacitanceLaw,
     LeakyShutterLaw,
     LightLeakLaw,
+    PhaseDetectionRowsLaw,
     ResponseTailLaw,
     SmearLaw,
     TapGainLaw,
@@ -138,6 +139,9 @@ LISTED: tuple[type[Law], ...] = (
     BitWeightsLaw,
     ResponseKneeLaw,
     ColouredLineNoiseLaw,
+    PhaseDetectionRowsLaw,
+    TapGainLaw,
+    TapOffsetLaw,
 )
 
 #: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.
@@ -153,8 +157,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     AbsorptionBandLaw,
     RedLeakLaw,
     PolarisedLightLaw,
-    TapGainLaw,
-    TapOffsetLaw,
     LightLeakLaw,
     PeriodicBandingLaw,
     TreeRingsLaw,
