@@ -78,11 +78,7 @@ class PhaseDetectionRows(Effect):
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         fields = ("loss_percent",) if camera.cfa == "MONO" else ("loss_percent", "colour_percent")
         return tuple(
-            tuple(
-                cls(period=period, first_row=first, **{field: sign})
-                for field in fields
-                for sign in (1.5, -1.5)
-            )
+            tuple(cls(period=period, first_row=first, **{field: sign}) for field in fields for sign in (1.5, -1.5))
             for period in PERIODS
             for first in range(period)
         )

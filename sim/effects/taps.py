@@ -18,30 +18,15 @@ from sim.stages import Signal
 #: Where an area may end, as shares of the side.
 BORDERS = (0.25, 0.5, 0.75)
 
-Gain = Annotated[
-    float,
-    Quantity(
-        "%",
-        "gain beyond this border over that before it, less 1",
-        lower=-50.0,
-        upper=50.0,
-        prior=(0.0, 1.0),
-        absent=0.0,
-        dispensable=True,
-    ),
-]
-Offset = Annotated[
-    float,
-    Quantity(
-        "e",
-        "by how much dark pixels beyond this border lie above those before it",
-        lower=-1e4,
-        upper=1e4,
-        prior=(0.0, 5.0),
-        absent=0.0,
-        dispensable=True,
-    ),
-]
+
+def _gain(border: str, dispensable: bool = True) -> Quantity:
+    meaning = f"gain beyond {border} over that before it, less 1"
+    return Quantity("%", meaning, lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0, dispensable=dispensable)
+
+
+def _offset(border: str, dispensable: bool = True) -> Quantity:
+    meaning = f"by how much dark pixels beyond {border} lie above those before it"
+    return Quantity("e", meaning, lower=-1e4, upper=1e4, prior=(0.0, 5.0), absent=0.0, dispensable=dispensable)
 
 
 class Taps(Effect):
@@ -62,12 +47,12 @@ class Taps(Effect):
         "the same line."
     )
 
-    gain_percent: Gain = 0.0
-    quarter_gain_percent: Gain = 0.0
-    last_gain_percent: Gain = 0.0
-    offset_e: Offset = 0.0
-    quarter_offset_e: Offset = 0.0
-    last_offset_e: Offset = 0.0
+    gain_percent: Annotated[float, _gain("the half", dispensable=False)] = 0.0
+    quarter_gain_percent: Annotated[float, _gain("the first quarter")] = 0.0
+    last_gain_percent: Annotated[float, _gain("the third quarter")] = 0.0
+    offset_e: Annotated[float, _offset("the half", dispensable=False)] = 0.0
+    quarter_offset_e: Annotated[float, _offset("the first quarter")] = 0.0
+    last_offset_e: Annotated[float, _offset("the third quarter")] = 0.0
     across: Annotated[Literal["columns", "rows"], Field(description="lines between which the areas meet")] = "columns"
 
     @classmethod
@@ -101,5 +86,7 @@ class Taps(Effect):
             signal = signal.add_laws(gains=factor)
         if any(offsets):
             line = self._by_line(np.arange(float(count)), count, offsets)
-            signal = signal.add_laws(disturbances=LineOffsets(line[None, :] if self.across == "columns" else line[:, None]))
+            signal = signal.add_laws(
+                disturbances=LineOffsets(line[None, :] if self.across == "columns" else line[:, None])
+            )
         return signal
