@@ -251,7 +251,8 @@ class Image(State):
 class Charge(State):
     """Electrons in the pixels: where they come from and where they end up.
 
-    `exposure_s`: time asked for -> time in which light is collected. `collected`: electrons of light
+    `exposure_s`: time asked for -> time in which light is collected. `leak_s`: place down the frame, 0 first row .. 1
+    last -> time in which light is collected besides, whatever is asked for. `collected`: electrons of light
     (rows, cols) -> electrons, pixel by pixel; it depends on the place by a short period alone, as measurements ask it
     on small tiles, and keeps each colour's mean, as levels don't ask it at all. `dark_current`: (e/s, sensor
     temperature) -> e/s, of all pixels or of each (rows, cols). `defects`: pixels with additional dark current.
@@ -266,6 +267,7 @@ class Charge(State):
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
+    leak_s: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     collected: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     dark_current: tuple[Callable[[FloatArray | float, float | None], FloatArray | float], ...] = ()
     defects: tuple[Defects, ...] = ()
@@ -280,6 +282,10 @@ class Charge(State):
     def collected_s(self, exposure_s: float) -> float:
         """The time in which light is collected, given the time that was asked for."""
         return reduce(lambda value, law: law(value), self.exposure_s, exposure_s)
+
+    def leaked_s(self, down: FloatArray) -> FloatArray | float:
+        """The time in which light is collected beside the exposure, at places down the frame, 0..1."""
+        return sum((law(down) for law in self.leak_s), 0.0)
 
     def collect_light(self, electrons: FloatArray) -> FloatArray:
         """Mean electrons of light (rows, cols) as the pixels collect them."""

@@ -13,7 +13,7 @@ import numpy as np
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.flat_lines import collect_rows
 from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import ADDED, COLLECTED, GAINS, acting
+from lab.diagnose.measurements.reads import ADDED, COLLECTED, GAINS, LEAK, acting
 from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
@@ -91,7 +91,7 @@ def shading_block(study: Study) -> Block:
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures),
         p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | ADDED | COLLECTED | GAINS | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT,
+        reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT,
         predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
@@ -233,10 +233,13 @@ def _shaded(planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effect
     light = (1.0 - even) * light + even * light.mean()
     added = _cells(model.added_e - model.added_e.mean()).ravel() if model.adds_signal else 0.0
     collected, gains = _collected(study, effects), model.gain_map()
+    leaked_s = _cell_means(model.leaked_s(place))
     gain = 1.0 if gains is None else _cells(gains).ravel()
     found = []
     for plane in planes:
         own = light * collected.get(plane.channel, 1.0)
+        if model.leaks:
+            own = own * (1.0 + leaked_s * float(np.mean([1.0 / c.exposure_s for c in plane.captures])))
         electrons = model.response(own / own.mean() * plane.level_e) * gain
         found.append(electrons / electrons.mean() + added * plane.inverse_per_e)
     return np.concatenate(found)

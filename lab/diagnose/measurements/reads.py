@@ -14,6 +14,8 @@ DARK_CURRENT = frozenset({"charge.dark_current"})
 COLLECTED = frozenset({"charge.collected"})
 #: What read-out adds to the pixels, lit or dark.
 ADDED = frozenset({"signal.disturbances"})
+#: Light that is collected beside the exposure.
+LEAK = frozenset({"charge.leak_s"})
 #: Factors on what is read, by place.
 GAINS = frozenset({"signal.gains"})
 #: Row and column noise.

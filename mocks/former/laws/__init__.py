@@ -142,6 +142,7 @@ LISTED: tuple[type[Law], ...] = (
     PhaseDetectionRowsLaw,
     TapGainLaw,
     TapOffsetLaw,
+    LeakyShutterLaw,
 )
 
 #: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.
@@ -165,7 +166,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     DefectInterpolationLaw,
     DigitalGainLaw,
     LossyCodesLaw,
-    LeakyShutterLaw,
     MotionLaw,
     TrefoilLaw,
     HaloLaw,

@@ -185,14 +185,22 @@ class ExposureOffsetLaw(Law):
 
 
 class LeakyShutterLaw(Law):
-    """Light is still collected while rows wait for read-out, longer the later the row (related to the exposure
-    offset)."""
+    """Light is still collected while rows wait for read-out, longer the later the row. Variants: read from the top; from
+    the bottom; from the top, in bursts of eight rows."""
 
-    name, unit, nominal, limits = "leaky_shutter", "us", 60.0, (0.5, 5000.0)
-    families = frozenset({"field_of_light", "response_to_light"})
+    name, effect = "leaky_shutter", "shutter_leakage"
+    variants, unit, nominal, limits = 3, "us", 60.0, (0.5, 5000.0)
 
     def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
-        return electrons + rate_e_per_s * self.strength * 1e-6 * (np.arange(len(electrons)) / len(electrons))[:, None]
+        waits = np.arange(len(electrons)) / len(electrons)
+        if self.variant == 1:
+            waits = waits[::-1]
+        if self.variant == 2:
+            waits = np.floor(waits * len(electrons) / 8.0) * 8.0 / len(electrons)
+        return electrons + rate_e_per_s * self.strength * 1e-6 * waits[:, None]
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"last_row_us": self.strength}
 
 
 class SmearLaw(Law):
