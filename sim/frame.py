@@ -177,7 +177,13 @@ def is_steady(camera: CameraModel, effects: Sequence[Effect]) -> bool:
 
 def grows_with_exposure(camera: CameraModel, effects: Sequence[Effect]) -> bool:
     """Return whether mean electrons are in proportion to the exposure that is asked for."""
-    return not laws_of(camera, effects) & {"charge.exposure_s", "charge.leak_s", "light.rows", "charge.overflow", "light.unsteadiness"}
+    return not laws_of(camera, effects) & {
+        "charge.exposure_s",
+        "charge.leak_s",
+        "light.rows",
+        "charge.overflow",
+        "light.unsteadiness",
+    }
 
 
 def screen_light(

@@ -76,9 +76,8 @@ class PhaseDetectionRows(Effect):
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
-        fields = ("loss_percent",) if camera.cfa == "MONO" else ("loss_percent", "colour_percent")
         return tuple(
-            tuple(cls(period=period, first_row=first, **{field: sign}) for field in fields for sign in (1.5, -1.5))
+            tuple(cls(period=period, first_row=first, loss_percent=loss) for loss in (1.5, -1.5))
             for period in PERIODS
             for first in range(period)
         )

@@ -17,12 +17,12 @@ from sim.camera import CameraModel
 from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
+from sim.stages import PERIOD_PX
 from sim.uniform import Uniform
 
 LINE_FLOOR = 1e-4  # relative standard deviation of a step beside noise
 #: Where the areas of two read-outs may meet, as shares of a side.
 MEETING = (0.25, 0.5, 0.75)
-TILE_COLS = 48  # of the frame by which rows are predicted: a whole number of any short period
 LEAST_LINES = 8  # least side of a plane of the mosaic, lines: half of them determine the light's slope
 LEAST_PLACES = 8  # places from which on the spread of steps is measured; with fewer it is that by noise and PRNU
 
@@ -107,10 +107,10 @@ def collect_rows(camera: CameraModel, effects: Effects) -> FloatArray:
     """Return what the rows collect of even light, (rows, period of the mosaic): means over the even and the odd pixels
     of a row, each colour's plane over its mean.
     """
-    even = {c: np.ones((camera.rows, TILE_COLS)) for c in camera.channels}
+    even = {c: np.ones((camera.rows, PERIOD_PX)) for c in camera.channels}
     tile = collected_mosaic(camera, mosaic.assemble(even, camera.cfa), effects, exposure_s=1.0, elapsed_s=0.0)
     for plane in mosaic.planes(tile, camera.cfa).values():
-        plane /= plane.mean()
+        plane[...] = plane / plane.mean()
     step = mosaic.step(camera.cfa)
     return np.stack([tile[:, first::step].mean(axis=1) for first in range(step)], axis=1)
 

@@ -143,6 +143,7 @@ LISTED: tuple[type[Law], ...] = (
     TapGainLaw,
     TapOffsetLaw,
     LeakyShutterLaw,
+    PulsedLightLaw,
 )
 
 #: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.
@@ -161,7 +162,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     LightLeakLaw,
     PeriodicBandingLaw,
     TreeRingsLaw,
-    PulsedLightLaw,
     ResponseTailLaw,
     DefectInterpolationLaw,
     DigitalGainLaw,

@@ -99,8 +99,9 @@ class GreenImbalanceLaw(Law):
 
 
 class PhaseDetectionRowsLaw(Law):
-    """Half-masked pixels for autofocus. Variants: whole rows, all of their pixels alike, every 8; every 12, the colour that isn't green
-    alone (mono: all); every 16, pairs of pixels masked left and right, which fall off to opposite sides of the field."""
+    """Half-masked pixels for autofocus. Variants: whole rows, all of their pixels alike, every 8; every 12, the colour
+    that isn't green alone (mono: all); every 16, pairs of pixels masked left and right, which fall off to opposite
+    sides of the field."""
 
     name = effect = "phase_detection_rows"
     variants, unit, nominal, limits = 3, "%", 4.0, (0.05, 60.0)
@@ -131,15 +132,16 @@ class PhaseDetectionRowsLaw(Law):
 
 
 class TapGainLaw(Law):
-    """Parts of the sensor are read by amplifiers of other gains, which noise shares. Variants: the right half; four strips, each of
-    another; the lower half."""
+    """Parts of the sensor are read by amplifiers of other gains, which noise shares. Variants: the right half; four
+    strips, each of another; the lower half."""
 
     name, effect = "tap_gain", "taps"
     variants, unit, nominal, limits = 3, "%", 1.0, (0.02, 8.0)
 
     def response(self, electrons: Array) -> Array:
         rows, cols = electrons.shape
-        tap = 2 * np.arange(rows)[:, None] // rows if self.variant == 2 else (4 if self.variant == 1 else 2) * np.arange(cols) // cols
+        strips = 4 if self.variant == 1 else 2
+        tap = 2 * np.arange(rows)[:, None] // rows if self.variant == 2 else strips * np.arange(cols) // cols
         change = (0.0, 1.0, -0.5, 0.7) if self.variant == 1 else (0.0, 1.0)
         return electrons * (1.0 + self.strength / 100.0 * np.array(change)[tap])
 
@@ -185,8 +187,8 @@ class ExposureOffsetLaw(Law):
 
 
 class LeakyShutterLaw(Law):
-    """Light is still collected while rows wait for read-out, longer the later the row. Variants: read from the top; from
-    the bottom; from the top, in bursts of eight rows."""
+    """Light is still collected while rows wait for read-out, longer the later the row. Variants: read from the top;
+    from the bottom; from the top, in bursts of eight rows."""
 
     name, effect = "leaky_shutter", "shutter_leakage"
     variants, unit, nominal, limits = 3, "us", 60.0, (0.5, 5000.0)
