@@ -233,7 +233,7 @@ def _shaded(
     study: Study,
     collected: Mapping[str, FloatArray],
 ) -> FloatArray:
-    """Predicted cells of all planes, each plane relative to its mean, (planes x cells,); `collected`: of `_collected`."""
+    """Predicted cells of all planes, each relative to its mean, (planes x cells,); `collected` of `_collected`."""
     model = Uniform(study.camera, effects)
     light = _cell_means(model.field(place).light)
     # a veil of scattered light reduces the contrast of the fall-off
