@@ -146,7 +146,8 @@ def collected_electrons(
         mean *= rows[:, None]
     if isinstance(light.room, np.ndarray) or light.room:
         mean += light.room
-    mean *= charge.collected_s(exposure.exposure_s)
+    down = np.linspace(0.0, 1.0, camera.rows)[:, None]
+    mean *= charge.collected_s(exposure.exposure_s) + charge.leaked_s(down)
     np.add(charge.collect_light(mean), dark_electrons(camera, exposure, effects), out=mean)
     return charge.overflow_wells(charge.move_charge(mean))
 
@@ -176,7 +177,13 @@ def is_steady(camera: CameraModel, effects: Sequence[Effect]) -> bool:
 
 def grows_with_exposure(camera: CameraModel, effects: Sequence[Effect]) -> bool:
     """Return whether mean electrons are in proportion to the exposure that is asked for."""
-    return not laws_of(camera, effects) & {"charge.exposure_s", "light.rows", "charge.overflow", "light.unsteadiness"}
+    return not laws_of(camera, effects) & {
+        "charge.exposure_s",
+        "charge.leak_s",
+        "light.rows",
+        "charge.overflow",
+        "light.unsteadiness",
+    }
 
 
 def screen_light(
@@ -409,6 +416,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         codes.convert if codes.codes else None,
         (lambda electrons: np.asarray(charge.neighbour_correlation(electrons))) if charge.correlation else None,
         signal.filter_kernel(),
+        signal.gain_map(shape),
     )
 
 

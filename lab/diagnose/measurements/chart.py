@@ -66,7 +66,7 @@ def chart_block(study: Study) -> Block:
         model = Uniform(camera, effects)
         time = np.array([model.collected_s(float(t)) for t in exposures])
         ambient = np.array([model.ambient_e(p.channel, float(t)) for p, t in zip(points, exposures, strict=True)])
-        electrons = rates * model.field(place).light * time
+        electrons = rates * model.field(place).light * (time + model.leaked_s(place))
         electrons = electrons * _mixing(study, points, electrons, model)
         veil = even_share(camera, effects) * surround + halo_light([p.around for p in points], effects, camera)
         electrons = wide_contrast(camera, effects) * electrons + (veil + tail) / noise.gain + ambient

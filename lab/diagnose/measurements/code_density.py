@@ -164,11 +164,13 @@ class _Counts:
 def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
     """A plane's pixels by level, as `_Counts.groups`.
 
-    Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels. Its variance is proportional to the
-    signal above black, and scaled so that its mean is the measured mean square of the departures from the local mean.
+    Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels, and by as much beside it as its row is on
+    the whole. Its variance is proportional to the signal above black, and scaled so that its mean is the measured mean
+    square of the departures.
     """
     surface = ndimage.uniform_filter(plane, AROUND, mode="reflect")
-    own = AROUND**2 / (AROUND**2 - 1.0)
+    surface = surface + (plane - surface).mean(axis=1, keepdims=True)
+    own = AROUND**2 / (AROUND**2 - 1.0) / (1.0 - 1.0 / plane.shape[1])
     signal = max(float(surface.mean()) - study.noise.black, 1.0)
     variance = own * float(np.mean(np.square(plane - surface), dtype=float))
     # pixels are binned by level, in steps narrow beside the noise; the variance of the levels within a bin is added
