@@ -36,6 +36,11 @@ class Changes(Frozen):
     gain_db: Annotated[float | None, Quantity("dB", "analogue gain", lower=-40.0, upper=80.0)] = None
     radiance_factor: Annotated[float | None, Quantity("1", "factor on the light", lower=1e-6, upper=1e6)] = None
 
+    @property
+    def changes_lens(self) -> bool:
+        """Whether the lens, or its aperture, is another one."""
+        return self.f_number is not None or self.lens is not None
+
     def spectrum(self) -> Spectrum | None:
         """The changed lamp's radiance, W sr^-1 m^-2 nm^-1; None: the plan's. Raises InputError for a file that can't be
         used."""

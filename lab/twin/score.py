@@ -11,13 +11,14 @@ from scipy.stats import norm
 from lab.capture_kinds.base import Capture
 from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.library import measurement_title
+from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.measurements.study import Study
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
 from lab.one_blas_thread import one_blas_thread
-from lab.twin.predict import is_predicted, measured_blocks
-from lab.twin.sealed import PredictedNumber, SealedPrediction, SidePrediction
+from lab.twin.predict import QUANTITIES, is_predicted, measured_blocks
+from lab.twin.sealed import PredictedName, PredictedNumber, SealedPrediction, SidePrediction, TwinNumber
 from sim.camera import CameraModel, Side
 from sim.parameters import Frozen
 from sim.spectrum import FloatArray
@@ -29,21 +30,18 @@ WIDTH_95 = float(norm.ppf(0.975))
 MOST_EXPOSURE, MOST_C, MOST_PX = 0.25, 3.0, 4.0
 #: Least change of the logarithm of the likelihood that an effect makes for its name to be tested.
 LEAST_GAIN = 2.0
+#: Measurements whose numbers a prediction may hold.
+SCORED = (*QUANTITIES, PHOTON_TRANSFER)
+#: Probability from which on one of the rivals is the name.
+SURE = 0.95
 #: Keys of the data sheet that have to be those of the prediction.
 SHEET = ("rows", "cols", "cfa", "bit_depth", "f_number")
 
 
-class ScoredNumber(Frozen):
+class ScoredNumber(TwinNumber):
     """One number: predicted, moved to the exposure and temperature that were really set, and measured."""
 
     side: Side
-    quantity: str
-    captures: tuple[str, ...]
-    channel: str
-    where: str
-    x: float
-    predicted: float
-    std: float
     measured: float
     deviation: float
     deviation_sigma: float
@@ -62,20 +60,53 @@ class QuantityScore(Frozen):
     chi2: float
 
 
+class TestedRival(Frozen):
+    """A rival of a name. `gain`: log likelihood of the numbers with it less that with the name; `before`, `after`: its
+    probability without and with these numbers."""
+
+    name: str
+    gain: float
+    before: float
+    after: float
+
+
 class TestedEffect(Frozen):
-    """Whether an effect's name survives. `gain`: log likelihood of the numbers with it less that without it."""
+    """Whether a name survives.
+
+    name : as it was told: an effect's, or a family's
+    gain : log likelihood of the numbers with it less that with nothing in its place
+    verdict : `survives`; `withdrawn`: the numbers are likelier without it, or a rival predicted them (`becomes`);
+        `named`: of a family, `becomes` is the effect that predicted them; `untested`: they show too little of it
+    probability : of what the verdict says, among the rivals, after these numbers
+    """
 
     side: Side
     name: str
     gain: float
-    verdict: Literal["survives", "withdrawn", "untested"]
+    verdict: Literal["survives", "withdrawn", "named", "untested"]
+    becomes: str | None = None
+    probability: float = 1.0
+    rivals: tuple[TestedRival, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """The verdict as a lab reads it, with the figures that it rests on."""
+        title = self.name.replace("_", " ")
+        other = (self.becomes or "").replace("_", " ")
+        was = next((f"{rival.before:.2g}" for rival in self.rivals if rival.name == self.becomes), "")
+        shares = f"probability {self.probability:.3g}" + (f", before {was}" if was else "")
+        if self.verdict == "named":
+            return f"{title}: is {other} ({shares})"
+        if self.verdict == "withdrawn" and self.becomes is not None:
+            return f"{title}: withdrawn: {other} predicted the session ({shares})"
+        return f"{title}: {self.verdict} (log likelihood {self.gain:+.1f})"
 
 
 class TwinScore(Frozen):
     """The result of `calibench twin score`."""
 
     format: Literal["calibench-twin-score"] = "calibench-twin-score"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     source: str
     quantities: tuple[QuantityScore, ...]
     effects: tuple[TestedEffect, ...]
@@ -99,7 +130,8 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
     for side, prediction in sealed.sides.items():
         camera = CameraModel.model_validate(json.loads(sealed.cameras[side]))
         study = Study(_with_curves(recordings, prediction, camera, side), side, camera)
-        blocks, left_out = measured_blocks(study)
+        wanted = {number.quantity for number in prediction.numbers}
+        blocks, left_out = measured_blocks(study, tuple(m for m in SCORED if m.name in wanted))
         skipped += left_out
         measured = {
             _key(b.measurement.name, label): (float(v), label.x)
@@ -121,9 +153,10 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
         for name in dict.fromkeys(prediction.numbers[i].quantity for i in here):
             mine = np.array([prediction.numbers[i].quantity == name for i in here])
             parts[name] = parts.get(name, 0.0) + chi2((seen - moved)[mine], covariance[np.ix_(mine, mine)])
-        for name, values in prediction.without.items():
-            change = np.array([values[i] - prediction.numbers[i].predicted for i in here])
-            effects.append(_tested(side, name, seen - moved, change, covariance))
+        at = np.array([prediction.numbers[i].predicted for i in here])
+        for name in prediction.names:
+            changes = [np.array(rival.numbers)[here] - at for rival in name.rivals]
+            effects.append(_tested(side, name, seen - moved, changes, covariance))
         numbers += [_scored(side, prediction.numbers[i], m, v) for i, m, v in zip(here, moved, seen, strict=True)]
     return TwinScore(
         source=recordings.source, quantities=tuple(_quantity(name, numbers, value) for name, value in parts.items()),
@@ -209,13 +242,45 @@ def _square(prediction: SidePrediction) -> FloatArray:
     return np.asarray(out + np.tril(out, -1).T)
 
 
-def _tested(side: Side, name: str, residual: FloatArray, change: FloatArray, covariance: FloatArray) -> TestedEffect:
-    gain = 0.5 * (chi2(residual - change, covariance) - chi2(residual, covariance))
-    told = 0.5 * chi2(change, covariance) >= LEAST_GAIN
-    verdict: Literal["survives", "withdrawn", "untested"] = (
-        "untested" if not told else "survives" if gain > 0 else "withdrawn"
-    )
-    return TestedEffect(side=side, name=name, gain=gain, verdict=verdict)
+def _tested(
+    side: Side, name: PredictedName, residual: FloatArray, changes: list[FloatArray], covariance: FloatArray
+) -> TestedEffect:
+    """Weigh a name against its rivals, which change the prediction by `changes` (n,) each. Log likelihoods are tempered
+    by chi2 / n of the best of them where that is above 1: what none predicts counts for none."""
+    fits = [chi2(residual - change, covariance) for change in changes]
+    own = chi2(residual, covariance)
+    tempered = max(min(own, *fits) / len(residual), 1.0)
+    gains = [0.5 * (own - fit) / tempered for fit in fits]
+    told = any(0.5 * chi2(change, covariance) >= LEAST_GAIN for change in changes)
+    weights = {name.effect: np.log(max(name.probability, 1e-9))}
+    weights |= {
+        rival.name: np.log(rival.probability) + gain
+        for rival, gain in zip(name.rivals, gains, strict=True)
+        if rival.name and rival.probability > 0
+    }
+    top = max(weights.values())
+    whole = sum(np.exp(w - top) for w in weights.values())
+    after = {key: float(np.exp(w - top) / whole) for key, w in weights.items()}
+    likeliest = max(after, key=lambda key: after[key])
+    absent = -next((gain for rival, gain in zip(name.rivals, gains, strict=True) if not rival.name), 0.0)
+    gain = dict(zip((rival.name for rival in name.rivals), gains, strict=True)) | {name.effect: 0.0}
+    is_another = likeliest != name.effect or name.told != name.effect
+    verdict: Literal["survives", "withdrawn", "named", "untested"] = "survives" if absent > 0 else "withdrawn"
+    becomes = None
+    if not told:
+        verdict = "untested"
+    elif is_another and after[likeliest] >= SURE and absent + gain[likeliest] > 0:
+        becomes = likeliest
+        verdict = "withdrawn" if name.told == name.effect else "named"
+    return TestedEffect(
+        side=side, name=name.told, gain=absent, verdict=verdict, becomes=becomes,
+        probability=after[likeliest] if becomes else after[name.effect],
+        rivals=tuple(
+            TestedRival(name=rival.name, gain=gain, before=rival.probability, after=after.get(rival.name, 0.0))
+            for rival, gain in zip(name.rivals, gains, strict=True)
+            if rival.name
+        ),
+    )  # fmt: skip
 
 
 def _scored(side: Side, number: PredictedNumber, moved: float, seen: float) -> ScoredNumber:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lab.capture_kinds.dark import DarkCapture
+from lab.capture_kinds.flat import FlatCapture
 from lab.cli import main
 from lab.diagnose.inference.refit import refit
 from lab.diagnose.measurements.blocks import measurement_model
@@ -141,6 +144,52 @@ def test_an_effect_that_the_camera_lacks_is_withdrawn() -> None:
     found = score(predict({"left": trained(2, wrong=True)}, PLAN, changes, light_std=0.0), captured(changes, 8))
     verdicts = {effect.name: effect.verdict for effect in found.effects}
     assert verdicts == {"dark_current_temperature": "survives", "veiling_glare": "withdrawn"}
+
+
+def _photons(recordings: RecordingSet, levels: slice) -> RecordingSet:
+    """The darks and some levels of the flats, which state photons in place of a radiance."""
+    flats = recordings.captures(FlatCapture, "left")
+    steps = sorted({c.exposure_s for c in flats})[levels]
+    told = [
+        c.model_copy(update={"radiance": None, "photons_per_pixel": 1e6 * c.exposure_s, "wavelength_nm": 550.0})
+        for c in flats
+        if c.exposure_s in steps
+    ]
+    captures = (*recordings.captures(DarkCapture, "left"), *told)
+    return recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
+
+
+@pytest.fixture(scope="module")
+def of_photons() -> tuple[CameraFile, RecordingSet, RecordingSet]:
+    """A model of the lowest levels of flats that state photons, the recordings of its fit, and those of the others."""
+    drawn = future_session(TRUTH, PLAN, "left", Changes(), 5)
+    low, high = _photons(drawn, slice(0, 4)), _photons(drawn, slice(4, None))
+    fit = fit_recording_set(low, steps=("noise",))
+    model, _ = measurement_model(low, "left", fit)
+    assert model is not None
+    return improved_model(low, "left", fit, None, model, (), ())[0], low, high
+
+
+def test_levels_of_stated_photons_are_predicted_relative_to_the_fitted_ones(
+    of_photons: tuple[CameraFile, RecordingSet, RecordingSet],
+) -> None:
+    content, low, high = of_photons
+    found = score(predict({"left": content}, high, Changes(), fitted=low), high)
+    scores = {q.quantity: q for q in found.quantities}
+    # three levels, of which the brightest channel clips in none: four repeats of three channels, and a variance of each
+    assert scores["photon_transfer"].n == 36 and scores["noise"].n == 9
+    levels = scores["photon_transfer"]
+    # a line through levels up to half of these, whose bend is told to some tenths of a per cent
+    assert levels.largest_of_95_percent < 1.0 and levels.chi2 < 2.0 * levels.n
+    wrong = replace(content, camera=content.camera.model_copy(update={"black_level_dn": 80.0}))
+    missed = score(predict({"left": wrong}, high, Changes(), fitted=low), high)
+    assert missed.chi2 > 10.0 * found.chi2
+
+
+def test_stated_photons_need_the_fitted_recordings(of_photons: tuple[CameraFile, RecordingSet, RecordingSet]) -> None:
+    content, _, high = of_photons
+    with pytest.raises(InputError, match="states photons and no radiance; give the fitted recordings"):
+        predict({"left": content}, high, Changes())
 
 
 def test_the_posterior_goes_through_the_camera_file(content: CameraFile, tmp_path: Path) -> None:
