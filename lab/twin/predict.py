@@ -40,6 +40,7 @@ from lab.twin.session import check_sensor, future_session
 from sim.camera import CameraModel, Side
 from sim.effects.empirical_law import EmpiricalLaw
 from sim.effects.model_discrepancy import ModelDiscrepancy
+from sim.effects.other_f_number import OtherFNumber
 from sim.sensor.electrons import dark_current_e_per_s, gain_dn_per_e
 from sim.spectrum import FloatArray
 
@@ -224,7 +225,7 @@ def _names(
         )
     told = {doubt.effect for doubt in posterior.doubts}
     for i, effect in enumerate(content.effects):
-        if effect.name not in told and not isinstance(effect, ModelDiscrepancy | EmpiricalLaw):
+        if effect.name not in told and not isinstance(effect, ModelDiscrepancy | EmpiricalLaw | OtherFNumber):
             rest = (*content.effects[:i], *content.effects[i + 1 :])
             absent = PredictedRival(name="", probability=0.0, numbers=numbers(rest, {}))
             found.append(PredictedName(effect=effect.name, told=effect.name, probability=1.0, rivals=(absent,)))

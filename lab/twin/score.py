@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -34,6 +35,8 @@ LEAST_GAIN = 2.0
 SCORED = (*QUANTITIES, PHOTON_TRANSFER)
 #: Probability from which on one of the rivals is the name.
 SURE = 0.95
+#: Probability that a rival has at least before a session: so sure is no diagnosis.
+LEAST_PROBABILITY = 1e-3
 #: Keys of the data sheet that have to be those of the prediction.
 SHEET = ("rows", "cols", "cfa", "bit_depth", "f_number")
 
@@ -46,6 +49,11 @@ class ScoredNumber(TwinNumber):
     deviation: float
     deviation_sigma: float
     deviation_percent: float
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether the measured number lies in the 95 % interval."""
+        return abs(self.deviation_sigma) <= WIDTH_95
 
 
 class QuantityScore(Frozen):
@@ -67,23 +75,29 @@ class TestedRival(Frozen):
     name: str
     gain: float
     before: float
-    after: float
+    after: float = 0.0
+
+
+TwinVerdict = Literal["survives", "withdrawn", "named", "untested"]
 
 
 class TestedEffect(Frozen):
     """Whether a name survives.
 
-    name : as it was told: an effect's, or a family's
+    name, effect : as it was told, an effect's or a family's, and the effect that stands for it in the model
     gain : log likelihood of the numbers with it less that with nothing in its place
+    before : probability of the effect among its rivals, without these numbers
     verdict : `survives`; `withdrawn`: the numbers are likelier without it, or a rival predicted them (`becomes`);
         `named`: of a family, `becomes` is the effect that predicted them; `untested`: they show too little of it
-    probability : of what the verdict says, among the rivals, after these numbers
+    probability : of `becomes`, else of the effect, among the rivals, with these numbers
     """
 
     side: Side
     name: str
+    effect: str
     gain: float
-    verdict: Literal["survives", "withdrawn", "named", "untested"]
+    before: float
+    verdict: TwinVerdict = "untested"
     becomes: str | None = None
     probability: float = 1.0
     rivals: tuple[TestedRival, ...] = ()
@@ -93,8 +107,8 @@ class TestedEffect(Frozen):
         """The verdict as a lab reads it, with the figures that it rests on."""
         title = self.name.replace("_", " ")
         other = (self.becomes or "").replace("_", " ")
-        was = next((f"{rival.before:.2g}" for rival in self.rivals if rival.name == self.becomes), "")
-        shares = f"probability {self.probability:.3g}" + (f", before {was}" if was else "")
+        was = next((rival.before for rival in self.rivals if rival.name == self.becomes), self.before)
+        shares = f"probability {self.probability:.3g}, before {was:.2g}"
         if self.verdict == "named":
             return f"{title}: is {other} ({shares})"
         if self.verdict == "withdrawn" and self.becomes is not None:
@@ -251,36 +265,61 @@ def _tested(
     own = chi2(residual, covariance)
     tempered = max(min(own, *fits) / len(residual), 1.0)
     gains = [0.5 * (own - fit) / tempered for fit in fits]
-    told = any(0.5 * chi2(change, covariance) >= LEAST_GAIN for change in changes)
-    weights = {name.effect: np.log(max(name.probability, 1e-9))}
-    weights |= {
-        rival.name: np.log(rival.probability) + gain
+    is_told = any(0.5 * chi2(change, covariance) >= LEAST_GAIN for change in changes)
+    absent = -next((gain for rival, gain in zip(name.rivals, gains, strict=True) if not rival.name), 0.0)
+    rivals = [
+        TestedRival(name=rival.name, gain=gain, before=rival.probability)
         for rival, gain in zip(name.rivals, gains, strict=True)
-        if rival.name and rival.probability > 0
-    }
+        if rival.name
+    ]
+    plain = TestedEffect(side=side, name=name.told, effect=name.effect, gain=absent, before=name.probability)
+    return _judged(plain, rivals, is_told)
+
+
+def _judged(plain: TestedEffect, rivals: Sequence[TestedRival], is_told: bool) -> TestedEffect:
+    """The verdict on a name by its gain over nothing and the gains of its rivals over it."""
+    weights = {plain.effect: float(np.log(max(plain.before, LEAST_PROBABILITY)))}
+    weights |= {one.name: float(np.log(max(one.before, LEAST_PROBABILITY))) + one.gain for one in rivals}
     top = max(weights.values())
     whole = sum(np.exp(w - top) for w in weights.values())
     after = {key: float(np.exp(w - top) / whole) for key, w in weights.items()}
     likeliest = max(after, key=lambda key: after[key])
-    absent = -next((gain for rival, gain in zip(name.rivals, gains, strict=True) if not rival.name), 0.0)
-    gain = dict(zip((rival.name for rival in name.rivals), gains, strict=True)) | {name.effect: 0.0}
-    is_another = likeliest != name.effect or name.told != name.effect
-    verdict: Literal["survives", "withdrawn", "named", "untested"] = "survives" if absent > 0 else "withdrawn"
+    gain = {one.name: one.gain for one in rivals} | {plain.effect: 0.0}
+    verdict: TwinVerdict = "survives" if plain.gain > 0 else "withdrawn"
     becomes = None
-    if not told:
+    is_another = likeliest != plain.effect or plain.name != plain.effect
+    if not is_told:
         verdict = "untested"
-    elif is_another and after[likeliest] >= SURE and absent + gain[likeliest] > 0:
+    elif is_another and after[likeliest] >= SURE and plain.gain + gain[likeliest] > 0:
         becomes = likeliest
-        verdict = "withdrawn" if name.told == name.effect else "named"
-    return TestedEffect(
-        side=side, name=name.told, gain=absent, verdict=verdict, becomes=becomes,
-        probability=after[likeliest] if becomes else after[name.effect],
-        rivals=tuple(
-            TestedRival(name=rival.name, gain=gain, before=rival.probability, after=after.get(rival.name, 0.0))
-            for rival, gain in zip(name.rivals, gains, strict=True)
-            if rival.name
-        ),
-    )  # fmt: skip
+        verdict = "withdrawn" if plain.name == plain.effect else "named"
+    return plain.model_copy(
+        update={
+            "verdict": verdict,
+            "becomes": becomes,
+            "probability": after[becomes or plain.effect],
+            "rivals": tuple(one.model_copy(update={"after": after[one.name]}) for one in rivals),
+        }
+    )
+
+
+def together(tests: Sequence[Sequence[TestedEffect]]) -> tuple[TestedEffect, ...]:
+    """What several sessions say together of the names of one model: log likelihoods add up."""
+    found: dict[tuple[Side, str], list[TestedEffect]] = {}
+    for session in tests:
+        for one in session:
+            found.setdefault((one.side, one.effect), []).append(one)
+    whole = []
+    for members in found.values():
+        told = [one for one in members if one.verdict != "untested"]
+        first = members[0]
+        rivals = [
+            rival.model_copy(update={"gain": sum(r.gain for one in told for r in one.rivals if r.name == rival.name)})
+            for rival in first.rivals
+        ]
+        plain = first.model_copy(update={"gain": sum(one.gain for one in told)})
+        whole.append(_judged(plain, rivals, bool(told)))
+    return tuple(whole)
 
 
 def _scored(side: Side, number: PredictedNumber, moved: float, seen: float) -> ScoredNumber:
@@ -300,7 +339,7 @@ def _quantity(name: str, numbers: list[ScoredNumber], value: float) -> QuantityS
     return QuantityScore(
         quantity=name, n=len(mine), unit="1" if is_share else "%", median=float(np.median(away)),
         largest_of_95_percent=float(np.quantile(away, 0.95)),
-        within_95_percent_interval=float(np.mean([abs(n.deviation_sigma) <= WIDTH_95 for n in mine])), chi2=value,
+        within_95_percent_interval=float(np.mean([n.is_inside for n in mine])), chi2=value,
     )  # fmt: skip
 
 

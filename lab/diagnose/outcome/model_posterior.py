@@ -101,6 +101,8 @@ def model_posterior(
         covariance = projected({i: kernel for i, kernel in given.items() if i not in noise})[1]
     stated = np.array([c.index < len(effects) for c in coords], bool)
     mean[at_effects[stated]] = 0.0  # the file states them at their best values
+    if np.any(np.abs(mean[at_effects[~stated]]) > width[~stated]):  # it stands in for something else
+        mean[at_effects[~stated]] = 0.0
     moves = _from_first(model.noise, camera, gain_db)
     for i, name in enumerate(names):
         if name.startswith("curve:") or (is_corrected and (name in ("gain", "read") or name.startswith("read:"))):

@@ -155,7 +155,8 @@ def _photons(recordings: RecordingSet, levels: slice) -> RecordingSet:
         for c in flats
         if c.exposure_s in steps
     ]
-    captures = (*recordings.captures(DarkCapture, "left"), *told)
+    darks = [c for c in recordings.captures(DarkCapture, "left") if c.temperature_c == 25.0]
+    captures = (*darks, *told)
     return recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
 
 
