@@ -90,11 +90,6 @@ def extrapolate(name: str, recordings: RecordingSet, folder: Path) -> Extrapolat
 def section(found: list[Extrapolation]) -> str:
     """The section of the page, Markdown."""
     lines = [
-        "## Photon transfer beyond where it was fitted",
-        "",
-        "`python -m benchmarks.real.extrapolation` fits and diagnoses the lowest 60 % of the levels of a set,",
-        "seals the prediction of all others, and opens it against them. Deviations are per cent of the prediction.",
-        "",
         "| set | levels fitted, predicted | quantity | n | median | 95 % within | in 95 % intervals | chi2 / n |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
@@ -133,7 +128,7 @@ def main(
             print(f"{name}: {found[-1].named or 'nothing named'}", flush=True)
     print(section(found))
     if page is not None:
-        text = page.read_text(encoding="utf-8") if page.is_file() else "# Real recordings\n"
+        text = page.read_text(encoding="utf-8") if page.is_file() else "# Proof of the twin\n"
         page.write_text(placed(text, "extrapolation", section(found)), encoding="utf-8")
 
 

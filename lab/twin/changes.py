@@ -77,7 +77,7 @@ def checked_changes(values: Mapping[str, Any], where: str) -> Changes:
     try:
         return Changes.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
+        first = next((one for one in error.errors() if one["type"] == "value_error"), error.errors()[0])
         told = first["msg"].removeprefix("Value error, ")
         given = first["input"] if isinstance(first["input"], str | int | float) else "..."
         raise InputError(f"{where}{first['loc'][0]}={given}: {told}; correct it") from error
