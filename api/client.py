@@ -43,7 +43,6 @@ from api.schemas import (
     PipelineResults,
     PipelineStart,
     PlanAsked,
-    Prediction,
     PredictionStart,
     QueuePlace,
     Recordings,
@@ -53,6 +52,7 @@ from api.schemas import (
     SetAsked,
     StationState,
     StoredCapture,
+    StoredPrediction,
     StoredSession,
 )
 from lab.calibration.life import CalibrationRecord, History
@@ -557,17 +557,17 @@ class ServiceClient:
         """Write the camera files of a model to `file`, a .zip or .tar."""
         return self._fetched(f"/camera-models/{model_id}/archive", file)
 
-    def predict(self, asked: PredictionStart) -> Prediction:
+    def predict(self, asked: PredictionStart) -> StoredPrediction:
         """Predict a session that hasn't been captured, and seal that."""
-        return self._post(Prediction, "/predictions", asked)
+        return self._post(StoredPrediction, "/predictions", asked)
 
-    def predictions(self) -> Iterator[Prediction]:
+    def predictions(self) -> Iterator[StoredPrediction]:
         """The sealed predictions, the newest first."""
-        return self._pages(Prediction, "/predictions")
+        return self._pages(StoredPrediction, "/predictions")
 
-    def prediction(self, prediction_id: str) -> Prediction:
+    def prediction(self, prediction_id: str) -> StoredPrediction:
         """One prediction."""
-        return self._get(Prediction, f"/predictions/{prediction_id}")
+        return self._get(StoredPrediction, f"/predictions/{prediction_id}")
 
     def sealed_prediction(self, prediction_id: str) -> bytes:
         """The sealed file, whose SHA-256 is that of the prediction."""

@@ -554,7 +554,7 @@ class PredictionStart(Asked):
     light_std_percent: float = Field(default=0.3, ge=0, le=100, description="standard deviation of the light to come")
 
 
-class Prediction(Schema):
+class StoredPrediction(Schema):
     """A sealed prediction. `plan`: id of the session or recordings that were planned again."""
 
     id: str

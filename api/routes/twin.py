@@ -20,7 +20,7 @@ from fastapi.responses import FileResponse
 from api.errors import Conflict, answers
 from api.kept_sets import KeptSet, sent_set, session_set
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers, page_of
-from api.schemas import Prediction, PredictionStart, SetAsked
+from api.schemas import PredictionStart, SetAsked, StoredPrediction
 from api.service import CALIBRATE, READ, Here, HexId, Service, camera_model
 from lab.calibration import camera_models
 from lab.capture.catalogue import step_times
@@ -75,10 +75,10 @@ def _sealed(service: Service, prediction_id: str) -> SealedPrediction:
     return open_seal(file)
 
 
-def _fields(service: Service, prediction_id: str) -> Prediction:
+def _fields(service: Service, prediction_id: str) -> StoredPrediction:
     found = _sealed(service, prediction_id)
     file = _folder(service) / f"{prediction_id}.json"
-    return Prediction(
+    return StoredPrediction(
         id=prediction_id,
         sha256=seal_path(file).read_text(encoding="utf-8").split()[0],
         created=datetime.fromtimestamp(file.stat().st_mtime, UTC),
@@ -92,7 +92,7 @@ def _fields(service: Service, prediction_id: str) -> Prediction:
 
 
 @router.post("/predictions", status_code=201, dependencies=[CALIBRATE], responses=answers(401, 403, 404, 409, 422))
-def make_prediction(service: Here, asked: PredictionStart, response: Response) -> Prediction:
+def make_prediction(service: Here, asked: PredictionStart, response: Response) -> StoredPrediction:
     """Predict the measured numbers of a session that hasn't been captured, with their covariance, and seal them, as
     `calibench twin predict` does. 422, in one line, for a change that the model can't carry."""
     changes = checked_changes(asked.changes.model_dump(exclude_none=True), "changes.")
@@ -119,7 +119,7 @@ def make_prediction(service: Here, asked: PredictionStart, response: Response) -
 @router.get("/predictions", dependencies=[READ], responses=answers(401, 422) | {200: {"headers": HEADERS}})
 def list_predictions(
     service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
-) -> list[Prediction]:
+) -> list[StoredPrediction]:
     """Sealed predictions, the newest first, in pages."""
     there = sorted(_folder(service).glob("[0-9a-f]*.json"), key=lambda file: (-file.stat().st_mtime, file.stem))
     every = [file.stem for file in there]
@@ -129,7 +129,7 @@ def list_predictions(
 
 
 @router.get("/predictions/{prediction_id}", dependencies=[READ], responses=answers(401, 404, 422))
-def get_prediction(service: Here, prediction_id: HexId) -> Prediction:
+def get_prediction(service: Here, prediction_id: HexId) -> StoredPrediction:
     """One prediction: of which model, with which changes, and its hash."""
     return _fields(service, prediction_id)
 

@@ -63,7 +63,7 @@ WANTED_INSIDE, WANTED_EXCESS, WANTED_NAMED = (0.90, 0.98), 0.2, 0.8
 
 
 @dataclass(frozen=True)
-class Transfer:
+class TransferSetting:
     """One change: of the concealed camera, of what is taken of it, and as `twin predict` is told it."""
 
     plan: dict[str, Any] = field(default_factory=dict)
@@ -71,24 +71,24 @@ class Transfer:
     changes: Changes = field(default_factory=Changes)
 
 
-def _aperture(f_number: float) -> Transfer:
+def _aperture(f_number: float) -> TransferSetting:
     """Another aperture, in light by as much brighter or dimmer."""
     light = (1.0 + 4.0 * f_number**2) / (1.0 + 4.0 * F_NUMBER**2)
-    return Transfer({"light": light}, {"f_number": f_number}, Changes(f_number=f_number, radiance_factor=light))
+    return TransferSetting({"light": light}, {"f_number": f_number}, Changes(f_number=f_number, radiance_factor=light))
 
 
 GAIN_DB = float(20.0 * np.log10(GAIN))
-TRANSFERS: dict[str, Transfer] = {
+TRANSFERS: dict[str, TransferSetting] = {
     "f/4 to f/2.8": _aperture(2.8),
     "f/4 to f/8": _aperture(8.0),
-    "LED to tungsten": Transfer({"lamp": "tungsten"}),
-    "15 degrees warmer": Transfer({"temperature_c": 40.0}, {}, Changes(temperature_c=40.0)),
-    "exposure x 8, gain x 4": Transfer(
+    "LED to tungsten": TransferSetting({"lamp": "tungsten"}),
+    "15 degrees warmer": TransferSetting({"temperature_c": 40.0}, {}, Changes(temperature_c=40.0)),
+    "exposure x 8, gain x 4": TransferSetting(
         {"light": 1.0 / (GAIN * LONGER), "longer": LONGER, "gain_db": GAIN_DB},
         {"amplification": GAIN},
         Changes(exposure_factor=LONGER, gain_db=GAIN_DB, radiance_factor=1.0 / (GAIN * LONGER)),
     ),
-    "at 150 mm": Transfer({}, {"distance_mm": DISTANCE_MM}, Changes(distance_mm=DISTANCE_MM)),
+    "at 150 mm": TransferSetting({}, {"distance_mm": DISTANCE_MM}, Changes(distance_mm=DISTANCE_MM)),
 }
 
 

@@ -141,6 +141,7 @@ def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path:
         "sequence": "nothing",
         "model_id": "0" * 16,
         "challenge_id": "0" * 16,
+        "prediction_id": "0" * 16,
         "case": "case-0001",
         "form": "tar",
         "picture": "png",
