@@ -28,7 +28,18 @@ from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.pictures import Pictures
 from api.public_text import PublicText
-from api.routes import calibrations, camera_models, challenges, findings, jobs, knowledge, queue, recordings, sessions
+from api.routes import (
+    calibrations,
+    camera_models,
+    challenges,
+    findings,
+    jobs,
+    knowledge,
+    queue,
+    recordings,
+    sessions,
+    twin,
+)
 from api.routes.stations import router as stations_router
 from api.schemas import Health, Login, Me
 from api.security import (
@@ -269,7 +280,8 @@ def create_app(
     app.include_router(open_to_all)
     strict = [Depends(check_query)]
     app.include_router(stations_router, prefix=PREFIX, dependencies=strict)
-    for part in (knowledge, sessions, queue, recordings, jobs, findings, calibrations, camera_models, challenges):
+    parts = (knowledge, sessions, queue, recordings, jobs, findings, calibrations, camera_models, challenges, twin)
+    for part in parts:
         app.include_router(part.router, prefix=PREFIX, dependencies=strict)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

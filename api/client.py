@@ -43,13 +43,16 @@ from api.schemas import (
     PipelineResults,
     PipelineStart,
     PlanAsked,
+    PredictionStart,
     QueuePlace,
     Recordings,
     SentAs,
     SessionDetail,
     SessionStart,
+    SetAsked,
     StationState,
     StoredCapture,
+    StoredPrediction,
     StoredSession,
 )
 from lab.calibration.life import CalibrationRecord, History
@@ -65,6 +68,9 @@ from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.quick_look.curves import Curves
 from lab.quick_look.frame_figures import FrameFigures
 from lab.report.findings import DiagnosisFindings
+from lab.twin.budget import BudgetResult
+from lab.twin.score import TwinScore
+from sim.camera import Side
 
 M = TypeVar("M", bound=BaseModel)
 W = TypeVar("W", SessionDetail, Job)
@@ -550,6 +556,36 @@ class ServiceClient:
     def fetch_camera_model(self, model_id: str, file: Path) -> Path:
         """Write the camera files of a model to `file`, a .zip or .tar."""
         return self._fetched(f"/camera-models/{model_id}/archive", file)
+
+    def predict(self, asked: PredictionStart) -> StoredPrediction:
+        """Predict a session that hasn't been captured, and seal that."""
+        return self._post(StoredPrediction, "/predictions", asked)
+
+    def predictions(self) -> Iterator[StoredPrediction]:
+        """The sealed predictions, the newest first."""
+        return self._pages(StoredPrediction, "/predictions")
+
+    def prediction(self, prediction_id: str) -> StoredPrediction:
+        """One prediction."""
+        return self._get(StoredPrediction, f"/predictions/{prediction_id}")
+
+    def sealed_prediction(self, prediction_id: str) -> bytes:
+        """The sealed file, whose SHA-256 is that of the prediction."""
+        return self.request("GET", f"/predictions/{prediction_id}/sealed.json").content
+
+    def delete_prediction(self, prediction_id: str) -> None:
+        """Delete a prediction for ever."""
+        self.request("DELETE", f"/predictions/{prediction_id}")
+
+    def score_prediction(self, prediction_id: str, asked: SetAsked) -> TwinScore:
+        """Open a prediction against the recordings of the session that it foretold."""
+        return self._post(TwinScore, f"/predictions/{prediction_id}/score", asked)
+
+    def budget(self, model_id: str, use: str, station: str | None = None) -> dict[Side, BudgetResult]:
+        """What matters for a use of each camera of a model; with a station, which of its sequences to take next."""
+        params = {"use": use} | ({} if station is None else {"station": station})
+        found = self.request("GET", f"/camera-models/{model_id}/budget", params=params).json()
+        return {side: BudgetResult.model_validate(one) for side, one in found.items()}
 
     def compare(self, a: str, b: str, fail_on: Sequence[str] = ()) -> Comparison:
         """Two calibrations, by id, compared as `calibench compare` does."""

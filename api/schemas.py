@@ -493,6 +493,81 @@ class Challenge(Schema):
     scored: Utc | None = Field(description="when it was scored; null: its truths are sealed")
 
 
+# --- the twin
+# ----------------------------------------------------------------------------------------------------------
+
+
+class SetAsked(Asked):
+    """Recordings: a session's, or some that were sent in."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"session_id": "20300101-120000-abcdef"}})
+
+    session_id: str | None = Field(default=None, pattern=r"^[0-9A-Za-z-]{1,40}$")
+    recordings_id: str | None = Field(default=None, pattern=r"^[0-9a-f]{16}$")
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.session_id is None) == (self.recordings_id is None):
+            raise ValueError("session_id, recordings_id: give one of both")
+        return self
+
+
+class LampAsked(Asked):
+    """The radiance of a lamp, W sr^-1 m^-2 nm^-1, over the wavelength."""
+
+    wavelength_nm: tuple[float, ...] = Field(min_length=2, max_length=10_000)
+    value: tuple[float, ...] = Field(min_length=2, max_length=10_000)
+
+
+class ChangesAsked(Asked):
+    """What is changed between the session that a model was fitted to and the one that is predicted; null: as in the
+    plan. Another lens is another camera model: send that in."""
+
+    f_number: float | None = None
+    temperature_c: float | None = Field(default=None, description="of the sensor, in all captures")
+    lamp: LampAsked | None = Field(default=None, description="in place of that of flats, chart and edges")
+    distance_mm: float | None = Field(default=None, description="of the scene")
+    exposure_factor: float | None = None
+    gain_db: float | None = None
+    radiance_factor: float | None = Field(default=None, description="on all light")
+
+
+class PredictionStart(Asked):
+    """What to predict."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "camera_model": "0123456789abcdef",
+                "plan": {"session_id": "20300101-120000-abcdef"},
+                "changes": {"f_number": 8, "radiance_factor": 4},
+            }
+        }
+    )
+
+    camera_model: str = Field(pattern=r"^[0-9a-f]{16}$")
+    plan: SetAsked = Field(description="its captures are planned again; only its manifest and spectra are used")
+    changes: ChangesAsked = ChangesAsked()
+    fitted: SetAsked | None = Field(
+        default=None, description="the recordings of the fit: levels of flats are predicted relative to theirs"
+    )
+    light_std_percent: float = Field(default=0.3, ge=0, le=100, description="standard deviation of the light to come")
+
+
+class StoredPrediction(Schema):
+    """A sealed prediction. `plan`: id of the session or recordings that were planned again."""
+
+    id: str
+    sha256: str = Field(description="of the sealed file; give it to someone else before you capture")
+    created: Utc
+    camera_model: str
+    plan: str
+    changes: dict[str, Any]
+    numbers: dict[Side, int] = Field(description="how many numbers are predicted")
+    names: dict[Side, tuple[str, ...]] = Field(description="the names that the session will test")
+    not_predicted: tuple[str, ...] = Field(default=(), description="why other numbers aren't predicted")
+
+
 # --- a station's devices ----------------------------------------------------------------------------------------------
 
 

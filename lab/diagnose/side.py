@@ -20,6 +20,7 @@ from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.outcome.board_departure import board_departure
 from lab.diagnose.outcome.detectability import detectability
+from lab.diagnose.outcome.doubts import names_in_doubt
 from lab.diagnose.outcome.effect_sets import side_models
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
 from lab.diagnose.outcome.improved_model import improved_model
@@ -116,6 +117,9 @@ def diagnose_side(
     improved, corrections = improved_model(
         recordings, side, fit, baseline, model, verdict.effects, verdict.discrepancies
     )
+    if improved.posterior is not None and verdict.named:
+        doubts = names_in_doubt(verdict, policy)
+        improved = replace(improved, posterior=improved.posterior.model_copy(update={"doubts": doubts}))
     improved = replace(improved, effects=(*improved.effects, *(law_of(one, study) for one in discovered)))
     fitted = fit.cameras.get(side) if fit is not None else None
     shape = (model.camera.rows, model.camera.cols)

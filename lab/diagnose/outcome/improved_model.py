@@ -91,7 +91,12 @@ def improved_model(
             corrections.append(Correction(block.measurement.name, None, said))
             continue
         at = model.slices[one.index]
-        x, factor, each = _factor(block, discrepancy[at], model.fitted_mean(effects)[at])
+        fitted = model.fitted_mean(effects, kernels)[at]
+        if kind == "noise":  # the camera keeps its gain: the correction holds what the fit moved that by, too
+            stated = model.mean(effects)[at]
+            x, factor, each = _factor(block, fitted - stated, stated)
+        else:
+            x, factor, each = _factor(block, discrepancy[at], model.fitted_mean(effects)[at])
         if kind == "sensitivity":
             for channel, (wavelength_nm, by) in each.items():
                 if channel in curves:
@@ -106,7 +111,8 @@ def improved_model(
     unknown = "" if model.gain_is_known else ", conversion gain unknown: electrons of 1 DN/e are DN"
     name = f"{recordings.manifest.name} {side}{unknown}".strip()
     gain_db = most_frequent_gain_db(recordings.captures(FlatCapture, side))
-    posterior = model_posterior(model, effects, improved, kernels, gain_db)
+    is_corrected = any(one.kind == "noise" for one in corrections)
+    posterior = model_posterior(model, effects, improved, kernels, gain_db, is_corrected)
     return CameraFile(name, improved, tuple(acting), posterior=posterior), tuple(corrections)
 
 
