@@ -60,7 +60,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
         verdict = "explained" if is_whole else "partly_explained"
     models = tuple(f.models for f in found if f.models is not None)
     held_out = _held_out(found)
-    offered = tuple(proposal.capture for f in found for proposal in f.proposals)
+    offered = tuple(capture for f in found if f.doubt is not None for capture in f.doubt.listed(policy))
     return DiagnosisResult(
         source=source,
         verdict=verdict,
