@@ -287,8 +287,8 @@ class JobRunner:
 
         `capturer`: how the job reaches the instruments; with one, the job runs in a thread of this process. `resolve`:
         of a pipeline, take the captures that tell the remaining rivals apart, within these limits. `camera_model`: id
-        of one that stands in for the fitted cameras of a validation or a diagnosis. Raises InputError for an unknown kind,
-        and for `resolve` or `camera_model` where the job can't take it.
+        of one that stands in for the fitted cameras of a validation or a diagnosis. Raises InputError for an unknown
+        kind, and for `resolve` or `camera_model` where the job can't take it.
         """
         if kind not in KINDS:
             raise InputError(f"job {kind!r}: no such work; choose from {', '.join(KINDS)}")

@@ -305,7 +305,9 @@ def resolving(
         return Diagnosis(DiagnosisResult(source=recordings.source, verdict=verdict), {}, tuple(left))
 
     monkeypatch.setattr(lab.diagnose, "examine", examine)
-    monkeypatch.setattr(lab.resolve, "step_times", lambda *_: StepTimes({}))  # typical times, whatever this computer does
+    monkeypatch.setattr(
+        lab.resolve, "step_times", lambda *_: StepTimes({})
+    )  # typical times, whatever this computer does
     capture = CaptureRequest(session=session) if session else CaptureRequest(plan=DARKS, name="one")
     request = PipelineRequest("pipeline", capture=capture, resolve=limits or ResolveLimits())
     return run_pipeline(request, tell, store=store, capturer=Bench(store)), seen
