@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import lab.diagnose
@@ -23,8 +22,7 @@ from lab.capture.store import Store
 from lab.capture.take_step import DUMMY_FRAMES
 from lab.capture_kinds.dark import DarkSequence
 from lab.diagnose import Diagnosis
-from lab.diagnose.outcome.expected_information import Forecast
-from lab.diagnose.outcome.next_capture import Doubt, OpenCapture
+from lab.diagnose.outcome.next_capture import Doubt
 from lab.errors import Cancelled, InputError
 from lab.formats import recording_set
 from lab.formats.recording_set import RecordingSet
@@ -42,8 +40,7 @@ from lab.pipeline import (
 )
 from lab.resolve import ResolveLimits, read_journal
 from tests.lab import fake_bench
-
-DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
+from tests.lab.doubts import DARKS, doubt, offered
 
 
 @pytest.fixture
@@ -266,19 +263,6 @@ def test_only_with_a_station_is_anything_captured(store: Store) -> None:
 
 
 # --- resolving --------------------------------------------------------------------------------------------------------
-
-
-FAR = 40.0  # standard deviations between two rivals: such a capture tells all
-
-
-def offered(words: str, apart: float = FAR, plan: CapturePlan | None = DARKS) -> OpenCapture:
-    """A capture in which the rivals lie so many standard deviations apart."""
-    none = [np.zeros((1, 0))] * 2
-    return OpenCapture(words, Forecast.of(np.array([[0.0], [apart]]), none, none, np.eye(1)), plan, "a lens is lacking")
-
-
-def doubt(*captures: OpenCapture) -> list[Doubt]:
-    return [Doubt("left", ("defocus", "coma"), (0.7, 0.3), captures)]
 
 
 TIE: DiagnosisVerdict = "partly_explained"
