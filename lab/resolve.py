@@ -143,8 +143,10 @@ class Resolver:
     def next(self, result: DiagnosisResult, doubts: Sequence[Doubt]) -> Choice | None:
         """The next capture; None at the end, which the journal then tells."""
         if not doubts:
-            left = "no rivals are left" if result.verdict != "nothing_judged" else "there is nothing to settle"
-            return self._ended("settled", f"{left}; {result.next_capture}" if self._is_empty(result) else left)
+            if result.verdict in ("explained", "no_mismatch"):
+                return self._ended("settled", "no rivals are left")
+            left = "nothing is judged" if result.verdict == "nothing_judged" else "no rivals are left, but a mismatch"
+            return self._ended("this station can't", _and_then(left, result))
         station = self._store.station(self._session)
         times = step_times(self._store, station)
         taken = {(step.side, step.capture) for step in self.journal.resolutions}
@@ -177,11 +179,7 @@ class Resolver:
         share, words, lacks = max(told, default=(0.0, "", ""))
         if share >= self._policy.resolve_least_share:
             return f"you need {words}: {lacks}"
-        return f"no capture that can be predicted is enough; {result.next_capture or 'take other captures'}"
-
-    @staticmethod
-    def _is_empty(result: DiagnosisResult) -> bool:
-        return result.verdict == "nothing_judged" and result.next_capture is not None
+        return _and_then("no capture that can be predicted is enough", result)
 
     def begin(self, choice: Choice, result: DiagnosisResult, name: str) -> str:
         """Register the session of a choice and note it in the journal; nothing moves yet. Returns its id."""
@@ -225,6 +223,11 @@ class Resolver:
     def _keep(self, **changes: object) -> None:
         self.journal = self.journal.model_copy(update=changes)
         write_durably(self._store.folder(self._session) / JOURNAL, result_json(self.journal).encode("utf-8"))
+
+
+def _and_then(what: str, result: DiagnosisResult) -> str:
+    """A reason with what the diagnosis proposes, as one line without its full stop."""
+    return what if result.next_capture is None else f"{what}; {result.next_capture.rstrip('.')}"
 
 
 def odds_of(doubt: Doubt) -> tuple[RivalOdds, ...]:

@@ -278,6 +278,7 @@ def resolving(
     limits: ResolveLimits | None = None,
     tell: Callable[[PipelineProgress], None] | None = None,
     session: str = "",
+    verdict: DiagnosisVerdict = "explained",
 ) -> tuple[PipelineResult, list[int]]:
     """A pipeline whose diagnoses leave these doubts one after the other; and how many captures each diagnosis saw."""
     seen: list[int] = []
@@ -285,8 +286,8 @@ def resolving(
     def examine(recordings: RecordingSet, fitted: FitResult, tell: Any, **_: Any) -> Diagnosis:
         left = doubts[len(seen)]
         seen.append(len(recordings.captures()))
-        verdict = TIE if left else "explained"
-        return Diagnosis(DiagnosisResult(source=recordings.source, verdict=verdict), {}, tuple(left))
+        said = DiagnosisResult(source=recordings.source, verdict=TIE if left else verdict, next_capture="Take darks.")
+        return Diagnosis(said, {}, tuple(left))
 
     monkeypatch.setattr(lab.diagnose, "examine", examine)
     monkeypatch.setattr(
@@ -375,6 +376,21 @@ def test_resolving_captures_and_diagnoses_until_it_is_settled(
     journal = read_journal(store, found.session)
     assert journal is not None and (journal.resolutions, journal.end) == (told.resolutions, told.resolve_end)
     assert store.results(found.session, "diagnose")[0].document == told.model_dump(mode="json")
+
+
+@pytest.mark.parametrize(
+    ("verdict", "said"),
+    [
+        ("unexplained", "no rivals are left, but a mismatch; Take darks"),
+        ("nothing_judged", "nothing is judged; Take darks"),
+    ],
+)
+def test_what_has_no_name_is_not_settled(
+    verdict: DiagnosisVerdict, said: str, store: Store, steps: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, _ = resolving(store, monkeypatch, [[]], verdict=verdict)
+    assert found.diagnosis is not None
+    assert (found.diagnosis.resolve_end, found.diagnosis.resolve_reason) == ("this station can't", said)
 
 
 @pytest.mark.parametrize("when", ["capture", "diagnosis"])

@@ -198,7 +198,8 @@ def test_a_pipeline_resolves_and_its_session_tells_the_journal(
     ready = iter([*left, []])
 
     def examine(*_: object, **__: object) -> Diagnosis:
-        return Diagnosis(DiagnosisResult(source="x", verdict="partly_explained"), {}, tuple(next(ready)))
+        found = tuple(next(ready))
+        return Diagnosis(DiagnosisResult(source="x", verdict="unexplained" if found else "explained"), {}, found)
 
     monkeypatch.setattr(lab.diagnose, "examine", examine)
     with running.client("admin") as client:
