@@ -144,9 +144,11 @@ class Resolver:
         """The next capture; None at the end, which the journal then tells."""
         if not doubts:
             if result.verdict in ("explained", "no_mismatch"):
-                return self._ended("settled", "no rivals are left")
+                self._ended("settled", "no rivals are left")
+                return None
             left = "nothing is judged" if result.verdict == "nothing_judged" else "no rivals are left, but a mismatch"
-            return self._ended("this station can't", _and_then(left, result))
+            self._ended("this station can't", _and_then(left, result))
+            return None
         station = self._store.station(self._session)
         times = step_times(self._store, station)
         taken = {(step.side, step.capture) for step in self.journal.resolutions}
@@ -167,8 +169,10 @@ class Resolver:
             words = f"{wanted.first.capture.words} would go on telling {rivals}, in {minutes:.2g} min"
             taken_too = f"{len(self.journal.resolutions)} captures were taken of {self._limits.rounds}"
             spent = f"{self.spent_s / 60.0:.2g} of {self._limits.minutes or math.inf:g} min are spent"
-            return self._ended("budget spent", f"{taken_too if found else spent}; {words}")
-        return self._ended("this station can't", f"to tell {rivals}, {self._needed(lacking, result)}")
+            self._ended("budget spent", f"{taken_too if found else spent}; {words}")
+        else:
+            self._ended("this station can't", f"to tell {rivals}, {self._needed(lacking, result)}")
+        return None
 
     def _needed(self, lacking: Sequence[tuple[Doubt, OpenCapture, str]], result: DiagnosisResult) -> str:
         """The capture that would tell most of those that the station lacks something for, and what that is."""

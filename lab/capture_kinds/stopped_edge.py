@@ -34,7 +34,7 @@ class StoppedEdgeSequence(EdgeSequence):
     purpose: ClassVar[str] = "MTF at another f-number: which part of a blur is the lens's"
     targets: ClassVar[tuple[type[Target], ...]] = (EdgeTarget, ApertureTarget)
 
-    f_number: Annotated[float, Quantity("1", "f-number of the captures", lower=0.5, upper=64.0)]
+    f_number: Annotated[float, Quantity("1", "f-number that the lenses are set to", lower=0.5, upper=64.0)]
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
