@@ -6,7 +6,7 @@ capture c is the one in which the two nearest rivals k, l lie furthest apart:
     argmax over c of min over k, l of D,   D = 1/2 |L^-1 (m_k(c) - m_l(c))|^2,   L L' = covariance of m(c)
 
 The covariance holds noise, floors and nuisance parameters. Two rivals are then told apart with
-probability Phi(sqrt(D / 2)).
+probability Phi(sqrt(D / 2)). So captures are listed in the report; `lab/resolve.py` chooses by what they tell a second.
 """
 
 from __future__ import annotations
