@@ -22,7 +22,7 @@ from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.challenge.kept import ChallengeWork
 from lab.challenge.truth import SIZES
 from lab.formats.importers import KINDS
-from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ValidationResult
+from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from sim.camera import Cfa, Side
 
 #: Databases that forget the time zone give back UTC.
@@ -308,6 +308,9 @@ class SessionDetail(StoredSession):
         description="kind -> id of the newest `fit` (also the id of its calibration and camera model), `validate`, "
         "`diagnose`, `report`"
     )
+    resolving: ResolveJournal | None = Field(
+        default=None, description="what was in doubt, taken and said while it was resolved; null: it never was"
+    )
 
 
 class StoredCapture(Schema):
@@ -324,6 +327,14 @@ class StoredCapture(Schema):
     frame: str = Field(description="path of its raw frame, .npy, uint16 (rows, cols)")
 
 
+RESOLVE_MINUTES = Field(
+    default=None, gt=0, le=1e5, description="with `resolve`: lab time that its captures may take, min; null: any"
+)
+RESOLVE_ROUNDS = Field(
+    default=None, ge=1, le=100, description="with `resolve`: how many captures it takes at most; null: 6"
+)
+
+
 class JobStart(Asked):
     """What to compute. `pipeline`: everything, from what is left to capture to the report."""
 
@@ -335,6 +346,8 @@ class JobStart(Asked):
         description="pipeline of a session: while rivals are left, take the capture that tells them apart and "
         "diagnose again",
     )
+    resolve_minutes: float | None = RESOLVE_MINUTES
+    resolve_rounds: int | None = RESOLVE_ROUNDS
     camera_model: str | None = Field(
         default=None,
         pattern=r"^[0-9a-f]{16}$",
@@ -359,6 +372,8 @@ class PipelineStart(CaptureStart):
         default=False,
         description="while rivals are left, take the capture that tells them apart and diagnose again",
     )
+    resolve_minutes: float | None = RESOLVE_MINUTES
+    resolve_rounds: int | None = RESOLVE_ROUNDS
 
 
 class PipelineResults(Schema):

@@ -18,6 +18,7 @@ from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId,
 from lab.challenge.kept import WORK
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
+from lab.resolve import resolve_limits
 
 router = APIRouter()
 
@@ -46,7 +47,8 @@ def _submit(service: Service, start: JobStart, source: str) -> str:
     files."""
     if start.camera_model is not None and not camera_model(service, start.camera_model).sides:
         raise Conflict(f"camera model {start.camera_model}: no camera file was kept; fit again")
-    return service.jobs.submit(start.kind, source, resolve=start.resolve, camera_model=start.camera_model)
+    limits = resolve_limits(start.resolve, start.resolve_minutes, start.resolve_rounds)
+    return service.jobs.submit(start.kind, source, resolve=limits, camera_model=start.camera_model)
 
 
 @router.post(
@@ -77,8 +79,9 @@ def start_session_job(
         raise HTTPException(422, "camera_model: a pipeline fits its own; leave it out, or validate or diagnose with it")
     if start.resolve or info.state != "finished":
         Demand(Permission.ADMIN)(request, None, None)
+    limits = resolve_limits(start.resolve, start.resolve_minutes, start.resolve_rounds)
     station = service.station(start.station) if start.station is not None else service.store.station(session_id)
-    job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
+    job_id = service.jobs.submit("pipeline", session_id, resolve=limits, capturer=service.live.capturer(station))
     return accepted(service, job_id, response)
 
 
@@ -93,10 +96,11 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     """Start a session and the whole pipeline on it: capture, fit, validate, diagnose, resolve, report. The job's
     `session_id` is the session, which can be followed, paused and aborted as any other. 409 while another runs on the
     same instruments. The key's scope has to be `admin`, for this captures and computes."""
+    limits = resolve_limits(start.resolve, start.resolve_minutes, start.resolve_rounds)
     station = service.station(start.station)
     plan = start.plan(station)
     session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
-    job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
+    job_id = service.jobs.submit("pipeline", session_id, resolve=limits, capturer=service.live.capturer(station))
     return accepted(service, job_id, response)
 
 

@@ -36,6 +36,7 @@ from lab.capture.session import CaptureSession, Progress
 from lab.errors import InputError
 from lab.quick_look.curves import Curves
 from lab.quick_look.frame_figures import FrameFigures
+from lab.resolve import read_journal
 from sim.camera import Side
 
 router = APIRouter()
@@ -143,6 +144,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
         ),
         results=service.store.newest_results(session_id),
+        resolving=read_journal(service.store, session_id),
     )
 
 

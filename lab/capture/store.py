@@ -361,6 +361,15 @@ class Store:
             )
         return True
 
+    def lab_time_s(self, session_id: str) -> float:
+        """Time that the finished steps of a session took, s, whatever lay between them."""
+        asked = sa.select(StepRow.started, StepRow.finished).where(
+            StepRow.session_id == session_id, StepRow.started.is_not(None), StepRow.finished.is_not(None)
+        )
+        with self.reading() as db:
+            rows = [(started, finished) for started, finished in db.execute(asked) if started and finished]
+        return float(sum((finished - started).total_seconds() for started, finished in rows))
+
     def sweep(self, session_id: str) -> list[str]:
         """Remove the files that no finished step links, as a crash leaves them; their paths. Needs the session's
         lock."""

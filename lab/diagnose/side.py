@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lab.capture_kinds.base import Equipment
 from lab.diagnose.discovery import discover, law_of, told
 from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
@@ -26,7 +27,7 @@ from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, pla
 from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.outcome.mismatches import family_corrections, located, shown_in, unexplained, vetoed_names
 from lab.diagnose.outcome.misstated_light import misstated_light
-from lab.diagnose.outcome.next_capture import CaptureProposal, proposals
+from lab.diagnose.outcome.next_capture import Doubt, doubt_of
 from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
@@ -60,6 +61,7 @@ class SideFindings:
     gain_is_known  whether a conversion gain is stated or measured; else electrons are those of 1 DN/e
     threshold  of an effect's score; None where no effect acts on the measurements
     improved   the improved model
+    doubt      rivals that are left, and the captures that would tell them apart
     settling   what to capture for a mismatch without a name, as a sentence
     """
 
@@ -72,7 +74,7 @@ class SideFindings:
     abstained: tuple[Candidate, ...] = ()
     held_out: HeldOut | None = None
     improved: CameraFile | None = None
-    proposals: tuple[CaptureProposal, ...] = ()
+    doubt: Doubt | None = None
     settling: str | None = None
 
 
@@ -87,6 +89,7 @@ def diagnose_side(
     pictures: bool = False,
     bootstrap: int = 0,
     workers: Workers | None = None,
+    station: Equipment | None = None,
 ) -> SideFindings:
     """Diagnose one side; arguments as of `lab.diagnose.examine`. Residual pictures take some seconds. Each draw of the
     bootstrap takes as long as summarising the recordings."""
@@ -163,6 +166,6 @@ def diagnose_side(
         abstained=verdict.abstained,
         held_out=held_out(verdict),
         improved=improved,
-        proposals=proposals(recordings, side, verdict, policy),
+        doubt=doubt_of(recordings, side, verdict, policy, station),
         settling=settling_sentence(recordings, side, left),
     )

@@ -53,7 +53,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
         is_whole = not lists.unexplained and not lists.discovered and not is_inexact
         verdict = "explained" if is_whole else "partly_explained"
     held_out = _held_out(found)
-    offered = tuple(proposal.capture for f in found for proposal in f.proposals)
+    offered = tuple(capture for f in found if f.doubt is not None for capture in f.doubt.listed(policy))
     return DiagnosisResult(
         **dict(lists),
         source=source,

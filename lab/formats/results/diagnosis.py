@@ -295,14 +295,50 @@ class ResidualPicture(Frozen):
     after: tuple[tuple[float, ...], ...]
 
 
+class RivalOdds(Frozen):
+    """A rival and its probability among the rivals."""
+
+    name: str
+    probability: float
+
+
+#: How resolving ended.
+ResolveEnd = Literal["settled", "this station can't", "budget spent"]
+
+
 class Resolution(Frozen):
-    """One capture that `run --resolve` took: what it is, the session that holds its frames, and the diagnosis before
-    it."""
+    """One step of resolving: what was in doubt on a side, the capture that was taken, and what the diagnosis said.
+
+    `session` holds its frames; `verdict_before`, `effects_before`: the diagnosis before it. `rivals`, `rivals_after`:
+    what was and what is in doubt, or the names that stand there; None while no diagnosis has said it yet. `then`: the
+    capture that is planned after it, as only both together tell. `information_nat`: expected information of the capture
+    (of both), `expected_s` and `spent_s`: lab time that was expected and that it took.
+    """
 
     capture: str
     session: str
     verdict_before: DiagnosisVerdict
     effects_before: tuple[NamedEffect, ...]
+    side: Side = "left"
+    rivals: tuple[RivalOdds, ...] = ()
+    then: str = ""
+    information_nat: float | None = None
+    expected_s: float | None = None
+    spent_s: float | None = None
+    rivals_after: tuple[RivalOdds, ...] | None = None
+
+
+class ResolveJournal(Frozen):
+    """The journal of resolving one session. `budget_min`: lab time that its captures may take (None: any),
+    `most_rounds`: how many they may be. `end`, `reason`: how it ended and why; None while it goes on."""
+
+    format: Literal["calibench-resolve-journal"] = "calibench-resolve-journal"
+    version: Literal[1] = 1
+    budget_min: float | None = None
+    most_rounds: int | None = None
+    resolutions: tuple[Resolution, ...] = ()
+    end: ResolveEnd | None = None
+    reason: str = ""
 
 
 class PolicyRule(Frozen):
@@ -350,6 +386,8 @@ class DiagnosisResult(DiagnosisLists):
     next_capture: str | None = None
     next_captures: tuple[NextCapture, ...] = ()  # best first, for each side
     resolutions: tuple[Resolution, ...] = ()  # in the order in which they were taken
+    resolve_end: ResolveEnd | None = None  # how resolving ended; None: nothing was to be resolved
+    resolve_reason: str = ""
     threshold: float | None = None
     false_alarm_rate: float | None = None
     summary: tuple[str, ...] = ()  # the diagnosis in sentences
