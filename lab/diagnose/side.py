@@ -134,7 +134,8 @@ def diagnose_side(
     report("scoring the effects")
     verdict = decide(model, rng, policy, report, least_threshold=least)
     report("looking for laws that no effect has")
-    discovered = discover(study, (*model.always, *verdict.effects), policy)
+    left_over = verdict if verdict.after or verdict.held_out else None
+    discovered = discover(study, (*model.always, *verdict.effects), policy, left_over)
     report("looking for the next capture")
     improved, corrections = improved_model(
         recordings, side, fit, baseline, model, verdict.effects, verdict.discrepancies

@@ -108,20 +108,26 @@ class Unexplained(Frozen):
 
 
 class DiscoveredLaw(Frozen):
-    """A table by code, row or column that recordings hold and no effect of the library has; it stands in the improved
-    model as `empirical_law`.
+    """A table or a curve along one index of the camera that recordings hold and no effect of the library has; it stands
+    in the improved model as `empirical_law`.
 
-    `stage`, `along`, `period` and `table` are those of that effect. `shown_departure` is the shortest table that does
-    nearly as well, by index mod `shown_period` (0: by index): departures from no change, relative or in DN (stage
-    `signal`), with their standard deviations. chi2 is of the `n` numbers along the index
-    in held-out captures (in the captures themselves where none are held out), without and with the law. `suspects`:
-    what physics may do it; none of them is a name.
+    `stage`, `along`, `of`, `period`, `columns`, `first`, `at` and `table` are those of that effect. `form` is that in
+    which it was found (`periodic`, `by index`, `step`, `line`, `knee`, `formula`, `curve`). `shown_departure` is the
+    shortest table that does nearly as well, by index mod `shown_period` (0: by index, or by `at`): departures from no
+    change, relative, or in DN or e (offsets of stage `signal`), with their standard deviations. chi2 is of the `n`
+    numbers along the index in held-out captures (in the captures themselves where none are held out), without and with
+    the law. `measurements`: those that it shows in. `suspects`: what physics may do it; none of them is a name.
     """
 
     side: Side
     stage: str
     along: str
+    of: str = "mean"
+    form: str = "periodic"
     period: int
+    columns: int = 0
+    first: int = 0
+    at: tuple[float, ...] = ()
     table: tuple[float, ...]
     shown_period: int
     shown_departure: tuple[float, ...]
@@ -129,6 +135,7 @@ class DiscoveredLaw(Frozen):
     chi2_before: float
     chi2_after: float
     n: int
+    measurements: tuple[str, ...] = ()
     suspects: str
     statement: str
 
