@@ -7,7 +7,7 @@ findings.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +19,13 @@ from lab.diagnose.measurements.blocks import measurement_model, study_of
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.outcome.board_departure import board_departure
+from lab.diagnose.outcome.described import (
+    corrected_by_laws,
+    described,
+    in_light_of_laws,
+    left_to_smooth,
+    with_laws,
+)
 from lab.diagnose.outcome.detectability import detectability
 from lab.diagnose.outcome.effect_sets import side_models
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
@@ -137,10 +144,12 @@ def diagnose_side(
     left_over = verdict if verdict.after or verdict.held_out else None
     discovered = discover(study, (*model.always, *verdict.effects), policy, left_over)
     report("looking for the next capture")
-    improved, corrections = improved_model(
-        recordings, side, fit, baseline, model, verdict.effects, verdict.discrepancies
-    )
-    improved = replace(improved, effects=(*improved.effects, *(law_of(one, study) for one in discovered)))
+    laws = tuple(law_of(one, study) for one in discovered)
+    by_laws = described(verdict, discovered, laws)
+    smooth = left_to_smooth(verdict, by_laws)
+    improved, corrections = improved_model(recordings, side, fit, baseline, model, verdict.effects, smooth)
+    corrections = corrected_by_laws(verdict, corrections, by_laws)
+    improved = with_laws(improved, laws)
     fitted = fit.cameras.get(side) if fit is not None else None
     shape = (model.camera.rows, model.camera.cols)
     departure = board_departure(side, fitted.geometry if fitted is not None else None, shape, policy)
@@ -149,7 +158,9 @@ def diagnose_side(
         found.append(Mismatch(**departure.model_dump(include=set(Mismatch.model_fields))))
     left = (
         *wrong,
-        *unexplained(recordings, side, verdict, corrections, policy),
+        *in_light_of_laws(
+            recordings, side, verdict, unexplained(recordings, side, verdict, corrections, policy), by_laws
+        ),
         *misstated_light(
             side,
             fitted,
@@ -172,7 +183,7 @@ def diagnose_side(
         unexplained=left,
         vetoed=tuple(vetoed_names(side, verdict)),
         models=side_models(side, verdict.models, policy),
-        held_out=held_out(verdict),
+        held_out=held_out(verdict, laws, by_laws),
         curves=tuple(residual_curves(side, verdict)),
         improved=improved,
         proposals=proposals(recordings, side, verdict, policy),

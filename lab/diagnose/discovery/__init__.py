@@ -49,8 +49,12 @@ from sim.effects.empirical_law import PLACES, EmpiricalLaw
 from sim.spectrum import FloatArray
 
 LEAST_WIDTH = 0.02  # of a code: a missing code's
-#: Share of what the chosen table takes off chi2 that a shorter one takes off, too, from which on that one is told first.
+#: Share of what the chosen table takes off chi2 from which on a shorter one that takes it off is told first.
 SHORTER_SHARE = 0.9
+#: The same of a curve in place of one of more numbers.
+NEARLY_ALL = 0.95
+#: Lines by which steps are moved to see whether they are sharp, and the most that these may gain, over the gain.
+BESIDE_LINES, SHARP_SHARE = 2, 0.75
 MOST_BY_CODE = 4096  # entries of a table by code
 MOST_CURVES = 2  # laws along coordinates, one after the other
 #: Description length by which another place in the chain may be longer and is told beside.
@@ -101,14 +105,25 @@ def _predictive(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> Pr
         return None
     best = min(kept, key=lambda table: description_length(look.seen, table))
     judged = _judged(look, best)
-    gain = judged.chi2[0] - judged.chi2[1]
-    if gain < policy.least_discovery_share * judged.chi2[0] or not _predicts_other_half(look.seen, best.form):
+    if not _takes_enough(judged, policy) or not _predicts_other_half(look.seen, best.form):
+        return None
+    if best.form.name == "step" and not look.at and not _is_sharp(look, best):
         return None
     if not best.period:
         return judged
     shorter = (_judged(look, table) for table in kept if table.period and table.period < best.period)
-    base = next((one for one in shorter if one.chi2[0] - one.chi2[1] >= SHORTER_SHARE * gain), None)
+    base = next((one for one in shorter if _gain(one) >= SHORTER_SHARE * _gain(judged)), None)
     return replace(judged, shorter=() if base is None else (base,))
+
+
+def _gain(one: PredictiveTable) -> float:
+    return one.chi2[0] - one.chi2[1]
+
+
+def _takes_enough(one: PredictiveTable, policy: DecisionPolicy) -> bool:
+    """Whether it takes `least_discovery_share` off chi2, a curve twice the standard deviation of chi2 at least."""
+    least = 2.0 * np.sqrt(2.0 * one.chi2[2]) if one.look.at else 0.0
+    return _gain(one) >= max(policy.least_discovery_share * one.chi2[0], float(least))
 
 
 def _predicts_other_half(profile: Profile, form: Form) -> bool:
@@ -117,6 +132,18 @@ def _predicts_other_half(profile: Profile, form: Form) -> bool:
         table, judge = fitted(profile.part(one), form).departure, profile.part(other)
         if judge.chi2(table) >= judge.chi2(np.zeros(1)):
             return form.name == "step" and not form.period and _lies_in_one_half(profile, form)
+    return True
+
+
+def _is_sharp(look: Look, table: Table) -> bool:
+    """Whether steps some lines aside take much less off chi2: a smooth wave's don't."""
+    none, seen = look.seen.chi2(np.zeros(1)), look.seen
+    gain, aside = none - seen.chi2(table.departure), BESIDE_LINES * look.step
+    for move in (-aside, aside):
+        moved = np.roll(table.form.basis, move, axis=0)
+        moved[:aside], moved[-aside:] = 0.0, 1.0
+        if none - seen.chi2(fitted(seen, replace(table.form, basis=moved)).departure) > SHARP_SHARE * gain:
+            return False
     return True
 
 
@@ -183,22 +210,39 @@ def _curves(
         located = _located(left.model, acting, policy)
         looks = list(curve_looks(left.model, study, acting, located)) if located else []
         tables = [[fitted(look.seen, form) for form in _curve_forms(look)] for look in looks]
-        limit = _limit([*tried, *(table.log_probability for own in tables for table in own)], policy) if looks else 0.0
-        candidates = []
-        for look, own in zip(looks, tables, strict=True):
-            kept = [table for table in own if table.log_probability <= limit]
-            one = _predictive(look, kept, policy)
-            if one is not None:
-                length = min(description_length(look.seen, table) for table in kept)
-                candidates.append((length, one))
+        every = [*tried, *(table.log_probability for own in tables for table in own)]
+        limit = _limit(every, policy) if looks else 0.0
+        likeliest = [
+            _predictive_curve(look, [table for table in own if table.log_probability <= limit], policy)
+            for look, own in zip(looks, tables, strict=True)
+        ]
+        # a curve without a form is the smooth discrepancy's, where that predicts
+        smooth = {left.model.blocks[i].measurement.name for i in left.kernels}
+        candidates = [
+            one
+            for one in likeliest
+            if one is not None and (one.form.name != "curve" or one.look.shown_in.isdisjoint(smooth))
+        ]
         if not candidates:
             break
-        least, best = min(candidates, key=lambda candidate: candidate[0])
-        equal = [
-            place_in_words(one.look) for length, one in candidates if one is not best and length < least + EQUAL_LENGTH
-        ]
-        laws.append(replace(best, equal=tuple(equal)))
+        length = [description_length(one.look.seen, one) for one in candidates]
+        near = [one for one, own in zip(candidates, length, strict=True) if own < min(length) + EQUAL_LENGTH]
+        best = next((one for one in near if one.look.is_own_axis), candidates[int(np.argmin(length))])
+        laws.append(replace(best, equal=tuple(place_in_words(one.look) for one in near if one is not best)))
     return laws
+
+
+def _predictive_curve(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> PredictiveTable | None:
+    """Return the form of the fewest numbers that predicts the captures held out nearly as well as any does.
+
+    Where none are held out, the one of the least description length that predicts every other number from the rest.
+    """
+    if look.held_out is None:
+        return _predictive(look, kept, policy)
+    judged = [_judged(look, table) for table in kept]
+    most = max((_gain(one) for one in judged), default=0.0)
+    near = [one for one in judged if _gain(one) >= NEARLY_ALL * most and _takes_enough(one, policy)]
+    return min(near, key=lambda one: (one.form.numbers, description_length(look.seen, one)), default=None)
 
 
 def _located(model: MeasurementModel, effects: Effects, policy: DecisionPolicy) -> list[int]:
@@ -209,11 +253,11 @@ def _located(model: MeasurementModel, effects: Effects, policy: DecisionPolicy) 
 
 def _curve_forms(look: Look) -> Iterator[Form]:
     x = np.array(look.at)
-    yield from curve_forms(x, unit_of(look), entry(look))
-    yield from formulas(look.seen, x, unit_of(look))
+    yield from curve_forms(look.seen, x, np.array(look.known), unit_of(look), entry(look))
+    yield from formulas(look.seen, x, unit_of(look), by_inverse=look.along == "wavelength")
 
 
-# --- as a result, and as an effect ----------------------------------------------------------------------------------------------------
+# --- as a result, and as an effect ---
 
 
 def told(side: Side, study: Study, found: Sequence[PredictiveTable]) -> tuple[DiscoveredLaw, ...]:

@@ -21,6 +21,8 @@ from sim.effects.library import list_changes
 from sim.spectrum import FloatArray
 
 MOST_POINTS, LEAST_POINTS = 16, 4
+MOST_TIMES = 48  # points of time, at any of which something may happen at once
+FINE_NM = 2.5  # from one wavelength to the next: a band is narrower than the steps of most sweeps
 SMALL = 0.01  # change of a factor by which its slope is found
 SMALL_E = 1.0  # the same of an offset, e
 #: Axis of the measurements whose numbers lie along a coordinate.
@@ -32,9 +34,8 @@ def curve_looks(model: MeasurementModel, study: Study, effects: Effects, located
 
     The residuals are whitened, those of held-out captures given the seen ones: n numbers of variance 1.
     """
-    places = [
-        (place, points) for place in PLACES if len(points := _points(model, study, place, located)) >= LEAST_POINTS
-    ]
+    points_of = {place: _points(model, study, place, located) for place in PLACES}
+    places = {place: points for place, points in points_of.items() if len(points[1]) >= LEAST_POINTS}
     if not places or model.seen.all() or not model.seen.any():
         return
     gaussian = model.gaussian(effects)
@@ -43,7 +44,8 @@ def curve_looks(model: MeasurementModel, study: Study, effects: Effects, located
     shared = solve_triangular(lower, covariance[np.ix_(seen, ~seen)], lower=True)
     given = covariance[np.ix_(~seen, ~seen)] - shared.T @ shared
     given = 0.5 * (given + given.T) + _rounding(covariance, ~seen)
-    for place, points in places:
+    own_axes = {model.blocks[i].measurement.axis for i in located}
+    for place, (points, known) in places.items():
         slopes, shown = _slopes(model, effects, place, points)
         if not slopes[seen].any():
             continue
@@ -55,7 +57,10 @@ def curve_looks(model: MeasurementModel, study: Study, effects: Effects, located
             own = cholesky(given[np.ix_(judged, judged)], lower=True)
             held_out = _profile(solve_triangular(own, out[judged], lower=True))
         stage, along, of = place
-        yield Look(stage, along, _profile(white), held_out, of=of, at=tuple(points.tolist()), shown_in=shown)
+        yield Look(
+            stage, along, _profile(white), held_out, of=of, at=tuple(points.tolist()), known=tuple(known.tolist()),
+            shown_in=shown, is_own_axis=AXES.get(along) in own_axes,
+        )  # fmt: skip
 
 
 def _rounding(covariance: FloatArray, where: np.ndarray) -> FloatArray:
@@ -70,38 +75,55 @@ def _profile(white: FloatArray) -> Profile:
 
 def _points(
     model: MeasurementModel, study: Study, place: tuple[Stage, Along, Of], located: Sequence[int]
-) -> FloatArray:
-    """Return the points of a curve: places of the seen numbers of the blocks that a law there could change."""
-    along = place[1]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the points of a curve, and those of them that seen numbers lie at: places of the numbers of the located
+    blocks that a law there could change.
+    """
+    along, none = place[1], np.zeros(0)
     if along in {"code", "row", "column", "row and column"}:
-        return np.zeros(0)
+        return none, none
     changed = list_changes(_law(place, np.array([0.0, 1.0]), np.array([0.0, 0.1])))
-    found = [_coordinate(model.blocks[i], study, along) for i in located if model.blocks[i].reads & changed]
-    every = np.unique(np.concatenate([np.zeros(0), *found]).round(9))
+    every, seen = [none], [none]
+    for i in located:
+        block = model.blocks[i]
+        if not block.reads & changed:
+            continue
+        x = _coordinate(block, study, along)
+        there = np.isfinite(x)
+        every.append(x[there])
+        seen.append(x[there & model.seen[model.slices[i]]])
+    points = np.unique(np.concatenate(every).round(9))
     if along == "frequency":
-        every = np.append(0.0, every[every > 0.0])
-    if len(every) > MOST_POINTS:
-        every = every[np.unique(np.linspace(0, len(every) - 1, MOST_POINTS).round().astype(int))]
-    return every
+        points = np.append(0.0, points[points > 0.0])
+    most = MOST_TIMES if along in {"time", "wavelength"} else MOST_POINTS
+    if len(points) > most:
+        points = points[np.unique(np.linspace(0, len(points) - 1, most).round().astype(int))]
+    known = points[np.isin(points, np.concatenate(seen).round(9))]
+    if along == "wavelength" and len(points):
+        points = np.union1d(points, np.arange(points[0], points[-1], FINE_NM))
+    return points, known
 
 
 def _coordinate(block: Block, study: Study, along: Along) -> FloatArray:
-    """Return where a block's seen numbers lie along a coordinate; none where it isn't one of the block's."""
-    seen = np.array([not label.held_out for label in block.labels])
+    """Return where a block's numbers lie along a coordinate (n,); NaN where it isn't one of theirs."""
+    none = np.full(len(block.labels), np.nan)
     axis = block.measurement.axis
     if along in AXES:
-        x = np.array([label.x for label in block.labels])[seen]
+        x = np.array([label.x for label in block.labels])
         if axis != AXES[along] or block.measurement.places:
-            return np.zeros(0)
+            return none
         if along == "level":  # variances are stated by signals above black
             x = (x if block.measurement.of_variances else x - study.noise.black) / study.noise.gain
         return x / study.camera.pixel_pitch_um if along == "frequency" else x
     if along == "radius":
         place = block.position
-        return 1e3 * np.hypot(*place[seen].T) if axis == "field" and place.ndim == 2 else np.zeros(0)
+        return 1e3 * np.hypot(*place.T) if axis == "field" and place.ndim == 2 else none
     captures = {c.id: c for c in study.recordings.captures(side=study.side)}
-    single = [captures[label.captures[0]] for label in block.labels if not label.held_out and len(label.captures) == 1]
-    return np.array([study.elapsed_s(c) if along == "time" else c.exposure_s for c in single], float)
+    for k, label in enumerate(block.labels):
+        if len(label.captures) == 1:
+            capture = captures[label.captures[0]]
+            none[k] = study.elapsed_s(capture) if along == "time" else capture.exposure_s
+    return none
 
 
 def _law(place: tuple[Stage, Along, Of], points: FloatArray, departure: FloatArray) -> EmpiricalLaw:

@@ -1,4 +1,4 @@
-"""What is looked at along indices: codes, rows, columns and their residues, from summaries that the measurements made."""
+"""What is looked at along indices: codes, rows, columns, and cells of both, from summaries of the measurements."""
 
 from __future__ import annotations
 
@@ -180,8 +180,8 @@ def _polynomial_filter(count: int) -> sparse.csr_array | None:
 
 
 def _within_cells(study: Study, image: FloatArray, cell: tuple[int, int]) -> Profile | None:
-    """Return how pixels differ by their place in a cell (rows, columns) of a plane of the mosaic, beyond what whole rows
-    and columns do.
+    """Return how pixels differ by their place in a cell (rows, columns) of a plane of the mosaic, beyond what whole
+    rows and columns do.
 
     The means of the cell's pixels over each of `STRIPS` strips of the frame, in the orthogonal contrasts of Helmert
     along rows times those along columns: these are independent of each other, and free of rows and columns.

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
+from scipy.optimize import minimize
 from scipy.stats import f as f_distribution
 
 from sim.effects.empirical_law import Along, Of, Stage
@@ -15,10 +17,13 @@ from sim.spectrum import FloatArray
 
 PERIODS = (*range(2, 17), 20, 24, 32, 64)
 LEAST_REPEATS = 6  # of a period over the index
-#: Eigenvalues of a form's normal equations, over the largest, below which a combination of its numbers isn't determined.
+#: Eigenvalues of a form's normal equations, over the largest, below which its numbers aren't determined.
 DETERMINED = 1e-12
-#: Decay lengths and periods of the symbolic terms, over the range of the coordinate.
-DECAYS, WAVES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0), (1 / 6, 1 / 5, 1 / 4, 1 / 3, 2 / 5, 1 / 2, 2 / 3, 1.0)
+#: Decay lengths of the symbolic terms and widths of bumps, over the range of the coordinate; and the waves' cycles over
+#: it, with the points that each needs.
+DECAYS, WIDTHS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0), np.geomspace(1 / 60, 1 / 5, 20)
+MOST_CENTRES = 64  # of bumps
+CYCLES_STEP, POINTS_A_CYCLE, LEAST_CYCLES = 0.25, 2.5, 0.5
 MOST_TERMS = 3
 FEW_POINTS = 7  # points of the coarser of two curves
 #: Coefficients of a form -> the form in words; and a number with its unit.
@@ -68,9 +73,10 @@ class Profile:
 class Look:
     """The profiles of one quantity along one index: of the captures that the search may use, and of those held out.
 
-    `at`: the points of a curve, in the coordinate's unit; none along an index. `columns`: of a table by row and column,
-    the period of the columns. `step`: lines of a period of the mosaic. `shown_in`: measurements that the quantity is
-    part of.
+    `at`: the points of a curve, in the coordinate's unit; none along an index. `known`: those at which there are seen
+    numbers. `columns`: of a table by row and column, the period of the columns. `step`: lines of a period of the
+    mosaic. `shown_in`: measurements that the quantity is part of. `is_own_axis`: whether a mismatched one of them is
+    stated along it.
     """
 
     stage: Stage
@@ -79,16 +85,18 @@ class Look:
     held_out: Profile | None
     of: Of = "mean"
     at: tuple[float, ...] = ()
+    known: tuple[float, ...] = ()
     columns: int = 0
     step: int = 1
     shown_in: frozenset[str] = frozenset()
+    is_own_axis: bool = False
 
 
 @dataclass(frozen=True)
 class Form:
     """A way to write the departures by index with few numbers.
 
-    name     "periodic", "step", "line", "knee", "formula", "curve"
+    name     "periodic", "by index", "step", "line", "knee", "bump", "formula", "curve"
     basis    (N, k), or (period, k) of a table that repeats
     numbers  that it has, those beside its k coefficients too
     tried    alternatives of the same form, the best of which counts
@@ -155,7 +163,7 @@ def fitted(profile: Profile, form: Form) -> Table:
     return Table(form, departure, std, min(log_p, 0.0), said)
 
 
-def description_length(profile: Profile, table: Table) -> float:
+def description_length(profile: Profile, table: Table | PredictiveTable) -> float:
     """Return n ln chi2 + k ln n + 2 ln(alternatives) of a table with k numbers."""
     n, form = len(profile.residual), table.form
     return float(n * np.log(profile.chi2(table.departure)) + form.numbers * np.log(n) + 2.0 * np.log(form.tried))
@@ -204,55 +212,93 @@ class _Term:
     beside: int = 0
 
 
-def curve_forms(x: FloatArray, unit: str, entry: Entry) -> Iterator[Form]:
-    """Yield a straight line, steps and knees at every place, and curves through few and through all points (N,)."""
-    count = len(x)
-    middle, scale = x[:-1] + 0.5 * np.diff(x), float(np.ptp(x))
-    yield Form("line", ((x - x[0]) / scale)[:, None], 1, say=lambda c: f"a straight line, {entry(c[0])} over the range")
-    for edge in middle:
-        step = (x > edge).astype(float)[:, None]
-        yield Form("step", step, 2, count - 1, say=lambda c, e=edge: f"a step of {entry(c[0])} at {e:.4g} {unit}")
-    for place in x[1:-1]:
-        bend = (np.maximum(x - place, 0.0) / scale)[:, None]
-        yield Form("knee", bend, 2, count - 2, say=lambda c, e=place: f"a knee at {e:.4g} {unit}")
-    if count > FEW_POINTS:
-        few = x[np.unique(np.linspace(0, count - 1, FEW_POINTS).round().astype(int))]
-        hats = np.array([np.interp(x, few, one) for one in np.eye(len(few))]).T
-        yield Form("curve", hats, len(few), say=lambda c: f"a curve through {FEW_POINTS} points")
-    yield Form("curve", np.eye(count), count, say=lambda c, n=count: f"a curve through {n} points")
+def curve_forms(profile: Profile, x: FloatArray, known: FloatArray, unit: str, entry: Entry) -> Iterator[Form]:
+    """Yield a straight line; a step, a knee and a bump at the place where each takes most off chi2; and curves through
+    few and through all points.
 
-
-def formulas(profile: Profile, x: FloatArray, unit: str) -> Iterator[Form]:
-    """Yield short laws: for 1, 2 and 3 terms the one that forward selection finds, of 1, u, u^2, sqrt u, ln u, 1/u,
-    exp(-u/t) and cos(2 pi u/p), u the coordinate over its largest value.
+    x : the points (N,); known : those at which there are seen numbers
     """
-    terms = _terms(x)
+    scale = float(np.ptp(x))
+    yield Form("line", ((x - x[0]) / scale)[:, None], 1, say=lambda c: f"a straight line, {entry(c[0])} over the range")
+
+    edges = x[:-1] + 0.5 * np.diff(x)
+    edge = edges[_most_gaining(profile, (x[:, None] > edges).astype(float))]
+    step = (x > edge).astype(float)[:, None]
+    yield Form("step", step, 2, len(edges), say=lambda c: f"a step of {entry(c[0])} at {edge:.4g} {unit}")
+
+    bends = np.maximum(x[:, None] - x[1:-1], 0.0) / scale
+    best = _most_gaining(profile, bends)
+    yield Form("knee", bends[:, [best]], 2, len(x) - 2, say=lambda c: f"a knee at {x[1 + best]:.4g} {unit}")
+
+    centres, widths = (one.ravel() for one in np.meshgrid(x[:: -(-len(x) // MOST_CENTRES)], scale * WIDTHS))
+    best = _most_gaining(profile, _bumps(x, centres, widths))
+    start = np.array([centres[best], np.log(widths[best])])
+    simplex = start + np.array([[0.0, 0.0], [0.3 * widths[best], 0.0], [0.0, 0.1]])
+    place = minimize(
+        lambda p: -float(_gains(profile, _bumps(x, p[:1], np.exp(p[1:])))[0]), start, method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxiter": 60},
+    ).x  # fmt: skip
+    centre, width = float(np.clip(place[0], x[0], x[-1])), float(np.clip(np.exp(place[1]), widths[0], widths[-1]))
+    bump = _bumps(x, np.array([centre]), np.array([width]))
+    words = f"at {centre:.4g} {unit}, {width:.3g} {unit} wide (1 sigma)"
+    yield Form("bump", bump, 3, len(centres), say=lambda c: f"a bump of {entry(c[0])} {words}")
+
+    for number in (FEW_POINTS, len(known)) if len(known) > FEW_POINTS else (len(known),):
+        through = known[np.unique(np.linspace(0, len(known) - 1, number).round().astype(int))]
+        hats = np.array([np.interp(x, through, one) for one in np.eye(number)]).T
+        yield Form("curve", hats, number, say=lambda c: f"a curve through {len(c)} points")
+
+
+def _bumps(x: FloatArray, centre: FloatArray, width: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(-0.5 * np.square((x[:, None] - centre) / width)))
+
+
+def _gains(profile: Profile, basis: FloatArray) -> FloatArray:
+    """Return how much each column of a basis (N, m), by itself, takes off chi2."""
+    columns = np.asarray(profile.matrix @ basis) / np.sqrt(profile.variance)[:, None]
+    value = profile.residual / np.sqrt(profile.variance)
+    return np.asarray(np.square(value @ columns) / np.maximum(np.square(columns).sum(axis=0), 1e-300))
+
+
+def _most_gaining(profile: Profile, basis: FloatArray) -> int:
+    return int(np.argmax(_gains(profile, basis)))
+
+
+def formulas(profile: Profile, x: FloatArray, unit: str, *, by_inverse: bool) -> Iterator[Form]:
+    """Yield short laws: for 1, 2 and 3 terms those that forward selection finds, of u, u^2, sqrt u, ln u, 1/u,
+    exp(-u/t) and cos(2 pi u/p), u the coordinate x over its largest value. A constant is none: levels are free.
+
+    by_inverse : whether waves in 1/u are terms, too, as interference has them
+    """
+    terms = _terms(x, by_inverse)
     chosen: list[int] = []
     weight = 1.0 / np.sqrt(profile.variance)
     value = profile.residual * weight
     columns = [np.asarray(profile.matrix @ term.values) * weight[:, None] for term in terms]
     for _ in range(MOST_TERMS):
-
-        def left(number: int) -> float:
-            every = np.hstack([columns[k] for k in (*chosen, number)])
-            fit = np.linalg.lstsq(every, value, rcond=1e-8)[0]
-            return float(np.sum(np.square(value - every @ fit)))
-
-        chosen.append(min((k for k in range(len(terms)) if k not in chosen), key=left))
+        before = np.hstack([np.zeros((len(value), 0)), *(columns[k] for k in chosen)])
+        rest = [k for k in range(len(terms)) if k not in chosen]
+        chosen.append(min(rest, key=lambda k: _left(np.hstack([before, columns[k]]), value)))
         own = [terms[k] for k in chosen]
         ends = np.cumsum([0, *(term.values.shape[1] for term in own)])
 
         def say(c: FloatArray, own: list[_Term] = own, ends: np.ndarray = ends) -> str:
-            parts = [term.say(c[a:b]) for term, a, b in zip(own, ends, ends[1:], strict=False)]
-            return f"{' '.join(parts)} with u = {float(np.abs(x).max()):.4g} {unit} as unit"
+            parts = [term.say(c[a:b]) for term, (a, b) in zip(own, pairwise(ends), strict=True)]
+            return f"{' '.join(parts)} with u = 1 at {float(np.abs(x).max()):.4g} {unit}"
 
         numbers = int(ends[-1]) + sum(term.beside for term in own)
         yield Form("formula", np.hstack([t.values for t in own]), numbers, len(terms) ** len(chosen), say=say)
 
 
-def _terms(x: FloatArray) -> list[_Term]:
+def _left(columns: FloatArray, value: FloatArray) -> float:
+    """Return the sum of squares that least squares leave."""
+    normal, shared = columns.T @ columns, columns.T @ value
+    return float(value @ value - shared @ np.linalg.pinv(normal, rcond=DETERMINED, hermitian=True) @ shared)
+
+
+def _terms(x: FloatArray, by_inverse: bool) -> list[_Term]:
     u = x / float(np.abs(x).max())
-    found = [_Term(np.ones((len(u), 1)), lambda c: f"{c[0]:+.3g}")]
+    found: list[_Term] = []
 
     def add(values: FloatArray, words: str, beside: int = 0) -> None:
         found.append(_Term(values[:, None], lambda c: f"{c[0]:+.3g} {words}", beside))
@@ -264,24 +310,22 @@ def _terms(x: FloatArray) -> list[_Term]:
     if float(u.min()) > 1e-3:
         add(np.log(u), "ln u")
         add(1.0 / u, "1/u")
-    reach = float(np.ptp(u))
-    for share in DECAYS:
-        add(np.exp(-(u - u.min()) / (share * reach)), f"exp(-u / {share * reach:.3g})", 1)
-    for share in WAVES:
-        if share * (len(u) - 1) < 4.0:  # points a period
-            continue
-        period = share * reach
-        both = np.stack([np.cos(2.0 * np.pi * u / period), np.sin(2.0 * np.pi * u / period)], axis=1)
-        found.append(
-            _Term(
-                both,
-                lambda c, p=period: (
-                    f"{float(np.hypot(*c)):+.3g} cos(2 pi (u - {float(np.arctan2(c[1], c[0])) * p / 2 / np.pi:.3g}) / {p:.3g})"
-                ),
-                1,
-            )
-        )
+    for decay in float(np.ptp(u)) * np.array(DECAYS):
+        add(np.exp(-(u - u.min()) / decay), f"exp(-(u - {u.min():.3g}) / {decay:.3g})", 1)
+    for wave, word in ((u, "u"), (1.0 / u, "1/u")) if by_inverse else ((u, "u"),):
+        for cycles in np.arange(LEAST_CYCLES, len(u) / POINTS_A_CYCLE, CYCLES_STEP):
+            found.append(_wave(wave, float(np.ptp(wave) / cycles), word))
     return found
+
+
+def _wave(u: FloatArray, period: float, word: str) -> _Term:
+    turn = 2.0 * np.pi * u / period
+
+    def say(c: FloatArray) -> str:
+        ahead = float(np.arctan2(c[1], c[0])) * period / (2.0 * np.pi)
+        return f"{float(np.hypot(*c)):+.3g} cos(2 pi ({word} - {ahead:.3g}) / {period:.3g})"
+
+    return _Term(np.stack([np.cos(turn), np.sin(turn)], axis=1), say, 1)
 
 
 @dataclass(frozen=True)
