@@ -265,6 +265,8 @@ def told(side: Side, study: Study, found: Sequence[PredictiveTable]) -> tuple[Di
     laws = []
     for one in found:
         shortest, law = (*one.shorter, one)[0], law_of(one, study)
+        # of a table by code, the codes that were counted
+        shown = slice(law.first, law.first + len(law.table)) if shortest.form.name == "by index" else slice(None)
         laws.append(
             DiscoveredLaw(
                 side=side,
@@ -278,8 +280,8 @@ def told(side: Side, study: Study, found: Sequence[PredictiveTable]) -> tuple[Di
                 at=law.at,
                 table=law.table,
                 shown_period=shortest.period,
-                shown_departure=tuple(shortest.departure.tolist()),
-                shown_std=tuple(shortest.std.tolist()),
+                shown_departure=tuple(shortest.departure[shown].tolist()),
+                shown_std=tuple(shortest.std[shown].tolist()),
                 chi2_before=one.chi2[0],
                 chi2_after=one.chi2[1],
                 n=one.chi2[2],
