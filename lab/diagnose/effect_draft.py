@@ -124,7 +124,7 @@ def _class_name(name: str) -> str:
 
 
 def _numbers(name: str, values: Sequence[float], comment: str) -> str:
-    shown = ", ".join(f"{value:.6g}" if float(f"{value:.6g}") == value else repr(value) for value in values)
+    shown = ", ".join(f"{value:.8g}" for value in values)
     lines = textwrap.wrap(shown, WIDTH - 4)
     body = "\n".join(f"    {line}" for line in lines)
     return f"#: {comment}\n{name} = (\n{body},\n)  # fmt: skip\n"
@@ -162,6 +162,7 @@ def _effect(law: DiscoveredLaw, found: EmpiricalLaw, number: int, source: str, n
     call = "\n".join(textwrap.wrap(", ".join(given), WIDTH - 12, initial_indent=" " * 12, subsequent_indent=" " * 12))
     title = name.replace("_", " ")
     said = law.statement.removeprefix("No named effect accounts for this: ")
+    said = f"{said[0].upper()}{said[1:]}"
     head = _wrapped(f"{title[0].upper()}{title[1:]}: drafted from law {number} of {Path(source).name}.", "")
     sentence = f"The {quantity} goes by {law.along}. {law.suspects[0].upper()}{law.suspects[1:]}."
     family = FAMILIES.get((law.stage, law.along)) or FAMILIES[law.stage, ""]

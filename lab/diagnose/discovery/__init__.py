@@ -80,6 +80,7 @@ def discover(
             one = _by_code(look, one, policy)
         if one is not None:
             found.append(one)
+    found = [one for one in found if not one.look.columns] + _smallest_cells(found)
     if left is not None:
         found += _curves(study, left, found, every, policy)
     return tuple(sorted(found, key=lambda one: one.log_probability))
@@ -124,6 +125,28 @@ def _takes_enough(one: PredictiveTable, policy: DecisionPolicy) -> bool:
     """Whether it takes `least_discovery_share` off chi2, a curve twice the standard deviation of chi2 at least."""
     least = 2.0 * np.sqrt(2.0 * one.chi2[2]) if one.look.at else 0.0
     return _gain(one) >= max(policy.least_discovery_share * one.chi2[0], float(least))
+
+
+def _smallest_cells(found: Sequence[PredictiveTable]) -> list[PredictiveTable]:
+    """Return of each stage's tables by row and column that of the smallest cell that takes as much off chi2 as any, in
+    what is seen of the largest one.
+    """
+    kept = []
+    for stage in dict.fromkeys(one.look.stage for one in found if one.look.columns):
+        mine = sorted(
+            (one for one in found if one.look.columns and one.look.stage == stage), key=lambda one: one.period
+        )
+        largest = mine[-1].look
+        judge = largest.held_out or largest.seen
+        rows = judge.count // largest.columns
+        gains = []
+        for one in mine:
+            cell = one.departure.reshape(-1, one.look.columns)
+            repeated = np.resize(cell, (rows, one.look.columns))
+            table = np.tile(repeated, (1, largest.columns // one.look.columns))
+            gains.append(judge.chi2(np.zeros(1)) - judge.chi2(table.ravel()))
+        kept.append(next(one for one, gain in zip(mine, gains, strict=True) if gain >= SHORTER_SHARE * max(gains)))
+    return kept
 
 
 def _predicts_other_half(profile: Profile, form: Form) -> bool:

@@ -227,8 +227,8 @@ def curve_forms(profile: Profile, x: FloatArray, known: FloatArray, unit: str, e
     yield Form("step", step, 2, len(edges), say=lambda c: f"a step of {entry(c[0])} at {edge:.4g} {unit}")
 
     bends = np.maximum(x[:, None] - x[1:-1], 0.0) / scale
-    best = _most_gaining(profile, bends)
-    yield Form("knee", bends[:, [best]], 2, len(x) - 2, say=lambda c: f"a knee at {x[1 + best]:.4g} {unit}")
+    bend = _most_gaining(profile, bends)
+    yield Form("knee", bends[:, [bend]], 2, len(x) - 2, say=lambda c: f"a knee at {x[1 + bend]:.4g} {unit}")
 
     centres, widths = (one.ravel() for one in np.meshgrid(x[:: -(-len(x) // MOST_CENTRES)], scale * WIDTHS))
     best = _most_gaining(profile, _bumps(x, centres, widths))

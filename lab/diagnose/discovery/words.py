@@ -17,6 +17,9 @@ SUSPECTS: dict[tuple[str, str, str], str] = {
     ("codes", "code", "periodic"): (
         "converter bits of wrong weight do that, interleaved converters, or codes rescaled from another bit depth"
     ),
+    ("codes", "code", "no power of two"): (
+        "codes multiplied after the converter do that, or a last stage of the converter that has that many steps"
+    ),
     ("codes", "code", ""): "a converter's own differential nonlinearity does that, or a look-up table after it",
     ("charge", "row", "step"): "halves of the sensor that are exposed or read apart do that, or a mask's shadow",
     ("charge", "column", "step"): "two or four read-outs (taps) of unequal gain do that",
@@ -97,6 +100,9 @@ def place_in_words(look: Look) -> str:
 def suspects_of(found: PredictiveTable) -> str:
     """Return what physics may do it; none of it is a name."""
     look, name = (*found.shorter, found)[0].look, (*found.shorter, found)[0].form.name
+    period = (*found.shorter, found)[0].period
+    if look.along == "code" and period & (period - 1):
+        name = "no power of two"
     kinds = (name, "variance", "") if look.of == "variance" else (name, "")
     return next(SUSPECTS[look.stage, look.along, k] for k in kinds if (look.stage, look.along, k) in SUSPECTS)
 
