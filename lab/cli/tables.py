@@ -139,7 +139,8 @@ def print_diagnosis(diagnosis: DiagnosisResult) -> None:
     if diagnosis.held_out is not None:
         held = diagnosis.held_out
         captures = f"{len(held.captures)} held-out captures"
-        out.print(f"{captures}: chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after, n = {held.n}")
+        beside = "" if held.chi2_discovered is None else f", {held.chi2_discovered:.0f} with laws without a name"
+        out.print(f"{captures}: chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after{beside}, n = {held.n}")
     departing = {(m.side, m.measurement) for m in diagnosis.mismatches}
     departing |= {(u.side, u.measurement) for u in diagnosis.unexplained}
     table = Table(box=None, pad_edge=False)

@@ -20,6 +20,13 @@ from lab.diagnose.measurements.blocks import measurement_model, study_of
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.outcome.board_departure import board_departure
+from lab.diagnose.outcome.described import (
+    corrected_by_laws,
+    described,
+    in_light_of_laws,
+    left_to_smooth,
+    with_laws,
+)
 from lab.diagnose.outcome.detectability import detectability
 from lab.diagnose.outcome.doubts import names_in_doubt
 from lab.diagnose.outcome.effect_sets import side_models
@@ -115,15 +122,18 @@ def diagnose_side(
     report("scoring the effects")
     verdict = decide(model, rng, policy, report, least_threshold=least)
     report("looking for laws that no effect has")
-    discovered = discover(study, (*model.always, *verdict.effects), policy)
+    left_over = verdict if verdict.after or verdict.held_out else None
+    discovered = discover(study, (*model.always, *verdict.effects), policy, left_over)
     report("looking for the next capture")
-    improved, corrections = improved_model(
-        recordings, side, fit, baseline, model, verdict.effects, verdict.discrepancies
-    )
+    laws = tuple(law_of(one, study) for one in discovered)
+    by_laws = described(verdict, discovered, laws)
+    smooth = left_to_smooth(verdict, by_laws)
+    improved, corrections = improved_model(recordings, side, fit, baseline, model, verdict.effects, smooth)
+    corrections = corrected_by_laws(verdict, corrections, by_laws)
     if improved.posterior is not None and verdict.named:
         doubts = names_in_doubt(verdict, policy)
         improved = replace(improved, posterior=improved.posterior.model_copy(update={"doubts": doubts}))
-    improved = replace(improved, effects=(*improved.effects, *(law_of(one, study) for one in discovered)))
+    improved = with_laws(improved, laws)
     fitted = fit.cameras.get(side) if fit is not None else None
     shape = (model.camera.rows, model.camera.cols)
     departure = board_departure(side, fitted.geometry if fitted is not None else None, shape, policy)
@@ -132,7 +142,9 @@ def diagnose_side(
         found.append(Mismatch(**departure.model_dump(include=set(Mismatch.model_fields))))
     left = (
         *wrong,
-        *unexplained(recordings, side, verdict, corrections, policy),
+        *in_light_of_laws(
+            recordings, side, verdict, unexplained(recordings, side, verdict, corrections, policy), by_laws
+        ),
         *misstated_light(
             side,
             fitted,
@@ -164,7 +176,7 @@ def diagnose_side(
             for c in verdict.named
         ),
         abstained=verdict.abstained,
-        held_out=held_out(verdict),
+        held_out=held_out(verdict, laws, by_laws),
         improved=improved,
         doubt=doubt_of(recordings, side, verdict, policy, station),
         settling=settling_sentence(recordings, side, left),

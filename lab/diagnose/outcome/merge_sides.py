@@ -230,14 +230,17 @@ def _mean(values: list[tuple[float, float | None]], is_shared: bool) -> tuple[fl
 
 def _held_out(found: Sequence[SideFindings]) -> HeldOut | None:
     """Sum over the sides on which something was found; over all, where nothing was."""
-    anything = any(f.named or f.lists.unexplained for f in found)
-    parts = [f.held_out for f in found if f.held_out is not None and (f.named or f.lists.unexplained or not anything)]
+    told = [f for f in found if f.named or f.lists.unexplained or f.lists.discovered]
+    parts = [f.held_out for f in told or found if f.held_out is not None]
     if not parts:
         return None
     return HeldOut(
         captures=tuple(capture for part in parts for capture in part.captures),
         chi2_before=sum(part.chi2_before for part in parts),
         chi2_after=sum(part.chi2_after for part in parts),
+        chi2_discovered=None
+        if all(part.chi2_discovered is None for part in parts)
+        else sum(part.chi2_after if part.chi2_discovered is None else part.chi2_discovered for part in parts),
         n=sum(part.n for part in parts),
     )
 
@@ -267,6 +270,7 @@ def _summary(
     lines += [e.statement for e in effects]
     lines += [
         f"Not explained: {measurement_title(u.measurement)} of the {u.side} camera, {u.where}: {u.shape}."
+        f"{' ' if u.would_help else ''}{u.would_help}"
         for u in lists.unexplained
     ]
     lines += [d.statement for d in lists.discovered]

@@ -106,7 +106,8 @@ class Unexplained(Frozen):
     chi2_after: float
     n: int
     captures: tuple[str, ...] = ()  # that show it
-    correction: str = ""  # the model discrepancy, in words
+    correction: str = ""  # the model discrepancy, or the discovered law, in words
+    would_help: str = ""  # captures that would help where nothing predicts it, as a sentence
     check: str = ""  # stated values, of the camera or of captures, that the recordings contradict, as sentences
 
     @property
@@ -116,20 +117,26 @@ class Unexplained(Frozen):
 
 
 class DiscoveredLaw(Frozen):
-    """A table by code, row or column that recordings hold and no effect of the library has; it stands in the improved
-    model as `empirical_law`.
+    """A table or a curve along one index of the camera that recordings hold and no effect of the library has; it stands
+    in the improved model as `empirical_law`.
 
-    `stage`, `along`, `period` and `table` are those of that effect. `shown_departure` is the shortest table that does
-    nearly as well, by index mod `shown_period` (0: by index): departures from no change, relative or in DN (stage
-    `signal`), with their standard deviations. chi2 is of the `n` numbers along the index
-    in held-out captures (in the captures themselves where none are held out), without and with the law. `suspects`:
-    what physics may do it; none of them is a name.
+    `stage`, `along`, `of`, `period`, `columns`, `first`, `at` and `table` are those of that effect. `form` is that in
+    which it was found (`periodic`, `by index`, `step`, `line`, `knee`, `bump`, `formula`, `curve`). `shown_departure`
+    is the shortest table that does nearly as well, by index mod `shown_period` (0: by index, or by `at`): departures
+    from no change, relative, or in DN or e (offsets of stage `signal`), with their standard deviations. chi2 is of the
+    `n` numbers along the index in held-out captures (in the captures themselves where none are held out), without and
+    with the law. `measurements`: those that it shows in. `suspects`: what physics may do it; none of them is a name.
     """
 
     side: Side
     stage: str
     along: str
+    of: str = "mean"
+    form: str = "periodic"
     period: int
+    columns: int = 0
+    first: int = 0
+    at: tuple[float, ...] = ()
     table: tuple[float, ...]
     shown_period: int
     shown_departure: tuple[float, ...]
@@ -137,6 +144,7 @@ class DiscoveredLaw(Frozen):
     chi2_before: float
     chi2_after: float
     n: int
+    measurements: tuple[str, ...] = ()
     suspects: str
     statement: str
 
@@ -160,12 +168,14 @@ class VetoedName(Frozen):
 class HeldOut(Frozen):
     """chi2 of captures that neither the fit nor the choice of effects has used.
 
-    `before`: under the baseline. `after`: with the named effects and the mean of the model discrepancy.
+    `before`: under the baseline. `after`: with the named effects and the mean of the model discrepancy. `discovered`:
+    with the laws besides that no effect has; None where there are none.
     """
 
     captures: tuple[str, ...]
     chi2_before: float
     chi2_after: float
+    chi2_discovered: float | None = None
     n: int
 
 
