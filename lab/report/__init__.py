@@ -277,6 +277,7 @@ def render_report(
         "skipped": list(skipped.values()),
         "warnings": recordings.warnings,
         "provenance": provenance,
+        "changes": recordings.manifest.changes,
         "notes": recordings.manifest.notes,
         "listed": recordings.captures(),
         "chart_data": ChartData(),
