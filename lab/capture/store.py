@@ -470,12 +470,12 @@ class Store:
             told: dict[str, Any] = {"instruments": runs[-1].instruments} if runs else {}
             if changes := tuple(line for run in runs for line in run.changes):
                 told["changes"] = changes
+            cameras: Any = {side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()}
             manifest = Manifest(
                 name=row.name or session_id,
                 notes=row.notes,
                 **told,
-                cameras={side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()},
-                # type: ignore[misc]
+                cameras=cameras,
                 captures=tuple(_capture(session_id, one) for one in db.scalars(asked.order_by(CaptureRow.id))),
             )
             where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in db.execute(files)}
