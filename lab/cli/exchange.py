@@ -10,15 +10,17 @@ from rich.markup import escape
 
 from lab.capture_kinds.base import Names, names_in
 from lab.cli.console import out, warn
-from lab.cli.sources import recordings_of
+from lab.cli.progress import progress_bar
+from lab.cli.sources import recordings_of, store_to_read
 from lab.errors import InputError
+from lab.pipeline import session_recordings
 
 if TYPE_CHECKING:
     from lab.formats.cgats import CgatsSpectra
     from lab.formats.importers.import_options import ImportOptions
 
 #: `import --from` these, and `export --as` these; the last of a camera file.
-SPECTRA, LENSFUN = "spectra", "lensfun"
+SPECTRA, LENSFUN, TILED = "spectra", "lensfun", "tiled"
 OF_A_CAMERA = (LENSFUN, "rawtoaces", "dcp", "icc", "pyxel")
 
 
@@ -133,3 +135,16 @@ def export_camera(kind: str, source: str, to: Path, options: ExportOptions) -> N
         remarks = writer(to, content)
     warn(tuple(f"{to}: {remark}" for remark in remarks))
     out.print(escape(str(to)))
+
+
+def export_tiled(session: str, to: str, data: Path | None) -> None:
+    """A stored session into a Tiled catalogue: a server's address, or a folder."""
+    from lab.capture.tiled_catalogue import open_catalogue, write_session
+
+    store = store_to_read(data)
+    recordings = session_recordings(store, session)
+    warn(recordings.warnings)
+    catalogue = open_catalogue(to)
+    with progress_bar("export") as advance:
+        key = write_session(catalogue, recordings, store.folder(session) / "documents.jsonl", advance)
+    out.print(escape(f"{to}: {key}, {len(recordings.manifest.captures)} captures"))

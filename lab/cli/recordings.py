@@ -14,9 +14,11 @@ from lab.cli.exchange import (
     LENSFUN,
     OF_A_CAMERA,
     SPECTRA,
+    TILED,
     ExportOptions,
     export_camera,
     export_spectra,
+    export_tiled,
     import_lens,
     import_spectra,
 )
@@ -183,13 +185,20 @@ def export(
             "icc and pyxel: a camera file",
         ),
     ],
-    to: Annotated[Path, typer.Option("--to", metavar="PATH", help="the recording set (a folder) or the file to write")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="PATH",
+            help="the recording set (a folder) or the file to write; tiled: a catalogue's folder, or a server's address",
+        ),
+    ],
     kind: Annotated[
         str,
         typer.Option(
             "--as",
             metavar="KIND",
-            help="recording-set, spectra (.sp or .ti3), lensfun, rawtoaces, dcp, icc or pyxel",
+            help="recording-set, tiled, spectra (.sp or .ti3), lensfun, rawtoaces, dcp, icc or pyxel",
         ),
     ] = "recording-set",
     quantity: Annotated[
@@ -210,17 +219,20 @@ def export(
     from lab.formats import recording_set
 
     if kind == SPECTRA:
-        export_spectra(source, to, quantity, data)
+        export_spectra(source, Path(to), quantity, data)
+        return
+    if kind == TILED:
+        export_tiled(source, to, data)
         return
     if kind in OF_A_CAMERA:
-        export_camera(kind, source, to, ExportOptions(exposure_s, photons, wavelength_nm, channel))
+        export_camera(kind, source, Path(to), ExportOptions(exposure_s, photons, wavelength_nm, channel))
         return
     if kind != "recording-set":
-        raise InputError(f"--as {kind}: no such format; choose recording-set, {SPECTRA}, {', '.join(OF_A_CAMERA)}")
+        raise InputError(f"--as {kind}: no such format; choose {', '.join((SPECTRA, TILED, *OF_A_CAMERA))}")
     recordings = session_recordings(store_to_read(data), source)
     warn(recordings.warnings)
     with progress_bar("export") as advance:
-        folder = recording_set.write(recordings, to, progress=advance)
+        folder = recording_set.write(recordings, Path(to), progress=advance)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
