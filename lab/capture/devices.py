@@ -97,7 +97,7 @@ class LightSetting:
 
 
 class LightDevice(Device):
-    """The monochromator's grating and slits. Movable to a `LightSetting`, or to a wavelength (nm), the slits unchanged."""
+    """The monochromator's grating and slits. Movable to a `LightSetting`, or a wavelength (nm) alone."""
 
     def __init__(self, monochromator: Monochromator) -> None:
         super().__init__("monochromator")

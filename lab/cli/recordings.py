@@ -190,7 +190,7 @@ def export(
         typer.Option(
             "--to",
             metavar="PATH",
-            help="the recording set (a folder) or the file to write; tiled: a catalogue's folder, or a server's address",
+            help="the recording set (a folder) or the file to write; tiled: a catalogue's folder, or a server's URL",
         ),
     ],
     kind: Annotated[
