@@ -20,6 +20,7 @@ from lab.effect_titles import at_beginning, effect_title
 from lab.errors import InputError
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set.snapshot import told
 from lab.formats.results import (
     Check,
     DiagnosisResult,
@@ -161,6 +162,7 @@ def page_environment() -> jinja2.Environment:
         "stated": stated,
         "stated_as": lambda value, std, unit: "–" if value is None else measured(value, std, unit),
         "still": still,
+        "setting": told,
         "mood": diagnosis_page.mood,
     }
     return environment

@@ -69,7 +69,7 @@ def _changed(name: str, before: InstrumentSnapshot, now: InstrumentSnapshot) -> 
             continue
         was, is_now = before.settings.get(key), now.settings.get(key)
         if not _same(was, is_now):
-            yield f"{name}: {key} was {_told(was)}, is {_told(is_now)}"
+            yield f"{name}: {key} was {told(was)}, is {told(is_now)}"
 
 
 def _same(was: Value | None, is_now: Value | None) -> bool:
@@ -78,5 +78,6 @@ def _same(was: Value | None, is_now: Value | None) -> bool:
     return was == is_now
 
 
-def _told(value: Value | None) -> str:
+def told(value: Value | None) -> str:
+    """A setting's value in words."""
     return "not there" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

@@ -146,7 +146,7 @@ def test_page_says_what_the_results_say(page: Page) -> None:
         "no bernoulli captures of pose p2; capture one",
         "serial number C-1",
         "Settings of the camera left: 2 before the first capture, 1 of them found otherwise",
-        "BalanceRatio[Red] 1.0 1.8",
+        "BalanceRatio[Red] 1 1.8",
         "Gamma = 0.8: its codes aren't the converter's",
         "camera left: it differs",
         "numpy",
