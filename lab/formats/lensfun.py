@@ -331,7 +331,8 @@ def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple
         if left_px > TOLD_PX:
             remarks.append(f"distortion: k1, k2, k3 leave {left_px:.2f} px of lensfun's law at most")
     if lens.vignetting is not None:
-        radius = np.linspace(0.0, 1.0, NODES)
+        off_px = math.hypot(*_centre(camera)) * _half_short_px(camera)
+        radius = np.linspace(0.0, 1.0 + off_px / camera.half_diagonal_px, NODES)  # of the half diagonal, to every corner
         k1, k2, k3 = lens.vignetting
         r = radius * camera.half_diagonal_um * 1e-3 / lens.half_diagonal_mm
         light = 1.0 + k1 * r**2 + k2 * r**4 + k3 * r**6
@@ -353,19 +354,19 @@ def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple
 def _brown(
     camera: CameraModel, law: Callable[[FloatArray], FloatArray], half_short_mm: float
 ) -> tuple[Geometry, float]:
-    """OpenCV's distortion nearest to lensfun's law over the frame, and the greatest departure (px). What the law has at
-    the centre goes into the focal length."""
+    """OpenCV's distortion nearest to lensfun's law over the frame, and the greatest departure (px). What is in proportion
+    to the radius goes into the focal length."""
     unit_px, radius_px = half_short_mm * 1e3 / camera.pixel_pitch_um, camera.half_diagonal_px
     share = np.linspace(0.0, 1.0, 8 * NODES)[1:]  # of the half diagonal
-    at_centre = float(law(np.zeros(1))[0])
-    if not at_centre > 0:
-        raise InputError(f"distortion scales the centre by {at_centre:.3g}, not above 0; take another lens")
-    shift = (law(share * radius_px / unit_px) / at_centre - 1.0) * share
-    design = np.stack([share**3, share**5, share**7], axis=1)
-    k, *_ = np.linalg.lstsq(design, shift, rcond=None)
-    left_px = float(np.abs(shift - design @ k).max()) * radius_px * at_centre
-    focal = _focal_px(camera) * at_centre
-    k = k * (focal / at_centre / radius_px) ** np.array([2, 4, 6])
+    lands = law(share * radius_px / unit_px) * share
+    design = np.stack([share, share**3, share**5, share**7], axis=1)
+    found, *_ = np.linalg.lstsq(design, lands, rcond=None)
+    scale = float(found[0])
+    if not scale > 0:
+        raise InputError(f"distortion scales the centre by {scale:.3g}, not above 0; take another lens")
+    left_px = float(np.abs(lands - design @ found).max()) * radius_px
+    focal = _focal_px(camera) * scale
+    k = found[1:] / scale * (_focal_px(camera) / radius_px) ** np.array([2, 4, 6])
     before: NDArray[np.float64] = np.array(_geometry(camera).camera_matrix)
     matrix = ((focal, 0.0, float(before[0, 2])), (0.0, focal, float(before[1, 2])), (0.0, 0.0, 1.0))
     return Geometry(camera_matrix=matrix, distortion=(float(k[0]), float(k[1]), 0.0, 0.0, float(k[2]))), left_px
