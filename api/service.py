@@ -148,9 +148,12 @@ class Service:
             run.model_copy(
                 update={
                     "instruments": {
-                        name: {key: self.public(value) for key, value in identity.items()}
-                        for name, identity in run.instruments.items()
-                    }
+                        name: one.model_copy(
+                            update={key: self.public(value) for key, value in one if isinstance(value, str)}
+                        )
+                        for name, one in run.instruments.items()
+                    },
+                    "changes": tuple(map(self.public, run.changes)),
                 }
             )
             for run in runs

@@ -90,6 +90,11 @@ class FoundSettings:
         """(name, value) of each, what was changed last first."""
         return iter(list(reversed(self._values.items())))
 
+    @property
+    def values(self) -> dict[str, Setting]:
+        """The value of each, in the order in which they were changed."""
+        return dict(self._values)
+
     def get(self, name: str, otherwise: Setting) -> Setting:
         """What was found, or `otherwise` where it wasn't changed."""
         return self._values.get(name, otherwise)

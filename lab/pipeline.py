@@ -535,9 +535,8 @@ class _Pipeline:
         from lab.predict.both_models import predict_both
         from lab.report import provenance_of, write_report
 
-        runs = self.store.runs(self._session) if self.store is not None and self._session is not None else []
         file = self.request.report_file or self._session_files()
-        provenance = provenance_of(self.recordings, runs[-1].instruments if runs else None)
+        provenance = provenance_of(self.recordings)
         both = predict_both(
             self.recordings,
             self.fitted,

@@ -44,6 +44,11 @@ class RememberedFeatures:
     def execute(self, name: str) -> None:
         self._features.execute(name)
 
+    @property
+    def found(self) -> dict[str, Setting]:
+        """What was changed, by its place, as it was found."""
+        return self._found.values
+
     def restore(self) -> None:
         """Set all as it was found, what was changed last first. What the camera refuses is tried once more when the
         rest is set, and stays kept if it is refused then, too. Raises `NoAnswer` and `Disconnected`; what isn't

@@ -26,6 +26,7 @@ from lab.capture.tables import CalibrationRow, FigureRow, ResultRow, SessionRow
 from lab.errors import InputError
 from lab.fit.compare import FALSE_ALARM_RATE, Numbers, sidak_part, sigma_of_probability
 from lab.fit.noise.dark_current import SensorTemperature
+from lab.formats.recording_set import InstrumentSnapshot, Snapshots, differences
 from lab.formats.results import FitResult
 from lab.formats.results.figure_names import plain_name
 from sim.camera import Side
@@ -89,13 +90,13 @@ class History(Frozen):
 # --- cameras ----------------------------------------------------------------------------------------------------------
 
 
-def cameras_of(instruments: Mapping[str, Mapping[str, str]], station: Station) -> dict[Side, str]:
+def cameras_of(instruments: Snapshots, station: Station) -> dict[Side, str]:
     """Name of each camera of a run: maker, model and serial number as it reports them. Without a serial number it is
     known by its station and side."""
     found: dict[Side, str] = {}
     for side in station.sides:
-        identity = instruments.get(f"camera {side}", {})
-        parts = [identity.get(key, "") for key in ("maker", "model", "serial_number")]
+        one = instruments.get(f"camera {side}", InstrumentSnapshot())
+        parts = [one.maker, one.model, one.serial_number]
         where = [] if parts[2] else [f"({side} of {station.name or 'a station'})"]
         found[side] = " ".join([part for part in parts if part] + where)
     return found
@@ -106,25 +107,51 @@ def rig_of(cameras: Mapping[Side, str]) -> str:
     return json.dumps(dict(sorted(cameras.items())))
 
 
-def check_certified(store: Store, cameras: Mapping[Side, str]) -> None:
-    """Raises InputError unless the rig of these cameras has a certified calibration that isn't expired."""
+def check_certified(store: Store, instruments: Snapshots, station: Station) -> None:
+    """Raises InputError unless the rig of these cameras has a certified calibration that isn't expired, of which they
+    have the settings."""
     register(store)
+    cameras = cameras_of(instruments, station)
+    asked = _asked().order_by(CalibrationRow.created.desc())
     with store.reading() as db:
-        asked = _asked().where(CalibrationRow.rig == rig_of(cameras)).order_by(CalibrationRow.created.desc())
-        found = [_calibration(row, name) for row, name in db.execute(asked)]
-    if any(one.state == "certified" for one in found):
-        return
+        of_rig = db.execute(asked.where(CalibrationRow.rig == rig_of(cameras)))
+        found = [_calibration(row, name) for row, name in of_rig]
+        others = [_calibration(row, name) for row, name in ([] if found else db.execute(asked))]
+    for one in found:
+        if one.state == "certified":
+            _check_settings(store, one, instruments, cameras)
+            return
     expired = [one for one in found if one.state == "expired"]
     why = (
         f"its certified calibration {expired[0].id} expired on {expired[0].expires:%Y-%m-%d}"
         if expired and expired[0].expires
         else f"{len(found)} calibrations of it are known, none is certified"
     )
+    for other in [one for one in others if one.state == "certified" and one.cameras.keys() == cameras.keys()][:1]:
+        changed = [
+            f"{side} was {was}, is {cameras[side]}" for side, was in other.cameras.items() if was != cameras[side]
+        ]
+        why += f" (the newest certified one, {other.id}, is of other cameras: {'; '.join(changed)})"
     raise InputError(
         f"cameras {', '.join(cameras.values())}: the session demands a certified calibration, and {why}; certify one "
         "with "
         "`calibench calibrations certify ID`, or start without --certified"
     )
+
+
+def _check_settings(
+    store: Store, certified: CalibrationRecord, instruments: Snapshots, cameras: Mapping[Side, str]
+) -> None:
+    """Raises InputError where a camera is set otherwise than when the calibration was captured."""
+    if not store.has_session(certified.session_id) or not (runs := store.runs(certified.session_id)):
+        return
+    names = [f"camera {side}" for side in cameras]
+    then, now = ({name: of[name] for name in names if name in of} for of in (runs[-1].instruments, instruments))
+    if changed := differences(then, now):
+        raise InputError(
+            f"{'; '.join(changed)}: so the certified calibration {certified.id}, which the session demands, isn't of "
+            "these cameras as they are; set them as they were, or start without --certified and certify a new one"
+        )
 
 
 def check_nothing_rests_on(store: Store, session_id: str) -> None:

@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
@@ -271,6 +271,19 @@ class Store:
         with self.reading() as db:
             return [RunRecord.model_validate(run) for run in self._row(db, session_id).runs]
 
+    def run_before(self, session_id: str) -> tuple[str, RunRecord] | None:
+        """The last run on the session's station so far, with its session's id: of this session, or of one that was
+        registered earlier. None: there is none."""
+        with self.reading() as db:
+            row = self._row(db, session_id)
+            station = row.station.get("name", "")
+            asked = sa.select(SessionRow.id, SessionRow.station, SessionRow.runs)
+            asked = asked.where(sa.tuple_(SessionRow.created, SessionRow.id) <= sa.tuple_(row.created, row.id))
+            for id, other, runs in db.execute(asked.order_by(SessionRow.created.desc(), SessionRow.id.desc())):
+                if runs and other.get("name", "") == station:
+                    return id, RunRecord.model_validate(runs[-1])
+        return None
+
     def set_state(
         self,
         session_id: str,
@@ -462,10 +475,16 @@ class Store:
             files = files.where(sa.or_(FileRow.role != "frame", FileRow.id.in_(theirs)))
         with self.reading() as db:
             row = self._row(db, session_id)
+            runs = [RunRecord.model_validate(run) for run in row.runs]
+            told: dict[str, Any] = {"instruments": runs[-1].instruments} if runs else {}
+            if changes := tuple(line for run in runs for line in run.changes):
+                told["changes"] = changes
+            cameras: Any = {side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()}
             manifest = Manifest(
                 name=row.name or session_id,
                 notes=row.notes,
-                cameras={cast(Side, side): DataSheet.model_validate(camera) for side, camera in row.cameras.items()},
+                **told,
+                cameras=cameras,
                 captures=tuple(_capture(session_id, one) for one in db.scalars(asked.order_by(CaptureRow.id))),
             )
             where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in db.execute(files)}

@@ -212,4 +212,6 @@ def print_comparison(comparison: ComparisonResult, every: bool) -> None:
         "which an unchanged rig "
         f"passes in {100 * comparison.false_alarm_rate:g} % of all comparisons"
     )
+    for line in comparison.instruments:
+        out.print(f"instruments: {escape(line)}")
     print_skipped(comparison.skipped)

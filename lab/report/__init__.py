@@ -21,6 +21,7 @@ from lab.errors import InputError
 from lab.formats.provenance import Provenance, installed_versions, provenance_of
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set.snapshot import told
 from lab.formats.results import (
     Check,
     DiagnosisResult,
@@ -161,6 +162,7 @@ def page_environment() -> jinja2.Environment:
         "stated": stated,
         "stated_as": lambda value, std, unit: "–" if value is None else measured(value, std, unit),
         "still": still,
+        "setting": told,
         "mood": diagnosis_page.mood,
     }
     return environment
@@ -277,6 +279,7 @@ def render_report(
         "skipped": list(skipped.values()),
         "warnings": recordings.warnings,
         "provenance": provenance,
+        "changes": recordings.manifest.changes,
         "notes": recordings.manifest.notes,
         "listed": recordings.captures(),
         "chart_data": ChartData(),

@@ -254,6 +254,7 @@ def test_a_session_that_demands_a_certified_calibration_runs_only_with_one(store
     with pytest.raises(InputError, match="demands a certified calibration, and 0 calibrations"):
         first.run()
     assert store.session(first.id).state == "failed" and not bench.opened
+    bench.settings["camera left"] = {"PixelFormat": "BayerRG12", "ExposureTime": 100.0}
     free = CaptureSession.start(store, STATION, DARKS, connect=bench.drivers)
     assert free.run().state == "finished"
     of_it = store.add_result("fit", free.id, fitted(2.0).model_dump(mode="json"))
@@ -261,6 +262,17 @@ def test_a_session_that_demands_a_certified_calibration_runs_only_with_one(store
         session().run()
     life.certify(store, of_it, "ada", limits(valid_days=30))
     assert session().run().state == "finished"
+    bench.settings["camera left"] = {"PixelFormat": "BayerRG10", "ExposureTime": 200.0}
+    with pytest.raises(
+        InputError, match="camera left: PixelFormat was BayerRG12, is BayerRG10: so the certified"
+    ) as told:
+        session().run()
+    assert "\n" not in str(told.value) and "ExposureTime" not in str(told.value)
+    bench.settings["camera left"] = {"PixelFormat": "BayerRG12", "ExposureTime": 300.0}
+    bench.serials["camera left"] = "SN-2"
+    with pytest.raises(InputError, match=f"{of_it}, is of other cameras: left was fake camera left SN-1, is .* SN-2"):
+        session().run()
+    bench.serials.clear()
     assert (
         CaptureSession(store, first.id, connect=bench.drivers).run().state == "finished"
     )  # a resumed one is looked at anew

@@ -15,7 +15,7 @@ import pytest
 
 from lab.calibration.limits import CalibrationLimits
 from lab.errors import InputError
-from lab.formats.recording_set import DataSheet, RecordingSet
+from lab.formats.recording_set import DataSheet, InstrumentSnapshot, RecordingSet
 from lab.formats.results import (
     CameraFit,
     DiagnosisResult,
@@ -104,8 +104,17 @@ class Page(HTMLParser):
 @pytest.fixture
 def page(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> Page:
     recordings = small_set()
-    instruments = {"monochromator": {"model": "Cornerstone 260", "serial": "C-1"}}
-    return Page(render_report(recordings, *made_up(), provenance_of(recordings, instruments)))
+    there = {
+        "monochromator": InstrumentSnapshot(model="Cornerstone 260", serial_number="C-1"),
+        "camera left": InstrumentSnapshot(
+            settings={"BalanceRatio[Red]": 1.0, "Gamma": 0.8},
+            found={"BalanceRatio[Red]": 1.8},
+            departures=("Gamma = 0.8: its codes aren't the converter's",),
+        ),
+    }
+    manifest = recordings.manifest.model_copy(update={"instruments": there, "changes": ("camera left: it differs",)})
+    recordings = recordings.under(manifest)
+    return Page(render_report(recordings, *made_up(), provenance_of(recordings)))
 
 
 def test_page_needs_nothing_from_elsewhere(page: Page) -> None:
@@ -136,7 +145,11 @@ def test_page_says_what_the_results_say(page: Page) -> None:
         "the lamp drifted by 0.08 % between repeats",
         "baseline 60.020 ± 0.021 mm",
         "no bernoulli captures of pose p2; capture one",
-        "serial C-1",
+        "serial number C-1",
+        "Settings of the camera left: 2 before the first capture, 1 of them found otherwise",
+        "BalanceRatio[Red] 1 1.8",
+        "Gamma = 0.8: its codes aren't the converter's",
+        "camera left: it differs",
         "numpy",
     ):
         assert words in page.text, words
