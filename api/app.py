@@ -59,26 +59,8 @@ PREFIX = "/api/v1"
 ARCHIVES = frozenset((f"{PREFIX}/recordings", f"{PREFIX}/camera-models"))
 PAGES = Path(__file__).parent / "pages"
 ASSETS = {
-    "operator.css": "text/css",
-    "operator.js": "text/javascript",
-    **dict.fromkeys(
-        (
-            "page.js",
-            "charts.js",
-            "stations.js",
-            "plan.js",
-            "queue.js",
-            "watch.js",
-            "recordings.js",
-            "models.js",
-            "send.js",
-            "calibrations.js",
-            "challenges.js",
-            "findings.js",
-            "docs.js",
-        ),
-        "text/javascript",
-    ),
+    file.name: {".css": "text/css", ".js": "text/javascript"}[file.suffix]
+    for file in sorted((*PAGES.glob("*.css"), *PAGES.glob("*.js")))
 }
 TAGS = [
     {"name": "access", "description": "Keys, logins, health."},
@@ -220,6 +202,7 @@ def create_app(
     live = LiveSessions(store, connect, shared.forget)
     gate = Gate(lambda anew: stored_keys(store, anew), store.knows_keys)
     jobs_of = jobs_runner or JobRunner(store)
+    inbox = Inbox(store.root / "recordings")
     counted = Metrics({"sessions": store.count_states, "jobs": jobs_of.count_states})
     app = FastAPI(
         title="calibench",
@@ -250,9 +233,9 @@ def create_app(
         live=live,
         waiting=QueueRunner(store, live, lambda: rescue.settled),
         quick_look=QuickLook(store),
-        pictures=Pictures(store),
+        pictures=Pictures(store, inbox),
         jobs=jobs_of,
-        inbox=Inbox(store.root / "recordings"),
+        inbox=inbox,
         challenges=Challenges(store.root / "challenges"),
         gate=gate,
         public=app.state.public,

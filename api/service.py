@@ -184,6 +184,7 @@ READ = Depends(Demand(Permission.READ))
 OPERATE = Depends(Demand(Permission.OPERATE))
 CALIBRATE = Depends(Demand(Permission.CALIBRATE))
 ADMIN = Depends(Demand(Permission.ADMIN))
-SessionId = Annotated[str, PathParameter(pattern=r"^[0-9A-Za-z-]{1,40}$")]
-HexId = Annotated[str, PathParameter(pattern=r"^[0-9a-f]{16}$")]
+SESSION_ID, HEX_ID = r"^[0-9A-Za-z-]{1,40}$", r"^[0-9a-f]{16}$"
+SessionId = Annotated[str, PathParameter(pattern=SESSION_ID)]
+HexId = Annotated[str, PathParameter(pattern=HEX_ID)]
 RegistryId = Annotated[int, PathParameter(ge=1, le=2**31 - 1)]

@@ -14,33 +14,35 @@ from sse_starlette.sse import EventSourceResponse
 from api.archives import ARCHIVE, Form, Packed
 from api.errors import answers, known
 from api.events import described, event, stream, watched
+from api.frames import FOR_EVER, Npy, Picture, Stretch, Width, npy_of, picture_of
 from api.kept_sets import session_set
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers
 from api.preview import Form as PictureForm
 from api.schemas import (
     CaptureCount,
     CaptureKind,
+    ListedSession,
     SessionDetail,
     SessionResume,
     SessionStart,
+    SessionWords,
     StationState,
     StoredCapture,
     StoredSession,
 )
 from api.service import ADMIN, OPERATE, OVER, READ, Here, RegistryId, Service, SessionId, missing_session
-from lab.capture.durable_files import npy_bytes
+from lab.calibration.overview import SessionOverview, overviews, sessions_of_verdict, tags_of
 from lab.capture.plan import full_plan
 from lab.capture.queue import put_into_queue
 from lab.capture.records import CaptureInfo, SessionInfo
 from lab.capture.session import CaptureSession, Progress
 from lab.errors import InputError
+from lab.formats.results.diagnosis import DiagnosisVerdict
 from lab.quick_look.curves import Curves
 from lab.quick_look.frame_figures import FrameFigures
 from sim.camera import Side
 
 router = APIRouter()
-#: A capture never changes, and its path has its session's random id in it.
-FOR_EVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 
 
 # --- stations ---------------------------------------------------------------------------------------------------------
@@ -81,6 +83,11 @@ def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     return fields | {"error": None if runs else service.public.or_none(info.error)}
 
 
+def _listed(service: Service, info: SessionInfo, told: dict[str, SessionOverview]) -> dict[str, Any]:
+    overview = told.get(info.id, SessionOverview())  # it was deleted meanwhile
+    return _fields(service, info) | overview.model_dump() | {"tags": tags_of(info.notes)}
+
+
 def _session(service: Service, session_id: str) -> StoredSession:
     return StoredSession(**_fields(service, service.session(session_id)))
 
@@ -92,12 +99,30 @@ def _session(service: Service, session_id: str) -> StoredSession:
     responses=answers(401, 422) | {200: {"headers": HEADERS}},
 )
 def list_sessions(
-    service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
-) -> list[StoredSession]:
-    """Sessions, newest first, in pages."""
-    found = service.store.sessions(after, limit)
-    page_headers(request, response, service.store.count_sessions(), limit, [info.id for info in found])
-    return [StoredSession(**_fields(service, info)) for info in found]
+    service: Here,
+    request: Request,
+    response: Response,
+    after: IdCursor = None,
+    limit: Limit = PAGE,
+    search: Annotated[
+        str,
+        Query(
+            max_length=200,
+            description="only those with each of these words in id, name, notes, the station's name or what their "
+            "instruments reported",
+        ),
+    ] = "",
+    verdict: Annotated[
+        DiagnosisVerdict | None, Query(description="only those whose newest diagnosis said this")
+    ] = None,
+) -> list[ListedSession]:
+    """Sessions, newest first, in pages: all, or those that are searched for."""
+    only = None if verdict is None else sessions_of_verdict(service.store, verdict)
+    found = service.store.sessions(after, limit, search=search, only=only)
+    total = service.store.count_sessions(search=search, only=only)
+    page_headers(request, response, total, limit, [info.id for info in found])
+    told = overviews(service.store, [info.id for info in found])
+    return [ListedSession(**_listed(service, info, told)) for info in found]
 
 
 @router.post(
@@ -134,8 +159,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     """One session, with its provenance."""
     found = known(missing_session(session_id), lambda: service.store.details(session_id))
     return SessionDetail(
-        **_fields(service, found.info),
-        station=found.station,
+        **_listed(service, found.info, overviews(service.store, [session_id])),
         progress=service.progress(session_id) if found.info.closed is None else None,
         runs=service.public_runs(found.runs),
         captures=tuple(
@@ -144,6 +168,19 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
         ),
         results=service.store.newest_results(session_id),
     )
+
+
+@router.patch(
+    "/sessions/{session_id}",
+    tags=["sessions"],
+    dependencies=[OPERATE],
+    responses=answers(401, 403, 404, 422),
+)
+def describe_session(service: Here, session_id: SessionId, asked: SessionWords) -> StoredSession:
+    """Give a session another name or other notes, also while it runs."""
+    service.session(session_id)
+    service.store.describe_session(session_id, asked.name, asked.notes)
+    return _session(service, session_id)
 
 
 @router.delete(
@@ -318,14 +355,6 @@ def get_capture(service: Here, session_id: SessionId, capture_id: RegistryId) ->
     return _capture(_known_capture(service, session_id, capture_id))
 
 
-class Picture(Response):
-    media_type = "image/png"
-
-
-class Npy(Response):
-    media_type = "application/x-npy"
-
-
 @router.get(
     "/sessions/{session_id}/captures/{capture_id}/preview.{picture}",
     tags=["captures"],
@@ -339,18 +368,13 @@ def preview_capture(
     session_id: SessionId,
     capture_id: RegistryId,
     picture: PictureForm,
-    width: Annotated[int, Query(ge=16, le=4096, description="px, at most")] = 480,
-    stretch: Annotated[bool, Query(description="white is the frame's own brightest, not the data sheet's")] = False,
+    width: Width = 480,
+    stretch: Stretch = False,
 ) -> Response:
     """A small picture, .png or .webp (a tenth of its bytes): black subtracted, one value per colour and mosaic cell,
     gamma-encoded, without white balance."""
     info = _known_capture(service, session_id, capture_id)
-    tag = f'"{session_id}-{capture_id}-{width}-{int(stretch)}-{picture}"'
-    headers = FOR_EVER | {"ETag": tag}
-    if request.headers.get("if-none-match") == tag:
-        return Response(status_code=304, headers=headers)
-    content = service.pictures.picture(session_id, info.id, width, stretch, picture)
-    return Picture(content, headers=headers, media_type=f"image/{picture}")
+    return picture_of(service, request, session_id, info.id, picture, width, stretch)
 
 
 @router.get(
@@ -363,8 +387,7 @@ def preview_capture(
 def capture_frame(service: Here, session_id: SessionId, capture_id: RegistryId) -> Response:
     """The raw frame as .npy: uint16 (rows, cols), checked against its SHA-256."""
     info = _known_capture(service, session_id, capture_id)
-    headers = FOR_EVER | {"Content-Disposition": f'attachment; filename="capture-{info.id}.npy"'}
-    return Npy(npy_bytes(service.store.frame(info.id)), headers=headers)
+    return npy_of(service, session_id, info.id)
 
 
 @router.get(
