@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import tempfile
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Collection, Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,7 @@ from api.security import (
 )
 from api.service import READ, Here, Limits, Service
 from api.shared_answers import Shared, SharedAnswers
+from api.then import ThenRunner
 from api.upload import Inbox
 from api.waiting import QueueRunner
 from lab.capture.recovery import Recovery
@@ -167,6 +168,7 @@ def create_app(
     *,
     stations: Path | None = None,
     hosts: Iterable[str] = (),
+    webhook_hosts: Collection[str] = (),
     limits: Limits | None = None,
     connect: Callable[[Station], Drivers] = drivers_of,
     jobs_runner: JobRunner | None = None,
@@ -175,9 +177,10 @@ def create_app(
     """The application on a store.
 
     `stations`: the folder of the station files, by default `stations` in the data folder. `hosts`: names under which
-    the service is reached, beside this computer's own. `connect` makes a station's drivers. When the application ends,
-    it cancels its jobs and aborts its sessions, which can be resumed; shutters are closed. `recovery` may have begun
-    already; by default the application's start begins it.
+    the service is reached, beside this computer's own. `webhook_hosts`: those that may be told of sessions' ends.
+    `connect` makes a station's drivers. When the application ends, it cancels its jobs and aborts its sessions, which
+    can be resumed; shutters are closed. `recovery` may have begun already; by default the application's start begins
+    it.
     """
     folder = stations or store.root / "stations"
     folder.mkdir(parents=True, exist_ok=True)
@@ -190,8 +193,10 @@ def create_app(
         rescue.resume_with(app.state.service.live.resume)
         rescue.start()
         app.state.service.waiting.start()
+        app.state.service.then.start()
         yield
         await asyncio.to_thread(app.state.service.waiting.close)
+        await asyncio.to_thread(app.state.service.then.close)
         await asyncio.to_thread(rescue.close)
         await asyncio.to_thread(app.state.service.checks.close)
         app.state.service.jobs.close()  # first: a job that captures ends its session itself
@@ -232,6 +237,7 @@ def create_app(
         stations=folder,
         live=live,
         waiting=QueueRunner(store, live, lambda: rescue.settled),
+        then=ThenRunner(store, live, jobs_of, webhook_hosts, shared.forget),
         quick_look=QuickLook(store),
         pictures=Pictures(store, inbox),
         jobs=jobs_of,

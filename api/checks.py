@@ -45,8 +45,8 @@ _CHECKED = TypeAdapter(Checked)
 
 
 class DeviceChecks:
-    """Checks devices in the background, those of one station one after the other, and keeps sessions off its instruments
-    meanwhile.
+    """Checks devices in the background, those of one station one after the other, and keeps sessions off its
+    instruments meanwhile.
 
     `folder`: where the latest check of each device is kept, and what went over its wire.
     """

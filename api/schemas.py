@@ -16,6 +16,7 @@ from lab.calibration.camera_models import ModelOfCamera
 from lab.calibration.life import CalibrationRecord
 from lab.calibration.limits import CalibrationLimits, Mark
 from lab.capture.plan import CapturePlan, full_plan
+from lab.capture.queue import QueuedSession
 from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture.station import Station
@@ -156,6 +157,52 @@ class CaptureStart(PlanAsked):
     )
 
 
+class Then(Asked):
+    """What follows a session's end, when it has finished."""
+
+    kind: Literal["fit", "diagnose", "pipeline"] | None = Field(
+        default=None,
+        description="what to compute; `diagnose` fits and validates before, `pipeline` writes a report, too",
+    )
+    resolve: bool = Field(
+        default=False, description="of a pipeline: while rivals are left, take the capture that tells them apart"
+    )
+    compare: bool = Field(default=False, description="compare the fit with the cameras' certified calibration")
+    webhook: str | None = Field(
+        default=None,
+        max_length=400,
+        pattern=r"^https?://[^\s/@]+(/\S*)?$",
+        description="is told by a POST how it ended, also where the session ended early; on a host that the service "
+        "was started with (`--webhook-host`)",
+    )
+
+    @model_validator(mode="after")
+    def _belongs_together(self) -> Self:
+        if self.resolve and self.kind != "pipeline":
+            raise ValueError("resolve: goes with kind = pipeline; give both")
+        if self.compare and self.kind is None:
+            raise ValueError("compare: needs a fit; give a kind")
+        if self.kind is None and self.webhook is None:
+            raise ValueError("then: asks for nothing; give a kind or a webhook, or leave it out")
+        return self
+
+    @property
+    def in_words(self) -> str:
+        """What was asked for, in a few words."""
+        words = (self.kind, self.resolve and "resolve", self.compare and "compare", self.webhook and "tell")
+        return ", ".join(word for word in words if word)
+
+
+class ThenState(Schema):
+    """How far that is which follows a session's end. `words`: what was asked for, and what came of it."""
+
+    state: Literal["waiting", "running", "done", "failed"]
+    words: str
+    job_id: str | None = Field(default=None, description="of the job that computes it")
+    comparison: str | None = Field(default=None, description="path of the page that compares with the certified one")
+    told: str | None = Field(default=None, description="what came of telling the webhook")
+
+
 class SessionStart(CaptureStart):
     """A new session, started now or when its turn comes."""
 
@@ -165,6 +212,7 @@ class SessionStart(CaptureStart):
 
     queue: bool = Field(default=False, description="wait in the queue until the instruments are free")
     not_before: AwareDatetime | None = Field(default=None, description="with `queue`: the earliest time, with its zone")
+    then: Then | None = Field(default=None, description="what follows its end; needs a key of the scope `admin`")
 
     @model_validator(mode="after")
     def _time_of_a_queued_one(self) -> Self:
@@ -178,6 +226,16 @@ class QueuePlace(Asked):
 
     place: int | None = Field(default=None, ge=1, le=100_000, description="1: first; null: where it is, or last")
     not_before: AwareDatetime | None = Field(default=None, description="the earliest time, with its zone")
+
+
+class QueueEntry(QueuedSession):
+    """A session in the queue, and when it is expected to run: by what the instruments' finished sessions took, and by
+    what waits before it. null: held, or what is before it isn't known."""
+
+    expected_start: datetime | None = None
+    expected_end: datetime | None = None
+    then: str | None = Field(default=None, description="what follows its end, in words")
+    can_copy: bool = Field(default=False, description="whether `GET /sessions/ID/request` has what it was asked with")
 
 
 class Halt(Asked):
@@ -371,6 +429,7 @@ class SessionDetail(ListedSession):
     """A session with its progress and its provenance."""
 
     can_copy: bool = Field(default=False, description="whether `GET /sessions/ID/request` has what it was asked with")
+    then: ThenState | None = Field(default=None, description="how far that is which follows its end")
     progress: Progress | None = Field(description="null unless this service runs it now")
     runs: tuple[RunRecord, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
     captures: tuple[CaptureCount, ...] = Field(description="how many there are of each kind and side")

@@ -20,6 +20,7 @@ from api.pictures import Pictures
 from api.public_text import PublicText
 from api.safety import StationSafety
 from api.security import Demand, Gate
+from api.then import ThenRunner
 from api.upload import Inbox
 from api.waiting import QueueRunner
 from lab.calibration import camera_models
@@ -58,6 +59,7 @@ class Service:
     stations: Path
     live: LiveSessions
     waiting: QueueRunner
+    then: ThenRunner
     quick_look: QuickLook
     pictures: Pictures
     jobs: JobRunner

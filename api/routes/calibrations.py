@@ -6,23 +6,23 @@ import functools
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
+from fastapi.responses import HTMLResponse
 
+from api.certificate import Certificate, certificate, certificate_page, rejections
 from api.errors import Conflict, answers, known
 from api.keys import Permission, StoredKey
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import CalibrationDetail, Certify, DraftedLimit, DraftedLimits, FigureName, FigureOfFit, Revoke
-from api.security import Demand
+from api.security import REPORT_POLICY, Demand
 from api.service import READ, Here, HexId, Service, SessionId
 from lab.calibration import camera_models, life
 from lab.calibration.figures import Figure, figures_of
 from lab.calibration.life import CalibrationRecord, DriftBoard, History
 from lab.calibration.limits import judged, standing_limits
-from lab.calibration.overview import verdict_of
 from lab.capture.store import Store
 from lab.errors import InputError
 from lab.formats.results import FitResult
 from lab.formats.results.figure_names import plain_name, unit_of
-from lab.report.words import VERDICTS
 
 router = APIRouter(tags=["calibrations"])
 
@@ -67,18 +67,6 @@ def _has_cameras(service: Service, calibration_id: str) -> bool:
         return bool(camera_models.record(service.store, calibration_id).sides)
     except InputError:
         return False
-
-
-def rejections(store: Store, found: CalibrationRecord) -> tuple[str, ...]:
-    """What speaks against a calibration's model: its session's newest diagnosis, where that rejects it, or none."""
-    newest = store.newest_results(found.session_id)
-    if "diagnose" not in newest:
-        return ("The session isn't diagnosed: nobody looked whether the model leaves something out.",)
-    verdict = verdict_of(store, newest["diagnose"])
-    if verdict in ("no_mismatch", "nothing_judged"):
-        return ()
-    badge, _, words = VERDICTS[verdict]
-    return (f"The diagnosis rejects the model ({badge}): {words[0].lower()}{words[1:]}",)
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -180,6 +168,39 @@ def certify_calibration(
     if limits is None:
         raise HTTPException(422, "limits: the data folder has no limits.toml; put one there, or send the limits")
     return life.certify(service.store, calibration_id, key.name, limits, accept_warnings=asked.accept_warnings)
+
+
+def _certified(service: Service, calibration_id: str) -> CalibrationRecord:
+    found = _known(service, calibration_id)
+    if found.certified is None:
+        raise Conflict(f"calibration {calibration_id} is a {found.state}; certify it, then it has a certificate")
+    return found
+
+
+@router.get(
+    "/calibrations/{calibration_id}/certificate",
+    dependencies=[READ],
+    response_class=HTMLResponse,
+    responses=answers(401, 404, 409, 422),
+)
+def certificate_of_calibration(service: Here, calibration_id: HexId) -> HTMLResponse:
+    """The certificate as a page to print, or to keep as a PDF: limits, figures with their uncertainties, verdict,
+    serial numbers, hash. 409 before it is certified."""
+    found = _certified(service, calibration_id)
+    try:
+        runs = service.public_runs(service.store.runs(found.session_id))
+    except InputError:  # the session was deleted
+        runs = ()
+    page = certificate_page(service.store, found, runs)
+    return HTMLResponse(service.public.within(page), headers={"Content-Security-Policy": REPORT_POLICY})
+
+
+@router.get(
+    "/calibrations/{calibration_id}/certificate.json", dependencies=[READ], responses=answers(401, 404, 409, 422)
+)
+def certificate_content(service: Here, calibration_id: HexId) -> Certificate:
+    """What the certificate states, and its hashes: whoever has it sees whether it was changed."""
+    return certificate(service.store, _certified(service, calibration_id))
 
 
 @router.post("/calibrations/{calibration_id}/revoke", responses=answers(401, 403, 404, 409, 422))

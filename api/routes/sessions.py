@@ -16,6 +16,7 @@ from api.errors import answers, known
 from api.events import described, event, stream, watched
 from api.frames import FOR_EVER, Npy, Picture, Stretch, Width, npy_of, picture_of
 from api.kept_sets import session_set
+from api.keys import Permission
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers
 from api.preview import Form as PictureForm
 from api.schemas import (
@@ -30,12 +31,15 @@ from api.schemas import (
     StoredCapture,
     StoredSession,
 )
+from api.security import Demand
 from api.service import ADMIN, OPERATE, OVER, READ, Here, RegistryId, Service, SessionId, missing_session
+from api.then import check_webhook, keep_request, kept_request, then_of
 from lab.calibration.overview import SessionOverview, overviews, sessions_of_verdict, tags_of
 from lab.capture.plan import full_plan
 from lab.capture.queue import put_into_queue
 from lab.capture.records import CaptureInfo, SessionInfo
 from lab.capture.session import CaptureSession, Progress
+from lab.capture.station import Station
 from lab.errors import InputError
 from lab.formats.results.diagnosis import DiagnosisVerdict
 from lab.quick_look.curves import Curves
@@ -88,7 +92,40 @@ def _listed(service: Service, info: SessionInfo, told: dict[str, SessionOverview
     return _fields(service, info) | overview.model_dump() | {"tags": tags_of(info.notes)}
 
 
-def _session(service: Service, session_id: str) -> StoredSession:
+def check_then(service: Service, request: Request, start: SessionStart) -> None:
+    """Raises 403 for a key that may not ask for what follows a session, and 422 for a webhook on a foreign host."""
+    if start.then is not None:
+        Demand(Permission.ADMIN)(request, None, None)
+        check_webhook(start.then.webhook, service.then.hosts)
+
+
+def registered(service: Service, start: SessionStart, station: Station) -> str:
+    """Register a session that doesn't run yet; its id. Raises InputError where the station can't take it."""
+    session = CaptureSession.start(
+        service.store,
+        station,
+        start.plan(station),
+        name=start.name,
+        notes=start.notes,
+        demands_certified=start.demands_certified,
+    )
+    keep_request(service.store, session.id, start)
+    return session.id
+
+
+@router.get("/sessions/{session_id}/request", tags=["sessions"], dependencies=[READ], responses=answers(401, 404, 422))
+def session_request(service: Here, session_id: SessionId) -> SessionStart:
+    """What a session was asked to start with, as `POST /sessions` takes it: to be copied, or edited while it waits. 404
+    where it wasn't started by a service."""
+    service.session(session_id)
+    found = kept_request(service.store, session_id)
+    if found is None:
+        raise HTTPException(404, f"session {session_id}: what it was asked with isn't kept; start one by hand")
+    return found
+
+
+def stored_session(service: Service, session_id: str) -> StoredSession:
+    """A session as most routes answer it."""
     return StoredSession(**_fields(service, service.session(session_id)))
 
 
@@ -132,26 +169,22 @@ def list_sessions(
     dependencies=[OPERATE],
     responses=answers(401, 403, 404, 409, 422),
 )
-def start_session(service: Here, start: SessionStart, response: Response) -> StoredSession:
+def start_session(service: Here, request: Request, start: SessionStart, response: Response) -> StoredSession:
     """Start a session, which runs in the background. 409 while another session runs on the same instruments; with
-    `queue` it waits for its turn instead."""
+    `queue` it waits for its turn instead. With `then` it is analysed when it has finished, and the key's scope has to
+    be `admin`."""
+    check_then(service, request, start)
     station = service.station(start.station)
-    plan = start.plan(station)
     if start.queue:
-        session_id = CaptureSession.start(
-            service.store,
-            station,
-            plan,
-            name=start.name,
-            notes=start.notes,
-            demands_certified=start.demands_certified,
-        ).id
+        session_id = registered(service, start, station)
         put_into_queue(service.store, session_id, start.not_before)
         service.waiting.look_soon()
     else:
+        plan = start.plan(station)
         session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
+        keep_request(service.store, session_id, start)
     response.headers["Location"] = f"/api/v1/sessions/{session_id}"
-    return _session(service, session_id)
+    return stored_session(service, session_id)
 
 
 @router.get("/sessions/{session_id}", tags=["sessions"], dependencies=[READ], responses=answers(401, 404, 422))
@@ -160,6 +193,8 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     found = known(missing_session(session_id), lambda: service.store.details(session_id))
     return SessionDetail(
         **_listed(service, found.info, overviews(service.store, [session_id])),
+        can_copy=kept_request(service.store, session_id) is not None,
+        then=then_of(service.store, session_id),
         progress=service.progress(session_id) if found.info.closed is None else None,
         runs=service.public_runs(found.runs),
         captures=tuple(
@@ -180,7 +215,7 @@ def describe_session(service: Here, session_id: SessionId, asked: SessionWords) 
     """Give a session another name or other notes, also while it runs."""
     service.session(session_id)
     service.store.describe_session(session_id, asked.name, asked.notes)
-    return _session(service, session_id)
+    return stored_session(service, session_id)
 
 
 @router.delete(
@@ -220,7 +255,7 @@ def pause_session(service: Here, session_id: SessionId) -> StoredSession:
     """Pause at the end of the present step. The shutter closes, the screen goes dark."""
     service.session(session_id)
     service.live.pause(session_id)
-    return _session(service, session_id)
+    return stored_session(service, session_id)
 
 
 @router.post(
@@ -234,7 +269,7 @@ def resume_session(service: Here, session_id: SessionId, resume: SessionResume |
     """Continue after a pause, or continue a session that ended early. Finished steps aren't taken again."""
     service.session(session_id)
     service.live.resume(session_id, service.station(resume.station) if resume and resume.station else None)
-    return _session(service, session_id)
+    return stored_session(service, session_id)
 
 
 @router.post(
@@ -248,12 +283,12 @@ def abort_session(service: Here, session_id: SessionId) -> StoredSession:
     """End the run now. The present step is dropped, finished steps are kept, and the session can be resumed."""
     service.session(session_id)
     service.live.abort(session_id, "aborted over the network")
-    return _session(service, session_id)
+    return stored_session(service, session_id)
 
 
 async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> AsyncIterator[ServerSentEvent]:
     def look() -> StoredSession:
-        return _session(service, session_id)
+        return stored_session(service, session_id)
 
     seen = None
     live = service.live.find(session_id)

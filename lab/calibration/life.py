@@ -597,7 +597,7 @@ def _board_columns(store: Store, camera: str, newest: int) -> list[tuple[Calibra
     the newest of all that was certified."""
     has = sa.select(FigureRow.calibration_id).where(FigureRow.camera == camera)
     with store.reading() as db:
-        found = list(db.execute(_asked().where(CalibrationRow.id.in_(has)).order_by(CalibrationRow.created)).tuples())
+        found = list(db.execute(_asked().where(CalibrationRow.id.in_(has)).order_by(CalibrationRow.created)))
     certified = [one.id for one, _ in found if one.certified is not None and one.revoked is None]
     last = {one.session_id: one.id for one, _ in found}
     kept = [of for of in found if last[of[0].session_id] == of[0].id or of[0].certified is not None]
@@ -685,7 +685,7 @@ def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], int]:
     rig = rig_of(wanted.cameras)
     asked = _asked().where(CalibrationRow.rig == rig, CalibrationRow.revoked.is_(None))
     with store.reading() as db:
-        known = [one for one, _ in db.execute(asked.order_by(CalibrationRow.created)).tuples()]
+        known = [one for one, _ in db.execute(asked.order_by(CalibrationRow.created))]
     last = {one.session_id: one.id for one in known}
     earlier = [one.id for one in known if last[one.session_id] == one.id and _aware(one.created) < wanted.created]
     ids = earlier[-DRAFTED_FROM:] if len(earlier) >= DRAFTED_LEAST else [*earlier, wanted.id]

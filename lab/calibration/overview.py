@@ -72,8 +72,8 @@ def overviews(store: Store, sessions: Sequence[str]) -> dict[str, SessionOvervie
     fits = sa.select(CalibrationRow.session_id, CalibrationRow.id, CalibrationRow.cameras)
     fits = fits.where(CalibrationRow.session_id.in_(sessions)).order_by(CalibrationRow.created)
     with store.reading() as db:
-        kept = list(db.execute(of_sessions.where(SessionRow.id.in_(sessions))).tuples())
-        newest = {session: (id, cameras) for session, id, cameras in db.execute(fits).tuples()}
+        kept = list(db.execute(of_sessions.where(SessionRow.id.in_(sessions))))
+        newest = {session: (id, cameras) for session, id, cameras in db.execute(fits)}
         ids = [id for id, _ in newest.values()]
         figures = {name: _means(db, ids, patterns) for name, patterns in _SHOWN.items()}
     verdicts = _diagnoses(store, sessions)
