@@ -210,15 +210,12 @@ async function arrive() {
 
 window.addEventListener("hashchange", async () => {
   if ($("desk").hidden) return;
-  const before = document.activeElement;
-  scrollTo(0, 0);
+  const inTabs = document.activeElement?.closest("#session-tabs");
+  if (!inTabs) scrollTo(0, 0);
   await arrive().catch(() => {});
-  const inTabs = before?.closest?.("#session-tabs, #nav");
-  const heading = document.querySelector("section.view:not([hidden]) h2");
+  const section = document.querySelector("section.view:not([hidden])");
   if (inTabs) document.querySelector("#session-tabs [aria-current]")?.focus();
-  if (!inTabs || inTabs.id === "nav" || !document.activeElement || document.activeElement === document.body) {
-    if (!document.querySelector("section.view:not([hidden])")?.contains(document.activeElement)) heading?.focus({ preventScroll: true });
-  }
+  else if (!section.contains(document.activeElement)) section.querySelector("h2").focus({ preventScroll: true });
 });
 $("skip").addEventListener("click", (event) => {
   event.preventDefault();

@@ -397,7 +397,7 @@ def test_a_figure_of_the_drift_board_has_its_history(browser: Any, lab: Running)
     page.focus("#drift-rows button")
     page.keyboard.press("Enter")
     page.wait_for_selector("#history .point")
-    assert len(page.query_selector_all("#history .point")) == 3 and len(page.query_selector_all("#history .band")) == 2
+    assert len(page.query_selector_all("#history .point")) >= 3 and len(page.query_selector_all("#history .band")) == 2
     assert len(page.query_selector_all("#history path")) == 1  # the drift has a shape of its own
     assert "1 drifted" in page.inner_text("#history-words")
     watched.close()
