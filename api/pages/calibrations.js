@@ -92,6 +92,7 @@ addView({
   section: "view-calibration",
   title: (id) => `Calibration ${id}`,
   async show(first, id) {
+    if (shown !== id) $("calibration-title").textContent = `Calibration ${id}`;
     if (first) await findCertified();
     const one = await ask(`/calibrations/${id}`);
     if (shown !== id) {

@@ -37,7 +37,8 @@ async function enter() {
   $("then").hidden = !may("admin");
   stationsAre(() => refresh().catch(() => {}));
   queueIs(refresh);
-  await arrive();
+  await look();
+  await showView(true);
 }
 
 $("login-form").addEventListener("submit", async (event) => {
@@ -202,20 +203,17 @@ async function refresh() {
   await showView();
 }
 
-// Goes to the view at the page's address; the keyboard goes on at its heading.
-async function arrive() {
-  await look();
-  await showView(true);
-}
-
+// A view that is gone to has the focus at its heading; of the parts of a session, the focus stays on their names.
 window.addEventListener("hashchange", async () => {
   if ($("desk").hidden) return;
   const inTabs = document.activeElement?.closest("#session-tabs");
-  if (!inTabs) scrollTo(0, 0);
-  await arrive().catch(() => {});
-  const section = document.querySelector("section.view:not([hidden])");
+  const filled = showView(true);
+  if (!inTabs) {
+    scrollTo(0, 0);
+    document.querySelector("section.view:not([hidden]) h2").focus({ preventScroll: true });
+  }
+  await filled;
   if (inTabs) document.querySelector("#session-tabs [aria-current]")?.focus();
-  else if (!section.contains(document.activeElement)) section.querySelector("h2").focus({ preventScroll: true });
 });
 $("skip").addEventListener("click", (event) => {
   event.preventDefault();

@@ -111,6 +111,7 @@ async function showFigures(source, fit) {
 
 async function showSource(first, kind, id, tab) {
   const source = { kind, id };
+  if (shown !== `${kind}/${id}`) $("session-title").textContent = id;
   const one = await ask(`/${kind}/${id}`);
   const tabs = tabsOf(kind);
   const usual = kind === "recordings" ? "findings" : LIVE.includes(one.state) ? "live" : one.results.diagnose ? "findings" : "frames";

@@ -292,6 +292,7 @@ addView({
   async show(first, name) {
     if (first) {
       station = name;
+      $("station-title").textContent = name;
       $("station-problem").textContent = "";
       $("check-all").hidden = !may("operate");
       $("keep-transcript").parentElement.hidden = !may("operate");
