@@ -343,9 +343,12 @@ class JobRunner:
                 raise InputError(f"job {job_id!r} isn't in {self.store.root}; list the jobs for their ids")
             return JobInfo.model_validate(row)
 
-    def jobs(self, after: str | None = None, limit: int | None = None) -> list[JobInfo]:
-        """Jobs, the newest first: `limit` at most, those that follow the job `after` in this order."""
+    def jobs(self, after: str | None = None, limit: int | None = None, source: str | None = None) -> list[JobInfo]:
+        """Jobs, the newest first: `limit` at most, those that follow the job `after` in this order. `source`: only
+        those on it."""
         asked = sa.select(JobRow).order_by(JobRow.created.desc(), JobRow.id.desc()).limit(limit)
+        if source is not None:
+            asked = asked.where(JobRow.source == source)
         with self.store.reading() as db:
             if after is not None:
                 last = db.get(JobRow, after)
@@ -360,10 +363,11 @@ class JobRunner:
         with self.store.reading() as db:
             return [JobInfo.model_validate(row) for row in db.scalars(asked)]
 
-    def count_jobs(self) -> int:
-        """How many jobs there are."""
+    def count_jobs(self, source: str | None = None) -> int:
+        """How many jobs there are, or on one source."""
+        asked = sa.select(sa.func.count()).select_from(JobRow)
         with self.store.reading() as db:
-            return db.scalars(sa.select(sa.func.count()).select_from(JobRow)).one()
+            return db.scalars(asked if source is None else asked.where(JobRow.source == source)).one()
 
     def count_states(self) -> dict[str, int]:
         """State -> how many jobs are in it."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from typing import Annotated
 
-from fastapi import APIRouter, HTTPException, Request, Response
+from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from sse_starlette.sse import EventSourceResponse
 
@@ -14,7 +15,7 @@ from api.keys import Permission
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
-from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId, camera_model
+from api.service import ADMIN, CALIBRATE, HEX_ID, READ, SESSION_ID, Here, HexId, Service, SessionId, camera_model
 from lab.challenge.kept import WORK
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
@@ -123,14 +124,23 @@ def start_recordings_job(service: Here, recordings_id: HexId, start: JobStart, r
     "/jobs",
     tags=["jobs"],
     dependencies=[READ],
-    responses=answers(401, 422) | {200: {"headers": HEADERS}},
+    responses=answers(401, 404, 422) | {200: {"headers": HEADERS}},
 )
 def list_jobs(
-    service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
+    service: Here,
+    request: Request,
+    response: Response,
+    after: IdCursor = None,
+    limit: Limit = PAGE,
+    session_id: Annotated[str | None, Query(pattern=SESSION_ID, description="only those on this session")] = None,
+    recordings_id: Annotated[str | None, Query(pattern=HEX_ID, description="only those on these recordings")] = None,
 ) -> list[Job]:
-    """Jobs, the newest first, in pages."""
-    found = service.jobs.jobs(after, limit)
-    page_headers(request, response, service.jobs.count_jobs(), limit, [info.id for info in found])
+    """Jobs, the newest first, in pages: all, or those of one session or recording set."""
+    if session_id is not None and recordings_id is not None:
+        raise HTTPException(422, "session_id, recordings_id: a job has one source; leave one out")
+    source = session_id if recordings_id is None else str(service.recordings(recordings_id))
+    found = service.jobs.jobs(after, limit, source)
+    page_headers(request, response, service.jobs.count_jobs(source), limit, [info.id for info in found])
     return [_job(service, info) for info in found]
 
 
