@@ -28,6 +28,7 @@ from lab.errors import InputError
 from lab.fit.compare import compare
 from lab.formats.results import FitResult
 from lab.jobs import JobRunner
+from lab.resolve import ResolveLimits
 
 log = logging.getLogger(__name__)
 #: How often (s) it is looked whether something follows, and how long (s) a webhook may take to answer.
@@ -174,7 +175,8 @@ class ThenRunner:
             return
         try:
             capturer = self._live.capturer(self._store.station(one.id)) if one.asked.kind == "pipeline" else None
-            job_id = self._jobs.submit(one.asked.kind, one.id, resolve=one.asked.resolve, capturer=capturer)
+            limits = ResolveLimits() if one.asked.resolve else None
+            job_id = self._jobs.submit(one.asked.kind, one.id, resolve=limits, capturer=capturer)
         except InputError as error:
             self._end(one, "failed", one.then, str(error))
             return
