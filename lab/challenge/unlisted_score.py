@@ -157,8 +157,7 @@ def axis_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
     one of means or one of noise as that is."""
     said = axes_of(told.along)
     right = frozenset(word for alike in law.axes for word in alike)
-    # results that tell laws of noise say so in `of`
-    same = (getattr(told, "of", "mean") != "mean") == (law.acts in {"variance", "covariance"})
+    same = (told.of != "mean") == (law.acts in {"variance", "covariance"})
     return same and all(said & set(alike) for alike in law.axes) and said <= right | law.beside
 
 
@@ -181,9 +180,8 @@ def removed(found: DiagnosisResult | None, told: Sequence[DiscoveredLaw], strong
     pairs = []
     if found is not None and found.held_out is not None:
         held = found.held_out
-        # results that tell chi2 with the discovered laws by itself do so in `chi2_discovered`
-        discovered: float | None = getattr(held, "chi2_discovered", None)
-        pairs.append((held.chi2_before, held.chi2_after if discovered is None else discovered, held.n))
+        after = held.chi2_after if held.chi2_discovered is None else held.chi2_discovered
+        pairs.append((held.chi2_before, after, held.n))
     pairs.append((sum(t.chi2_before for t in told), sum(t.chi2_after for t in told), sum(t.n for t in told)))
     for before, after, n in pairs:
         if n and before - n > EXCESS_SIGMAS * (2.0 * n) ** 0.5:
