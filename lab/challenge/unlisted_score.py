@@ -27,24 +27,8 @@ from mocks.former import UNLISTED, UnlistedLaw
 from sim.effects.library import effects as library
 from sim.parameters import Frozen
 
-#: What an index may be called in a result, by the former's word for it.
-ALSO_CALLED = {
-    "rows": "row",
-    "col": "column",
-    "columns": "column",
-    "codes": "code",
-    "signal": "level",
-    "exposure time": "exposure",
-    "frame number": "frame",
-    "elapsed time": "time",
-    "colour": "plane",
-    "channel": "plane",
-    "distance from the centre": "radius",
-    "azimuth": "angle",
-    "cell": "row x column",
-}
 #: Between the indices of a product.
-BETWEEN = re.compile(r"\s*(?:,|\*|×|\band\b|\bby\b|\s+x\s+)\s*")
+BETWEEN = re.compile(r" and | x ")
 #: How a case ends, the best first, with its colour.
 Outcome = Literal["right", "axis only", "nothing told", "another law told", "listed name"]
 COLOURS: dict[Outcome, str] = {
@@ -146,10 +130,9 @@ class UnlistedScore(Frozen):
 
 
 def axes_of(along: str) -> frozenset[str]:
-    """The indices of a discovered law, as the former calls them."""
-    parts = (re.sub(r"\s*\bmod\b.*", "", part).strip() for part in BETWEEN.split(along.lower().replace("_", " ")))
-    named = (ALSO_CALLED.get(part, part) for part in parts if part)
-    return frozenset(axis for name in named for axis in BETWEEN.split(name))
+    """The indices of a discovered law. A table by row and column is one by place."""
+    said = frozenset(BETWEEN.split(along))
+    return said | {"place"} if said >= {"row", "column"} else said
 
 
 def axis_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
@@ -157,6 +140,8 @@ def axis_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
     one of means or one of noise as that is."""
     said = axes_of(told.along)
     right = frozenset(word for alike in law.axes for word in alike)
+    if "place" in said:
+        said = said - ({"row", "column"} if "place" in right else {"place"})
     same = (told.of != "mean") == (law.acts in {"variance", "covariance"})
     return same and all(said & set(alike) for alike in law.axes) and said <= right | law.beside
 
@@ -168,7 +153,7 @@ def stage_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
 
 def period_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
     """Whether the shortest table of a discovered law repeats with a period of the law."""
-    return told.shown_period in law.periods
+    return told.shown_period in law.periods or told.columns in law.periods
 
 
 def removed(found: DiagnosisResult | None, told: Sequence[DiscoveredLaw], strong: bool) -> float | None:
@@ -211,7 +196,7 @@ def case_score(case: str, truth: CaseTruth, run: CaseRun) -> UnlistedCase:
         separability=hidden.separability if hidden is not None else None,
         shown=hidden.noncentrality if hidden is not None else None,
         verdict=found.verdict if found is not None else "failed",
-        told=tuple(f"{t.stage} by {t.along}" + f" mod {t.shown_period}" * bool(t.shown_period) for t in discovered),
+        told=tuple(_words(t) for t in discovered),
         axis_right=bool(on_axis),
         right=bool(rightly),
         period_right=any(period_is_right(law, t) for t in on_axis) if law and law.periods and on_axis else None,
@@ -220,6 +205,11 @@ def case_score(case: str, truth: CaseTruth, run: CaseRun) -> UnlistedCase:
         excess_removed=removed(found, rightly, strong) if law is not None else None,
         cpu_s=run.cpu_s,
     )
+
+
+def _words(told: DiscoveredLaw) -> str:
+    what = told.stage if told.of == "mean" else f"{told.of} of {told.stage}"
+    return f"{what} by {told.along}" + f" mod {told.shown_period}" * bool(told.shown_period)
 
 
 # --- sums -------------------------------------------------------------------------------------------------------------

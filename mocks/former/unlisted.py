@@ -62,11 +62,11 @@ class ScrewErrorLaw(UnlistedLaw):
 
     name, unit, nominal, limits, shown_by = "screw_error", "nm", 0.3, (0.002, 8.0), SPECTRAL
     families = frozenset({"source_in_wavelength"})
-    stage, acts, axes, periods = "light", "factor", (("wavelength",),), (50,)
+    stage, acts, axes = "light", "factor", (("wavelength",),)
 
     def displacement_nm(self, wavelength_nm: float) -> float:
         """Of the line at a wavelength."""
-        return self.strength * float(np.sin(2 * np.pi * (wavelength_nm / self.periods[0] + self.uniform[0])))
+        return self.strength * float(np.sin(2 * np.pi * (wavelength_nm / 50.0 + self.uniform[0])))
 
     def radiance(self, radiance: Array, kind: str) -> Array:
         if kind != "narrowband":
