@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.camera.gphoto2 import Gphoto2Camera, seconds
-from drivers.errors import Disconnected, Garbled, InstrumentError
+from drivers.errors import Disconnected, InstrumentError
 from drivers.found_settings import FoundSettings
 from mocks.peers import VirtualCamera
 from mocks.tethered import write_dng
@@ -83,16 +83,12 @@ def test_pictures_that_are_none(peer: VirtualCamera) -> None:
     with Gphoto2Camera(peer.address, **peer.settings) as camera:
         camera.configure(0.005)
         camera.capture()
-        for data, raised, message in (
-            (b"\xff\xd8 a JPEG", Garbled, r"JPG can't be read \(.*\); let the camera write raw files"),
-            (0.02, InstrumentError, r"was exposed for 0\.02 s, and 0\.005 s were asked for: set the camera to manual"),
-            (None, Garbled, r"a picture has \(24, 32\) pixels of RGGB, those before had \(48, 64\)"),
+        for shape, exposure_s, message in (
+            ((48, 64), 0.02, r"was exposed for 0\.02 s, and 0\.005 s were asked for: set the camera to manual"),
+            ((24, 32), 0.005, r"a picture has \(24, 32\) pixels of RGGB, those before had \(48, 64\)"),
         ):
-            if isinstance(data, bytes):
-                peer.picture.write_bytes(data)
-            else:
-                write_dng(peer.picture, np.zeros((48, 64) if data else (24, 32), np.uint16), data or 0.005)
-            with pytest.raises(raised, match=message):
+            write_dng(peer.picture, np.zeros(shape, np.uint16), exposure_s)
+            with pytest.raises(InstrumentError, match=message):
                 camera.capture()
         write_dng(peer.picture, np.full((48, 64), 99, np.uint16), 0.005)
         assert camera.capture().raw.max() == 99
