@@ -127,17 +127,17 @@ class Apart:
         process.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(1.0)
-        for pipe in (process.stdin, process.stdout):
-            with contextlib.suppress(OSError):
-                if pipe is not None:
-                    pipe.close()
+        with contextlib.suppress(OSError):
+            if process.stdin is not None:
+                process.stdin.close()  # the other is closed by who listens
 
 
 def _listen(answers: Any, heard: queue.SimpleQueue[tuple[str, Any] | None]) -> None:
     """Take the answers as they come; None: no more will."""
     try:
-        while True:
-            heard.put(pickle.load(answers))
+        with answers:
+            while True:
+                heard.put(pickle.load(answers))
     except (EOFError, OSError, ValueError, pickle.UnpicklingError):
         heard.put(None)
 

@@ -18,6 +18,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drivers.camera.basler import pylon_library
 from drivers.contract.peer import Peer, RealInstrument
 from drivers.errors import InstrumentError
@@ -32,7 +34,7 @@ from mocks.scpi_meter import AREA_M2, MockScpiMeter
 from mocks.scpi_meter import calibration_csv as diode_calibration
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.stage import MockStage
-from mocks.tethered import TetheredCamera
+from mocks.tethered import TetheredCamera, write_dng
 from mocks.usb import UsbIpServer, stereo_pair
 from mocks.usb2000plus import MockUsb2000Plus
 from mocks.usb2000plus import calibration_csv as spectrometer_calibration
@@ -486,6 +488,34 @@ class LibraryPeer(Peer):
         self._signal(signal.SIGKILL)
 
 
+class VirtualCamera(LibraryPeer):
+    """libgphoto2's virtual camera, of the package gphoto2's wheel: it hands out one picture again and again."""
+
+    def __init__(self) -> None:
+        if find_spec("gphoto2") is None:
+            raise InstrumentError("gphoto2 cameras: gphoto2 isn't installed; install calibench[gphoto2]")
+        self._folder = tempfile.TemporaryDirectory(prefix="calibench-peer-")
+        self.picture = Path(self._folder.name) / "picture.jpg"  # the only ending that it looks for
+        codes = np.random.default_rng(1).integers(64, 4096, (48, 64), dtype=np.uint16)
+        write_dng(self.picture, codes, 0.0)
+        super().__init__("drivers.camera.gphoto2:Library", self.picture, "", timeout_s=3.0)
+        self.plug()
+
+    def unplug(self) -> None:
+        os.environ.pop("VCAMERADIR", None)
+        self._signal(signal.SIGKILL)
+
+    def plug(self) -> None:
+        os.environ["VCAMERADIR"] = self._folder.name
+
+    def slow(self, slowly: bool) -> bool:
+        return False
+
+    def close(self) -> None:
+        self.unplug()
+        self._folder.cleanup()
+
+
 #: Micro-Manager's own simulated camera and shutter, as somebody left them: binned, and mirrored.
 DEMO_CAMERA = """Property,Core,Initialize,0
 Device,Camera,DemoCamera,DCam
@@ -585,6 +615,10 @@ def alpaca() -> Peer:
 
 def indi() -> Peer:
     return IndiSimulator()
+
+
+def gphoto2() -> Peer:
+    return VirtualCamera()
 
 
 def micromanager() -> Peer:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -132,9 +133,12 @@ class CameraContract(FamilyContract):
 
     @staticmethod
     def _within(driver: Camera, exposure_s: float) -> float:
-        """An exposure that the camera has: the next longer, where its shortest is longer."""
-        limits = driver.sensor().exposure_s
-        return exposure_s if limits is None else max(exposure_s, limits[0])
+        """An exposure of about that which the camera has: its shortest may be longer, and some have a few alone."""
+        for longer in (1.0, 1.25, 2.5, 5.0):
+            with suppress(InstrumentError):
+                driver.check(longer * exposure_s)
+                return longer * exposure_s
+        return exposure_s
 
     def everyday(self, driver: Camera) -> None:
         driver.configure(self._within(driver, 0.005))

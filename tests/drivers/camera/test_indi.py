@@ -159,7 +159,7 @@ def answering() -> Iterator[Callable[[bytes], IndiDevice]]:
         one.close()
 
 
-DEFINED = b"<defSwitchVector device='C' name='CONNECTION' state='Ok'><defSwitch name='CONNECT'>On</defSwitch></defSwitchVector>"
+DEFINED = b"<defSwitchVector device='C' name='CONNECTION'><defSwitch name='CONNECT'>On</defSwitch></defSwitchVector>"
 
 
 @pytest.mark.parametrize(
