@@ -82,8 +82,9 @@ class PwmRows(Effect):
             return np.asarray(whole * on + np.minimum(periods - whole, on))
 
         def factors(rows: int, exposure_s: float, elapsed_s: float) -> FloatArray:
-            begin = self.frequency_hz * (elapsed_s + line_s * np.arange(rows))
+            begin = np.asarray(self.frequency_hz * (elapsed_s + line_s * np.arange(rows)), np.float64)
             length = max(self.frequency_hz * exposure_s, 1e-9)
-            return np.asarray((lit_periods(begin + length) - lit_periods(begin)) / (length * on))
+            end = np.asarray(begin + length, np.float64)
+            return np.asarray((lit_periods(end) - lit_periods(begin)) / (length * on))
 
         return light.add_laws(rows=RowLight(1.0 / self.frequency_hz, factors))

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_readout import OFFSETS_STD, dark_readout
@@ -50,7 +51,7 @@ class _Rows:
         return np.asarray(line[half:-half] - np.convolve(line, box / self.period, mode="valid"))
 
     @property
-    def place(self) -> FloatArray:
+    def place(self) -> NDArray[np.intp]:
         """Place in the period of each of the rows that `rough` leaves."""
         half = self.period // 2
         return np.arange(half, self.rows - half) % self.period
