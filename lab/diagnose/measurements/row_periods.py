@@ -17,10 +17,9 @@ from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.stages import PERIOD_PX
 
 #: Rows of a period, of which what repeats after fewer is a part: 2, 3, 4, 6, 8, 12, 16 and 24 rows. Low frames: half.
-PERIOD, LOW_PERIOD = PERIOD_PX, PERIOD_PX // 2
+PERIOD, LOW_PERIOD = mosaic.PERIOD_PX, mosaic.PERIOD_PX // 2
 LEAST_PERIODS = 3  # of a frame, one of which its ends lose
 
 
