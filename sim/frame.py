@@ -211,13 +211,6 @@ def collected_mosaic(
     return charge.move_charge(charge.collect_light(electrons if rows is None else electrons * rows[:, None]))
 
 
-def charge_response(camera: CameraModel, shape: tuple[int, int], effects: Sequence[Effect]) -> FloatArray:
-    """Where one electron of the middle pixel of a frame (rows, cols) ends up."""
-    single = np.zeros(shape)
-    single[shape[0] // 2, shape[1] // 2] = 1.0
-    return charge_of(camera, effects).move_charge(single)
-
-
 def pair_gain_factor(camera: CameraModel, effects: Sequence[Effect]) -> float:
     """Factor on the right camera's signal over the left one's in a scene that both see, against what their own captures
     of uniform light say.

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
-from sim.effects.empirical_law import LineOffsets
+from sim.effects.empirical_law import PatternNoise
 from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
@@ -87,6 +87,8 @@ class Taps(Effect):
         if any(offsets):
             line = self._by_line(np.arange(float(count)), count, offsets)
             signal = signal.add_laws(
-                disturbances=LineOffsets(line[None, :] if self.across == "columns" else line[:, None])
+                disturbances=PatternNoise(
+                    line[None, :] if self.across == "columns" else line[:, None], np.zeros((1, 1))
+                )
             )
         return signal

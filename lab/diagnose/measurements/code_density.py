@@ -18,10 +18,10 @@ from scipy.special import ndtr
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.held_out import held_out_flats, held_out_of
-from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.errors import NotDetermined
+from lab.measure.study import Study, held_out_flats, held_out_of
+from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.flat_lines import collect_rows
-from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import ADDED, COLLECTED, GAINS, LEAK, acting
 from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import ADDED, COLLECTED, GAINS, LEAK, acting
+from lab.measure.study import Study, held_out_flats
 from sim.camera import CameraModel
+from sim.effects.base import Effects
 from sim.point import even_share
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_readout import OFFSETS_STD, DarkReadOut, dark_readout
 from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, FlatLevel, flats
-from lab.diagnose.measurements.reads import COLLECTED, GAINS, acting
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import COLLECTED, GAINS, acting
+from lab.measure.study import Study
 from sim.camera import CameraModel
+from sim.effects.base import Effects
 from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray

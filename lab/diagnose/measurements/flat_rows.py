@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_readout import DarkRowPower, dark_readout, row_profile
 from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, dark_level_dn
-from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import ADDED, LEAK
 from lab.diagnose.measurements.row_light import PHASES, ROW_LIGHT
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import ADDED, LEAK
+from lab.measure.study import Study, held_out_flats
+from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import FieldPoints, Uniform

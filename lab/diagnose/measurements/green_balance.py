@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.even_flats import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
-from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN
-from lab.diagnose.measurements.reads import COLLECTED, acting
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.noise_figures import BLACK_FLOOR_DN
+from lab.measure.reads import COLLECTED, acting
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_readout import OFFSETS_STD, dark_readout
 from lab.diagnose.measurements.even_flats import flats
 from lab.diagnose.measurements.flat_lines import LINE_FLOOR, collect_rows, without_dark
-from lab.diagnose.measurements.reads import COLLECTED, acting
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import COLLECTED, acting
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 

@@ -3,8 +3,7 @@ quantities."""
 
 from __future__ import annotations
 
-from lab.diagnose.measurements.block import Effects
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 from sim.effects.library import list_changes
 
 #: Image lag.
