@@ -32,9 +32,6 @@ from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
 
-#: A whole number of the periods by which pixels of one colour may collect light unlike each other, px.
-PERIOD_PX = 48
-
 
 @dataclass(frozen=True)
 class State:
@@ -257,7 +254,7 @@ class Charge(State):
     `exposure_s`: time asked for -> time in which light is collected. `leak_s`: place down the frame, 0 first row .. 1
     last -> time in which light is collected besides, whatever is asked for. `collected`: electrons of light (rows,
     cols) -> electrons, pixel by pixel and in proportion; it depends on the place by a short period alone, a part of
-    `PERIOD_PX` pixels, as measurements ask it on small tiles, and keeps each colour's mean, as levels don't ask it at
+    `mosaic.PERIOD_PX`, as measurements ask it on small tiles, and keeps each colour's mean, as levels don't ask it at
     all. `dark_current`: (e/s, sensor temperature) -> e/s, of all pixels or of each (rows, cols). `defects`: pixels with
     additional dark current.
     `transfer`: (fx, fy in cy/um, wavelength_nm) -> factor on the transfer function, 1 at zero frequency, alike for all

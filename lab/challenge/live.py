@@ -77,7 +77,6 @@ SIZES: dict[str, str] = {
     "other_f_number": "left:ratio=1.4",
     "phase_detection_rows": "left:loss_percent=4,period=8,first_row=3",
     "pixel_aperture": "left:side_change_um=-0.7",
-    "pwm_rows": "both:off_percent=40,frequency_hz=1000,line_time_us=20",
     "radiometer_nonlinearity": "both:exponent_percent=4",
     "random_telegraph_noise": "left:amplitude_e=40,share_percent=0.5",
     "response_knee": "left:slope_percent=-10,knee_share=0.45",

@@ -65,12 +65,12 @@ class Taps(Effect):
 
     def _by_line(self, line: FloatArray, count: int, steps: tuple[float, float, float]) -> FloatArray:
         """Return a staircase of `steps` up at the borders, of mean 0 over `count` lines."""
-        every = np.arange(count)
 
         def stairs(at: FloatArray) -> FloatArray:
-            return sum((step * (at >= share * count) for share, step in zip(BORDERS, steps, strict=True)), 0.0 * at)
+            above = [step * (at >= share * count) for share, step in zip(BORDERS, steps, strict=True)]
+            return np.asarray(np.sum(above, axis=0), np.float64)
 
-        return stairs(line) - float(np.mean(stairs(every)))
+        return stairs(line) - float(np.mean(stairs(np.arange(float(count)))))
 
     def on_signal(self, signal: Signal) -> Signal:
         gains = (self.quarter_gain_percent, self.gain_percent, self.last_gain_percent)

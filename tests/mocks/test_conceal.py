@@ -109,7 +109,6 @@ CASES = (
     Case("left:other_f_number:ratio=2", (EDGE, SCREEN)),
     Case("left:phase_detection_rows:loss_percent=20,period=12,first_row=5", (FLAT, SWEPT)),
     Case("left:pixel_aperture:side_change_um=1.5", (SCREEN,)),
-    Case("both:pwm_rows:off_percent=60,frequency_hz=800,line_time_us=30", (FLAT,)),
     Case("both:radiometer_nonlinearity:exponent_percent=12,growth=0.5", (SWEPT,)),
     Case("left:random_telegraph_noise:amplitude_e=40,share_percent=10", (DARK,)),
     Case("left:row_noise:noise_e=4,offset_e=4", (DARK,), tolerance=0.4),

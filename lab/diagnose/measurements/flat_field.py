@@ -32,7 +32,6 @@ AXIS_STD, AXIS_STD_KNOWN = (
 )  # of the optical axis without and with a fitted geometry, over the frame's diagonal
 MOST_FRAMES, MOST_LEVELS = 6, 2  # brightest levels, of seen and of held-out flats each
 BLOCK_PX = 4  # side of the blocks in a channel's plane at which its fixed pattern is measured
-DARK = 1e-3  # share of the mean light below which a frame of pulsed light is one without
 ALIKE = 1.5  # largest ratio of the fixed pattern's variance in blocks to that of independent pixels
 #: Variance of rows between frames over that by noise from which on the light flickers. A healthy set exceeds it once in
 #: thousands.
@@ -274,7 +273,7 @@ def _row_light(planes: Sequence[_ChannelCells], base: FloatArray, model: Uniform
 
     def of(light: FloatArray) -> FloatArray:
         cells = np.add.reduceat(light, edges[:-1], axis=1) / np.diff(edges)
-        return np.asarray(cells / np.maximum(cells.mean(1, keepdims=True), DARK))
+        return np.asarray(cells / cells.mean(1, keepdims=True))
 
     vectors = []
     for held_out in (False, True):

@@ -18,7 +18,6 @@ from sim.effects.base import Effects
 from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.stages import PERIOD_PX
 from sim.uniform import Uniform
 
 LINE_FLOOR = 1e-4  # relative standard deviation of a step beside noise
@@ -108,7 +107,7 @@ def collect_rows(camera: CameraModel, effects: Effects) -> FloatArray:
     """Return what the rows collect of even light, (rows, period of the mosaic): means over the even and the odd pixels
     of a row, each colour's plane over its mean.
     """
-    even = {c: np.ones((camera.rows, PERIOD_PX)) for c in camera.channels}
+    even = {c: np.ones((camera.rows, mosaic.PERIOD_PX)) for c in camera.channels}
     tile = collected_mosaic(camera, mosaic.assemble(even, camera.cfa), effects, exposure_s=1.0, elapsed_s=0.0)
     for plane in mosaic.planes(tile, camera.cfa).values():
         plane[...] = plane / plane.mean()

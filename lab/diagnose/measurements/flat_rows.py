@@ -38,7 +38,6 @@ SMOOTH_STD, SMOOTH_POWER = 1e-3, 1.5
 #: variance of the read noise: a camera whose rows are noisier than its pixels shows nothing but stripes.
 MOST_ROW_NOISE = 3.0
 LEAST_ROWS = 24  # of a plane of the mosaic
-DARK = 1e-3  # share of the mean light below which a frame of pulsed light is one without
 LEAST_POWER = 0.05  # of a band over that of the pixels' noise, as predicted
 #: Times within a period at which a frame may begin, interpolated between `PHASES`; and how often they are found anew,
 #: beside the mean of all frames that follows from them.
@@ -259,7 +258,7 @@ def _added_power(
     for level in levels:
         by_phase = model.row_factors_by_phase(camera_rows, level.captures[0].exposure_s, PHASES)
         profiles = by_phase[:, : camera_rows // step * step].reshape(PHASES, -1, step).mean(2)
-        factors.append(resample(profiles / np.maximum(profiles.mean(1, keepdims=True), DARK), FINE_PHASES))
+        factors.append(resample(profiles / profiles.mean(1, keepdims=True), FINE_PHASES))
     mean, light = np.ones(factors[0].shape[1]), list[FloatArray]()
     for _ in range(REFINEMENTS):
         light = [_nearest(level.rows * mean, own) for level, own in zip(levels, factors, strict=True)]

@@ -19,12 +19,11 @@ from sim.effects.base import Effects
 from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.stages import PERIOD_PX
 
 GREEN_FLOOR = 1e-4  # standard deviation of the ratio of equal greens beside noise
 GREEN_NOISE = 0.02  # ratios of a larger standard deviation aren't used
 CELLS = (3, 4)
-TILE_ROWS, TILE_COLS = PERIOD_PX, 4  # size of the uniform frame by which effects are predicted
+TILE_ROWS, TILE_COLS = mosaic.PERIOD_PX, 4  # size of the uniform frame by which effects are predicted
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_readout import OFFSETS_STD, dark_readout
@@ -17,10 +18,9 @@ from lab.measure.study import Study
 from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.stages import PERIOD_PX
 
 #: Rows of a period, of which what repeats after fewer is a part: 2, 3, 4, 6, 8, 12, 16 and 24 rows. Low frames: half.
-PERIOD, LOW_PERIOD = PERIOD_PX, PERIOD_PX // 2
+PERIOD, LOW_PERIOD = mosaic.PERIOD_PX, mosaic.PERIOD_PX // 2
 LEAST_PERIODS = 3  # of a frame, one of which its ends lose
 
 
@@ -51,7 +51,7 @@ class _Rows:
         return np.asarray(line[half:-half] - np.convolve(line, box / self.period, mode="valid"))
 
     @property
-    def place(self) -> FloatArray:
+    def place(self) -> NDArray[np.intp]:
         """Place in the period of each of the rows that `rough` leaves."""
         half = self.period // 2
         return np.arange(half, self.rows - half) % self.period

@@ -143,7 +143,6 @@ LISTED: tuple[type[Law], ...] = (
     TapGainLaw,
     TapOffsetLaw,
     LeakyShutterLaw,
-    PulsedLightLaw,
 )
 
 #: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.
@@ -162,6 +161,7 @@ OUTSIDE: tuple[type[Law], ...] = (
     LightLeakLaw,
     PeriodicBandingLaw,
     TreeRingsLaw,
+    PulsedLightLaw,
     ResponseTailLaw,
     DefectInterpolationLaw,
     DigitalGainLaw,

@@ -30,9 +30,10 @@ from sim.optics.imaging import ZernikePupil
 from sim.optics.pupil import pupil_otf, seidel
 from sim.point import TRANSFER, Blur, displaced_um, edge_profile, even_share, halos, optical_transfer
 from sim.scene.scenes import Darkness, EdgeRegion, KnifeEdge, PlanarTarget, PointArray, UniformField
+from sim.sensor.mosaic import PERIOD_PX
 from sim.sensor.mosaic import phases as mosaic_phases
 from sim.spectrum import Spectrum
-from sim.stages import PERIOD_PX, charge_of, signal_of
+from sim.stages import charge_of, signal_of
 from sim.uniform import Uniform, electron_rate
 
 ALL = list(effects().values())

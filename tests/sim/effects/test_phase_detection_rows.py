@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sim.effects.phase_detection_rows import PhaseDetectionRows
-from sim.stages import PERIOD_PX, Charge
+from sim.sensor.mosaic import PERIOD_PX
+from sim.stages import Charge
 from tests.sim.effects.test_effects import CAMERA
 
 
