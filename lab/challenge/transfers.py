@@ -77,10 +77,59 @@ def _aperture(f_number: float) -> TransferSetting:
     return TransferSetting({"light": light}, {"f_number": f_number}, Changes(f_number=f_number, radiance_factor=light))
 
 
+#: A lens of one surface that is free of spherical aberration: from the glass into air, a hyperboloid of conic -n^2
+#: (Born and Wolf, Principles of Optics, 4.2.3). Its glass has no dispersion.
+LENS_FILE, LENS_F_NUMBER, INDEX = "stigmatic.zmx", 8.0, 1.5
+PRESCRIPTION = """VERS 140000 0 0
+MODE SEQ
+NAME stigmatic
+UNIT MM X W X CM MR CPMM
+ENPD {aperture_mm:.9g}
+FTYP 0 0 2 3 0 0 0
+XFLN 0 0
+YFLN 0 {field_deg:.9g}
+WAVM 1 0.48 1
+WAVM 2 0.55 1
+WAVM 3 0.63 1
+PWAV 2
+SURF 0
+  TYPE STANDARD
+  CURV 0
+  DISZ INFINITY
+SURF 1
+  STOP
+  TYPE STANDARD
+  CURV 0
+  DISZ {thickness_mm:.9g}
+  GLAS ___BLANK 1 0 {index:.9g} 1000000 0
+SURF 2
+  TYPE STANDARD
+  CURV {curvature:.12g}
+  CONI {conic:.9g}
+  DISZ {focal_mm:.12g}
+SURF 3
+  TYPE STANDARD
+  CURV 0
+  DISZ 0
+"""
+
+
+def write_lens(folder: Path, focal_mm: float) -> Path:
+    """Write the prescription of a stigmatic lens at `LENS_F_NUMBER`; its file."""
+    text = PRESCRIPTION.format(
+        aperture_mm=focal_mm / LENS_F_NUMBER, field_deg=3.0, thickness_mm=1.0, index=INDEX,
+        curvature=-1.0 / ((INDEX - 1.0) * focal_mm), conic=-(INDEX**2), focal_mm=focal_mm,
+    )  # fmt: skip
+    file = folder / LENS_FILE
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
 GAIN_DB = float(20.0 * np.log10(GAIN))
 TRANSFERS: dict[str, TransferSetting] = {
     "f/4 to f/2.8": _aperture(2.8),
     "f/4 to f/8": _aperture(8.0),
+    "another lens, by its file": _aperture(LENS_F_NUMBER),
     "LED to tungsten": TransferSetting({"lamp": "tungsten"}),
     "15 degrees warmer": TransferSetting({"temperature_c": 40.0}, {}, Changes(temperature_c=40.0)),
     "exposure x 8, gain x 4": TransferSetting(
@@ -166,9 +215,13 @@ def run_case(case: str, seed: int = SEED) -> CameraRun:
     short = replace(FITTED, kinds=PREDICTED_KINDS, lights=False)
     plan = recordings_of(concealed_camera(case, seed=seed), short)
     runs, failed, tests = {}, {}, []
+    lenses = tempfile.TemporaryDirectory()
     for number, (name, transfer) in enumerate(TRANSFERS.items(), start=1):
         taken = recordings_of(concealed_camera(case, number, seed, **transfer.camera), replace(short, **transfer.plan))
         changes = transfer.changes
+        if "lens" in name:
+            of_lens = {"f_number": None, "lens": write_lens(Path(lenses.name), taken.camera("left").focal_length_mm)}
+            changes = changes.model_copy(update=of_lens)
         if "lamp" in transfer.plan:  # as the radiometer reads it there
             changes = Changes(lamp=taken.spectrum(taken.captures("flat", "left")[0].radiance))
         try:
@@ -178,6 +231,7 @@ def run_case(case: str, seed: int = SEED) -> CameraRun:
             continue
         tests.append(result.effects)
         runs[name] = _run(result)
+    lenses.cleanup()
     return CameraRun(
         case=case, seed=seed, concealed=tuple(law.name for law in laws), told=tuple(e.name for e in
         found.result.effects), tested=together(tests), transfers=runs, failed=failed, commit=commit(),
