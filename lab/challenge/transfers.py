@@ -1,10 +1,11 @@
 """Predictions in configurations that a model was never fitted in: 24 concealed cameras of the second image former, each
 fitted and diagnosed at one configuration, and predicted in others.
 
-`python -m lab.challenge.transfers --out DIR`. Eight cameras are healthy, eight conceal one effect, eight two; the dark
-current of all doubles with the temperature, as that of silicon does. Each is recorded at f/4 in LED light at 25 C. Then
-the model is carried to each of `TRANSFERS`, its predictions are sealed, the concealed camera is recorded there, and the
-seal is opened. Each camera leaves DIR/results/CASE.json; one whose result is there isn't run again.
+`python -m lab.challenge.transfers --out DIR`. Eight cameras are healthy, eight conceal one effect, eight two. Eight
+more conceal one weak blur, which a session at one aperture may tell as a family only. The dark current of all doubles
+with the temperature, as that of silicon does. Each is recorded at f/4 in LED light at 25 C. Then the model is carried
+to each of `TRANSFERS`, its predictions are sealed, the concealed camera is recorded there, and the seal is opened.
+Each camera leaves DIR/results/CASE.json; one whose result is there isn't run again.
 """
 
 from __future__ import annotations
@@ -52,6 +53,10 @@ CONCEALED = frozenset(
         "black_level_temperature",
     }
 )  # fmt: skip
+#: Laws that lose contrast alike in all directions, and the share of their nominal strength that a weak camera has of
+#: one.
+BLURS = frozenset({"optical_low_pass_filter", "defocus", "spherical_aberration", "pixel_aperture", "charge_diffusion"})
+WEAK = (0.3, 0.6)
 #: Every camera's dark current doubles in 1 / 1.3 x 10 degrees.
 DARK_LAW = next(law for law in LISTED if law.name == "dark_current_temperature")
 #: What a session after a transfer takes: what a twin predicts.
@@ -169,14 +174,18 @@ class CameraRun(Frozen):
     cpu_s: float = 0.0
 
 
-Kind = Literal["healthy", "single", "double"]
-KINDS: tuple[Kind, ...] = ("healthy", "single", "double")
+Kind = Literal["healthy", "single", "double", "weak"]
+KINDS: tuple[Kind, ...] = ("healthy", "single", "double", "weak")
+#: How many laws the cameras of a kind conceal, and how many cameras there are of each.
+LAWS = {"healthy": 0, "single": 1, "double": 2, "weak": 1}
 OF_EACH = 8
 
 
 def case_names() -> tuple[str, ...]:
-    """All cases, the kinds in turn."""
-    return tuple(f"{kind}-{number}" for number in range(1, OF_EACH + 1) for kind in KINDS)
+    """All cases, the kinds in turn, weak ones last."""
+    numbers = range(1, OF_EACH + 1)
+    strong = tuple(f"{kind}-{number}" for number in numbers for kind in KINDS[:3])
+    return strong + tuple(f"weak-{number}" for number in numbers)
 
 
 def laws_of(case: str, seed: int = SEED) -> list[Law]:
@@ -184,9 +193,15 @@ def laws_of(case: str, seed: int = SEED) -> list[Law]:
     kind, _, number = case.partition("-")
     rng = np.random.default_rng([seed, KINDS.index(kind), int(number)])  # type: ignore[arg-type]
     is_mono = ConcealedCamera(_seed(case, seed)).cfa == "MONO"
-    able = [law for law in LISTED if law.name in CONCEALED and law.needs not in ({"bayer"} if is_mono else {"mono"})]
-    chosen = rng.permutation(len(able))[: KINDS.index(kind)]  # type: ignore[arg-type]
-    return [able[k](able[k].nominal, int(rng.integers(able[k].variants)), int(rng.integers(2**31))) for k in chosen]
+    pool = BLURS if kind == "weak" else CONCEALED
+    able = [law for law in LISTED if law.name in pool and law.needs not in ({"bayer"} if is_mono else {"mono"})]
+    chosen = rng.permutation(len(able))[: LAWS[kind]]
+    laws = []
+    for k in chosen:
+        law, variant, own = able[k], int(rng.integers(able[k].variants)), int(rng.integers(2**31))
+        share = float(rng.uniform(*WEAK)) if kind == "weak" else 1.0
+        laws.append(law(share * law.nominal, variant, own))
+    return laws
 
 
 def _seed(case: str, seed: int) -> int:
