@@ -137,8 +137,8 @@ def get_prediction(service: Here, prediction_id: HexId) -> StoredPrediction:
 @router.get(
     "/predictions/{prediction_id}/sealed.json",
     dependencies=[READ],
-    response_model=SealedPrediction,
-    responses=answers(401, 404, 422),
+    response_class=FileResponse,
+    responses=answers(401, 404, 422) | {200: {"content": {"application/json": {"schema": {"type": "object"}}}}},
 )
 def sealed_prediction(service: Here, prediction_id: HexId) -> FileResponse:
     """The sealed file, byte by byte: its SHA-256 is `sha256` of the prediction."""

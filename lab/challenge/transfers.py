@@ -1,10 +1,11 @@
 """Predictions in configurations that a model was never fitted in: 24 concealed cameras of the second image former, each
 fitted and diagnosed at one configuration, and predicted in others.
 
-`python -m lab.challenge.transfers --out DIR`. Eight cameras are healthy, eight conceal one effect, eight two; the dark
-current of all doubles with the temperature, as that of silicon does. Each is recorded at f/4 in LED light at 25 C. Then
-the model is carried to each of `TRANSFERS`, its predictions are sealed, the concealed camera is recorded there, and the
-seal is opened. Each camera leaves DIR/results/CASE.json; one whose result is there isn't run again.
+`python -m lab.challenge.transfers --out DIR`. Eight cameras are healthy, eight conceal one effect, eight two. Eight
+more conceal one weak blur, which a session at one aperture may tell as a family only. The dark current of all doubles
+with the temperature, as that of silicon does. Each is recorded at f/4 in LED light at 25 C. Then the model is carried
+to each of `TRANSFERS`, its predictions are sealed, the concealed camera is recorded there, and the seal is opened.
+Each camera leaves DIR/results/CASE.json; one whose result is there isn't run again.
 """
 
 from __future__ import annotations
@@ -52,6 +53,10 @@ CONCEALED = frozenset(
         "black_level_temperature",
     }
 )  # fmt: skip
+#: Laws that lose contrast alike in all directions, and the share of their nominal strength that a weak camera has of
+#: one.
+BLURS = frozenset({"optical_low_pass_filter", "defocus", "spherical_aberration", "pixel_aperture", "charge_diffusion"})
+WEAK = (0.3, 0.6)
 #: Every camera's dark current doubles in 1 / 1.3 x 10 degrees.
 DARK_LAW = next(law for law in LISTED if law.name == "dark_current_temperature")
 #: What a session after a transfer takes: what a twin predicts.
@@ -77,10 +82,59 @@ def _aperture(f_number: float) -> TransferSetting:
     return TransferSetting({"light": light}, {"f_number": f_number}, Changes(f_number=f_number, radiance_factor=light))
 
 
+#: A lens of one surface that is free of spherical aberration: from the glass into air, a hyperboloid of conic -n^2
+#: (Born and Wolf, Principles of Optics, 4.2.3). Its glass has no dispersion.
+LENS_FILE, LENS_F_NUMBER, INDEX = "stigmatic.zmx", 8.0, 1.5
+PRESCRIPTION = """VERS 140000 0 0
+MODE SEQ
+NAME stigmatic
+UNIT MM X W X CM MR CPMM
+ENPD {aperture_mm:.9g}
+FTYP 0 0 2 3 0 0 0
+XFLN 0 0
+YFLN 0 {field_deg:.9g}
+WAVM 1 0.48 1
+WAVM 2 0.55 1
+WAVM 3 0.63 1
+PWAV 2
+SURF 0
+  TYPE STANDARD
+  CURV 0
+  DISZ INFINITY
+SURF 1
+  STOP
+  TYPE STANDARD
+  CURV 0
+  DISZ {thickness_mm:.9g}
+  GLAS ___BLANK 1 0 {index:.9g} 1000000 0
+SURF 2
+  TYPE STANDARD
+  CURV {curvature:.12g}
+  CONI {conic:.9g}
+  DISZ {focal_mm:.12g}
+SURF 3
+  TYPE STANDARD
+  CURV 0
+  DISZ 0
+"""
+
+
+def write_lens(folder: Path, focal_mm: float) -> Path:
+    """Write the prescription of a stigmatic lens at `LENS_F_NUMBER`; its file."""
+    text = PRESCRIPTION.format(
+        aperture_mm=focal_mm / LENS_F_NUMBER, field_deg=3.0, thickness_mm=1.0, index=INDEX,
+        curvature=-1.0 / ((INDEX - 1.0) * focal_mm), conic=-(INDEX**2), focal_mm=focal_mm,
+    )  # fmt: skip
+    file = folder / LENS_FILE
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
 GAIN_DB = float(20.0 * np.log10(GAIN))
 TRANSFERS: dict[str, TransferSetting] = {
     "f/4 to f/2.8": _aperture(2.8),
     "f/4 to f/8": _aperture(8.0),
+    "another lens, by its file": _aperture(LENS_F_NUMBER),
     "LED to tungsten": TransferSetting({"lamp": "tungsten"}),
     "15 degrees warmer": TransferSetting({"temperature_c": 40.0}, {}, Changes(temperature_c=40.0)),
     "exposure x 8, gain x 4": TransferSetting(
@@ -120,14 +174,18 @@ class CameraRun(Frozen):
     cpu_s: float = 0.0
 
 
-Kind = Literal["healthy", "single", "double"]
-KINDS: tuple[Kind, ...] = ("healthy", "single", "double")
+Kind = Literal["healthy", "single", "double", "weak"]
+KINDS: tuple[Kind, ...] = ("healthy", "single", "double", "weak")
+#: How many laws the cameras of a kind conceal, and how many cameras there are of each.
+LAWS = {"healthy": 0, "single": 1, "double": 2, "weak": 1}
 OF_EACH = 8
 
 
 def case_names() -> tuple[str, ...]:
-    """All cases, the kinds in turn."""
-    return tuple(f"{kind}-{number}" for number in range(1, OF_EACH + 1) for kind in KINDS)
+    """All cases, the kinds in turn, weak ones last."""
+    numbers = range(1, OF_EACH + 1)
+    strong = tuple(f"{kind}-{number}" for number in numbers for kind in KINDS[:3])
+    return strong + tuple(f"weak-{number}" for number in numbers)
 
 
 def laws_of(case: str, seed: int = SEED) -> list[Law]:
@@ -135,9 +193,15 @@ def laws_of(case: str, seed: int = SEED) -> list[Law]:
     kind, _, number = case.partition("-")
     rng = np.random.default_rng([seed, KINDS.index(kind), int(number)])  # type: ignore[arg-type]
     is_mono = ConcealedCamera(_seed(case, seed)).cfa == "MONO"
-    able = [law for law in LISTED if law.name in CONCEALED and law.needs not in ({"bayer"} if is_mono else {"mono"})]
-    chosen = rng.permutation(len(able))[: KINDS.index(kind)]  # type: ignore[arg-type]
-    return [able[k](able[k].nominal, int(rng.integers(able[k].variants)), int(rng.integers(2**31))) for k in chosen]
+    pool = BLURS if kind == "weak" else CONCEALED
+    able = [law for law in LISTED if law.name in pool and law.needs not in ({"bayer"} if is_mono else {"mono"})]
+    chosen = rng.permutation(len(able))[: LAWS[kind]]
+    laws = []
+    for k in chosen:
+        law, variant, own = able[k], int(rng.integers(able[k].variants)), int(rng.integers(2**31))
+        share = float(rng.uniform(*WEAK)) if kind == "weak" else 1.0
+        laws.append(law(share * law.nominal, variant, own))
+    return laws
 
 
 def _seed(case: str, seed: int) -> int:
@@ -166,9 +230,13 @@ def run_case(case: str, seed: int = SEED) -> CameraRun:
     short = replace(FITTED, kinds=PREDICTED_KINDS, lights=False)
     plan = recordings_of(concealed_camera(case, seed=seed), short)
     runs, failed, tests = {}, {}, []
+    lenses = tempfile.TemporaryDirectory()
     for number, (name, transfer) in enumerate(TRANSFERS.items(), start=1):
         taken = recordings_of(concealed_camera(case, number, seed, **transfer.camera), replace(short, **transfer.plan))
         changes = transfer.changes
+        if "lens" in name:
+            of_lens = {"f_number": None, "lens": write_lens(Path(lenses.name), taken.camera("left").focal_length_mm)}
+            changes = changes.model_copy(update=of_lens)
         if "lamp" in transfer.plan:  # as the radiometer reads it there
             changes = Changes(lamp=taken.spectrum(taken.captures("flat", "left")[0].radiance))
         try:
@@ -178,6 +246,7 @@ def run_case(case: str, seed: int = SEED) -> CameraRun:
             continue
         tests.append(result.effects)
         runs[name] = _run(result)
+    lenses.cleanup()
     return CameraRun(
         case=case, seed=seed, concealed=tuple(law.name for law in laws), told=tuple(e.name for e in
         found.result.effects), tested=together(tests), transfers=runs, failed=failed, commit=commit(),

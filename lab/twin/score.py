@@ -14,6 +14,7 @@ from lab.diagnose.measurements.block import Label
 from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.errors import InputError
+from lab.formats.camera_file import lens_cache, traced_table
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
 from lab.measure.gaussian import chi2
@@ -22,6 +23,7 @@ from lab.one_blas_thread import one_blas_thread
 from lab.twin.predict import QUANTITIES, is_predicted, measured_blocks
 from lab.twin.sealed import PredictedName, PredictedNumber, SealedPrediction, SidePrediction, TwinNumber
 from sim.camera import CameraModel, Side
+from sim.optics.table import load_cached
 from sim.parameters import Frozen
 from sim.spectrum import FloatArray
 
@@ -30,6 +32,8 @@ WIDTH_95 = float(norm.ppf(0.975))
 #: Most relative change of an exposure, change of a temperature (C) and of a corner (px) that still is the session that
 #: was predicted.
 MOST_EXPOSURE, MOST_C, MOST_PX = 0.25, 3.0, 4.0
+#: Most relative difference of an f-number from that of the prediction.
+MOST_F_NUMBER = 0.02
 #: Least change of the logarithm of the likelihood that an effect makes for its name to be tested.
 LEAST_GAIN = 2.0
 #: Measurements whose numbers a prediction may hold.
@@ -143,7 +147,7 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
     whole, missing = 0.0, 0
     parts: dict[str, float] = {}
     for side, prediction in sealed.sides.items():
-        camera = CameraModel.model_validate(json.loads(sealed.cameras[side]))
+        camera = _camera(sealed, side)
         study = Study(_with_curves(recordings, prediction, camera, side), side, camera)
         wanted = {number.quantity for number in prediction.numbers}
         blocks, left_out = measured_blocks(study, tuple(m for m in SCORED if m.name in wanted))
@@ -180,6 +184,26 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
     )  # fmt: skip
 
 
+def _camera(sealed: SealedPrediction, side: Side) -> CameraModel:
+    """The changed camera of a side. A traced lens is sealed by its hash: its table is the one that is kept on this
+    computer, else traced from the file of the changes. Raises InputError where neither is that lens."""
+    content = json.loads(sealed.cameras[side])
+    imaging = content["lens"]["imaging"]
+    if imaging["kind"] == "traced_lens":
+        wanted = imaging["content_hash"]
+        table = load_cached(lens_cache(), wanted)
+        file = sealed.changes.lens
+        if table is None and file is not None and file.is_file():
+            table = traced_table(file)
+        if table is None or table.content_hash != wanted:
+            where = f"lens: {file}" if file is not None else f"the {side} camera's lens"
+            raise InputError(
+                f"{where}: isn't the traced lens that was sealed, {wanted}; give its file where it was then"
+            )
+        content["lens"]["imaging"] = {"kind": "traced_lens", "table": table}
+    return CameraModel.model_validate(content)
+
+
 def check_session(prediction: SidePrediction, recordings: RecordingSet, side: Side) -> None:
     """Raises InputError where the recordings aren't of the session that was predicted: another data sheet, gain or
     setting."""
@@ -187,7 +211,10 @@ def check_session(prediction: SidePrediction, recordings: RecordingSet, side: Si
     isnt = f"{recordings.source}: isn't the session that was predicted:"
     for key in SHEET:
         there, wanted = getattr(stated, key), getattr(prediction.camera, key)
-        if there != wanted:
+        is_same = there == wanted
+        if key == "f_number" and there is not None and wanted is not None:  # a traced lens has it of its rays
+            is_same = abs(there / wanted - 1.0) <= MOST_F_NUMBER
+        if not is_same:
             raise InputError(f"{isnt} {key} of the {side} camera is {there}, predicted {wanted}; give that session")
     found = {c.id: c for c in recordings.captures(side=side)}
     for planned in prediction.captures:

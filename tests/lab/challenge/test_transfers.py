@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -21,19 +22,26 @@ from lab.challenge.transfers import (
     run_all,
     run_case,
     section,
+    write_lens,
 )
 from lab.challenge.truth import store
 from lab.errors import InputError
 from lab.twin import score as twin_score
+from lab.twin.changes import Changes
+from lab.twin.predict import predict
 from mocks.former import Plan
+from tests.lab.twin.test_twin import PLAN, captured, trained
 
 
 def test_eight_cameras_of_each_kind_conceal_none_one_and_two_laws() -> None:
     names = case_names()
-    assert len(set(names)) == 24
+    assert len(set(names)) == 32
     for name in names:
         laws = laws_of(name)
-        assert len({law.name for law in laws}) == {"healthy": 0, "single": 1, "double": 2}[name.split("-")[0]]
+        assert all(law.strength <= (0.6 if name.startswith("weak") else 1.0) * law.nominal for law in laws)
+        assert (
+            len({law.name for law in laws}) == {"healthy": 0, "single": 1, "double": 2, "weak": 1}[name.split("-")[0]]
+        )
     assert [law.name for law in laws_of("double-3", 9)] != [law.name for law in laws_of("double-3", 10)]
 
 
@@ -92,7 +100,7 @@ def _run(case: str, away: float) -> CameraRun:
 def test_the_page_counts_deviations_intervals_and_names(tmp_path: Path) -> None:
     runs = {case: _run(case, away) for case, away in (("healthy-1", 0.2), ("single-1", 0.8))}
     text = section(runs)
-    assert "2 of 24 cameras (1 of 8 healthy, 1 of 8 single, 0 of 8 double)" in text
+    assert "2 of 32 cameras (1 of 8 healthy, 1 of 8 single, 0 of 8 double, 0 of 8 weak)" in text
     assert "| patches of the chart | 0.5 % | 0.5 % | 0.8 % | 1 % | 75.0 % | 90 to 98 % |" in text
     assert "Families: 1, of which 1 became a name, 1 of them the right one." in text
     assert "Names: 2, 2 of them wrong, of which 2 were withdrawn;" in text
@@ -115,3 +123,22 @@ def test_a_healthy_camera_is_predicted_within_what_is_wanted() -> None:
         # of some 300 numbers with common errors: 95 % within four standard deviations of 100 effective ones
         assert np.mean(inside) > 0.95 - 4.0 * np.sqrt(0.95 * 0.05 / 100.0)
         assert transfer.chi2 < 1.5 * transfer.n
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_prediction_of_a_lens_by_its_file_is_scored_with_that_lens_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CALIBENCH_CACHE", str(tmp_path / "cache"))
+    changes = Changes(lens=write_lens(tmp_path, 8.0), radiance_factor=4.0)
+    prediction = predict({"left": trained(1)}, PLAN, changes, light_std=0.0)
+    aperture = Changes(f_number=8.0, radiance_factor=4.0)
+    found = twin_score.score(prediction, captured(aperture, 7))
+    inside = sum(q.n * q.within_95_percent_interval for q in found.quantities) / found.n
+    # a stigmatic lens is diffraction limited on its axis, where all edges are
+    assert found.missing == 0 and inside > 0.95 - 4.0 * np.sqrt(0.95 * 0.05 / 100.0)
+    shutil.rmtree(tmp_path / "cache")
+    write_lens(tmp_path, 8.5)
+    with pytest.raises(InputError, match="isn't the traced lens that was sealed"):
+        twin_score.score(prediction, captured(aperture, 7))
