@@ -6,6 +6,7 @@ stop of the ring. The sequence sets its stop first and asks for the data sheet's
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
@@ -44,24 +45,26 @@ class StoppedEdgeSequence(EdgeSequence):
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
         stops = {stop.f_number: name for name, stop in station.list_targets(ApertureTarget).items()}
-        usual = station.f_number
-        for f_number in (self.f_number, usual):
-            if f_number not in stops:
-                have = ", ".join(f"f/{one:g}" for one in sorted(stops)) or "none"
-                raise InputError(
-                    f"station: no target of kind 'aperture' with f_number = {f_number}; it has {have}; add "
-                    f'[targets."f/{f_number}"] to the station file if the lens has that stop'
-                )
+        opened, usual = _stop_of(stops, self.f_number), _stop_of(stops, station.f_number)
         stem = f"stopped_edge/f{self.f_number:g}"
-        taken = edge_steps(
-            self, station, stem, StoppedEdgeCapture, aperture=stops[self.f_number], f_number=self.f_number
-        )
+        taken = edge_steps(self, station, stem, StoppedEdgeCapture, aperture=opened, f_number=self.f_number)
         back = Step(
             id=f"{stem}/back",
-            what=f"lens back to f/{usual:g}",
-            setting=Setting(target=None, aperture=stops[usual]),
+            what=f"lens back to {usual}",
+            setting=Setting(target=None, aperture=usual),
         )
         return (*taken, back)
+
+
+def _stop_of(stops: Mapping[float, str], f_number: float) -> str:
+    """The name of the target that is the stop. Raises InputError where the station has none."""
+    if f_number in stops:
+        return stops[f_number]
+    have = ", ".join(f"f/{one:g}" for one in sorted(stops)) or "none"
+    raise InputError(
+        f"station: no target of kind 'aperture' with f_number = {f_number:g}; it has {have}; add "
+        f'[targets."f/{f_number:g}"] to the station file if the lens has that stop'
+    )
 
 
 class StoppedEdgeCapture(EdgeCapture):

@@ -21,6 +21,7 @@ from lab.capture.session import CaptureSession, Progress
 from lab.capture.store import Store
 from lab.capture.take_step import DUMMY_FRAMES
 from lab.capture_kinds.dark import DarkSequence
+from lab.capture_kinds.stopped_edge import StoppedEdgeSequence
 from lab.diagnose import Diagnosis
 from lab.diagnose.outcome.next_capture import Doubt
 from lab.errors import Cancelled, InputError
@@ -321,6 +322,14 @@ def resolving(
             "this station can't",
             "to tell defocus from coma, you need edges at f/8: a lens is lacking",
             id="too little",
+        ),
+        pytest.param(
+            [doubt(offered("edges at f/8", plan=CapturePlan((StoppedEdgeSequence(f_number=8.0),))))],
+            None,
+            [],
+            "this station can't",
+            "you need edges at f/8: station: no target of kind 'aperture' with f_number = 8; it has none",
+            id="a device that isn't there",
         ),
         pytest.param(
             [doubt(offered("darks", 0.2))],

@@ -46,7 +46,7 @@ def test_a_full_session_leaves_the_lens_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    ("targets", "said"), [({}, "it has none"), ({"f/4": STOPS["f/4"]}, "with f_number = 8.0; it has f/4; add")]
+    ("targets", "said"), [({}, "it has none"), ({"f/4": STOPS["f/4"]}, "with f_number = 8; it has f/4; add")]
 )
 def test_a_station_without_the_stop_says_so_before_anything_moves(
     targets: dict[str, object], said: str, store: Store
