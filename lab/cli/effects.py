@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-import click
 import typer
 from rich.markup import escape
 from rich.table import Table
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 class _ListedByDefault(TyperGroup):
     """Commands of which `list` is meant where none is named: `calibench effects NAME`."""
 
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put `list` before arguments that name no command."""
         if not args or args[0] not in {*self.commands, "--help"}:
             args = ["list", *args]

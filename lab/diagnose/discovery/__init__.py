@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
+from scipy.signal import savgol_filter
 from scipy.sparse.linalg import spsolve
 from scipy.stats import chi2 as chi_squared
 
@@ -40,6 +41,9 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.measurements.block import Effects
+from lab.diagnose.measurements.code_density import WIDEST
+from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import DiscoveredLaw
 from lab.measure.study import Study
@@ -239,13 +243,7 @@ def _curves(
             _predictive_curve(look, [table for table in own if table.log_probability <= limit], policy)
             for look, own in zip(looks, tables, strict=True)
         ]
-        # a curve without a form is the smooth discrepancy's, where that predicts
-        smooth = {left.model.blocks[i].measurement.name for i in left.kernels}
-        candidates = [
-            one
-            for one in likeliest
-            if one is not None and (one.form.name != "curve" or one.look.shown_in.isdisjoint(smooth))
-        ]
+        candidates = [one for one in likeliest if one is not None and _beats_smooth(one, left)]
         if not candidates:
             break
         length = [description_length(one.look.seen, one) for one in candidates]
@@ -253,6 +251,20 @@ def _curves(
         best = next((one for one in near if one.look.is_own_axis), candidates[int(np.argmin(length))])
         laws.append(replace(best, equal=tuple(place_in_words(one.look) for one in near if one is not best)))
     return laws
+
+
+def _beats_smooth(one: PredictiveTable, left: Verdict) -> bool:
+    """Whether a law predicts the captures held out as well as the smooth discrepancies of its measurements do, or to
+    their noise. What they predict better has no form.
+    """
+    names = one.look.shown_in
+    blocks = [i for i, block in enumerate(left.model.blocks) if block.measurement.name in names]
+    if not any(i in left.kernels for i in blocks):
+        return True
+    where = np.any([left.model.mask(i) for i in blocks], axis=0)
+    smooth, n = left.model.held_out(left.effects, where, left.kernels)
+    least = n + 2.0 * np.sqrt(2.0 * n) if one.form.name != "curve" else 0.0
+    return one.chi2[1] <= max(smooth, least)
 
 
 def _predictive_curve(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> PredictiveTable | None:
@@ -334,7 +346,12 @@ def law_of(found: PredictiveTable, study: Study) -> EmpiricalLaw:
         at, table = _corners(table)
     if found.form.name == "by index":
         counted = look.seen.index
-        first, table = int(counted.min()), table[int(counted.min()) : int(counted.max()) + 1]
+        first = int(counted.min())
+        moved = np.cumsum(found.departure[first : int(counted.max()) + 1])
+        # what accumulates over more codes than the counts' smoothing isn't determined
+        moved -= savgol_filter(moved, min(2 * WIDEST + 1, (len(moved) - 1) // 2 * 2 + 1), 2)
+        table = np.maximum(1.0 + np.diff(moved, prepend=0.0), LEAST_WIDTH)
+        table *= len(table) / table.sum()
     return EmpiricalLaw(
         stage=look.stage,
         along=look.along,

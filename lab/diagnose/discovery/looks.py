@@ -44,9 +44,8 @@ SHOWN_IN = {
 def index_looks(study: Study, effects: Effects) -> Iterator[Look]:
     """Yield what the effects leave along codes, rows and columns."""
     yield from _codes(study, effects)
-    for stage, images in (("charge", _lit_images(study)), ("signal", _dark_images(study, effects))):
-        if False in images:
-            yield from _of_images(study, stage, "mean", images)
+    yield from _of_images(study, "charge", "mean", _lit_images(study))
+    yield from _of_images(study, "signal", "mean", _dark_images(study, effects))
     yield from _of_images(study, "signal", "variance", _dark_variances(study), cells=False)
 
 

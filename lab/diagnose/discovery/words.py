@@ -93,7 +93,7 @@ def place_in_words(look: Look) -> str:
     """Return the quantity and the index of a look."""
     quantity = QUANTITIES.get((look.stage, look.along)) or BY_LINES[look.stage]
     if look.of == "variance" and look.stage == "signal":
-        quantity = "temporal noise in the dark"
+        quantity = "variances of the dark noise"
     return f"{quantity} by {look.along}"
 
 
