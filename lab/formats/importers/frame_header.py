@@ -24,6 +24,7 @@ from lab.errors import InputError
 from lab.formats.importers.fits_file import fits_header, is_fits
 from lab.formats.raw_file import TiffDescription
 from lab.formats.recording_set import RAWS, InstrumentSnapshot
+from lab.formats.recording_set.snapshot import Value
 
 #: Bytes of a JPEG or PNG file in which its EXIF is looked for: it stands before the picture.
 HEAD_BYTES = 1 << 20
@@ -119,7 +120,7 @@ def _camera(tags: Mapping[str, Any]) -> InstrumentSnapshot | None:
     maker, model, serial = (_text(tags.get(name)) for name in ("Make", "Model", "BodySerialNumber"))
     if not (maker or model or serial):
         return None
-    settings: dict[str, str] = {name: text for name in ("LensModel", "Software") if (text := _text(tags.get(name)))}
+    settings: dict[str, Value] = {name: text for name in ("LensModel", "Software") if (text := _text(tags.get(name)))}
     if (balance := tags.get("WhiteBalance")) in WHITE_BALANCE:
         settings["WhiteBalance"] = WHITE_BALANCE[balance]
     return InstrumentSnapshot(maker=maker, model=model, serial_number=serial, settings=settings)
