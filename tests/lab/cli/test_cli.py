@@ -250,7 +250,7 @@ def test_compare_tells_what_differs_of_the_instruments(tmp_path: Path, capsys: p
         sessions.append(session)
     store.close()
     assert cli.main(["compare", *sessions, "--data", str(tmp_path)]) == 0
-    assert "instruments: spectroradiometer: serial_number was SN-1, is SN-2" in capsys.readouterr().out
+    assert "instruments: spectroradiometer: serial number was SN-1, is SN-2" in capsys.readouterr().out
     assert cli.main(["compare", sessions[1], sessions[1], "--data", str(tmp_path)]) == 0
     assert "instruments" not in capsys.readouterr().out
 

@@ -247,4 +247,4 @@ def test_the_cameras_that_the_frames_name_go_into_the_set(tmp_path: Path) -> Non
     assert recording.read(recording.write(recordings, tmp_path / "set")).manifest.instruments == {"camera left": camera}
     _named(folder / "b.tif", "6009999")
     (line,) = [line for line in read_foreign("raw-folder", folder).warnings if "serial" in line]
-    assert "b.tif: camera left: serial_number was 6001234, is 6009999, as in a.tif: give each camera" in line
+    assert "b.tif: camera left: serial number was 6001234, is 6009999, as in a.tif: give each camera" in line
