@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium names soak kills setup run test serve bench proof proof-live real slow lint clean
+.PHONY: aravis chromium peers names soak kills setup run test serve bench proof proof-live twin real slow lint clean
 
 setup: $(STAMP)
 
@@ -33,6 +33,10 @@ kills: $(STAMP)
 # The library for GigE cameras of any maker, from the distribution; tests that need it skip without it.
 aravis:
 	scripts/install-aravis
+
+# Simulators of INDI's and Alpaca's cameras, and Argyll's spotread; tests that need them skip without them.
+peers: $(STAMP)
+	scripts/install-peers $(BIN)/python
 
 # The browser in which the tests drive the operator's page, from the distribution.
 chromium:
@@ -76,6 +80,13 @@ names: $(STAMP)
 REAL ?= ../shared/data
 real: $(STAMP)
 	$(BIN)/python -m benchmarks.real --data $(REAL) --out calibench-data/real $(ARGS)
+
+# The proof of the twin: concealed cameras carried to configurations that they weren't fitted in. Goes on where it stopped; ARGS="--only
+# CASE" runs one, another SEED draws cameras that nobody has seen. Then the highest levels of real photon-transfer sets from the lowest.
+TWIN ?= calibench-data/proof-twin
+twin: $(STAMP)
+	$(BIN)/python -m lab.challenge.transfers --out $(TWIN) $(if $(SEED),--seed $(SEED)) --page docs/proof-twin.md $(ARGS)
+	test ! -d $(REAL) || $(BIN)/python -m benchmarks.real.extrapolation --data $(REAL) --page docs/proof-twin.md
 
 # The tests that the everyday suite leaves out: recovery and coverage over many draws.
 slow: $(STAMP)

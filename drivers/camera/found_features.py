@@ -31,6 +31,10 @@ class RememberedFeatures:
                 self._found.note(place, before)
         self._features.set(name, value)
 
+    def note(self, name: str, value: Setting) -> None:
+        """Keep what a feature was, where it was changed by other means."""
+        self._found.note(name, value)
+
     def entries(self, name: str) -> Collection[str]:
         return self._features.entries(name)
 

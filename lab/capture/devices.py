@@ -66,10 +66,10 @@ class Device:
 
 
 class TargetDevice(Device):
-    """The stage: which target stands before the cameras. Movable to a target's name."""
+    """The stage: which target stands before the cameras, or which stop the lenses have. Movable to a target's name."""
 
-    def __init__(self, stage: Stage) -> None:
-        super().__init__("target")
+    def __init__(self, stage: Stage, name: str = "target") -> None:
+        super().__init__(name)
         self.stage = stage
         self.value: str | None = None  # None: not known
 

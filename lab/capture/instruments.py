@@ -78,6 +78,8 @@ class Instruments:
         sheets = {side: camera.datasheet for side, camera in station.cameras.items()}
         self.cameras = CamerasDevice(drivers.cameras, sheets, write_frame)
         self.target = TargetDevice(drivers.stage) if drivers.stage else None
+        #: The lenses' stop, which the stage's operator sets.
+        self.aperture = TargetDevice(drivers.stage, "aperture") if drivers.stage else None
         self.light = LightDevice(drivers.monochromator) if drivers.monochromator else None
         self.shutter = ShutterDevice(drivers.monochromator) if drivers.monochromator else None
         self.screen = ScreenDevice(drivers.display, cells) if drivers.display else None

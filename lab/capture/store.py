@@ -220,10 +220,26 @@ class Store:
             found = self._info(db, self._row(db, session_id))
         return self._now(found)
 
-    def sessions(self, after: str | None = None, limit: int | None = None) -> list[SessionInfo]:
-        """Sessions, the newest first: `limit` at most, those that follow the session `after` in this order."""
-        documents = (SessionRow.station, SessionRow.cameras, SessionRow.calibration, SessionRow.runs)
-        asked = sa.select(SessionRow).options(*map(defer, documents))
+    def sessions(
+        self,
+        after: str | None = None,
+        limit: int | None = None,
+        *,
+        search: str = "",
+        only: Sequence[str] | None = None,
+    ) -> list[SessionInfo]:
+        """Sessions, the newest first: `limit` at most, those that follow the session `after` in this order.
+
+        `search`: only those that have each of its words in their id, name, notes, their station's name or what their
+        instruments reported. `only`: ids of those that are asked for."""
+        documents = (
+            SessionRow.station,
+            SessionRow.cameras,
+            SessionRow.calibration,
+            SessionRow.runs,
+            SessionRow.request,
+        )
+        asked = _searched(sa.select(SessionRow).options(*map(defer, documents)), search, only)
         with self.reading() as db:
             if after is not None:
                 last = self._row(db, after)
@@ -232,10 +248,17 @@ class Store:
             found = self._infos(db, db.scalars(asked).all())
         return [self._now(one) for one in found]
 
-    def count_sessions(self) -> int:
-        """How many sessions there are."""
+    def count_sessions(self, *, search: str = "", only: Sequence[str] | None = None) -> int:
+        """How many sessions there are, of those that `sessions` answers."""
         with self.reading() as db:
-            return db.scalars(sa.select(sa.func.count()).select_from(SessionRow)).one()
+            return db.scalars(_searched(sa.select(sa.func.count()).select_from(SessionRow), search, only)).one()
+
+    def describe_session(self, session_id: str, name: str | None = None, notes: str | None = None) -> None:
+        """Give a session another name, or other notes; None leaves them."""
+        with self.transaction() as db:
+            row = self._row(db, session_id)
+            row.name = row.name if name is None else name
+            row.notes = row.notes if notes is None else notes
 
     def count_states(self) -> dict[str, int]:
         """State -> how many sessions the registry has in it."""
@@ -373,6 +396,15 @@ class Store:
                 for capture in captures
             )
         return True
+
+    def lab_time_s(self, session_id: str) -> float:
+        """Time that the finished steps of a session took, s, whatever lay between them."""
+        asked = sa.select(StepRow.started, StepRow.finished).where(
+            StepRow.session_id == session_id, StepRow.started.is_not(None), StepRow.finished.is_not(None)
+        )
+        with self.reading() as db:
+            rows = [(started, finished) for started, finished in db.execute(asked) if started and finished]
+        return float(sum((finished - started).total_seconds() for started, finished in rows))
 
     def sweep(self, session_id: str) -> list[str]:
         """Remove the files that no finished step links, as a crash leaves them; their paths. Needs the session's
@@ -598,6 +630,15 @@ class Store:
                 raise InputError(f"no API key is called {name!r}; list them for their names")
             db.delete(row)
         self._keys = (0.0, [])
+
+
+def _searched(asked: Any, search: str, only: Sequence[str] | None) -> Any:
+    """A query of sessions, confined to those that have all words of a text, and to some ids."""
+    for word in search.split():
+        places = (SessionRow.id, SessionRow.name, SessionRow.notes, SessionRow.station["name"].as_string())
+        reported = sa.cast(SessionRow.runs, sa.Text)
+        asked = asked.where(sa.or_(*(place.icontains(word, autoescape=True) for place in (*places, reported))))
+    return asked if only is None else asked.where(SessionRow.id.in_(only))
 
 
 def _captures_of(asked: Any, session_id: str, kind: str | None = None, side: str | None = None) -> Any:

@@ -1,24 +1,45 @@
-"""`calibench effects`."""
+"""`calibench effects`: the library, and drafts of new ones."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import click
 import typer
 from rich.markup import escape
 from rich.table import Table
+from typer.core import TyperGroup
 
 from lab.cli.console import check_writable, out, write_json
-from lab.cli.sources import Json
+from lab.cli.sources import Json, StoreFolder, recordings_of, run_here
+from lab.errors import InputError
+from lab.pipeline import PipelineRequest
 
 if TYPE_CHECKING:
     from lab.diagnose.effect_list import EffectDescription
 
-commands = typer.Typer()
+
+class _ListedByDefault(TyperGroup):
+    """Commands of which `list` is meant where none is named: `calibench effects NAME`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put `list` before arguments that name no command."""
+        if not args or args[0] not in {*self.commands, "--help"}:
+            args = ["list", *args]
+        return super().parse_args(ctx, args)
 
 
-@commands.command()
-def effects(
+commands = typer.Typer(
+    name="effects",
+    cls=_ListedByDefault,
+    help="The library of effects, and drafts of new ones from discovered laws. `calibench effects NAME` is "
+    "`calibench effects list NAME`.",
+)
+
+
+@commands.command("list")
+def list_effects(
     name: Annotated[str, typer.Argument(metavar="[NAME]", help="only this effect")] = "",
     json: Json = None,
 ) -> None:
@@ -38,6 +59,46 @@ def effects(
             if number:
                 out.print()
             _print_effect(effect)
+
+
+@commands.command()
+def draft(
+    source: Annotated[
+        str,
+        typer.Argument(metavar="SET", help="a recording set, a stored session, or the JSON file of a diagnosis"),
+    ],
+    law: Annotated[int, typer.Option("--law", metavar="N", help="which of the discovered laws, from 1 on")],
+    out_file: Annotated[
+        Path, typer.Option("--out", metavar="FILE.py", help="the effect's file; its name is the effect's")
+    ],
+    data: StoreFolder = None,
+) -> None:
+    """Write a law that a diagnosis discovered as a new effect's file, with its test. Both pass the contract of effects
+    as they stand; existing files are kept."""
+    from lab.diagnose.effect_draft import draft as drafted
+    from lab.diagnose.effect_draft import place_of_test
+    from lab.formats.result_file import read_result
+    from lab.formats.results import DiagnosisResult
+
+    files = out_file, place_of_test(out_file)
+    for file in files:
+        check_writable(file)
+        if file.exists():
+            raise InputError(f"{file}: is there already; name another file, or remove it")
+    if source.endswith(".json"):
+        diagnosis: DiagnosisResult | None = read_result(DiagnosisResult, Path(source))
+    else:
+        request = PipelineRequest("diagnose", recordings=recordings_of(source, data), pictures=False)
+        diagnosis = run_here(request).diagnosis
+    assert diagnosis is not None
+    laws = diagnosis.discovered
+    if not 1 <= law <= len(laws):
+        there = f"laws 1 to {len(laws)} were discovered" if laws else "no law was discovered"
+        raise InputError(f"--law {law}: {there} in {source}; `calibench diagnose` tells them in their order")
+    for file, text in zip(files, drafted(laws[law - 1], law, diagnosis.source, out_file), strict=True):
+        file.write_text(text, encoding="utf-8")
+        out.print(f"{file}")
+    out.print(escape(laws[law - 1].statement))
 
 
 def _print_effect(effect: EffectDescription) -> None:

@@ -25,8 +25,9 @@ app = typer.Typer(
 )
 
 
-for _group in (capturing, fitting, diagnosis, effects, recordings, kinds, simulation):
+for _group in (capturing, fitting, diagnosis, recordings, kinds, simulation):
     app.registered_commands += _group.commands.registered_commands
+app.add_typer(effects.commands)
 app.add_typer(challenge)
 app.add_typer(twin)
 app.add_typer(calibrations.calibrations)

@@ -78,7 +78,7 @@ def _write_maps(recordings: RecordingSet, folder: Path) -> None:
 def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) -> None:
     """Write the camera files of a fit. A line on stderr names each value that was neither fitted nor stated."""
     from lab.formats.camera_file import fitted_camera, write_camera
-    from lab.predict.camera_model import assumptions
+    from lab.formats.camera_model import assumptions
 
     make_folder(folder)
     for side, fitted in result.cameras.items():

@@ -10,9 +10,18 @@ from rich.table import Table
 from lab.cli.console import out
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from lab.capture.catalogue import PlanEstimate, SequenceDescription
     from lab.formats.recording_set import RecordingSet
-    from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
+    from lab.formats.results import (
+        ComparisonResult,
+        DiagnosisResult,
+        FitResult,
+        RivalOdds,
+        Skipped,
+        ValidationResult,
+    )
 
 
 def print_sequences(catalogue: tuple[SequenceDescription, ...], found: PlanEstimate | None) -> None:
@@ -130,7 +139,8 @@ def print_diagnosis(diagnosis: DiagnosisResult) -> None:
     if diagnosis.held_out is not None:
         held = diagnosis.held_out
         captures = f"{len(held.captures)} held-out captures"
-        out.print(f"{captures}: chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after, n = {held.n}")
+        beside = "" if held.chi2_discovered is None else f", {held.chi2_discovered:.0f} with laws without a name"
+        out.print(f"{captures}: chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after{beside}, n = {held.n}")
     departing = {(m.side, m.measurement) for m in diagnosis.mismatches}
     departing |= {(u.side, u.measurement) for u in diagnosis.unexplained}
     table = Table(box=None, pad_edge=False)
@@ -146,6 +156,30 @@ def print_diagnosis(diagnosis: DiagnosisResult) -> None:
     if diagnosis.next_capture:
         out.print(f"next: {escape(diagnosis.next_capture)}")
     print_skipped(diagnosis.skipped)
+
+
+def print_resolving(diagnosis: DiagnosisResult) -> None:
+    """The journal of resolving: in doubt, taken, said; and how it ended."""
+
+    def odds(rivals: Sequence[RivalOdds]) -> str:
+        return ", ".join(f"{rival.name} {rival.probability:.2g}" for rival in rivals) or "none"
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("in doubt", "taken", "expected, nat", "expected, s", "took, s", "said", "session"):
+        table.add_column(heading)
+    for step in diagnosis.resolutions:
+        numbers = (step.information_nat, step.expected_s, step.spent_s)
+        table.add_row(
+            escape(odds(step.rivals)),
+            escape(step.capture + (f", then {step.then}" if step.then else "")),
+            *("" if number is None else f"{number:.3g}" for number in numbers),
+            escape("nothing yet" if step.rivals_after is None else odds(step.rivals_after)),
+            step.session,
+        )
+    if table.row_count:
+        out.print(table)
+    if diagnosis.resolve_end is not None:
+        out.print(f"resolving: [bold]{diagnosis.resolve_end}[/]: {escape(diagnosis.resolve_reason)}")
 
 
 def print_comparison(comparison: ComparisonResult, every: bool) -> None:

@@ -18,6 +18,7 @@ from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.measurements.library import measurement_title
 from lab.effect_titles import at_beginning, effect_title
 from lab.errors import InputError
+from lab.formats.provenance import Provenance, installed_versions, provenance_of
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
 from lab.formats.recording_set.snapshot import told
@@ -39,7 +40,6 @@ from lab.report.chart_data import ChartData, plotly_base64
 from lab.report.emva import data_sheets
 from lab.report.figures import by_side, geometry_figures, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
-from lab.report.provenance import Provenance, installed_versions, provenance_of
 from lab.report.stills import still
 from sim.camera import Side
 

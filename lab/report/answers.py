@@ -126,9 +126,14 @@ def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
 
 def _law_line(law: DiscoveredLaw) -> str:
     """Say along what a law without a name acts, and what it takes off chi2."""
-    repeats = f"repeats every {law.shown_period} {law.along}s" if law.shown_period else f"goes by {law.along}"
+    if law.shown_period and not law.columns:
+        goes = f"repeats every {law.shown_period} {law.along}s"
+    elif law.form in {"step", "line", "knee", "bump"}:
+        goes = f"a {law.form} by {law.along}"
+    else:
+        goes = f"goes by {law.along}"
     before, after = law.chi2_before / law.n, law.chi2_after / law.n
-    return f"A law without a name, {law.side}, {repeats}: with it χ² per number falls from {before:.3g} to {after:.3g}."
+    return f"A law without a name, {law.side}, {goes}: with it χ² per number falls from {before:.3g} to {after:.3g}."
 
 
 def _sure_of(effect: NamedEffect) -> str:
@@ -146,11 +151,13 @@ def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
         return
     yield from (_sure_of(effect) for effect in diagnosis.effects[:NAMED])
     held = diagnosis.held_out
-    if held is not None and held.n and diagnosis.effects:
+    if held is not None and held.n and (diagnosis.effects or held.chi2_discovered is not None):
+        laws = held.chi2_discovered
+        beside = "" if laws is None else f", and with the laws without a name to {_short(laws / held.n)}"
         yield (
             f"On {len(held.captures)} held-out captures, χ² per number falls from {_short(held.chi2_before / held.n)} "
             "to "
-            f"{_short(held.chi2_after / held.n)} (noise alone: 1)."
+            f"{_short(held.chi2_after / held.n)}{beside} (noise alone: 1)."
         )
     if diagnosis.false_alarm_rate is not None:
         yield (

@@ -635,15 +635,17 @@ def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
     held = diagnosis.held_out
     if held is None or held.n == 0:
         return None
+    every = (held.chi2_before, held.chi2_after, held.chi2_discovered)
+    left = [one / held.n for one in every if one is not None]
     return {
         "data": [
             {
                 "type": "bar",
                 "orientation": "h",
-                "y": ["baseline", "improved model"],
-                "x": [held.chi2_before / held.n, held.chi2_after / held.n],
-                "marker": {"color": [BEFORE, AFTER]},
-                "text": [f"{held.chi2_before / held.n:.2f}", f"{held.chi2_after / held.n:.2f}"],
+                "y": ["baseline", "improved model", "with laws without a name"][: len(left)],
+                "x": left,
+                "marker": {"color": [BEFORE, AFTER, AFTER][: len(left)]},
+                "text": [f"{one:.2f}" for one in left],
                 "textposition": "auto",
                 "showlegend": False,
             }

@@ -24,8 +24,10 @@ from lab.formats.results.in_words import plain_number, shown_unit
 from lab.report.charts import AFTER, Figure, Trace, axis, band, layout
 from lab.report.pictures import difference_picture
 from sim.camera import Side
+from sim.effects.empirical_law import PLACES as EMPIRICAL_PLACES
 from sim.effects.library import effects as library
 from sim.parameters import Quantity
+from sim.spectrum import FloatArray
 
 #: Range of a residual image's colours, standard deviations.
 PICTURE_LIMIT = 6.0
@@ -54,29 +56,55 @@ def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[st
 
 
 def _law_chart(law: DiscoveredLaw) -> Figure:
-    """Draw the shortest table of a discovered law: a periodic one with two standard deviations of each entry, one by
-    code with the median of these as a band about no change.
+    """Draw the shortest table of a discovered law: a periodic one with two standard deviations of each entry; one by
+    code with the median of these as a band about no change; a curve over its coordinate; a table by row and column as a
+    map.
     """
-    factor, unit = (1.0, "DN") if law.stage == "signal" else (100.0, "%")
-    quantity = {"codes": "width less 1", "charge": "factor less 1", "signal": "offset"}[law.stage]
+    if law.columns:
+        return _cell_map(law)
+    factor, unit = (1.0, "DN") if law.stage == "signal" and law.of == "mean" and law.along != "level" else (100.0, "%")
+    unit = "e" if unit == "DN" and law.at else unit
+    quantity = {"codes": "width less 1", "signal": "offset"}.get(
+        law.stage if unit != "%" or law.stage == "codes" else ""
+    )
+    quantity = quantity or ("variance less its mean" if law.of == "variance" else "factor less 1")
     departure, half = factor * np.array(law.shown_departure), 2.0 * factor * np.array(law.shown_std)
-    x = np.arange(len(departure))
+    x: FloatArray = np.arange(len(departure)).astype(float)
     points: Trace = {"type": "scatter", "mode": "markers", "showlegend": False}
     data: list[Trace] = []
+    along = f"{law.along} mod {law.shown_period}" if law.shown_period else law.along
     if law.shown_period:
         points |= {
             "error_y": {"type": "data", "array": half.tolist(), "color": "@fg"},
             "marker": {"color": "@fg", "size": 7},
         }
-    else:
-        x = x[half < half.max() * DETERMINED]
-        departure, half = departure[x], half[x]
-        ends, none = [int(x[0]), int(x[-1])], np.zeros(2)
+    elif law.form == "by index":
+        known = half < half.max() * DETERMINED
+        x, departure, half = law.first + x[known], departure[known], half[known]
+        ends, none = [float(x[0]), float(x[-1])], np.zeros(2)
         data.append(band(ends, none, np.full(2, float(np.median(half))), AFTER))
         points["marker"] = {"color": "@fg", "size": 2}
+    else:
+        place = EMPIRICAL_PLACES[law.stage, law.along, law.of]  # type: ignore[index]
+        if len(law.at) == len(departure):
+            x, along = np.array(law.at), f"{law.along}, {place[2]}"
+        data.append(band(x.tolist(), departure, half, AFTER))
+        points |= {"mode": "lines", "line": {"color": "@fg", "width": 2}}
     points |= {"x": x.tolist(), "y": departure.tolist()}
-    along = f"{law.along} mod {law.shown_period}" if law.shown_period else law.along
     return {"data": [*data, points], "layout": layout(220, xaxis=axis(along), yaxis=axis(f"{quantity}, {unit}"))}
+
+
+def _cell_map(law: DiscoveredLaw) -> Figure:
+    """Draw a table by row and column as a map, in per cent or DN."""
+    factor, unit = (1.0, "DN") if law.stage == "signal" else (100.0, "%")
+    cells = factor * np.array(law.shown_departure).reshape(-1, law.columns)
+    most = float(np.abs(cells).max())
+    drawn: Trace = {
+        "type": "heatmap", "z": cells.tolist(), "zmin": -most, "zmax": most, "colorscale": "RdBu",
+        "colorbar": {"title": {"text": unit}},
+    }  # fmt: skip
+    rows = axis(f"row mod {law.period}", autorange="reversed")
+    return {"data": [drawn], "layout": layout(260, xaxis=axis(f"column mod {law.columns}"), yaxis=rows)}
 
 
 def mood(chi2: float, n: int) -> str:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
 from lab.diagnose.inference.decide import Verdict
-from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.inference.held_out import held_out_residual
 from lab.diagnose.inference.locate import chi2_by_slice
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import ExaminedPlace, HeldOut, MeasurementFit, ResidualCurve
+from lab.measure.gaussian import chi2
 from sim.camera import Side
+from sim.effects.base import Effects
+from sim.effects.library import list_changes
 from sim.spectrum import FloatArray
 
 
@@ -77,17 +78,24 @@ def _chi2_by_block(
     return found
 
 
-def held_out(verdict: Verdict) -> HeldOut | None:
-    """chi2 of held-out numbers in the measurements that a named effect or a discrepancy acts on; in all, where nothing
-    was found or nothing of those is held out."""
+def held_out(verdict: Verdict, laws: Effects = (), described: Collection[int] = ()) -> HeldOut | None:
+    """chi2 of held-out numbers in the measurements that a named effect, a discrepancy or a discovered law acts on; in
+    all, where nothing was found or nothing of those is held out. `described`: blocks in which laws stand in the place
+    of discrepancies."""
     model, effects, kernels = verdict.model, verdict.effects, verdict.kernels
     found = [model.affected(type(e)) for e in effects] + [model.mask(i) for i in kernels]
+    found += [model.mask(i) for law in laws for i, block in enumerate(model.blocks) if block.reads & list_changes(law)]
     where = np.any(found, axis=0) if found else None
     if where is not None and model.seen[where].all():
         where = None
     before, n = model.held_out((), where)
     after, _ = model.held_out(effects, where, kernels)
-    return HeldOut(captures=model.captures(True, where), chi2_before=before, chi2_after=after, n=n) if n else None
+    beside = {i: kernel for i, kernel in kernels.items() if i not in described}
+    discovered = model.held_out((*effects, *laws), where, beside)[0] if laws else None
+    if n == 0:
+        return None
+    captures = model.captures(True, where)
+    return HeldOut(captures=captures, chi2_before=before, chi2_after=after, chi2_discovered=discovered, n=n)
 
 
 def residual_curves(side: Side, verdict: Verdict) -> Iterator[ResidualCurve]:

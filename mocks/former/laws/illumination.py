@@ -65,19 +65,27 @@ class LightFlickerLaw(Law):
 
 
 class PulsedLightLaw(Law):
-    """A source dimmed by 2 kHz pulses under a rolling shutter (related to flicker)."""
+    """A source dimmed by pulses under a rolling shutter. Variants: 2 kHz; 500 Hz; 2 kHz with edges of a tenth of a
+    period."""
 
-    name, unit, nominal, limits = "pulsed_light", "%", 60.0, (5.0, 95.0)
-    families = frozenset({"source_in_time"})
+    name, effect = "pulsed_light", "pwm_rows"
+    variants, unit, nominal, limits = 3, "%", 60.0, (5.0, 95.0)
 
     def row_factors(self, count: int, exposure_s: float, k: int) -> Array:
-        on, period = 1 - self.strength / 100, 5e-4
+        on, period = 1 - self.strength / 100, 2e-3 if self.variant == 1 else 5e-4
         start = self.rng(8, k).random() * period + np.arange(count)[:, None] * 60e-6
 
         def light_until(t: Array) -> Array:
             return np.floor(t / period) * on + np.minimum(t / period % 1.0, on)
 
-        return (light_until(start + exposure_s) - light_until(start)) * period / exposure_s / on
+        edges = np.linspace(-0.05, 0.05, 21) * period if self.variant == 2 else np.zeros(1)
+        lit = light_until(start + edges + exposure_s) - light_until(start + edges)
+        return lit.mean(axis=1, keepdims=True) * period / exposure_s / on
+
+    def library_parameters(self) -> dict[str, float]:
+        frequency = 500.0 if self.variant == 1 else 2000.0
+        sharp = {} if self.variant == 2 else {"off_percent": self.strength}
+        return sharp | {"frequency_hz": frequency, "line_time_us": 60.0}
 
 
 class AmbientLightLaw(Law):

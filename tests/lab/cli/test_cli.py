@@ -23,6 +23,7 @@ from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession
 from lab.capture_kinds.dark import DarkSequence
 from lab.cli import bench_process, capturing, diagnosis, fitting
+from lab.cli.exit_codes import EXIT_INPUT
 from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
 from lab.diagnose.effect_list import EffectList, effect_list
@@ -44,6 +45,7 @@ from lab.formats.results import (
 )
 from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult
 from lab.predict import validate as validation
+from lab.resolve import ResolveLimits
 from sim.effects.library import effects
 from tests.lab import fake_bench
 
@@ -421,7 +423,14 @@ def test_the_main_job_says_where_the_report_is_and_what_it_says(
 ) -> None:
     fit = FitResult(source="s", cameras={"left": CameraFit(noise=NoiseFit(conversion_gain_dn_per_e=0.4))})
     taken = Resolution(capture="dark frames", session="session-2", verdict_before="partly_explained", effects_before=())
-    diagnosed = DiagnosisResult(source="s", verdict="no_mismatch", next_capture="Darks.", resolutions=(taken,))
+    diagnosed = DiagnosisResult(
+        source="s",
+        verdict="no_mismatch",
+        next_capture="Darks.",
+        resolutions=(taken,),
+        resolve_end="settled",
+        resolve_reason="no rivals are left",
+    )
     asked: list[PipelineRequest] = []
 
     def pipeline(request: PipelineRequest, *_: object) -> PipelineResult:
@@ -436,20 +445,40 @@ def test_the_main_job_says_where_the_report_is_and_what_it_says(
         )
 
     monkeypatch.setattr(capturing, "run_here", pipeline)
-    assert cli.main(["run", "--quick", "--name", "mine", "--resolve"]) == 0
+    assert cli.main(["run", "--quick", "--name", "mine", "--resolve", "--resolve-minutes", "20"]) == 0
     session = CaptureRequest(quick=True, name="mine")
-    assert asked == [PipelineRequest("pipeline", capture=session, resolve=True)]
+    assert asked == [PipelineRequest("pipeline", capture=session, resolve=ResolveLimits(20.0))]
     shown = capsys.readouterr().out
     for words in (
         "system gain K",
         "0.4 DN/e",
         "The baseline model explains",
-        "Resolved with: dark frames (session session-2)",
+        "dark frames",
+        "session-2",
+        "resolving: settled: no rivals are left",
         "Next capture: Darks.",
         "session: session-1",
         "report: somewhere/report.html",
     ):
         assert words in shown
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--resolve", "--resolve-minutes=-5"], "resolve minutes: -5 isn't above 0"),
+        (["--resolve", "--resolve-rounds=0"], "resolve rounds: 0 is below 1"),
+        (["--resolve-minutes=5"], "go with resolve"),
+    ],
+)
+def test_a_budget_that_cannot_be_kept_is_one_line_before_anything_moves(
+    options: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(capturing, "run_here", lambda *_: pytest.fail("something moved"))
+    assert cli.main(["run", *options]) == EXIT_INPUT
+    shown = capsys.readouterr().err
+    assert said in shown
+    assert len(shown.splitlines()) == 1
 
 
 def test_only_the_mock_bench_conceals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

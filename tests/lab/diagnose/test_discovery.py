@@ -10,15 +10,24 @@ import pytest
 from numpy.typing import NDArray
 
 from lab.challenge.recordings import recording_set, recordings_of
-from lab.diagnose import diagnose, examine
+from lab.diagnose import diagnose, discovery, examine
 from lab.diagnose.discovery import PredictiveTable, discover, law_of
+from lab.diagnose.discovery.profile import Profile, curve_forms, description_length, fitted, formulas
 from lab.diagnose.measurements.blocks import study_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.fit import FOR_DIAGNOSIS, fit_recording_set
 from lab.formats.importers import ImportOptions, read_foreign
 from lab.formats.recording_set import RecordingSet, read, write
 from mocks.former import ConcealedCamera, Law, Plan, record
-from mocks.former.laws import DigitalGainLaw, LossyCodesLaw
+from mocks.former.laws import (
+    AbsorptionBandLaw,
+    DigitalGainLaw,
+    LampJumpLaw,
+    LossyCodesLaw,
+    TapGainLaw,
+    TapOffsetLaw,
+    TreeRingsLaw,
+)
 from sim.effects.column_noise import ColumnNoise
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -140,6 +149,144 @@ def test_one_bright_line_is_no_law() -> None:
         return frame
 
     assert not [one for one in _found(_changed(772012, bright)) if one.look.stage != "codes"]
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "GRBG"])
+def test_the_step_where_two_read_outs_meet_is_found_with_its_size(cfa: str) -> None:
+    """A gain of 1 % and an offset of 3 e right of the middle: to 4 standard deviations of 48 columns of 96 pixels.
+
+    Pixels scatter by 1 % in light and by 5 e in the dark at most; three darks of each of three exposures.
+    """
+    laws = (TapGainLaw(1.0), TapOffsetLaw(3.0))
+    camera = ConcealedCamera(772021, laws, cfa=cfa, rows=96, cols=128)
+    recordings = recordings_of(camera, LIT_AND_DARK)
+    found = {one.look.stage: one for one in _found(recordings)}
+    assert {(one.look.along, one.form.name) for one in found.values()} == {("column", "step")}
+    light, dark = found["charge"].departure, found["signal"].departure / camera.gain_dn_per_e
+    per_column = 4.0 * np.sqrt(2.0 / (48 * 96))
+    assert np.flatnonzero(np.diff(light)).tolist() == [63]
+    assert light[-1] - light[0] == pytest.approx(0.01, abs=0.01 * per_column + 1e-3)  # taken at a mean of unlike halves
+    assert dark[-1] - dark[0] == pytest.approx(3.0, abs=5.0 * per_column)
+    law = law_of(found["charge"], study_of(recordings, "left"))
+    assert law.at == pytest.approx((63.5 / 128, 64.5 / 128))
+
+
+def test_waves_are_no_steps() -> None:
+    """Tree rings bend the light smoothly, strong beside the noise, over some ten columns."""
+    camera = ConcealedCamera(772302, (TreeRingsLaw(3.0),), cfa="MONO", rows=96, cols=128)
+    assert not [one for one in _found(recordings_of(camera, LIT_AND_DARK)) if one.form.name == "step"]
+
+
+def test_pixels_that_differ_within_a_cell_are_found() -> None:
+    """A checkerboard of +-0.5 % has no rows and no columns of its own."""
+    board = 0.005 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+
+    def shaded(frame: Frame, kind: str, black_dn: float) -> Frame:
+        change = np.tile(board, (frame.shape[0] // 2, frame.shape[1] // 2))
+        return frame if kind == "dark" else black_dn + (frame - black_dn) * (1.0 + change)
+
+    recordings = _changed(772012, shaded)
+    (one,) = _found(recordings)
+    assert (one.look.stage, one.look.along) == ("charge", "row and column")
+    law = law_of(one, study_of(recordings, "left"))
+    cell = np.array(law.table).reshape(law.period, law.columns) - 1.0
+    # pixels scatter by 1 %, 96 x 128 of them in two classes
+    assert cell[:2, :2] == pytest.approx(board, abs=4.0 * 0.01 / np.sqrt(96 * 128 / 4))
+
+
+def test_rows_of_unequal_noise_in_the_dark_are_found() -> None:
+    """Every fourth row has the variance of the others and 25 DN^2 besides: a table of variances, and none of means."""
+    rng = np.random.default_rng(7)
+
+    def noisier(frame: Frame, kind: str, black_dn: float) -> Frame:
+        frame[1::4] += np.round(5.0 * rng.standard_normal(frame[1::4].shape))
+        return frame
+
+    recordings = _changed(772012, noisier)
+    (one,) = _found(recordings)
+    assert (one.look.stage, one.look.along, one.look.of, one.period) == ("signal", "row", "variance", 4)
+    study = study_of(recordings, "left")
+    added_dn2 = study.noise.gain**2 * np.array(law_of(one, study).table)
+    assert int(np.argmax(added_dn2)) == 1
+    # variances of 24 rows of 128 pixels by two contrasts are known to sqrt(2 / 6144) = 1.8 %, of some 30 DN^2
+    assert added_dn2[1] - np.delete(added_dn2, 1).mean() == pytest.approx(25.0, rel=0.15)
+
+
+def test_beyond_a_number_of_codes_none_are_tabled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixteen bits would put 65,536 numbers on a page: the periodic table says so, and one by code alone isn't made."""
+    monkeypatch.setattr(discovery, "MOST_BY_CODE", 1000)
+    recordings = recordings_of(ConcealedCamera(772302, (DigitalGainLaw(10.0),), rows=96, cols=128), LIT_AND_DARK)
+    (one,) = _found(recordings)
+    assert one.period == 11
+    (law,) = discovery.told("left", study_of(recordings, "left"), (one,))
+    assert "Single codes aren't tabled: more than 1000 were counted" in law.statement
+    assert max(len(law.table), len(law.shown_departure)) == 11
+    assert not _found(recordings_of(ConcealedCamera(772021, (LossyCodesLaw(0.05),), rows=96, cols=128), LIT_AND_DARK))
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "law"),
+    [
+        ("line", "a straight line, +3 % over the range", lambda x: 0.03 * (x - 100.0) / 900.0),
+        ("step", "a step of +3 % at", lambda x: 0.03 * (x > 420.0)),
+        ("knee", "a knee at", lambda x: 0.05 * np.maximum(x - 450.0, 0.0) / 900.0),
+        ("bump", "a bump of -3 % at 52", lambda x: -0.03 * np.exp(-0.5 * ((x - 520.0) / 40.0) ** 2)),
+        ("formula", "cos(2 pi (u", lambda x: 0.03 * np.cos(2.0 * np.pi * x / 225.0)),
+        ("formula", "ln u", lambda x: 0.03 * np.log(x / 1000.0)),
+        ("formula", "exp(-(u", lambda x: 0.03 * np.exp(-(x - 100.0) / 112.5)),
+    ],
+)
+def test_a_law_is_found_in_its_own_form(name: str, said: str, law: Callable[[Frame], Frame]) -> None:
+    """The shortest description of a law in noise of a thirtieth of its size is its own form."""
+    x = np.linspace(100.0, 1000.0, 41)
+    three = np.repeat(np.eye(len(x)), 3, axis=0)  # repeats of each
+    residual = three @ law(x) + 0.001 * np.random.default_rng(2).standard_normal(len(three))
+    profile = Profile(np.arange(len(three)) % 2, residual, np.full(len(three), 1e-6), three)
+    forms = [
+        *curve_forms(profile, x, x, "nm", lambda value: f"{100.0 * value:+.1g} %"),
+        *formulas(profile, x, "nm", by_inverse=False),
+    ]
+    best = min((fitted(profile, form) for form in forms), key=lambda table: description_length(profile, table))
+    assert best.form.name == name
+    assert said in best.said
+    assert np.sqrt(np.mean(np.square(best.departure - best.departure.mean() - law(x) + law(x).mean()))) < 0.001
+
+
+@pytest.mark.parametrize(
+    ("law", "place", "name", "words"),
+    [
+        (LampJumpLaw(2.0), ("light", "time"), "step", "a step of +2 % at"),
+        (AbsorptionBandLaw(10.0), ("image", "wavelength"), "bump", "a bump of -9.9 % at 516.2 nm, 8.28 nm wide"),
+    ],
+)
+def test_a_mismatch_without_a_name_gets_a_law_along_its_coordinate(
+    law: Law, place: tuple[str, str], name: str, words: str
+) -> None:
+    """Nine tenths of what held-out captures depart by are gone with it, and it stands in the improved model.
+
+    The former's band is at 516.2 nm, 8.34 nm wide; its lamp jumps once, by 2 %.
+    """
+    found = examine(recordings_of(ConcealedCamera(772302, (law,), cfa="MONO", rows=96, cols=128), LIT_AND_DARK))
+    one = found.result.discovered[0]
+    assert ((one.stage, one.along), one.form) == (place, name)
+    assert words in one.statement
+    assert one.chi2_before - one.chi2_after > 0.9 * (one.chi2_before - one.n)
+    held = found.result.held_out
+    assert held is not None and held.chi2_discovered is not None
+    assert held.chi2_before - held.chi2_discovered > 0.9 * (held.chi2_before - held.n)
+    assert "empirical_law" in [effect.name for effect in found.improved["left"].effects]
+    assert [item.shape for item in found.result.unexplained if item.measurement in one.measurements] == [
+        f"as the law of the {'source by time' if name == 'step' else 'transmittance by wavelength'}, which has no name"
+    ]
+
+
+def test_a_mismatch_that_nothing_predicts_says_what_would_help() -> None:
+    camera = ConcealedCamera(772302, (TreeRingsLaw(3.0),), cfa="MONO", rows=96, cols=128)
+    found = diagnose(recordings_of(camera, LIT_AND_DARK), None)
+    (alone,) = [item for item in found.unexplained if item.shape.startswith("irregular")]
+    assert alone.would_help.startswith("Nothing that was tried predicts it")
+    assert "Repeat the flat and narrowband captures" in alone.would_help
+    assert any(alone.would_help in line for line in found.summary)
 
 
 def test_a_law_is_told_and_stands_in_the_improved_model() -> None:

@@ -27,6 +27,7 @@ from lab.formats.results import (
     PolicyRule,
     ResidualCurve,
     Resolution,
+    RivalOdds,
     SideModels,
     SpectralFit,
     Unexplained,
@@ -240,15 +241,35 @@ def test_each_capture_that_settled_a_tie_is_told_with_what_stood_before_it(
 ) -> None:
     recordings = small_set()
     fit, validation, diagnosis = made_up()
+    odds = [
+        tuple(RivalOdds(name=name, probability=p) for name, p in stage)
+        for stage in ((("defocus", 0.6), ("coma", 0.4)), (("defocus", 0.9), ("coma", 0.1)), (("defocus", 0.998),))
+    ]
     taken = tuple(
-        Resolution(capture=f"{what} frames", session=f"s-{what}", verdict_before=verdict, effects_before=())
-        for what, verdict in (("dark", "unexplained"), ("flat", "partly_explained"))
+        Resolution(
+            capture=f"{what} frames",
+            session=f"s-{what}",
+            verdict_before=verdict,
+            effects_before=(),
+            rivals=odds[k],
+            rivals_after=odds[k + 1],
+            information_nat=0.25,
+            expected_s=12.0,
+            spent_s=17.0,
+        )
+        for k, (what, verdict) in enumerate((("dark", "unexplained"), ("flat", "partly_explained")))
     )
-    settled = diagnosis.model_copy(update={"resolutions": taken})
+    ended = {"resolutions": taken, "resolve_end": "settled", "resolve_reason": "no rivals are left"}
+    settled = diagnosis.model_copy(update=ended)
     page = Page(render_report(recordings, fit, validation, settled, provenance_of(recordings)))
-    assert "dark frames (session s-dark), then flat frames (session s-flat)." in page.text
-    rows = [page.text.index(f"before {one.capture}") for one in taken]
+    told = " ".join(page.text.split())
+    assert "Settled: no rivals are left." in told
+    rows = [told.index(words) for words in ("dark frames (session s-dark)", "flat frames (session s-flat)")]
     assert rows == sorted(rows)
+    first, second = told[rows[0] : rows[1]], told[rows[1] :]
+    assert "0.25 nat" in first and "17 s" in first
+    assert re.search(r"defocus 0.9, coma 0.1", first, re.IGNORECASE)
+    assert re.search(r"defocus 1\b", second, re.IGNORECASE)
 
 
 def test_the_first_screen_answers_and_all_else_is_folded(

@@ -13,7 +13,6 @@ from scipy import stats
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
-from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements import dark_noise, defective_pixels
 from lab.diagnose.measurements.block import Block
@@ -21,11 +20,12 @@ from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import TAIL_EDGES, DarkCondition
 from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.library import measurements
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.predict.camera_model import camera_model
+from lab.measure.gaussian import chi2
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan, laws
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect

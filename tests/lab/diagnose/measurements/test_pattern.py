@@ -18,10 +18,10 @@ from lab.diagnose.measurements.even_flats import flats
 from lab.diagnose.measurements.flat_lines import line_block
 from lab.diagnose.measurements.green_balance import green_block
 from lab.diagnose.measurements.narrowband import narrowband_block
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
-from lab.predict.camera_model import camera_model
+from lab.formats.camera_model import camera_model
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     ColumnNoiseLaw,

@@ -1,0 +1,355 @@
+"""Discover laws that no effect of the library has: tables and curves along what a camera has, that predict what they
+weren't taken from.
+
+Looked at are the summaries that the measurements made, less what the baseline and the named effects predict: along
+codes, rows, columns, and cells of both (`looks.py`), and, for measurements that are mismatched, along level, time,
+exposure, wavelength, radius and frequency (`curves.py`). Forms from a table to a short symbolic law are fitted to the
+seen captures (`profile.py`). Of all that were tried, those are told whose false-discovery rate is below
+`DecisionPolicy.discovery_rate` by Benjamini and Yekutieli (Ann. Statist. 29, 1165, 2001), and which predict both halves
+of the index from the other one and the captures held out. Where the counts of single codes differ beyond any period,
+the table is one by code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+from scipy.stats import chi2 as chi_squared
+
+from lab.diagnose.discovery.curves import curve_looks
+from lab.diagnose.discovery.looks import index_looks
+from lab.diagnose.discovery.profile import (
+    Form,
+    Look,
+    PredictiveTable,
+    Profile,
+    Table,
+    curve_forms,
+    description_length,
+    fitted,
+    formulas,
+    periodic_forms,
+    tap_forms,
+)
+from lab.diagnose.discovery.words import BEYOND_TABLE, entry, place_in_words, statement, suspects_of, unit_of
+from lab.diagnose.inference.decide import Verdict
+from lab.diagnose.inference.held_out import held_out_mismatches
+from lab.diagnose.inference.locate import mismatches
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.policy import DecisionPolicy
+from lab.formats.results import DiscoveredLaw
+from lab.measure.study import Study
+from sim.camera import Side
+from sim.effects.base import Effects
+from sim.effects.empirical_law import PLACES, EmpiricalLaw
+from sim.spectrum import FloatArray
+
+LEAST_WIDTH = 0.02  # of a code: a missing code's
+#: Share of what the chosen table takes off chi2 from which on a shorter one that takes it off is told first.
+SHORTER_SHARE = 0.9
+#: The same of a curve in place of one of more numbers.
+NEARLY_ALL = 0.95
+#: Lines by which steps are moved to see whether they are sharp, and the most that these may gain, over the gain.
+BESIDE_LINES, SHARP_SHARE = 2, 0.75
+MOST_BY_CODE = 4096  # entries of a table by code
+MOST_CURVES = 2  # laws along coordinates, one after the other
+#: Description length by which another place in the chain may be longer and is told beside.
+EQUAL_LENGTH = 6.0
+
+
+def discover(
+    study: Study, effects: Effects, policy: DecisionPolicy, left: Verdict | None = None
+) -> tuple[PredictiveTable, ...]:
+    """Find laws that hold in what they weren't taken from, the most significant first; see the package.
+
+    `effects`: those of the baseline, and the named ones. `left`: the verdict, where it leaves a mismatch: it is looked
+    at along coordinates. Without, only indices are looked at.
+    """
+    looks = list(index_looks(study, effects))
+    tables = [[fitted(look.seen, form) for form in _index_forms(look)] for look in looks]
+    every = [table.log_probability for own in tables for table in own]
+    limit = _limit(every, policy)
+    found = []
+    for look, own in zip(looks, tables, strict=True):
+        one = _predictive(look, [table for table in own if table.log_probability <= limit], policy)
+        if look.stage == "codes":
+            one = _by_code(look, one, policy)
+        if one is not None:
+            found.append(one)
+    found = [one for one in found if not one.look.columns] + _smallest_cells(found)
+    if left is not None:
+        found += _curves(study, left, found, every, policy)
+    return tuple(sorted(found, key=lambda one: one.log_probability))
+
+
+def _limit(log_probabilities: Sequence[float], policy: DecisionPolicy) -> float:
+    """Return ln p of the largest k with p_(k) <= k q / (m (1 + 1/2 + ... + 1/m)) (Benjamini and Yekutieli)."""
+    order = np.sort(log_probabilities)
+    rank = np.arange(1, len(order) + 1)
+    below = np.flatnonzero(order <= np.log(rank * policy.discovery_rate / (len(order) * np.sum(1.0 / rank))))
+    return float(order[below[-1]]) if len(below) else -np.inf
+
+
+def _index_forms(look: Look) -> Iterator[Form]:
+    yield from periodic_forms(look)
+    if look.along in {"row", "column"} and look.of == "mean":
+        yield from tap_forms(look, entry(look))
+
+
+def _predictive(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> PredictiveTable | None:
+    """Return the form of the least description length that predicts what it wasn't taken from, with a shorter one."""
+    if not kept:
+        return None
+    best = min(kept, key=lambda table: description_length(look.seen, table))
+    judged = _judged(look, best)
+    if not _takes_enough(judged, policy) or not _predicts_other_half(look.seen, best.form):
+        return None
+    if best.form.name == "step" and not look.at and not _is_sharp(look, best):
+        return None
+    if not best.period:
+        return judged
+    shorter = (_judged(look, table) for table in kept if table.period and table.period < best.period)
+    base = next((one for one in shorter if _gain(one) >= SHORTER_SHARE * _gain(judged)), None)
+    return replace(judged, shorter=() if base is None else (base,))
+
+
+def _gain(one: PredictiveTable) -> float:
+    return one.chi2[0] - one.chi2[1]
+
+
+def _takes_enough(one: PredictiveTable, policy: DecisionPolicy) -> bool:
+    """Whether it takes `least_discovery_share` off chi2, a curve twice the standard deviation of chi2 at least."""
+    least = 2.0 * np.sqrt(2.0 * one.chi2[2]) if one.look.at else 0.0
+    return _gain(one) >= max(policy.least_discovery_share * one.chi2[0], float(least))
+
+
+def _smallest_cells(found: Sequence[PredictiveTable]) -> list[PredictiveTable]:
+    """Return of each stage's tables by row and column that of the smallest cell that takes as much off chi2 as any, in
+    what is seen of the largest one.
+    """
+    kept = []
+    for stage in dict.fromkeys(one.look.stage for one in found if one.look.columns):
+        mine = sorted(
+            (one for one in found if one.look.columns and one.look.stage == stage), key=lambda one: one.period
+        )
+        largest = mine[-1].look
+        judge = largest.held_out or largest.seen
+        rows = judge.count // largest.columns
+        gains = []
+        for one in mine:
+            cell = one.departure.reshape(-1, one.look.columns)
+            repeated = np.resize(cell, (rows, one.look.columns))
+            table = np.tile(repeated, (1, largest.columns // one.look.columns))
+            gains.append(judge.chi2(np.zeros(1)) - judge.chi2(table.ravel()))
+        kept.append(next(one for one, gain in zip(mine, gains, strict=True) if gain >= SHORTER_SHARE * max(gains)))
+    return kept
+
+
+def _predicts_other_half(profile: Profile, form: Form) -> bool:
+    """Whether a form fitted to each half of the index lowers chi2 of the other half: a few outlying lines don't."""
+    for one, other in ((profile.low, ~profile.low), (~profile.low, profile.low)):
+        table, judge = fitted(profile.part(one), form).departure, profile.part(other)
+        if judge.chi2(table) >= judge.chi2(np.zeros(1)):
+            return form.name == "step" and not form.period and _lies_in_one_half(profile, form)
+    return True
+
+
+def _is_sharp(look: Look, table: Table) -> bool:
+    """Whether steps some lines aside take much less off chi2: a smooth wave's don't."""
+    none, seen = look.seen.chi2(np.zeros(1)), look.seen
+    gain, aside = none - seen.chi2(table.departure), BESIDE_LINES * look.step
+    for move in (-aside, aside):
+        moved = np.roll(table.form.basis, move, axis=0)
+        moved[:aside], moved[-aside:] = 0.0, 1.0
+        if none - seen.chi2(fitted(seen, replace(table.form, basis=moved)).departure) > SHARP_SHARE * gain:
+            return False
+    return True
+
+
+def _lies_in_one_half(profile: Profile, form: Form) -> bool:
+    """Whether a step shows in residuals of one half alone: there is nothing that the other could say of it."""
+    shown = np.abs(np.asarray(profile.matrix @ form.basis)).sum(axis=1)
+    return bool(min(shown[profile.low].sum(), shown[~profile.low].sum()) < 0.1 * shown.sum())
+
+
+def _judged(look: Look, table: Table) -> PredictiveTable:
+    """Return the table with chi2 of the captures held out; of the seen ones where none are."""
+    judge = look.held_out or look.seen
+    chi2 = judge.chi2(np.zeros(1)), judge.chi2(table.departure), len(judge.residual)
+    return PredictiveTable(look, table.form, table.departure, table.std, table.log_probability, chi2, table.said)
+
+
+def _by_code(look: Look, periodic: PredictiveTable | None, policy: DecisionPolicy) -> PredictiveTable | None:
+    """Return a table by every code where the captures held out show that widths differ beyond a period's, else that.
+
+    The widths beyond the periodic table are normal with a variance tau^2 that is what the counts' noise doesn't explain
+    (empirical Bayes): d minimises |(r - A d) / sigma|^2 + |d|^2 / tau^2. The standard deviations are those given all
+    other widths. It has to take twice the standard deviation off chi2 of the captures held out, and
+    `least_discovery_share` of it. Beyond `MOST_BY_CODE` codes none is made, and the periodic table says so.
+    """
+    if look.held_out is None:
+        return periodic
+    seen, base = look.seen, np.zeros(1) if periodic is None else periodic.departure
+    if int(np.ptp(seen.index)) + 1 > MOST_BY_CODE:
+        return None if periodic is None else replace(periodic, remark=BEYOND_TABLE.format(most=MOST_BY_CODE))
+    own = np.asarray(seen.matrix[np.arange(len(seen.index)), seen.index]).ravel()  # change by the code's own width
+    left = seen.left_by(base)
+    excess = float(np.mean(np.square(left / own) - seen.variance / np.square(own)))
+    if excess <= 0.0:
+        return periodic
+    weighted = sparse.csr_array(seen.matrix / seen.variance[:, None])
+    normal = sparse.csc_array(seen.matrix.T @ weighted + sparse.eye_array(seen.count) / excess)
+    every = np.resize(base, seen.count) + spsolve(normal, weighted.T @ left)
+    std = 1.0 / np.sqrt(normal.diagonal())
+    n = len(look.held_out.residual)
+    first, before, after = (look.held_out.chi2(table) for table in (np.zeros(1), base, every))
+    if before - after < max(2.0 * np.sqrt(2.0 * n), policy.least_discovery_share * before):
+        return periodic
+    # chi2 of what the table takes off, as of one number
+    log_p = float(chi_squared.logsf(before - after, 1)) if periodic is None else periodic.log_probability
+    form = Form("by index", np.zeros((0, 0)), seen.count)
+    shorter = () if periodic is None else (*periodic.shorter, periodic)
+    return PredictiveTable(look, form, every, std, log_p, (first, after, n), shorter=shorter)
+
+
+# --- along coordinates -----------------------------------------------------------------------------------------------
+
+
+def _curves(
+    study: Study,
+    left: Verdict,
+    found: Sequence[PredictiveTable],
+    tried: Sequence[float],
+    policy: DecisionPolicy,
+) -> list[PredictiveTable]:
+    """Find laws along coordinates of what is mismatched, the one that describes most first, and others beside it."""
+    laws: list[PredictiveTable] = []
+    while len(laws) < MOST_CURVES:
+        acting = (*left.effects, *(law_of(one, study) for one in (*found, *laws)))
+        located = _located(left.model, acting, policy)
+        looks = list(curve_looks(left.model, study, acting, located)) if located else []
+        tables = [[fitted(look.seen, form) for form in _curve_forms(look)] for look in looks]
+        every = [*tried, *(table.log_probability for own in tables for table in own)]
+        limit = _limit(every, policy) if looks else 0.0
+        likeliest = [
+            _predictive_curve(look, [table for table in own if table.log_probability <= limit], policy)
+            for look, own in zip(looks, tables, strict=True)
+        ]
+        # a curve without a form is the smooth discrepancy's, where that predicts
+        smooth = {left.model.blocks[i].measurement.name for i in left.kernels}
+        candidates = [
+            one
+            for one in likeliest
+            if one is not None and (one.form.name != "curve" or one.look.shown_in.isdisjoint(smooth))
+        ]
+        if not candidates:
+            break
+        length = [description_length(one.look.seen, one) for one in candidates]
+        near = [one for one, own in zip(candidates, length, strict=True) if own < min(length) + EQUAL_LENGTH]
+        best = next((one for one in near if one.look.is_own_axis), candidates[int(np.argmin(length))])
+        laws.append(replace(best, equal=tuple(place_in_words(one.look) for one in near if one is not best)))
+    return laws
+
+
+def _predictive_curve(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> PredictiveTable | None:
+    """Return the form of the fewest numbers that predicts the captures held out nearly as well as any does.
+
+    Where none are held out, the one of the least description length that predicts every other number from the rest.
+    """
+    if look.held_out is None:
+        return _predictive(look, kept, policy)
+    judged = [_judged(look, table) for table in kept]
+    most = max((_gain(one) for one in judged), default=0.0)
+    near = [one for one in judged if _gain(one) >= NEARLY_ALL * most and _takes_enough(one, policy)]
+    return min(near, key=lambda one: (one.form.numbers, description_length(look.seen, one)), default=None)
+
+
+def _located(model: MeasurementModel, effects: Effects, policy: DecisionPolicy) -> list[int]:
+    """Return the indices of the blocks that are mismatched beside the effects, by seen or by held-out numbers."""
+    slices = mismatches(model, model.gaussian(effects), policy) or held_out_mismatches(model, effects, {}, policy)
+    return list(dict.fromkeys(model.blocks.index(one.block) for one in slices))
+
+
+def _curve_forms(look: Look) -> Iterator[Form]:
+    x = np.array(look.at)
+    yield from curve_forms(look.seen, x, np.array(look.known), unit_of(look), entry(look))
+    yield from formulas(look.seen, x, unit_of(look), by_inverse=look.along == "wavelength")
+
+
+# --- as a result, and as an effect ---
+
+
+def told(side: Side, study: Study, found: Sequence[PredictiveTable]) -> tuple[DiscoveredLaw, ...]:
+    """Put discovered laws into results: the law as it stands in a camera file, its chi2, and sentences."""
+    laws = []
+    for one in found:
+        shortest, law = (*one.shorter, one)[0], law_of(one, study)
+        # of a table by code, the codes that were counted
+        shown = slice(law.first, law.first + len(law.table)) if shortest.form.name == "by index" else slice(None)
+        laws.append(
+            DiscoveredLaw(
+                side=side,
+                stage=law.stage,
+                along=law.along,
+                of=law.of,
+                form=one.form.name,
+                period=law.period,
+                columns=law.columns,
+                first=law.first,
+                at=law.at,
+                table=law.table,
+                shown_period=shortest.period,
+                shown_departure=tuple(shortest.departure[shown].tolist()),
+                shown_std=tuple(shortest.std[shown].tolist()),
+                chi2_before=one.chi2[0],
+                chi2_after=one.chi2[1],
+                n=one.chi2[2],
+                measurements=tuple(sorted(one.look.shown_in)),
+                suspects=suspects_of(one),
+                statement=statement(side, one),
+            )
+        )
+    return tuple(laws)
+
+
+def law_of(found: PredictiveTable, study: Study) -> EmpiricalLaw:
+    """Return the law as an effect that acts on its stage, in its units."""
+    look, none = found.look, PLACES[found.look.stage, found.look.along, found.look.of][1]
+    first, at, table = 0, np.array(look.at), np.array(found.departure)
+    if look.of == "variance" and none == 0.0:  # added to the read noise, of which the least entry has none
+        table = (table - table.min()) * study.camera.read_noise_e**2
+    elif none == 0.0 and not look.at:
+        table = table / study.noise.gain
+    elif none == 1.0:
+        table = np.maximum(1.0 + table, LEAST_WIDTH)
+        if not look.at:
+            table = table / table.mean()
+    if look.along == "frequency":
+        table[0] = 1.0
+    if found.form.name == "step" and not look.at:
+        at, table = _corners(table)
+    if found.form.name == "by index":
+        counted = look.seen.index
+        first, table = int(counted.min()), table[int(counted.min()) : int(counted.max()) + 1]
+    return EmpiricalLaw(
+        stage=look.stage,
+        along=look.along,
+        of=look.of,
+        period=found.period // (look.columns or 1),
+        columns=look.columns,
+        first=first,
+        at=tuple(at.tolist()),
+        table=tuple(table.tolist()),
+        strength=1.0,
+    )
+
+
+def _corners(by_line: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of steps by line (N,): shares of the lines, and the values there."""
+    changes = np.flatnonzero(np.diff(by_line))
+    lines = np.unique(np.concatenate([changes, changes + 1]))
+    return (lines + 0.5) / len(by_line), by_line[lines]

@@ -1,0 +1,155 @@
+"""Discovered laws in words: what they are of, how large, and what may do that, as suspects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lab.diagnose.discovery.profile import Entry, Look, PredictiveTable
+from sim.camera import Side
+from sim.effects.empirical_law import PLACES
+
+MOST_TOLD = 16  # entries of a table
+
+#: What a law may come from, by stage, index, and form where that matters ("": any): suspects, not names.
+SUSPECTS: dict[tuple[str, str, str], str] = {
+    ("codes", "code", "periodic"): (
+        "converter bits of wrong weight do that, interleaved converters, or codes rescaled from another bit depth"
+    ),
+    ("codes", "code", "no power of two"): (
+        "codes multiplied after the converter do that, or a last stage of the converter that has that many steps"
+    ),
+    ("codes", "code", ""): "a converter's own differential nonlinearity does that, or a look-up table after it",
+    ("charge", "row", "step"): "halves of the sensor that are exposed or read apart do that, or a mask's shadow",
+    ("charge", "column", "step"): "two or four read-outs (taps) of unequal gain do that",
+    ("charge", "row", ""): "phase-detection rows do that, shared read-out of neighbouring rows, or light that pulses",
+    ("charge", "column", ""): "column amplifiers of unequal gain do that, or phase-detection columns",
+    ("charge", "row and column", ""): "pixels that share a floating diffusion do that, or phase-detection pixels",
+    ("signal", "row", "step"): "read-outs of the halves with offsets of their own do that",
+    ("signal", "column", "step"): "two or four read-outs (taps) with offsets of their own do that",
+    ("signal", "row", "variance"): "rows that share an amplifier do that, or pick-up in step with the lines",
+    ("signal", "column", "variance"): "column converters of unequal noise do that",
+    ("signal", "row", ""): "shared read-out of neighbouring rows does that, or pick-up at a fraction of the line rate",
+    ("signal", "column", ""): "interleaved column converters with offsets of their own do that",
+    ("signal", "row and column", ""): "pixels that share a floating diffusion, with offsets of their own, do that",
+    ("signal", "level", "step"): "a change of gain within the range (dual gain) does that",
+    ("signal", "level", "knee"): "companding, dual gain, or a well that begins to fill up do that",
+    (
+        "signal",
+        "level",
+        "",
+    ): "a response that isn't straight does that: source follower, companding, or a look-up table",
+    ("signal", "time", "step"): "a black-level clamp that was set anew does that",
+    ("signal", "time", ""): "a black level that follows the electronics' temperature does that",
+    (
+        "charge",
+        "level",
+        "",
+    ): "shot noise that neighbours share does that, gain by level, or noise reduction in the camera",
+    ("charge", "exposure", ""): "a shutter's delay does that, reciprocity failure, or light that leaks in beside it",
+    ("light", "time", "step"): "a lamp whose arc or current jumped does that, or a shutter that moved",
+    ("light", "time", ""): "a lamp that warms up or ages does that",
+    ("image", "radius", ""): "fall-off of lens or microlenses does that, tree rings, or fringes of a plate",
+    ("image", "wavelength", "step"): "a grating's anomaly does that, or an order-sorting filter",
+    ("image", "wavelength", ""): "absorption or interference in a glass does that, or a filter that nobody stated",
+    ("image", "frequency", ""): "a blur that isn't listed does that, or processing on the chip",
+}
+
+#: What a law is of, by stage and index.
+QUANTITIES: dict[tuple[str, str], str] = {
+    ("codes", "code"): "code widths",
+    ("charge", "level"): "shot noise",
+    ("charge", "exposure"): "time in which light is collected",
+    ("signal", "level"): "response",
+    ("signal", "time"): "black level",
+    ("light", "time"): "source",
+    ("image", "radius"): "light on the sensor",
+    ("image", "wavelength"): "transmittance",
+    ("image", "frequency"): "transfer function",
+}
+BY_LINES = {"charge": "sensitivities", "signal": "dark offsets"}
+#: Remark where a table by code isn't made.
+BEYOND_TABLE = (
+    "Single codes aren't tabled: more than {most} were counted, and a table of so many numbers describes no law; "
+    "flats of a narrower range of levels would show them."
+)
+
+
+def entry(look: Look) -> Entry:
+    """Return how a departure is written, with its unit."""
+    if look.stage == "signal" and look.of == "mean" and look.along != "level":
+        unit = "e" if look.at else "DN"
+        return lambda value: f"{value:+.2g} {unit}"
+    return lambda value: f"{100.0 * value:+.2g} %"
+
+
+def unit_of(look: Look) -> str:
+    """Return the unit of a curve's coordinate."""
+    return PLACES[look.stage, look.along, look.of][2].split(" after ")[0].split(" from ")[0]
+
+
+def place_in_words(look: Look) -> str:
+    """Return the quantity and the index of a look."""
+    quantity = QUANTITIES.get((look.stage, look.along)) or BY_LINES[look.stage]
+    if look.of == "variance" and look.stage == "signal":
+        quantity = "temporal noise in the dark"
+    return f"{quantity} by {look.along}"
+
+
+def suspects_of(found: PredictiveTable) -> str:
+    """Return what physics may do it; none of it is a name."""
+    look, name = (*found.shorter, found)[0].look, (*found.shorter, found)[0].form.name
+    period = (*found.shorter, found)[0].period
+    if look.along == "code" and period & (period - 1):
+        name = "no power of two"
+    kinds = (name, "variance", "") if look.of == "variance" else (name, "")
+    return next(SUSPECTS[look.stage, look.along, k] for k in kinds if (look.stage, look.along, k) in SUSPECTS)
+
+
+def statement(side: Side, found: PredictiveTable) -> str:
+    """Say which entries differ, what that may be, and by how much held-out captures are predicted better.
+
+    The shortest table is told, and what longer ones take off chi2 besides.
+    """
+    look, steps = found.look, (*found.shorter, found)
+    base, n, say = steps[0], found.chi2[2], entry(look)
+    line = look.along
+    what = f"No named effect accounts for this: the {place_in_words(look).split(' by ')[0]} of the {side} camera"
+    if look.columns:
+        period = f"{base.period // look.columns} rows and {look.columns} columns"
+        what += f" repeat every {period}, by up to {say(float(base.departure[np.argmax(np.abs(base.departure))]))}"
+    elif base.period:
+        shown = ", ".join(say(value) for value in base.departure[:MOST_TOLD])
+        more = ", ..." if base.period > MOST_TOLD else ""
+        each = f"each ± {say(float(np.median(base.std))).removeprefix('+')}"
+        what += f" repeat every {base.period} {line}s; by {line} mod {base.period}: {shown}{more} ({each})"
+    elif base.form.name == "by index":
+        rms = float(np.std(base.departure[look.seen.index]))
+        what += f" differ by {say(rms).removeprefix('+')} rms, without a period"
+    elif look.at:
+        what += f" follows the {line}: {base.said}"
+    else:
+        what += f" have {base.said}"
+    suspects = suspects_of(found)
+    where = " of held-out captures" if look.held_out is not None else ""
+    falls = ", ".join(f"to {one.chi2[1] / n:.3g} with {_numbers(one)}" for one in steps)
+    told = [
+        f"{what}.",
+        f"{suspects[0].upper()}{suspects[1:]}.",
+        f"By such a {'law' if look.at else 'table'} chi2 over n{where} falls from {found.chi2[0] / n:.3g} {falls}.",
+    ]
+    if found.equal:
+        told.append(f"These captures don't tell it from a law of the {_listed(found.equal)}.")
+    return " ".join([*told, *([found.remark] if found.remark else [])])
+
+
+def _numbers(one: PredictiveTable) -> str:
+    if one.form.name == "by index":
+        return "a width for every code"
+    count = one.period or one.form.numbers
+    return f"{count} numbers" if count > 1 else "one number"
+
+
+def _listed(words: Sequence[str]) -> str:
+    return ", or of the ".join(words)
