@@ -12,15 +12,17 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lab.capture_kinds.base import Names, names_in
 from lab.errors import InputError, one_line
-from lab.formats.recording_set import RecordingSet, manifest_json
+from lab.formats.recording_set import RecordingSet, manifest_json, parse_manifest
+from sim.spectrum import Spectrum
 
 #: Name of the catalogue's database in a folder.
 DATABASE = "catalog.db"
@@ -80,8 +82,10 @@ def write_session(
         if progress:
             progress(capture.id, number / len(listed))
     named = {(what, path) for capture in listed for _, what, path in names_in(capture)}
+    for camera in recordings.manifest.cameras.values():
+        named |= {(Names.SPECTRUM, path) for path in (camera.quantum_efficiency or {}).values()}
     spectra, targets = session.create_container("spectra"), session.create_container("targets")
-    for what, path in sorted(named, key=lambda pair: pair[1]):
+    for what, path in sorted(named, key=lambda pair: pair[1]):  # a lens's prescription has no place in it
         name, about_it = Path(path).stem, {"path": path}
         if what is Names.SPECTRUM:
             spectra.write_array(np.stack(recordings.spectrum(path).arrays), key=name, metadata=about_it)
@@ -89,6 +93,46 @@ def write_session(
             targets.write_array(recordings.target(path), key=name, metadata=about_it)
     _write_runs(session.create_container("runs"), documents)
     return key
+
+
+def read_session(client: Any, key: str) -> RecordingSet:
+    """A session that `write_session` wrote, as a recording set; frames are fetched when asked for.
+
+    Raises InputError where the catalogue has no such session, or what it has under the key isn't one.
+    """
+    if key not in client:
+        raise InputError(f"{key}: the catalogue has no such session; it has {', '.join(list(client)[:5]) or 'none'}")
+    session = client[key]
+    try:
+        nodes = {one.metadata["frame"]: one for one in session["captures"].values()}
+        captures = [dict(one.metadata) for one in session["captures"].values()]
+        spectra = {one.metadata["path"]: Spectrum.of(*one.read()) for one in session["spectra"].values()}
+        targets = {one.metadata["path"]: one.read() for one in session["targets"].values()}
+        about = json.loads(json.dumps(dict(session.metadata)))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{key}: isn't a session that calibench wrote ({one_line(error)}); name another") from error
+    about.pop("session", None)
+    about["cameras"] = {
+        side: {k: v for k, v in one.items() if k != "lens_file"} for side, one in about["cameras"].items()
+    }
+    manifest, warnings = parse_manifest(json.dumps(about | {"captures": captures}), key)
+    return RecordingSet(manifest, _Fetched(nodes), spectra, targets, source=key, warnings=tuple(warnings))
+
+
+class _Fetched(Mapping[str, NDArray[Any]]):
+    """Frames by their paths, each fetched from the catalogue when it is asked for."""
+
+    def __init__(self, nodes: Mapping[str, Any]) -> None:
+        self._nodes = nodes
+
+    def __getitem__(self, path: str) -> NDArray[Any]:
+        return np.asarray(self._nodes[path].read())
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._nodes)
+
+    def __len__(self) -> int:
+        return len(self._nodes)
 
 
 def _write_runs(runs: Any, documents: Path) -> None:

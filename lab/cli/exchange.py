@@ -148,3 +148,19 @@ def export_tiled(session: str, to: str, data: Path | None) -> None:
     with progress_bar("export") as advance:
         key = write_session(catalogue, recordings, store.folder(session) / "documents.jsonl", advance)
     out.print(escape(f"{to}: {key}, {len(recordings.manifest.captures)} captures"))
+
+
+def import_tiled(path: Path, to: Path) -> None:
+    """A session of a Tiled catalogue, CATALOGUE/SESSION, as a recording set."""
+    from lab.capture.tiled_catalogue import open_catalogue, read_session
+    from lab.formats import recording_set
+
+    where = str(path.parent)
+    server = where.startswith(("http:", "https:"))  # of whose address a path keeps one slash
+    if not server and not path.parent.is_dir():
+        raise InputError(f"{path}: no such catalogue; give FOLDER/SESSION, or the server's address with /SESSION")
+    recordings = read_session(open_catalogue(where.replace(":/", "://", 1) if server else where), path.name)
+    warn(recordings.warnings)
+    with progress_bar("import") as advance:
+        folder = recording_set.write(recordings, to, progress=advance)
+    out.print(escape(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}"))

@@ -21,6 +21,7 @@ from lab.cli.exchange import (
     export_tiled,
     import_lens,
     import_spectra,
+    import_tiled,
 )
 from lab.cli.progress import progress_bar
 from lab.cli.sources import StoreFolder, store_to_read
@@ -46,7 +47,7 @@ def import_(
             "--from",
             metavar="KIND",
             help="emva1288, raw-folder, fits, slanted-edge, colorchecker, dot-grid, checkerboard, "
-            "photon-transfer-table, spectral-table, spectra or lensfun",
+            "photon-transfer-table, spectral-table, spectra, lensfun or tiled",
         ),
     ],
     out_folder: Annotated[
@@ -120,10 +121,10 @@ def import_(
     )
     if lens and kind != LENSFUN:
         raise InputError(f"--from {kind} doesn't take --lens")
-    if kind == SPECTRA:
+    if kind in (SPECTRA, TILED):
         if options.stated():
             raise InputError(f"--from {kind} doesn't take {', '.join(options.stated())}; it takes none")
-        import_spectra(path, out_folder)
+        (import_spectra if kind == SPECTRA else import_tiled)(path, out_folder)
         return
     if kind == LENSFUN:
         import_lens(path, options, lens, out_folder)

@@ -332,9 +332,7 @@ def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple
             remarks.append(f"distortion: k1, k2, k3 leave {left_px:.2f} px of lensfun's law at most")
     if lens.vignetting is not None:
         off_px = math.hypot(*_centre(camera)) * _half_short_px(camera)
-        radius = np.linspace(
-            0.0, 1.0 + off_px / camera.half_diagonal_px, NODES
-        )  # of the half diagonal, to every corner
+        radius = np.linspace(0.0, 1.0 + off_px / camera.half_diagonal_px, NODES)  # to every corner
         k1, k2, k3 = lens.vignetting
         r = radius * camera.half_diagonal_um * 1e-3 / lens.half_diagonal_mm
         light = 1.0 + k1 * r**2 + k2 * r**4 + k3 * r**6
@@ -356,8 +354,8 @@ def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple
 def _brown(
     camera: CameraModel, law: Callable[[FloatArray], FloatArray], half_short_mm: float
 ) -> tuple[Geometry, float]:
-    """OpenCV's distortion nearest to lensfun's law over the frame, and the greatest departure (px). What is in proportion
-    to the radius goes into the focal length."""
+    """OpenCV's distortion nearest to lensfun's law over the frame, and the greatest departure (px). What is
+    in proportion to the radius goes into the focal length."""
     unit_px, radius_px = half_short_mm * 1e3 / camera.pixel_pitch_um, camera.half_diagonal_px
     share = np.linspace(0.0, 1.0, 8 * NODES)[1:]  # of the half diagonal
     lands = law(share * radius_px / unit_px) * share

@@ -61,7 +61,7 @@ def _changed(name: str, before: InstrumentSnapshot, now: InstrumentSnapshot) -> 
     for key in ("maker", "model", "serial_number", "firmware"):
         was, is_now = getattr(before, key), getattr(now, key)
         if was and is_now and was != is_now:  # one that doesn't say it may be the same
-            yield f"{name}: {key} was {was}, is {is_now}"
+            yield f"{name}: {key.replace('_', ' ')} was {was}, is {is_now}"
     if not before.settings or not now.settings:  # recorded before settings were, or by a driver that tells none
         return
     for key in dict.fromkeys((*before.settings, *now.settings)):

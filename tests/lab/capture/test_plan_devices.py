@@ -22,6 +22,7 @@ from lab.capture.store import Store
 from lab.capture_kinds.dark import DarkSequence
 from lab.capture_kinds.flat import FlatSequence
 from lab.errors import InputError
+from lab.formats.recording_set import read
 from tests.lab import fake_bench
 from tests.lab.fake_bench import BLACK, SLOPE, Bench
 
@@ -118,6 +119,18 @@ def test_a_session_goes_into_a_tiled_catalogue(tmp_path: Path, capsys: pytest.Ca
     assert {run.metadata["stop"]["exit_status"] for run in runs} == {"success", "abort"}
     (whole,) = [run for run in runs if run.metadata["stop"]["exit_status"] == "success"]
     assert whole.metadata["start"]["session"] == session.id and set(whole) == {"dark", "flat"}
+    back = tmp_path / "back"
+    assert cli.main(["import", f"{folder}/{session.id}", "--from", "tiled", "--out", str(back)]) == 0
+    again = read(back)
+    assert again.manifest.cameras == recordings.manifest.cameras
+    assert again.manifest.captures == recordings.manifest.captures
+    assert again.manifest.instruments == recordings.manifest.instruments
+    for capture in recordings.captures():
+        np.testing.assert_array_equal(again.frame(again.capture(capture.id)), recordings.frame(capture))
+        if (radiance := getattr(capture, "radiance", None)) is not None:
+            assert again.spectrum(radiance) == recordings.spectrum(radiance)
+    assert cli.main(["import", f"{folder}/other", "--from", "tiled", "--out", str(tmp_path / "no")]) == 2
+    assert "has no such session; it has" in " ".join(capsys.readouterr().err.split())
     with pytest.raises(InputError, match="has it already"):
         write_session(catalogue, recordings, documents)
 

@@ -117,7 +117,7 @@ def test_a_session_has_a_snapshot_of_its_instruments_and_says_what_changed(store
     second.run()
     (run,) = store.runs(second.id)
     changes = (
-        "spectroradiometer: serial_number was SN-1, is SN-2",
+        "spectroradiometer: serial number was SN-1, is SN-2",
         "camera left: PixelFormat was BayerRG12, is BayerRG10",
     )
     assert (run.compared_with, run.changes) == (first.id, changes)

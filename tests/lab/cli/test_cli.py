@@ -242,6 +242,21 @@ def test_diagnosis_with_a_stored_fit(
     assert "not what --json wrote" in capsys.readouterr().err
 
 
+def test_compare_tells_what_differs_of_the_instruments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store, bench, sessions = open_store(tmp_path), fake_bench.Bench(), []
+    plan = CapturePlan((DarkSequence(exposures_s=(0.001,), frames=2),))
+    for serial in ("SN-1", "SN-2"):
+        bench.serials["spectroradiometer"] = serial
+        session = CaptureSession.start(store, fake_bench.station(), plan, connect=bench.drivers).run().id
+        store.add_result("fit", session, FitResult(source=session, cameras={}).model_dump(mode="json"))
+        sessions.append(session)
+    store.close()
+    assert cli.main(["compare", *sessions, "--data", str(tmp_path)]) == 0
+    assert "instruments: spectroradiometer: serial number was SN-1, is SN-2" in capsys.readouterr().out
+    assert cli.main(["compare", sessions[1], sessions[1], "--data", str(tmp_path)]) == 0
+    assert "instruments" not in capsys.readouterr().out
+
+
 def test_a_report_says_what_is_stored_and_takes_it(
     flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
