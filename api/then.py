@@ -67,9 +67,8 @@ def then_of(store: Store, session_id: str) -> ThenState | None:
     words = Then.model_validate(asked["then"]).in_words
     if state != "waiting":
         words = f"{words}: {kept.get('words') or state}"
-    return ThenState(
-        state=state, words=words, job_id=kept.get("job_id"), comparison=kept.get("comparison"), told=kept.get("told")
-    )
+    more = {name: kept.get(name) for name in ("job_id", "comparison", "told")}
+    return ThenState.model_validate({"state": state, "words": words, **more})
 
 
 def check_webhook(url: str | None, hosts: Collection[str]) -> None:

@@ -112,7 +112,7 @@ function drawHistory(history) {
     picture.append(svg("line", { class: "grid", x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value) }));
     picture.append(svg("text", { x: LEFT - 8, y: y(value) + 4, "text-anchor": "end" }, number(value)));
   }
-  const every = Math.ceil(points.length / Math.max(2, Math.floor(width / 90)));
+  const every = Math.ceil(points.length / Math.max(2, Math.floor((width - LEFT - RIGHT) / 84)));
   points.forEach((p, at) => {
     const mark = svg("g", { class: `point ${p.mark ?? ""} ${p.state}` }, svg("title", {}, `${time(p.created)}: ${valueText(p)}`));
     mark.append(svg("line", { x1: x(at), x2: x(at), y1: y(p.value - 2 * p.std), y2: y(p.value + 2 * p.std) }));

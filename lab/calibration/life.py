@@ -714,7 +714,9 @@ def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], int]:
     with store.reading() as db:
         known = [one for one, _ in db.execute(asked.order_by(CalibrationRow.created))]
     last = {one.session_id: one.id for one in known}
-    earlier = [one.id for one in known if last[one.session_id] == one.id and _aware(one.created) < wanted.created]
+    earlier = [
+        one.id for one in known if last[one.session_id] == one.id and (_aware(one.created) or now()) < wanted.created
+    ]
     ids = earlier[-DRAFTED_FROM:] if len(earlier) >= DRAFTED_LEAST else [*earlier, wanted.id]
     by_figure: dict[tuple[str, Side | None, str], list[Figure]] = {}
     for one in ids:

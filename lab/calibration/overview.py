@@ -48,7 +48,7 @@ def verdict_of(store: Store, diagnosis: str) -> DiagnosisVerdict:
     """Of a kept diagnosis, which never changes, and is long."""
     with store.reading() as db:
         said = db.scalars(sa.select(ResultRow.document["verdict"].as_string()).where(ResultRow.id == diagnosis)).one()
-    return said  # type: ignore[no-any-return]
+    return said
 
 
 def _diagnoses(store: Store, sessions: Sequence[str] | None) -> dict[str, DiagnosisVerdict]:

@@ -538,6 +538,52 @@ def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:
     watched.close()
 
 
+def test_what_waits_is_edited_and_copied_with_what_follows(browser: Any, lab: Running) -> None:
+    """What was asked with stands in the form again; the edited one keeps its place."""
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    page.wait_for_selector("#plan-words:has-text('3 sequences')")
+    page.fill("#start-form input[name=name]", "for the night")
+    page.fill("#start-form input[name=notes]", "cold #night")
+    page.fill("#start-form input[name=not_before]", "2999-01-01T20:00")
+    page.press("#then-words", "Enter")
+    assert page.is_disabled("#start-form input[name=compare]")
+    page.select_option("#start-form select[name=then]", "pipeline")
+    page.check("#start-form input[name=resolve]")
+    page.check("#start-form input[name=compare]")
+    page.wait_for_selector("#then-words:has-text('the whole pipeline, with a report, resolve, compare')")
+    assert watched.faults() == []
+    page.click("#start:has-text('Queue a session')")
+    row = "#queue tr:has-text('for the night')"
+    page.wait_for_selector(f"{row}:has-text('pipeline, resolve, compare')")
+    place = page.inner_text(f"{row} td").split(".")[0]
+    page.click(f"{row} a:has-text('Edit')")
+    page.wait_for_selector("#start:has-text('Keep the changes')")
+    page.wait_for_function("() => document.querySelector('#start-form input[name=name]').value === 'for the night'")
+    assert page.input_value("#start-form input[name=not_before]") == "2999-01-01T20:00"
+    assert page.is_checked("#start-form input[name=compare]")
+    page.fill("#start-form input[name=name]", "for the next night")
+    page.select_option("#start-form select[name=then]", "fit")
+    page.click("#start")
+    row = "#queue tr:has-text('for the next night')"
+    page.wait_for_selector(f"{row}:has-text('fit, compare')")
+    assert page.inner_text(f"{row} td").split(".")[0] == place
+    page.wait_for_selector("#start:not(:has-text('Keep the changes'))")
+    page.click(f"{row} a:has-text('Copy')")
+    page.wait_for_function(
+        "() => document.querySelector('#start-form input[name=name]').value === 'for the next night'"
+    )
+    page.fill("#start-form input[name=name]", "once more")
+    page.fill("#start-form input[name=not_before]", "2999-01-02T20:00")
+    page.click("#start:has-text('Queue a session')")
+    page.wait_for_selector("#queue tr:has-text('once more'):has-text('fit, compare')")
+    for name in ("for the next night", "once more"):
+        page.click(f"#queue tr:has-text('{name}') button:has-text('Remove')")
+        page.wait_for_selector(f"#queue tr:has-text('{name}')", state="detached")
+    watched.close()
+
+
 def test_a_challenge_is_made_and_deleted(browser: Any, lab: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     """The drawing itself is a stand-in that ends at once, with no case made."""
     monkeypatch.setattr("lab.jobs.carry_out", lambda *_: None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import sqlalchemy as sa
 from alembic import op
 
@@ -10,8 +12,16 @@ down_revision = "0006"
 branch_labels = None
 depends_on = None
 
-_OF_SESSIONS = {"request": sa.JSON(), "then_state": sa.String(20), "then": sa.JSON()}
-_OF_CALIBRATIONS = {"revoked": sa.DateTime(timezone=True), "revoked_by": sa.String(100), "revoked_why": sa.Text()}
+_OF_SESSIONS: dict[str, sa.types.TypeEngine[Any]] = {
+    "request": sa.JSON(),
+    "then_state": sa.String(20),
+    "then": sa.JSON(),
+}
+_OF_CALIBRATIONS: dict[str, sa.types.TypeEngine[Any]] = {
+    "revoked": sa.DateTime(timezone=True),
+    "revoked_by": sa.String(100),
+    "revoked_why": sa.Text(),
+}
 
 
 def upgrade() -> None:
