@@ -197,6 +197,12 @@ class IndiDevice:
         """Return once a number is above 0: some are told when it is connected, and are 0 before."""
         self._await(name, lambda: self.number(name, element) > 0)
 
+    def ask(self, name: str) -> None:
+        """Let the device tell a property anew."""
+        before = self._vector(name).updates
+        self._send(f"<getProperties version='1.7' device={quoteattr(self.name)} name={quoteattr(name)}/>")
+        self._await(name, lambda: self._vector(name).updates > before)
+
     def get(self, name: str) -> Setting:
         """A property's value as it was told last."""
         vector = self._vector(name)
