@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from drivers.camera.base import Camera, StreamingCamera
 from drivers.camera.stream import FrameStream
 from drivers.display.base import Display
-from drivers.errors import InstrumentError
+from drivers.errors import Disconnected, InstrumentError, NoAnswer
 from drivers.light_source.base import LightSource
 from drivers.monochromator.base import Monochromator
 from drivers.photodiode.base import Photodiode
@@ -136,9 +135,13 @@ class CameraContract(FamilyContract):
     def _within(driver: Camera, exposure_s: float) -> float:
         """An exposure of about that which the camera has: its shortest may be longer, and some have a few alone."""
         for longer in (1.0, 1.25, 2.5, 5.0):
-            with suppress(InstrumentError):
+            try:
                 driver.check(longer * exposure_s)
-                return longer * exposure_s
+            except (NoAnswer, Disconnected):
+                raise
+            except InstrumentError:
+                continue
+            return longer * exposure_s
         return exposure_s
 
     def everyday(self, driver: Camera) -> None:
