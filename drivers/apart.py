@@ -24,6 +24,8 @@ from drivers.errors import Disconnected, InstrumentError, NoAnswer
 
 #: How long (s) the library is given to let its instrument go before its process is ended.
 _FAREWELL_S = 3.0
+#: How a call ended that raised an error of the library's own.
+_UNEXPECTED = "unexpected"
 
 
 class Apart:
@@ -105,6 +107,8 @@ class Apart:
         ended, value = answer
         if ended == "":
             return value
+        if ended == _UNEXPECTED:
+            raise InstrumentError(f"{self._who}: {value}")
         kind = getattr(errors, ended, InstrumentError)
         raise (kind if kind is not errors.Refused else InstrumentError)(value)
 
@@ -173,7 +177,7 @@ def _serve(served: str, arguments: list[str]) -> None:
             ended, value = type(error).__name__, str(error)
         except Exception as error:
             said = " ".join(str(error).split())
-            ended, value = "InstrumentError", f"{doing} failed ({type(error).__name__}: {said}); look into its library"
+            ended, value = _UNEXPECTED, f"{doing} failed ({type(error).__name__}: {said}); look into its library"
         told = None if doing == "start" else value
         pickle.dump((ended, value if ended else told), answers, protocol=pickle.HIGHEST_PROTOCOL)
         answers.flush()
@@ -182,7 +186,8 @@ def _serve(served: str, arguments: list[str]) -> None:
     made = answer("start", lambda: getattr(import_module(module), name)(*arguments))
     while made is not None and (request := requests.get()) is not None:
         method, given = request
-        answer(method, lambda method=method, given=given: getattr(made, method)(*given))
+        doing = " ".join([method, *map(str, given)])[:80]
+        answer(doing, lambda method=method, given=given: getattr(made, method)(*given))
     with contextlib.suppress(Exception):
         made.close()
     os._exit(0)

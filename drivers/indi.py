@@ -12,6 +12,7 @@ import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any, cast
 from urllib.parse import urlsplit
 from xml.etree.ElementTree import Element, ParseError, XMLPullParser
 from xml.sax.saxutils import quoteattr
@@ -53,7 +54,7 @@ class IndiDevice:
         self._who = f"INDI device {address}"
         self._left_s, self._record = left_s, recorder
         self._line: socket.socket | None = None
-        self._parser: XMLPullParser | None = None
+        self._parser: XMLPullParser[Any] | None = None
         self._root: Element | None = None
         self._vectors: dict[str, _Vector] = {}
         self._others: set[str] = set()
@@ -128,7 +129,8 @@ class IndiDevice:
             raise self._gone("the server ended it")
         try:
             self._parser.feed(piece)
-            for event, found in self._parser.read_events():
+            for told in self._parser.read_events():
+                event, found = cast("tuple[str, Element]", told)
                 if self._root is None:
                     self._root = found
                 elif event == "end" and found in self._root:
@@ -196,6 +198,12 @@ class IndiDevice:
     def await_number(self, name: str, element: str) -> None:
         """Return once a number is above 0: some are told when it is connected, and are 0 before."""
         self._await(name, lambda: self.number(name, element) > 0)
+
+    def ask(self, name: str) -> None:
+        """Let the device tell a property anew."""
+        before = self._vector(name).updates
+        self._send(f"<getProperties version='1.7' device={quoteattr(self.name)} name={quoteattr(name)}/>")
+        self._await(name, lambda: self._vector(name).updates > before)
 
     def get(self, name: str) -> Setting:
         """A property's value as it was told last."""

@@ -302,6 +302,8 @@ class ProcessPeer(Peer):
     """A program of others in the instrument's place, a process of its own on loopback; one at a time on this
     computer."""
 
+    exposes = True
+
     def __init__(self, name: str, command: Sequence[str], environment: dict[str, str] | None = None) -> None:
         self._command, self._environment = command, os.environ | (environment or {})
         self._lock = (Path(tempfile.gettempdir()) / f"calibench-{name}.lock").open("w")
@@ -339,7 +341,7 @@ class ProcessPeer(Peer):
         os.killpg(self._process.pid, signal.SIGSTOP if silent else signal.SIGCONT)
 
     def slow(self, slowly: bool) -> bool:
-        return True  # it exposes in real time
+        return self.exposes  # in real time
 
     def close(self) -> None:
         self.unplug()
@@ -349,7 +351,7 @@ class ProcessPeer(Peer):
 class AravisFakeCamera(ProcessPeer):
     """The fake GigE camera of the package aravis-tools."""
 
-    program = "arv-fake-gv-camera-0.8"
+    program, exposes = "arv-fake-gv-camera-0.8", False
 
     def __init__(self) -> None:
         if shutil.which(self.program) is None:
@@ -362,9 +364,6 @@ class AravisFakeCamera(ProcessPeer):
             asking.settimeout(0.1)
             asking.sendto(bytes.fromhex("42 01 00 02 00 00 00 01"), ("127.0.0.1", 3956))  # GVCP: who is there
             return bool(asking.recv(1024))
-
-    def slow(self, slowly: bool) -> bool:
-        return False
 
 
 def _free_port() -> int:
@@ -420,12 +419,13 @@ class AlpacaSimulator(ProcessPeer):
 class IndiSimulator(ProcessPeer):
     """INDI's server with its simulated camera and lamp, as somebody left them: binned."""
 
-    def __init__(self) -> None:
+    def __init__(self, device: str = "CCD Simulator") -> None:
         if shutil.which("indiserver") is None:
             raise InstrumentError("INDI: indiserver isn't installed (scripts/install-peers)")
         self._folder = tempfile.TemporaryDirectory(prefix="calibench-peer-")
         self._port = _free_port()
-        self.address, self.settings = f"127.0.0.1:{self._port}/CCD Simulator", {"timeout_s": 3.0}
+        self.exposes = device == "CCD Simulator"
+        self.address, self.settings = f"127.0.0.1:{self._port}/{device}", {"timeout_s": 3.0}
         command = ["indiserver", "-p", str(self._port), "indi_simulator_ccd", "indi_simulator_lightpanel"]
         super().__init__("indi", command, {"HOME": self._folder.name})
 
@@ -619,6 +619,16 @@ def indi() -> Peer:
 
 def gphoto2() -> Peer:
     return VirtualCamera()
+
+
+def alpaca_lamp() -> Peer:
+    peer = AlpacaSimulator()
+    peer.exposes = False
+    return peer
+
+
+def indi_lamp() -> Peer:
+    return IndiSimulator("Light Panel Simulator")
 
 
 def micromanager() -> Peer:

@@ -1,5 +1,8 @@
 """GigE Vision and USB3 Vision cameras of any maker through Aravis (0.8), by GObject introspection.
 
+The library runs in a process of its own (`drivers.apart`): its calls on a camera that is silent take up to 15 s, and a
+camera that was gone can't be controlled again by the process that had it.
+
 Aravis is a library of the distribution (Debian: `gir1.2-aravis-0.8`, `python3-gi`; `scripts/install-aravis` installs
 them). A virtual environment doesn't see the distribution's `gi`; it is loaded from there alone, if it was built for
 this version of Python."""
@@ -9,11 +12,13 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Callable, Collection, Iterator
-from functools import cache
+from contextlib import suppress
+from functools import cache, cached_property
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec
 from typing import Any, TypeVar
 
+from drivers.apart import Apart
 from drivers.camera.buffers import Grabbed
 from drivers.camera.genicam import GenicamCamera
 from drivers.errors import Disconnected, InstrumentError, InUse, NoAnswer
@@ -23,6 +28,8 @@ _T = TypeVar("_T")
 _DISTRIBUTION = "/usr/lib/python3/dist-packages"
 _BUFFERS = 4
 _CLEARED = 1
+#: Longest time (s) until an interpreter has loaded the library.
+_LOADING_S = 20.0
 _STATUS = {
     2: "it came after the time-out",
     3: "packets are missing",
@@ -137,12 +144,123 @@ class _AravisFeatures:
         self.do(f"executing {name}", lambda: self._camera.execute_command(name))
 
 
-class AravisCamera(GenicamCamera):
-    """The camera that Aravis knows as `address`: its identifier, or its IP address."""
+class AravisDevice:
+    """Aravis with one camera, in the process apart: `open` comes first."""
 
     _camera: Any = None
     _stream: Any = None
     _nodes: Any = None
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+
+    def load(self) -> None:
+        """Load the library. Raises `InstrumentError` where it isn't installed."""
+        _library()
+
+    def open(self) -> tuple[str, str, str, str]:
+        """Find and control the camera; its maker, model, serial number and firmware."""
+        library = _library()
+        try:
+            self._camera = library.Camera.new(self.address)
+        except _glib_error() as error:
+            raise Disconnected(
+                f"camera {self.address}: Aravis finds no such camera ({getattr(error, 'message', error)}); check the "
+                "cable, the power and the network"
+            ) from error
+        nodes = _AravisFeatures(self._camera, f"camera {self.address}")
+        device = self._camera.get_device()
+        if hasattr(device, "is_controller") and not device.is_controller():
+            raise InUse(f"camera {self.address}: another program controls it; close that one")
+        self._nodes = nodes
+        with suppress(_glib_error()):
+            self._camera.stop_acquisition()  # one that a process left running that was killed
+        names = [
+            nodes.do("reading who it is", read) for read in (self._camera.get_vendor_name, self._camera.get_model_name)
+        ]
+        serial_number = next(
+            (str(nodes.get(name)) for name in ("DeviceSerialNumber", "DeviceID") if nodes.has(name)), ""
+        )
+        firmware = str(nodes.get("DeviceVersion")) if nodes.has("DeviceVersion") else ""
+        return names[0], names[1], serial_number, firmware
+
+    def feature(self, method: str, *arguments: Any) -> Any:
+        """What `_AravisFeatures` has and does."""
+        return getattr(self._nodes, method)(*arguments)
+
+    def start(self) -> None:
+        """Queue buffers and start acquisition."""
+        library = _library()
+        payload = self._nodes.do("reading its frame's size", self._camera.get_payload)
+        self._stream = self._nodes.do("opening its stream", lambda: self._camera.create_stream(None, None))
+        for _ in range(_BUFFERS):
+            self._stream.push_buffer(library.Buffer.new_allocate(payload))
+        self._nodes.do("starting", self._camera.start_acquisition)
+
+    def halt(self) -> None:
+        """Stop acquisition, discard what is queued."""
+        self._stream = None
+        self._nodes.do("stopping", self._camera.stop_acquisition)
+
+    def grab(self, timeout_s: float) -> dict[str, Any] | None:
+        """The fields of a `Grabbed`; None if nothing came in time."""
+        buffer = self._stream.timeout_pop_buffer(round(timeout_s * 1e6))
+        if buffer is None:
+            return None
+        status = int(buffer.get_status())
+        if status == _CLEARED:  # nothing was written into it; seen with the fake camera on a busy computer
+            self._stream.push_buffer(buffer)
+            return None
+        damage = "" if status == 0 else _STATUS.get(status, f"status {status}")
+        grabbed = {
+            "payload": b"" if damage else buffer.get_data(),
+            "rows": 0 if damage else buffer.get_image_height(),
+            "cols": 0 if damage else buffer.get_image_width(),
+            "code": 0 if damage else buffer.get_image_pixel_format() & 0xFFFFFFFF,
+            "frame_id": int(buffer.get_frame_id()),
+            "damage": damage,
+            "camera_time_ns": int(buffer.get_timestamp()) or None,
+        }
+        self._stream.push_buffer(buffer)
+        return grabbed
+
+    def close(self) -> None:
+        """Let it go: a GigE camera's others may control it from now on."""
+        leave = None if self._camera is None else getattr(self._camera.get_device(), "leave_control", None)
+        if leave is not None:
+            leave()
+
+
+class _Apart:
+    """The features of a camera that another process has."""
+
+    def __init__(self, ask: Callable[..., Any]) -> None:
+        self._ask = ask
+
+    def has(self, name: str) -> bool:
+        return bool(self._ask("has", name))
+
+    def get(self, name: str) -> Setting:
+        found: Setting = self._ask("get", name)
+        return found
+
+    def set(self, name: str, value: Setting) -> None:
+        self._ask("set", name, value)
+
+    def entries(self, name: str) -> Collection[str]:
+        found: Collection[str] = self._ask("entries", name)
+        return found
+
+    def limits(self, name: str) -> tuple[float, float]:
+        found: tuple[float, float] = self._ask("limits", name)
+        return found
+
+    def execute(self, name: str) -> None:
+        self._ask("execute", name)
+
+
+class AravisCamera(GenicamCamera):
+    """The camera that Aravis knows as `address`: its identifier, or its IP address."""
 
     @staticmethod
     def enumerate_cameras() -> Iterator[tuple[str, str]]:
@@ -157,64 +275,33 @@ class AravisCamera(GenicamCamera):
             )
             yield library.get_device_id(index), f"{' '.join(filter(None, told))} ({library.get_device_protocol(index)})"
 
-    def _open(self) -> tuple[_AravisFeatures, Identity]:
-        library = _library()
-        try:
-            self._camera = library.Camera.new(self.address)
-        except _glib_error() as error:
-            raise Disconnected(
-                f"camera {self.address}: Aravis finds no such camera ({getattr(error, 'message', error)}); check the "
-                "cable, the power and the network"
-            ) from error
-        nodes = _AravisFeatures(self._camera, f"camera {self.address}")
-        device = self._camera.get_device()
-        if hasattr(device, "is_controller") and not device.is_controller():
-            raise InUse(f"camera {self.address}: another program controls it; close that one")
-        self._nodes = nodes
-        names = [
-            nodes.do("reading who it is", read) for read in (self._camera.get_vendor_name, self._camera.get_model_name)
-        ]
-        serial_number = next(
-            (str(nodes.get(name)) for name in ("DeviceSerialNumber", "DeviceID") if nodes.has(name)), ""
+    @cached_property
+    def _device(self) -> Apart:
+        return Apart(
+            "drivers.camera.aravis:AravisDevice",
+            self.address,
+            who=f"camera {self.address}",
+            start_timeout_s=_LOADING_S,
         )
-        firmware = str(nodes.get("DeviceVersion")) if nodes.has("DeviceVersion") else ""
-        return nodes, Identity(names[0], names[1], serial_number, firmware)
+
+    def _call(self, method: str, *arguments: Any, longer_s: float = 0.0) -> Any:
+        return self._device.call(method, *arguments, timeout_s=self._timeout_s + longer_s)
+
+    def _open(self) -> tuple[_Apart, Identity]:
+        self._device.start()
+        self._device.call("load", timeout_s=_LOADING_S)
+        identity = Identity(*self._call("open", longer_s=self._timeout_s))
+        return _Apart(lambda *asked: self._call("feature", *asked)), identity
 
     def _start(self) -> None:
-        library = _library()
-        payload = self._nodes.do("reading its frame's size", self._camera.get_payload)
-        self._stream = self._nodes.do("opening its stream", lambda: self._camera.create_stream(None, None))
-        for _ in range(_BUFFERS):
-            self._stream.push_buffer(library.Buffer.new_allocate(payload))
-        self._nodes.do("starting", self._camera.start_acquisition)
+        self._call("start")
 
     def _halt(self) -> None:
-        self._stream = None
-        self._nodes.do("stopping", self._camera.stop_acquisition)
+        self._call("halt")
 
     def _grab(self, timeout_s: float) -> Grabbed | None:
-        buffer = self._stream.timeout_pop_buffer(round(timeout_s * 1e6))
-        if buffer is None:
-            return None
-        status = int(buffer.get_status())
-        if status == _CLEARED:  # nothing was written into it; seen with the fake camera on a busy computer
-            self._stream.push_buffer(buffer)
-            return None
-        damage = "" if status == 0 else _STATUS.get(status, f"status {status}")
-        grabbed = Grabbed(
-            payload=b"" if damage else buffer.get_data(),
-            rows=0 if damage else buffer.get_image_height(),
-            cols=0 if damage else buffer.get_image_width(),
-            code=0 if damage else buffer.get_image_pixel_format() & 0xFFFFFFFF,
-            frame_id=int(buffer.get_frame_id()),
-            damage=damage,
-            camera_time_ns=int(buffer.get_timestamp()) or None,
-        )
-        self._stream.push_buffer(buffer)
-        return grabbed
+        found = self._call("grab", timeout_s, longer_s=timeout_s)
+        return None if found is None else Grabbed(**found)
 
     def _release(self) -> None:
-        camera, self._camera, self._stream, self._nodes = self._camera, None, None, None
-        leave = None if camera is None else getattr(camera.get_device(), "leave_control", None)
-        if leave is not None:  # a GigE camera's: others may control it from now on
-            leave()
+        self._device.end()

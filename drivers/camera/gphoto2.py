@@ -78,7 +78,8 @@ class Library:
 
     def identity(self) -> tuple[str, str, str, str]:
         """Maker, model, serial number, firmware."""
-        return tuple(self._first(name) for name in ("manufacturer", "cameramodel", "serialnumber", "deviceversion"))  # type: ignore[return-value]
+        first = self._first
+        return first("manufacturer"), first("cameramodel"), first("serialnumber"), first("deviceversion")
 
     def _first(self, *names: str) -> str:
         return next((str(self.get(name)) for name in names if self.has(name)), "")
@@ -185,8 +186,8 @@ class Gphoto2Camera(SingleFrameCamera):
     address: the only one.
 
     It has to stand on manual. `image_format`: the choice that makes it write raw files alone; None: the one with `raw`
-    in its name that writes nothing else. `settings`: others to be set, by gphoto2's names. `base_iso`: the sensitivity at
-    0 dB; a gain of 6 dB is twice that. The first call that asks for the sensor's size takes a picture.
+    in its name that writes nothing else. `settings`: others to be set, by gphoto2's names. `base_iso`: the sensitivity
+    at 0 dB; a gain of 6 dB is twice that. The first call that asks for the sensor's size takes a picture.
     """
 
     def __init__(

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,8 @@ import numpy as np
 from drivers.camera.base import Camera, StreamingCamera
 from drivers.camera.stream import FrameStream
 from drivers.display.base import Display
-from drivers.errors import InstrumentError
+from drivers.errors import Disconnected, InstrumentError, NoAnswer
+from drivers.light_source.base import LightSource
 from drivers.monochromator.base import Monochromator
 from drivers.photodiode.base import Photodiode
 from drivers.spectroradiometer.base import Spectroradiometer
@@ -135,9 +135,13 @@ class CameraContract(FamilyContract):
     def _within(driver: Camera, exposure_s: float) -> float:
         """An exposure of about that which the camera has: its shortest may be longer, and some have a few alone."""
         for longer in (1.0, 1.25, 2.5, 5.0):
-            with suppress(InstrumentError):
+            try:
                 driver.check(longer * exposure_s)
-                return longer * exposure_s
+            except (NoAnswer, Disconnected):
+                raise
+            except InstrumentError:
+                continue
+            return longer * exposure_s
         return exposure_s
 
     def everyday(self, driver: Camera) -> None:
@@ -243,6 +247,28 @@ class PhotodiodeContract(FamilyContract):
             require_refused(lambda wrong_nm=wrong_nm: driver.measure(wrong_nm), f"{wrong_nm} nm")  # type: ignore[misc]
 
 
+class LightSourceContract(FamilyContract):
+    """Levels of light."""
+
+    kind = LightSource
+
+    def everyday(self, driver: LightSource) -> None:
+        require(0.0 <= driver.level() <= 1.0, f"its level is {driver.level()}")
+
+    def takes_long(self, driver: LightSource) -> None:
+        driver.set_level(0.0 if driver.level() > 0.5 else 1.0)
+
+    def settings(self, driver: LightSource) -> None:
+        for channel in driver.channels():
+            for level in (1.0, 0.5, 0.0):
+                driver.set_level(level, channel)
+                found = driver.level(channel)
+                require(abs(found - level) <= 0.05, f"told to be lit at {level} it says {found}")
+        for wrong in (-0.1, 1.1, math.nan):
+            require_refused(lambda wrong=wrong: driver.set_level(wrong), f"a level of {wrong}")  # type: ignore[misc]
+        require_refused(lambda: driver.set_level(0.5, "no-such-channel"), "a channel that isn't there")
+
+
 CONTRACTS: dict[str, FamilyContract] = {
     "monochromator": MonochromatorContract(),
     "spectroradiometer": SpectroradiometerContract(),
@@ -250,4 +276,5 @@ CONTRACTS: dict[str, FamilyContract] = {
     "stage": StageContract(),
     "display": DisplayContract(),
     "photodiode": PhotodiodeContract(),
+    "light_source": LightSourceContract(),
 }

@@ -1,4 +1,4 @@
-"""Argyll's spotread measures on the mock of a spectraval: a program that many labs trust, and that knows nothing of calibench."""
+"""Argyll's spotread measures on the mocks of JETI's instruments: it knows nothing of calibench."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from mocks.peers import LinePeer
 from mocks.specbos1211 import MockSpecbos1211
 from tests.peers import missing
 
-#: Where there is no /dev/bus/usb, Argyll takes every device in /dev for a USB device, and waits for its description: with
-#: a serial line without end. So it is shown a /dev of its own: the mock's line, and a USB bus that nothing is plugged into.
-#: A line is known by its name as one that an instrument may be on.
+#: Where there is no /dev/bus/usb, Argyll takes every device in /dev for a USB device, and waits for its description: at
+#: a serial line without end. So it is shown a /dev of its own: the mock's line, and a USB bus with nothing on it.
+#: It knows a line on which an instrument may be by its name.
 ALONE = """
 set -eu
 dev="$1"; line="$2"; shift 2

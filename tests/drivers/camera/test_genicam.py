@@ -3,12 +3,14 @@ GigE camera."""
 
 from __future__ import annotations
 
+import contextlib
+import time
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
-from drivers.camera.aravis import AravisCamera
+from drivers.camera.aravis import AravisCamera, AravisDevice
 from drivers.camera.base import capture_together
 from drivers.camera.basler import BaslerCamera
 from drivers.errors import Disconnected, InstrumentError, InUse, NoAnswer
@@ -114,6 +116,41 @@ def test_frames_of_a_gige_camera_come_one_a_trigger(fake: AravisFakeCamera) -> N
             AravisCamera(fake.address).connect()
 
 
+def _used_again(camera: AravisCamera) -> None:
+    """A dead controller keeps a GigE camera until its heartbeat is missed: 3 s."""
+    for _ in range(100):
+        with contextlib.suppress(InstrumentError):
+            camera.configure(0.002)
+            assert camera.capture().raw.shape == (512, 512)
+            return
+        time.sleep(0.2)
+    camera.capture()
+
+
+def test_a_frozen_camera_is_given_up_and_controlled_again(fake: AravisFakeCamera) -> None:
+    with AravisCamera(fake.address, timeout_s=2.0) as camera:
+        camera.configure(0.002)
+        camera.capture()
+        fake.mute(True)
+        for _ in range(2):
+            with pytest.raises(InstrumentError) as raised:
+                camera.configure(0.002)
+            assert "\n" not in str(raised.value)
+        fake.mute(False)
+        _used_again(camera)
+
+
+def test_a_camera_that_died_is_controlled_again_by_the_same_driver(fake: AravisFakeCamera) -> None:
+    with AravisCamera(fake.address, timeout_s=2.0) as camera:
+        camera.configure(0.002)
+        camera.capture()
+        fake.unplug()
+        with pytest.raises(InstrumentError):
+            camera.capture()
+        fake.plug()
+        _used_again(camera)
+
+
 def test_nobody_at_the_address(fake: AravisFakeCamera) -> None:
     with pytest.raises(Disconnected, match=r"Aravis finds no such camera \(Can't connect"):
         AravisCamera("127.0.0.9").connect()
@@ -135,7 +172,7 @@ def test_an_empty_buffer_is_no_frame() -> None:
         def push_buffer(self, buffer: Stream) -> None:
             self.queued.append(buffer)
 
-    camera = AravisCamera("nowhere")
-    camera._stream = Stream()
-    assert camera._grab(0.1) is None
-    assert camera._stream.queued == [camera._stream]
+    device = AravisDevice("nowhere")
+    device._stream = Stream()
+    assert device.grab(0.1) is None
+    assert device._stream.queued == [device._stream]

@@ -123,7 +123,7 @@ def test_the_shutter_is_open_during_an_exposure_alone(peer: DemoCamera) -> None:
     ("settings", "message"),
     [
         ({"pixel_type": "32bitRGB"}, r"4 values of 8 bits .*; one of 8 or 16 bits is wanted: set pixel_type to one of"),
-        ({"pixel_type": "64"}, "set failed .*PixelType"),
+        ({"pixel_type": "64"}, "camera .*: set PixelType 64 failed"),
         ({"properties": {"Brightness": "3"}}, "it has no property 'Brightness'; correct it in the station file"),
         ({"shutter": "Lamp"}, "can't be loaded"),
         ({"trigger_line": "Line1"}, "trigger_line 'Line1' can't be waited for"),

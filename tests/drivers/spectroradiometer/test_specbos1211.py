@@ -84,7 +84,9 @@ def test_every_model_measures_as_far_as_it_is_calibrated(served: Callable[..., s
         assert radiometer.identity().model == model
         measured = radiometer.measure().radiance_w_sr_m2_nm
     assert (measured.wavelength_nm[0], measured.wavelength_nm[-1]) == (380.0, 780.0)
-    np.testing.assert_allclose(measured.value, lamp.radiance().at(np.arange(380, 781)), rtol=5e-7)
+    # Half of the last digit: a spectraval sends one fewer.
+    rtol = 5e-6 if model.startswith("spectraval") else 5e-7
+    np.testing.assert_allclose(measured.value, lamp.radiance().at(np.arange(380, 781)), rtol=rtol)
 
 
 def test_a_unit_that_claims_more_than_it_is_calibrated_for_is_asked_for_less(served: Callable[..., str]) -> None:
