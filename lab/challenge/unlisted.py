@@ -34,6 +34,7 @@ COMPANIONS: tuple[type[Law], ...] = tuple(
 )
 TARGETS, COMPANION_TARGETS = (10.0, 600.0), (100.0, 1000.0)  # ranges of separability, and of non-centrality
 SIZING_ROUNDS, SIZING_FACTOR = 6, 1.3
+COMPANION_ROUNDS = 2  # its summaries take long, and its strength is of no account
 #: Captures of which means need no others: they come first in a session.
 UNIFORM = ("dark", "flat", "narrowband")
 MOSAICS = ("RGGB", "BGGR", "GRBG", "GBRG", "MONO")
@@ -108,7 +109,7 @@ def draw_unlisted(
             other = COMPANIONS[int(rng.integers(len(COMPANIONS)))]
             companion = other(other.nominal, int(rng.integers(other.variants)), int(rng.integers(2**31)))
             wanted = float(np.exp(rng.uniform(*np.log(COMPANION_TARGETS))))
-            laws.append(sized(companion, lambda one: _shown(take, (one,), ()), wanted)[0])
+            laws.append(sized(companion, lambda one: _shown(take, (one,), ()), wanted, COMPANION_ROUNDS)[0])
         whole = tuple(laws)
         for one in laws:
             others = tuple(law for law in whole if law is not one)
@@ -142,11 +143,14 @@ def draw_unlisted(
     return Case(recording_set(session), truth)
 
 
-def sized(law: AnyLaw, measured: Callable[[AnyLaw], float], target: float) -> tuple[AnyLaw, float]:
-    """The law at the strength at which it measures about the target, within its limits, and what it measures there."""
+def sized(
+    law: AnyLaw, measured: Callable[[AnyLaw], float], target: float, rounds: int = SIZING_ROUNDS
+) -> tuple[AnyLaw, float]:
+    """The law at the strength at which it measures about the target, within its limits and after so many `rounds` at
+    most, and what it measures there."""
     size = measured(law)
     low, high = law.limits
-    for _ in range(SIZING_ROUNDS):
+    for _ in range(rounds):
         if target / SIZING_FACTOR < size < SIZING_FACTOR * target:
             break
         # below 0.1 rounding is measured

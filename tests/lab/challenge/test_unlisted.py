@@ -167,6 +167,15 @@ def test_the_same_arguments_give_the_same_case() -> None:
     assert np.array_equal(one.recordings.frame(last), two.recordings.frame(last))
 
 
+def test_a_strength_is_found_in_a_few_rounds_within_its_limits() -> None:
+    law = LAW["row_banks"]
+    one, size = sized(law(1.0), lambda some: 3.0 * some.strength**2, 300.0)
+    assert (one.strength, size) == (pytest.approx(10.0), pytest.approx(300.0))
+    # steps of a factor of 10 at most, and as many as are allowed
+    assert sized(law(0.01), lambda some: some.strength**2, 1e4, 1)[0].strength == pytest.approx(0.1)
+    assert sized(law(1.0), lambda some: some.strength**2, 1e6)[0].strength == law.limits[1]
+
+
 def test_a_size_without_one_frame_is_refused() -> None:
     with pytest.raises(InputError, match="foreign"):
         draw_unlisted(5, 1, "foreign")
