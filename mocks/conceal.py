@@ -101,7 +101,7 @@ def _made(spec: str, kind: type[Effect], text: str) -> Effect:
                 f"{values[field]!r} is no number; give one{'' if unit == '1' else f', which is in {unit}'}, without a "
                 "unit"
             )
-        raise ConcealError(f"--conceal {spec}: {kind.name} {field}: {said}") from None
+        raise ConcealError(f"--conceal {spec}: {' '.join((kind.name, field)).strip()}: {said}") from None
     if effect == kind():
         raise ConcealError(f"--conceal {spec}: nothing of {kind.name} would be there; give a value of {known}")
     return effect

@@ -79,7 +79,7 @@ SIZES: dict[str, str] = {
     "pixel_aperture": "left:side_change_um=-0.7",
     "radiometer_nonlinearity": "both:exponent_percent=4",
     "random_telegraph_noise": "left:amplitude_e=40,share_percent=0.5",
-    "response_knee": "left:slope_percent=-10,knee_share=0.45",
+    "response_knee": "left:slope_percent=-3,knee_share=0.45",
     "row_noise": "left:noise_e=3",
     "screen_gamma": "both:exponent=1.8",
     "screen_pixel_structure": "both:amplitude_percent=20",

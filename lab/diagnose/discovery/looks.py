@@ -15,7 +15,7 @@ from lab.diagnose.measurements.code_density import CodeCounts, counted, prepared
 from lab.diagnose.measurements.dark_frames import dark_frames
 from lab.diagnose.measurements.dark_readout import dark_readout
 from lab.diagnose.measurements.even_flats import flats
-from lab.diagnose.measurements.flat_lines import without_dark
+from lab.diagnose.measurements.flat_lines import differing_light, without_dark
 from lab.errors import NotDetermined
 from lab.measure.study import Study
 from sim.effects.base import Effects
@@ -44,7 +44,7 @@ SHOWN_IN = {
 def index_looks(study: Study, effects: Effects) -> Iterator[Look]:
     """Yield what the effects leave along codes, rows and columns."""
     yield from _codes(study, effects)
-    yield from _of_images(study, "charge", "mean", _lit_images(study))
+    yield from _of_images(study, "charge", "mean", _lit_images(study, effects))
     yield from _of_images(study, "signal", "mean", _dark_images(study, effects))
     yield from _of_images(study, "signal", "variance", _dark_variances(study), cells=False)
 
@@ -77,18 +77,20 @@ def _code_profile(codes: CodeCounts, effects: Effects, study: Study) -> Profile:
 # --- images ----------------------------------------------------------------------------------------------------------
 
 
-def _lit_images(study: Study) -> dict[bool, FloatArray]:
-    """The mean flat, each plane over its mean, less the dark offsets: of seen (False) and of held-out captures."""
+def _lit_images(study: Study, effects: Effects) -> dict[bool, FloatArray]:
+    """The mean flat, each plane over its mean, less the dark offsets, over what the effects leave of even light: of
+    seen (False) and of held-out captures.
+    """
     try:
         levels, images = study.once(flats)
     except NotDetermined:
         return {}
-    dark = study.once(dark_readout)
+    dark, known = study.once(dark_readout), differing_light(study.camera, effects)
     found = {}
     for held_out, (image, _) in images.items():
         part = [u for u in levels if u.held_out == held_out]
         level = image if dark is None else without_dark(study, dark, part, image)[0]
-        found[held_out] = np.asarray(level, float)
+        found[held_out] = np.asarray(level if known is None else level / known, float)
     return found
 
 
