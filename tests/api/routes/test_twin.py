@@ -68,6 +68,7 @@ def test_a_prediction_is_sealed_and_opened_over_the_network(
     file.write_text(file.read_text().replace('"n', '"m', 1))
     with pytest.raises(ServiceProblem, match="was edited"):
         client.score_prediction(again.id, SetAsked(recordings_id=taken))
+    assert len([*client.predictions()]) == 2
     client.delete_prediction(found.id)
     with pytest.raises(ServiceProblem, match="no prediction"):
         client.prediction(found.id)
