@@ -401,7 +401,7 @@ def _effects_of(run: CameraRun) -> set[str | None]:
     return {law.effect for law in LISTED if law.name in (*run.concealed, DARK_LAW.name)}
 
 
-LABEL_PX, PLOT_PX, ROW_PX, HEAD_PX = 330, 420, 20, 46
+LABEL_PX, PLOT_PX, ROW_PX, HEAD_PX = 350, 420, 20, 46
 
 
 def drawing(runs: dict[str, CameraRun]) -> str:
