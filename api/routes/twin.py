@@ -26,6 +26,7 @@ from lab.calibration import camera_models
 from lab.capture.catalogue import step_times
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
+from lab.formats.result_file import read_result
 from lab.twin.budget import BudgetResult, budget, parse_uses
 from lab.twin.changes import checked_changes
 from lab.twin.predict import predict
@@ -75,8 +76,7 @@ def _sealed(service: Service, prediction_id: str) -> SealedPrediction:
     return open_seal(file)
 
 
-def _fields(service: Service, prediction_id: str) -> StoredPrediction:
-    found = _sealed(service, prediction_id)
+def _fields(service: Service, prediction_id: str, found: SealedPrediction) -> StoredPrediction:
     file = _folder(service) / f"{prediction_id}.json"
     return StoredPrediction(
         id=prediction_id,
@@ -113,25 +113,26 @@ def make_prediction(service: Here, asked: PredictionStart, response: Response) -
     if not (folder / f"{id}.json").is_file():  # the same prediction stays the one that was sealed first
         seal(found, folder / f"{id}.json")
     response.headers["Location"] = f"/api/v1/predictions/{id}"
-    return _fields(service, id)
+    return _fields(service, id, found)
 
 
 @router.get("/predictions", dependencies=[READ], responses=answers(401, 422) | {200: {"headers": HEADERS}})
 def list_predictions(
     service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
 ) -> list[StoredPrediction]:
-    """Sealed predictions, the newest first, in pages."""
+    """Sealed predictions, the newest first, in pages. Whether a seal holds is looked at where one is asked for."""
     there = sorted(_folder(service).glob("[0-9a-f]*.json"), key=lambda file: (-file.stat().st_mtime, file.stem))
     every = [file.stem for file in there]
     page = page_of(every, after, limit, "prediction")
     page_headers(request, response, len(every), limit, page)
-    return [_fields(service, one) for one in page]
+    folder = _folder(service)
+    return [_fields(service, one, read_result(SealedPrediction, folder / f"{one}.json")) for one in page]
 
 
 @router.get("/predictions/{prediction_id}", dependencies=[READ], responses=answers(401, 404, 422))
 def get_prediction(service: Here, prediction_id: HexId) -> StoredPrediction:
-    """One prediction: of which model, with which changes, and its hash."""
-    return _fields(service, prediction_id)
+    """One prediction: of which model, with which changes, and its hash. 422 where the file was edited."""
+    return _fields(service, prediction_id, _sealed(service, prediction_id))
 
 
 @router.get(

@@ -191,7 +191,7 @@ def case_names() -> tuple[str, ...]:
 def laws_of(case: str, seed: int = SEED) -> list[Law]:
     """The concealed laws of a case beside that of the dark current."""
     kind, _, number = case.partition("-")
-    rng = np.random.default_rng([seed, KINDS.index(kind), int(number)])  # type: ignore[arg-type]
+    rng = np.random.default_rng([seed, KINDS.index(kind), int(number)])
     is_mono = ConcealedCamera(_seed(case, seed)).cfa == "MONO"
     pool = BLURS if kind == "weak" else CONCEALED
     able = [law for law in LISTED if law.name in pool and law.needs not in ({"bayer"} if is_mono else {"mono"})]
@@ -206,7 +206,7 @@ def laws_of(case: str, seed: int = SEED) -> list[Law]:
 
 def _seed(case: str, seed: int) -> int:
     kind, _, number = case.partition("-")
-    return seed + 1000 * int(number) + KINDS.index(kind)  # type: ignore[arg-type]
+    return seed + 1000 * int(number) + KINDS.index(kind)
 
 
 def concealed_camera(case: str, noise_draw: int = 0, seed: int = SEED, **settings: Any) -> ConcealedCamera:
@@ -235,8 +235,8 @@ def run_case(case: str, seed: int = SEED) -> CameraRun:
         taken = recordings_of(concealed_camera(case, number, seed, **transfer.camera), replace(short, **transfer.plan))
         changes = transfer.changes
         if "lens" in name:
-            of_lens = {"f_number": None, "lens": write_lens(Path(lenses.name), taken.camera("left").focal_length_mm)}
-            changes = changes.model_copy(update=of_lens)
+            file = write_lens(Path(lenses.name), concealed_camera(case, seed=seed).focal_length_mm)
+            changes = changes.model_copy(update={"f_number": None, "lens": file})
         if "lamp" in transfer.plan:  # as the radiometer reads it there
             changes = Changes(lamp=taken.spectrum(taken.captures("flat", "left")[0].radiance))
         try:
@@ -401,7 +401,7 @@ def _effects_of(run: CameraRun) -> set[str | None]:
     return {law.effect for law in LISTED if law.name in (*run.concealed, DARK_LAW.name)}
 
 
-LABEL_PX, PLOT_PX, ROW_PX, HEAD_PX = 330, 420, 20, 46
+LABEL_PX, PLOT_PX, ROW_PX, HEAD_PX = 350, 420, 20, 46
 
 
 def drawing(runs: dict[str, CameraRun]) -> str:

@@ -212,12 +212,12 @@ def _use(
     found.sort(key=lambda one: -one.share_percent)
     gains = []
     for one, known in after:
-        left = _relative_std(gradient, known)
+        then = _relative_std(gradient, known)
         gains.append(
             CaptureGain(
-                sequence=one.words, minutes=one.minutes, is_learned=one.is_learned, std_percent=100.0 * left,
-                reduced_percent=100.0 * (std - left),
-                reduced_percent_per_minute=100.0 * (std - left) / max(one.minutes, 1e-3),
+                sequence=one.words, minutes=one.minutes, is_learned=one.is_learned, std_percent=100.0 * then,
+                reduced_percent=100.0 * (std - then),
+                reduced_percent_per_minute=100.0 * (std - then) / max(one.minutes, 1e-3),
             )
         )  # fmt: skip
     gains.sort(key=lambda one: -one.reduced_percent_per_minute)

@@ -8,7 +8,7 @@ After it, the parameters' covariance V is (Rasmussen and Williams 2006, eq. 2.26
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -201,7 +201,7 @@ def _brightest(camera: CameraModel, light: Spectrum) -> float:
     return max(electron_rate(camera, c, light) for c in camera.channels)
 
 
-def _levels(content: CameraFile, items: list[tuple[Spectrum, str, float, Spectrum | None]]) -> FloatArray:
+def _levels(content: CameraFile, items: Iterable[tuple[Spectrum, str, float, Spectrum | None]]) -> FloatArray:
     """Levels above black (DN), channel by channel, of (light, kind of capture, exposure in s, reflectance)."""
     camera, model = content.camera, Uniform(content.camera, content.effects)
     field = model.field(FieldPoints.of(camera))

@@ -25,7 +25,7 @@ from lab.diagnose.measurements.noise import GAIN_STD, NOISE, READ_STD, shot_vari
 from lab.diagnose.measurements.slanted_edge import ASIDE, SLANTED_EDGE
 from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian, with_unnamed
 from lab.errors import InputError, NotDetermined
-from lab.fit import fit_recording_set
+from lab.fit import Step, fit_recording_set
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
 from lab.formats.recording_set import RecordingSet
@@ -57,6 +57,8 @@ HIGHEST_SHARE = 0.95
 USUAL_JITTER_DN = 0.02
 #: Relative standard deviation of the sensitivities where the model has none.
 CURVE_STD = 0.01
+#: What is fitted of the recordings that levels are relative to.
+NOISE_STEP: tuple[Step, ...] = ("noise",)
 #: Step (C) of the difference by temperature.
 STEP_C = 0.1
 
@@ -154,7 +156,7 @@ def _side(
     light = None
     if fitted is not None:
         check_sensor(content, fitted.camera(side), fitted.source)
-        noise_fit = fit_recording_set(fitted, steps=("noise",)).cameras.get(side)
+        noise_fit = fit_recording_set(fitted, steps=NOISE_STEP).cameras.get(side)
         misstated = frozenset(id for level in misstated_levels(noise_fit) for id in level.captures)
         light = relative_light(_study(content, posterior, fitted, side, misstated)[0], content.effects, posterior)
     session = future_session(content, plan, side, changes, dn_per_photon=None if light is None else light.dn_per_dose())

@@ -93,7 +93,7 @@ def relative_light(study: Study, effects: Effects, posterior: ModelPosterior) ->
     noise = block.covariance + sum((np.outer(c, c) for c in columns.values()), np.zeros_like(block.covariance))
     of_rates = np.column_stack(list(rates.values()))
     weighted = np.linalg.solve(noise, of_rates).T
-    covariance = np.linalg.inv(weighted @ of_rates)
+    covariance = np.asarray(np.linalg.inv(weighted @ of_rates), float)
     value = covariance @ weighted @ (block.value - model.mean(effects) - jacobian @ mean)
     return RelativeLight(
         rates_per_dose(study, block), value, tuple(known), -covariance @ weighted @ jacobian, covariance

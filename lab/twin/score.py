@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import norm
 
 from lab.capture_kinds.base import Capture
+from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.block import Label
 from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
@@ -173,9 +174,9 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
             mine = np.array([prediction.numbers[i].quantity == name for i in here])
             parts[name] = parts.get(name, 0.0) + chi2((seen - moved)[mine], covariance[np.ix_(mine, mine)])
         at = np.array([prediction.numbers[i].predicted for i in here])
-        for name in prediction.names:
-            changes = [np.array(rival.numbers)[here] - at for rival in name.rivals]
-            effects.append(_tested(side, name, seen - moved, changes, covariance))
+        for told in prediction.names:
+            changes = [np.array(rival.numbers)[here] - at for rival in told.rivals]
+            effects.append(_tested(side, told, seen - moved, changes, covariance))
         numbers += [_scored(side, prediction.numbers[i], m, v) for i, m, v in zip(here, moved, seen, strict=True)]
     return TwinScore(
         source=recordings.source, quantities=tuple(_quantity(name, numbers, value) for name, value in parts.items()),

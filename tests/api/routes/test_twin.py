@@ -65,9 +65,10 @@ def test_a_prediction_is_sealed_and_opened_over_the_network(
     again = client.predict(asked.model_copy(update={"changes": ChangesAsked(lamp=tungsten)}))
     assert again.changes["lamp"]["value"][0] == LAMP.value[0]
     file = running.store.root / "predictions" / f"{again.id}.json"
-    file.write_text(file.read_text().replace('"n', '"m', 1))
+    file.write_text(file.read_text().replace('"plan":"', '"plan":"0', 1))
     with pytest.raises(ServiceProblem, match="was edited"):
         client.score_prediction(again.id, SetAsked(recordings_id=taken))
+    assert len([*client.predictions()]) == 2
     client.delete_prediction(found.id)
     with pytest.raises(ServiceProblem, match="no prediction"):
         client.prediction(found.id)
