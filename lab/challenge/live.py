@@ -122,14 +122,12 @@ FIRST_SESSION = ("dark", "flat", "screen")
 
 #: Weak losses of contrast that are alike in all directions: `--isotropic` resolves each in three captures at most.
 ISOTROPIC: dict[str, tuple[str, ...]] = {
-    "defocus": ("defocus_um=6", "defocus_um=9", "defocus_um=13"),
-    "spherical_aberration": ("w040_um=0.07", "w040_um=0.1", "w040_um=0.14"),
-    "charge_diffusion": ("length_um=0.45", "length_um=0.6", "length_um=0.8"),
-    "pixel_aperture": ("side_change_um=-0.25", "side_change_um=-0.4", "side_change_um=-0.55"),
-    "optical_low_pass_filter": (
-        "displacement_x_um=0.8,displacement_y_um=0.8",
-        "displacement_x_um=1.1,displacement_y_um=1.1",
-        "displacement_x_um=1.4,displacement_y_um=1.4",
+    "defocus": ("defocus_um=6", "defocus_um=9", "defocus_um=13", "defocus_um=5", "defocus_um=7.5"),
+    "spherical_aberration": ("w040_um=0.07", "w040_um=0.1", "w040_um=0.14", "w040_um=0.04", "w040_um=0.055"),
+    "charge_diffusion": ("length_um=0.45", "length_um=0.6", "length_um=0.8", "length_um=0.55", "length_um=0.7"),
+    "pixel_aperture": tuple(f"side_change_um={um}" for um in (-0.25, -0.4, -0.55, -0.8, -1.1)),
+    "optical_low_pass_filter": tuple(
+        f"displacement_x_um={um},displacement_y_um={um}" for um in (0.8, 1.1, 1.4, 1.0, 1.25)
     ),
 }
 MOST_CAPTURES = 3
