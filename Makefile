@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium names soak kills setup run test serve bench proof proof-live real slow lint clean
+.PHONY: aravis chromium peers names soak kills setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
 
 setup: $(STAMP)
 
@@ -33,6 +33,10 @@ kills: $(STAMP)
 # The library for GigE cameras of any maker, from the distribution; tests that need it skip without it.
 aravis:
 	scripts/install-aravis
+
+# Simulators of INDI's and Alpaca's cameras, and Argyll's spotread; tests that need them skip without them.
+peers: $(STAMP)
+	scripts/install-peers $(BIN)/python
 
 # The browser in which the tests drive the operator's page, from the distribution.
 chromium:
@@ -59,6 +63,15 @@ proof: $(STAMP)
 	test -f $(PROOF).score.json || $(BIN)/calibench challenge make --proof --out $(PROOF) --cases $(CASES) --seed "$$(cat $(PROOF).seed)"
 	$(BIN)/calibench challenge score $(PROOF) --truths $(PROOF).truths.json --json $(PROOF).score.json --page docs/proof.md
 
+# A blind proof of discovery, of laws that no list has: goes on where it stopped; a new one needs another UNLISTED.
+UNLISTED_CASES ?= 200
+UNLISTED ?= calibench-data/proof-unlisted
+proof-unlisted: $(STAMP)
+	mkdir -p $(dir $(UNLISTED))
+	test -s $(UNLISTED).seed || $(BIN)/python -c "import random; print($(if $(SEED),$(SEED),random.SystemRandom().randrange(10**6, 2**32)))" > $(UNLISTED).seed
+	test -f $(UNLISTED).score.json || $(BIN)/calibench challenge make --unlisted --proof --out $(UNLISTED) --cases $(UNLISTED_CASES) --seed "$$(cat $(UNLISTED).seed)"
+	$(BIN)/calibench challenge score $(UNLISTED) --truths $(UNLISTED).truths.json --json $(UNLISTED).score.json --page docs/proof-unlisted.md
+
 # The live proof: benches that conceal each effect, a session over the wire of each, and the diagnosis. Goes on where it stopped;
 # ARGS="--only CASE" runs one.
 LIVE ?= calibench-data/proof-live
@@ -76,6 +89,13 @@ names: $(STAMP)
 REAL ?= ../shared/data
 real: $(STAMP)
 	$(BIN)/python -m benchmarks.real --data $(REAL) --out calibench-data/real $(ARGS)
+
+# The proof of the twin: concealed cameras carried to configurations that they weren't fitted in. Goes on where it stopped; ARGS="--only
+# CASE" runs one, another SEED draws cameras that nobody has seen. Then the highest levels of real photon-transfer sets from the lowest.
+TWIN ?= calibench-data/proof-twin
+twin: $(STAMP)
+	$(BIN)/python -m lab.challenge.transfers --out $(TWIN) $(if $(SEED),--seed $(SEED)) --page docs/proof-twin.md $(ARGS)
+	test ! -d $(REAL) || $(BIN)/python -m benchmarks.real.extrapolation --data $(REAL) --page docs/proof-twin.md
 
 # The tests that the everyday suite leaves out: recovery and coverage over many draws.
 slow: $(STAMP)

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import tempfile
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Collection, Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,18 @@ from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.pictures import Pictures
 from api.public_text import PublicText
-from api.routes import calibrations, camera_models, challenges, findings, jobs, knowledge, queue, recordings, sessions
+from api.routes import (
+    calibrations,
+    camera_models,
+    challenges,
+    findings,
+    jobs,
+    knowledge,
+    queue,
+    recordings,
+    sessions,
+    twin,
+)
 from api.routes.stations import router as stations_router
 from api.schemas import Health, Login, Me
 from api.security import (
@@ -43,6 +54,7 @@ from api.security import (
 )
 from api.service import READ, Here, Limits, Service
 from api.shared_answers import Shared, SharedAnswers
+from api.then import ThenRunner
 from api.upload import Inbox
 from api.waiting import QueueRunner
 from lab.capture.recovery import Recovery
@@ -59,26 +71,8 @@ PREFIX = "/api/v1"
 ARCHIVES = frozenset((f"{PREFIX}/recordings", f"{PREFIX}/camera-models"))
 PAGES = Path(__file__).parent / "pages"
 ASSETS = {
-    "operator.css": "text/css",
-    "operator.js": "text/javascript",
-    **dict.fromkeys(
-        (
-            "page.js",
-            "charts.js",
-            "stations.js",
-            "plan.js",
-            "queue.js",
-            "watch.js",
-            "recordings.js",
-            "models.js",
-            "send.js",
-            "calibrations.js",
-            "challenges.js",
-            "findings.js",
-            "docs.js",
-        ),
-        "text/javascript",
-    ),
+    file.name: {".css": "text/css", ".js": "text/javascript"}[file.suffix]
+    for file in sorted((*PAGES.glob("*.css"), *PAGES.glob("*.js")))
 }
 TAGS = [
     {"name": "access", "description": "Keys, logins, health."},
@@ -185,6 +179,7 @@ def create_app(
     *,
     stations: Path | None = None,
     hosts: Iterable[str] = (),
+    webhook_hosts: Collection[str] = (),
     limits: Limits | None = None,
     connect: Callable[[Station], Drivers] = drivers_of,
     jobs_runner: JobRunner | None = None,
@@ -193,9 +188,10 @@ def create_app(
     """The application on a store.
 
     `stations`: the folder of the station files, by default `stations` in the data folder. `hosts`: names under which
-    the service is reached, beside this computer's own. `connect` makes a station's drivers. When the application ends,
-    it cancels its jobs and aborts its sessions, which can be resumed; shutters are closed. `recovery` may have begun
-    already; by default the application's start begins it.
+    the service is reached, beside this computer's own. `webhook_hosts`: those that may be told of sessions' ends.
+    `connect` makes a station's drivers. When the application ends, it cancels its jobs and aborts its sessions, which
+    can be resumed; shutters are closed. `recovery` may have begun already; by default the application's start begins
+    it.
     """
     folder = stations or store.root / "stations"
     folder.mkdir(parents=True, exist_ok=True)
@@ -208,8 +204,10 @@ def create_app(
         rescue.resume_with(app.state.service.live.resume)
         rescue.start()
         app.state.service.waiting.start()
+        app.state.service.then.start()
         yield
         await asyncio.to_thread(app.state.service.waiting.close)
+        await asyncio.to_thread(app.state.service.then.close)
         await asyncio.to_thread(rescue.close)
         await asyncio.to_thread(app.state.service.checks.close)
         app.state.service.jobs.close()  # first: a job that captures ends its session itself
@@ -220,6 +218,7 @@ def create_app(
     live = LiveSessions(store, connect, shared.forget)
     gate = Gate(lambda anew: stored_keys(store, anew), store.knows_keys)
     jobs_of = jobs_runner or JobRunner(store)
+    inbox = Inbox(store.root / "recordings")
     counted = Metrics({"sessions": store.count_states, "jobs": jobs_of.count_states})
     app = FastAPI(
         title="calibench",
@@ -249,10 +248,11 @@ def create_app(
         stations=folder,
         live=live,
         waiting=QueueRunner(store, live, lambda: rescue.settled),
+        then=ThenRunner(store, live, jobs_of, webhook_hosts, shared.forget),
         quick_look=QuickLook(store),
-        pictures=Pictures(store),
+        pictures=Pictures(store, inbox),
         jobs=jobs_of,
-        inbox=Inbox(store.root / "recordings"),
+        inbox=inbox,
         challenges=Challenges(store.root / "challenges"),
         gate=gate,
         public=app.state.public,
@@ -269,7 +269,8 @@ def create_app(
     app.include_router(open_to_all)
     strict = [Depends(check_query)]
     app.include_router(stations_router, prefix=PREFIX, dependencies=strict)
-    for part in (knowledge, sessions, queue, recordings, jobs, findings, calibrations, camera_models, challenges):
+    parts = (knowledge, sessions, queue, recordings, jobs, findings, calibrations, camera_models, challenges, twin)
+    for part in parts:
         app.include_router(part.router, prefix=PREFIX, dependencies=strict)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

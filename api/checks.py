@@ -5,14 +5,17 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
+from pydantic import TypeAdapter, ValidationError
+
 from api.errors import Conflict
 from api.live import LiveSessions
+from lab.capture.durable_files import write_durably
 from lab.capture.records import now
 from lab.capture.self_test import SelfTest, record_transcript, self_test
 from lab.capture.station import Drivers, Station
@@ -38,61 +41,85 @@ class Checked:
         return "works" if self.test.works else "fails"
 
 
-class DeviceChecks:
-    """Checks devices in the background, one of a station at a time, and keeps sessions off its instruments meanwhile.
+_CHECKED = TypeAdapter(Checked)
 
-    `transcripts`: the folder of what went over the wires. How the checks went is kept as long as the service runs.
+
+class DeviceChecks:
+    """Checks devices in the background, those of one station one after the other, and keeps sessions off its
+    instruments meanwhile.
+
+    `folder`: where the latest check of each device is kept, and what went over its wire.
     """
 
-    def __init__(self, live: LiveSessions, connect: Callable[[Station], Drivers], transcripts: Path) -> None:
-        self._live, self._connect, self._transcripts = live, connect, transcripts
-        self._latest: dict[tuple[str, str], Checked] = {}
+    def __init__(self, live: LiveSessions, connect: Callable[[Station], Drivers], folder: Path) -> None:
+        self._live, self._connect, self._folder = live, connect, folder
+        self._latest: dict[tuple[str, str], Checked | None] = {}
         self._threads: list[threading.Thread] = []
         self._closed = False
 
     def latest(self, station: str, device: str) -> Checked | None:
-        """How the latest check of a device went; None if there was none."""
-        return self._latest.get((station, device))
+        """How the latest check of a device went, also before the service's start; None if there was none."""
+        if (station, device) not in self._latest:
+            self._latest[station, device] = self._kept(station, device)
+        return self._latest[station, device]
 
     def transcript(self, station: str, device: str) -> Path:
         """Where the transcript of a device's latest check is, if one was kept."""
-        return self._transcripts / station / f"{device}.txt"
+        return self._folder / station / f"{device}.txt"
 
-    def start(self, name: str, station: Station, device: str, keep_transcript: bool) -> None:
-        """Check a device in the background. Raises Conflict while a session or a check is under way on the station's
-        instruments."""
+    def _kept(self, station: str, device: str) -> Checked | None:
+        try:
+            return _CHECKED.validate_json((self._folder / station / f"{device}.json").read_bytes())
+        except (OSError, ValidationError):
+            return None
+
+    def start(self, name: str, station: Station, devices: Sequence[str], keep_transcript: bool) -> None:
+        """Check devices in the background, one after the other. Raises Conflict while a session or a check is under way
+        on the station's instruments."""
         if self._closed:
             raise Conflict("the service is being stopped; check the device when it is up again")
         let_go = self._live.hold(station)
-        self._latest[name, device] = Checked()
+        for device in devices:
+            self._latest[name, device] = Checked()
         thread = threading.Thread(
             target=self._work,
-            args=(name, station, device, keep_transcript, let_go),
-            name=f"check {name} {device}",
+            args=(name, station, devices, keep_transcript, let_go),
+            name=f"check {name} {', '.join(devices)}",
             daemon=True,
         )
         self._threads = [other for other in self._threads if other.is_alive()] + [thread]
         thread.start()
 
     def _work(
-        self, name: str, station: Station, device: str, keep_transcript: bool, let_go: Callable[[], None]
+        self, name: str, station: Station, devices: Sequence[str], keep_transcript: bool, let_go: Callable[[], None]
     ) -> None:
-        test = SelfTest(device, "", False, "the check failed by a defect of calibench; its log says more")
         try:
-            if keep_transcript:
-                file = self.transcript(name, device)
-                file.parent.mkdir(parents=True, exist_ok=True)
-                file.unlink(missing_ok=True)
-                test = record_transcript(station, device, file)
-            else:
-                test = self_test(station, device, self._connect)
+            for device in devices:
+                if self._closed:
+                    self._latest[name, device] = self._kept(name, device)
+                    continue
+                checked = Checked(self._test(name, station, device, keep_transcript), now())
+                self._latest[name, device] = checked
+                try:
+                    write_durably(self._folder / name / f"{device}.json", _CHECKED.dump_json(checked))
+                except (OSError, InputError) as error:
+                    log.warning("check of %s, %s: isn't kept: %s", name, device, error)
+        finally:
+            let_go()
+
+    def _test(self, name: str, station: Station, device: str, keep_transcript: bool) -> SelfTest:
+        try:
+            if not keep_transcript:
+                return self_test(station, device, self._connect)
+            file = self.transcript(name, device)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.unlink(missing_ok=True)
+            return record_transcript(station, device, file)
         except (InputError, DeviceError) as error:
-            test = SelfTest(device, "", False, str(error))
+            return SelfTest(device, "", False, str(error))
         except Exception:
             log.exception("check of %s, %s: a defect", name, device)
-        finally:
-            self._latest[name, device] = Checked(test, now())
-            let_go()
+            return SelfTest(device, "", False, "the check failed by a defect of calibench; its log says more")
 
     def close(self) -> None:
         """Wait for the checks that are under way."""

@@ -22,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, TypeAdapter
 
+from api.certificate import Certificate
 from api.schemas import (
+    CalibrationDetail,
     CameraModels,
     Certify,
     Challenge,
@@ -32,31 +34,41 @@ from api.schemas import (
     ConnectedDevice,
     DeviceCheck,
     DeviceState,
+    DraftedLimits,
     FigureName,
+    FigureOfFit,
     Halt,
     Halted,
     Health,
     Job,
     JobKind,
     JobStart,
+    ListedSession,
     Me,
     PipelineResults,
     PipelineStart,
     PlanAsked,
+    PredictionStart,
+    QueueEntry,
     QueuePlace,
+    RecordedCapture,
     Recordings,
+    RecordingsDetail,
+    Revoke,
     SentAs,
     SessionDetail,
     SessionStart,
+    SessionWords,
+    SetAsked,
     StationState,
     StoredCapture,
+    StoredPrediction,
     StoredSession,
 )
-from lab.calibration.life import CalibrationRecord, History
+from lab.calibration.life import BOARD_COLUMNS, CalibrationRecord, DriftBoard, History
 from lab.calibration.limits import CalibrationLimits
 from lab.capture.catalogue import PlanEstimate, SequenceDescription
 from lab.capture.plan import Parameters
-from lab.capture.queue import QueuedSession
 from lab.capture.session import Progress
 from lab.challenge.score import ChallengeScore
 from lab.challenge.truth import Truths
@@ -65,6 +77,9 @@ from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.quick_look.curves import Curves
 from lab.quick_look.frame_figures import FrameFigures
 from lab.report.findings import DiagnosisFindings
+from lab.twin.budget import BudgetResult
+from lab.twin.score import TwinScore
+from sim.camera import Side
 
 M = TypeVar("M", bound=BaseModel)
 W = TypeVar("W", SessionDetail, Job)
@@ -252,6 +267,12 @@ class ServiceClient:
             found = self.device(station, device)
         return found
 
+    def start_checks(self, station: str, *, transcript: bool = False) -> list[DeviceState]:
+        """Let every instrument of a station work once, one after the other, in the background."""
+        body = DeviceCheck(transcript=transcript).model_dump(mode="json")
+        response = self.request("POST", f"/stations/{station}/check", json=body)
+        return TypeAdapter(list[DeviceState]).validate_json(response.content)
+
     def transcript(self, station: str, device: str) -> str:
         """What went over an instrument's wire in the latest check that kept it."""
         return self.request("GET", f"/stations/{station}/devices/{device}/transcript").text
@@ -268,9 +289,9 @@ class ServiceClient:
         """What a session would take on a station: captures and time."""
         return self._post(PlanEstimate, f"/stations/{station}/estimate", asked or PlanAsked())
 
-    def sessions(self) -> Iterator[StoredSession]:
-        """All sessions, the newest first."""
-        return self._pages(StoredSession, "/sessions")
+    def sessions(self, **only: str) -> Iterator[ListedSession]:
+        """Sessions, the newest first; `only`: those that a `search` finds, or of a `verdict`."""
+        return self._pages(ListedSession, "/sessions", **only)
 
     def session(self, session_id: str) -> SessionDetail:
         """One session, with its provenance."""
@@ -280,20 +301,35 @@ class ServiceClient:
         """Start a session, which runs in the background."""
         return self._post(StoredSession, "/sessions", start)
 
-    def queue(self) -> list[QueuedSession]:
-        """The sessions that wait for their instruments, in their order."""
-        return list(self._pages(QueuedSession, "/queue"))
+    def describe_session(self, session_id: str, *, name: str | None = None, notes: str | None = None) -> StoredSession:
+        """Give a session another name, or other notes."""
+        body = SessionWords(name=name, notes=notes).model_dump(mode="json")
+        response = self.request("PATCH", f"/sessions/{session_id}", json=body)
+        return StoredSession.model_validate_json(response.content)
 
-    def queue_session(self, session_id: str, asked: QueuePlace | None = None) -> list[QueuedSession]:
+    def session_request(self, session_id: str) -> SessionStart:
+        """What a session was asked to start with."""
+        return self._get(SessionStart, f"/sessions/{session_id}/request")
+
+    def change_request(self, session_id: str, start: SessionStart) -> StoredSession:
+        """Let another session take the place of one that waits in the queue and never ran."""
+        response = self.request("PUT", f"/sessions/{session_id}/request", json=start.model_dump(mode="json"))
+        return StoredSession.model_validate_json(response.content)
+
+    def queue(self) -> list[QueueEntry]:
+        """The sessions that wait for their instruments, in their order."""
+        return list(self._pages(QueueEntry, "/queue"))
+
+    def queue_session(self, session_id: str, asked: QueuePlace | None = None) -> list[QueueEntry]:
         """Let a session wait for its turn, move one that waits, or release one that is held; the queue then."""
         body = (asked or QueuePlace()).model_dump(mode="json")
         response = self.request("PUT", f"/sessions/{session_id}/queue", json=body)
-        return TypeAdapter(list[QueuedSession]).validate_json(response.content)
+        return TypeAdapter(list[QueueEntry]).validate_json(response.content)
 
-    def unqueue_session(self, session_id: str) -> list[QueuedSession]:
+    def unqueue_session(self, session_id: str) -> list[QueueEntry]:
         """Take a session out of the queue; the queue then."""
         response = self.request("DELETE", f"/sessions/{session_id}/queue")
-        return TypeAdapter(list[QueuedSession]).validate_json(response.content)
+        return TypeAdapter(list[QueueEntry]).validate_json(response.content)
 
     def halt(self, station: str | None = None) -> tuple[str, ...]:
         """End every session now, or those on one station, and hold the queue; the ids of the sessions that ran."""
@@ -383,6 +419,10 @@ class ServiceClient:
         frame: NDArray[np.uint16] = np.load(io.BytesIO(content), allow_pickle=False)
         return frame
 
+    def session_figures(self, session_id: str) -> list[FigureOfFit]:
+        """The figures of a session's newest fit."""
+        return list(self._pages(FigureOfFit, f"/sessions/{session_id}/figures"))
+
     # --- recordings and jobs ------------------------------------------------------------------------------------------
 
     def send_recordings(self, archive: Path, asked: SentAs | None = None) -> Recordings:
@@ -395,9 +435,35 @@ class ServiceClient:
         """All recording sets that were sent in, the newest first."""
         return self._pages(Recordings, "/recordings")
 
-    def recording_set(self, recordings_id: str) -> Recordings:
+    def recording_set(self, recordings_id: str) -> RecordingsDetail:
         """One recording set that was sent in."""
-        return self._get(Recordings, f"/recordings/{recordings_id}")
+        return self._get(RecordingsDetail, f"/recordings/{recordings_id}")
+
+    def recorded_captures(self, recordings_id: str, **only: str) -> Iterator[RecordedCapture]:
+        """The captures of a recording set; `only`: of a `kind`, a `side`."""
+        return self._pages(RecordedCapture, f"/recordings/{recordings_id}/captures", **only)
+
+    def recorded_capture(self, recordings_id: str, number: int) -> RecordedCapture:
+        """One capture of a recording set, by its number from 1."""
+        return self._get(RecordedCapture, f"/recordings/{recordings_id}/captures/{number}")
+
+    def recorded_preview(self, recordings_id: str, number: int, *, picture: Literal["png", "webp"] = "png") -> bytes:
+        """The small picture of a recording set's capture."""
+        return self.request("GET", f"/recordings/{recordings_id}/captures/{number}/preview.{picture}").content
+
+    def recorded_frame(self, recordings_id: str, number: int) -> NDArray[np.uint16]:
+        """The raw frame of a recording set's capture: uint16 (rows, cols)."""
+        content = self.request("GET", f"/recordings/{recordings_id}/captures/{number}/frame.npy").content
+        frame: NDArray[np.uint16] = np.load(io.BytesIO(content), allow_pickle=False)
+        return frame
+
+    def recorded_capture_figures(self, recordings_id: str, number: int) -> FrameFigures:
+        """Histogram, mean and saturated share of each channel of a recording set's frame."""
+        return self._get(FrameFigures, f"/recordings/{recordings_id}/captures/{number}/figures")
+
+    def recordings_figures(self, recordings_id: str) -> list[FigureOfFit]:
+        """The figures of the newest fit of recordings."""
+        return list(self._pages(FigureOfFit, f"/recordings/{recordings_id}/figures"))
 
     def fetch_recordings(self, recordings_id: str, file: Path) -> Path:
         """Write a recording set that was sent in to `file`, a .zip or .tar."""
@@ -436,7 +502,7 @@ class ServiceClient:
         """One job."""
         return self._get(Job, f"/jobs/{job_id}")
 
-    def jobs(self) -> Iterator[Job]:
+    def jobs(self, **only: str) -> Iterator[Job]:
         """All jobs, the newest first."""
         return self._pages(Job, "/jobs")
 
@@ -520,9 +586,29 @@ class ServiceClient:
         """All calibrations, the newest first."""
         return self._pages(CalibrationRecord, "/calibrations")
 
-    def calibration(self, calibration_id: str) -> CalibrationRecord:
-        """One calibration, with its judgements."""
-        return self._get(CalibrationRecord, f"/calibrations/{calibration_id}")
+    def calibration(self, calibration_id: str) -> CalibrationDetail:
+        """One calibration, with its judgements, and what speaks against it."""
+        return self._get(CalibrationDetail, f"/calibrations/{calibration_id}")
+
+    def calibration_figures(self, calibration_id: str) -> list[FigureOfFit]:
+        """Every figure of a calibration."""
+        return list(self._pages(FigureOfFit, f"/calibrations/{calibration_id}/figures"))
+
+    def drafted_limits(self, calibration_id: str) -> DraftedLimits:
+        """Limits drafted from what the same cameras had before."""
+        return self._get(DraftedLimits, f"/calibrations/{calibration_id}/drafted-limits")
+
+    def certificate(self, calibration_id: str) -> Certificate:
+        """What a certificate states, and its hashes."""
+        return self._get(Certificate, f"/calibrations/{calibration_id}/certificate.json")
+
+    def certificate_page(self, calibration_id: str) -> str:
+        """A certificate as a page to print."""
+        return self.request("GET", f"/calibrations/{calibration_id}/certificate").text
+
+    def revoke(self, calibration_id: str, why: str) -> CalibrationRecord:
+        """Take a certificate back."""
+        return self._post(CalibrationRecord, f"/calibrations/{calibration_id}/revoke", Revoke(why=why))
 
     def certify(
         self, calibration_id: str, limits: CalibrationLimits | None = None, *, accept_warnings: bool = False
@@ -551,6 +637,36 @@ class ServiceClient:
         """Write the camera files of a model to `file`, a .zip or .tar."""
         return self._fetched(f"/camera-models/{model_id}/archive", file)
 
+    def predict(self, asked: PredictionStart) -> StoredPrediction:
+        """Predict a session that hasn't been captured, and seal that."""
+        return self._post(StoredPrediction, "/predictions", asked)
+
+    def predictions(self) -> Iterator[StoredPrediction]:
+        """The sealed predictions, the newest first."""
+        return self._pages(StoredPrediction, "/predictions")
+
+    def prediction(self, prediction_id: str) -> StoredPrediction:
+        """One prediction."""
+        return self._get(StoredPrediction, f"/predictions/{prediction_id}")
+
+    def sealed_prediction(self, prediction_id: str) -> bytes:
+        """The sealed file, whose SHA-256 is that of the prediction."""
+        return self.request("GET", f"/predictions/{prediction_id}/sealed.json").content
+
+    def delete_prediction(self, prediction_id: str) -> None:
+        """Delete a prediction for ever."""
+        self.request("DELETE", f"/predictions/{prediction_id}")
+
+    def score_prediction(self, prediction_id: str, asked: SetAsked) -> TwinScore:
+        """Open a prediction against the recordings of the session that it foretold."""
+        return self._post(TwinScore, f"/predictions/{prediction_id}/score", asked)
+
+    def budget(self, model_id: str, use: str, station: str | None = None) -> dict[Side, BudgetResult]:
+        """What matters for a use of each camera of a model; with a station, which of its sequences to take next."""
+        params = {"use": use} | ({} if station is None else {"station": station})
+        found = self.request("GET", f"/camera-models/{model_id}/budget", params=params).json()
+        return {side: BudgetResult.model_validate(one) for side, one in found.items()}
+
     def compare(self, a: str, b: str, fail_on: Sequence[str] = ()) -> Comparison:
         """Two calibrations, by id, compared as `calibench compare` does."""
         return self._get(Comparison, "/comparisons", a=a, b=b, fail_on=list(fail_on))
@@ -566,6 +682,11 @@ class ServiceClient:
     def history(self, camera: str, figure: str, place: str = "") -> History:
         """A figure of a camera over its calibrations."""
         return self._get(History, "/history", camera=camera, figure=figure, place=place)
+
+    def drift(self, camera: str, *, reference_c: float | None = None, newest: int = BOARD_COLUMNS) -> DriftBoard:
+        """All figures of a camera by its newest calibrations, dark currents at a reference temperature."""
+        asked: dict[str, Any] = {"camera": camera, "newest": newest}
+        return self._get(DriftBoard, "/drift", **asked | ({} if reference_c is None else {"reference_c": reference_c}))
 
     # --- what the models know -----------------------------------------------------------------------------------------
 

@@ -73,6 +73,10 @@ def serve(
     allow_host: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="a name under which others reach it; may be repeated")
     ] = None,
+    webhook_host: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="a host that may be told of sessions' ends (webhook); may be repeated"),
+    ] = None,
     create_first_key: Annotated[
         bool | None,
         typer.Option(
@@ -113,7 +117,8 @@ def serve(
         if makes_key:
             _first_key(store)
         names = {name.strip("[]").lower() for name in [*(allow_host or []), host] if name not in _ANY}
-        app = create_app(store, hosts=names, recovery=recovery)
+        told = {name.lower() for name in webhook_host or []}
+        app = create_app(store, hosts=names, webhook_hosts=told, recovery=recovery)
         sys.setswitchinterval(SWITCH_S)
         server = uvicorn.Server(
             uvicorn.Config(

@@ -183,7 +183,11 @@ class LiveSessions:
     @property
     def any_runs(self) -> bool:
         """Whether this process runs a session now."""
-        return any(not session.ended for session in list(self._live.values()))
+        return bool(self.running())
+
+    def running(self) -> list[LiveSession]:
+        """The sessions that this process runs now."""
+        return [session for session in list(self._live.values()) if not session.ended]
 
     def find(self, session_id: str) -> LiveSession | None:
         """The session if this process runs it now, else None."""

@@ -13,8 +13,10 @@ from api.safety import StationSafety
 from api.strict_kinds import check_kind
 from lab.calibration.camera_models import Kind as CameraModelKind
 from lab.calibration.camera_models import ModelOfCamera
-from lab.calibration.limits import CalibrationLimits
+from lab.calibration.life import CalibrationRecord
+from lab.calibration.limits import CalibrationLimits, Mark
 from lab.capture.plan import CapturePlan, full_plan
+from lab.capture.queue import QueuedSession
 from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture.station import Station
@@ -22,7 +24,8 @@ from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.challenge.kept import ChallengeWork
 from lab.challenge.truth import SIZES
 from lab.formats.importers import KINDS
-from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ValidationResult
+from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
+from lab.formats.results.diagnosis import DiagnosisVerdict
 from sim.camera import Cfa, Side
 
 #: Databases that forget the time zone give back UTC.
@@ -154,6 +157,52 @@ class CaptureStart(PlanAsked):
     )
 
 
+class Then(Asked):
+    """What follows a session's end, when it has finished."""
+
+    kind: Literal["fit", "diagnose", "pipeline"] | None = Field(
+        default=None,
+        description="what to compute; `diagnose` fits and validates before, `pipeline` writes a report, too",
+    )
+    resolve: bool = Field(
+        default=False, description="of a pipeline: while rivals are left, take the capture that tells them apart"
+    )
+    compare: bool = Field(default=False, description="compare the fit with the cameras' certified calibration")
+    webhook: str | None = Field(
+        default=None,
+        max_length=400,
+        pattern=r"^https?://[^\s/@]+(/\S*)?$",
+        description="is told by a POST how it ended, also where the session ended early; on a host that the service "
+        "was started with (`--webhook-host`)",
+    )
+
+    @model_validator(mode="after")
+    def _belongs_together(self) -> Self:
+        if self.resolve and self.kind != "pipeline":
+            raise ValueError("resolve: goes with kind = pipeline; give both")
+        if self.compare and self.kind is None:
+            raise ValueError("compare: needs a fit; give a kind")
+        if self.kind is None and self.webhook is None:
+            raise ValueError("then: asks for nothing; give a kind or a webhook, or leave it out")
+        return self
+
+    @property
+    def in_words(self) -> str:
+        """What was asked for, in a few words."""
+        words = (self.kind, self.resolve and "resolve", self.compare and "compare", self.webhook and "tell")
+        return ", ".join(word for word in words if word)
+
+
+class ThenState(Schema):
+    """How far that is which follows a session's end. `words`: what was asked for, and what came of it."""
+
+    state: Literal["waiting", "running", "done", "failed"]
+    words: str
+    job_id: str | None = Field(default=None, description="of the job that computes it")
+    comparison: str | None = Field(default=None, description="path of the page that compares with the certified one")
+    told: str | None = Field(default=None, description="what came of telling the webhook")
+
+
 class SessionStart(CaptureStart):
     """A new session, started now or when its turn comes."""
 
@@ -163,6 +212,7 @@ class SessionStart(CaptureStart):
 
     queue: bool = Field(default=False, description="wait in the queue until the instruments are free")
     not_before: AwareDatetime | None = Field(default=None, description="with `queue`: the earliest time, with its zone")
+    then: Then | None = Field(default=None, description="what follows its end; needs a key of the scope `admin`")
 
     @model_validator(mode="after")
     def _time_of_a_queued_one(self) -> Self:
@@ -176,6 +226,16 @@ class QueuePlace(Asked):
 
     place: int | None = Field(default=None, ge=1, le=100_000, description="1: first; null: where it is, or last")
     not_before: AwareDatetime | None = Field(default=None, description="the earliest time, with its zone")
+
+
+class QueueEntry(QueuedSession):
+    """A session in the queue, and when it is expected to run: by what the instruments' finished sessions took, and by
+    what waits before it. null: held, or what is before it isn't known."""
+
+    expected_start: datetime | None = None
+    expected_end: datetime | None = None
+    then: str | None = Field(default=None, description="what follows its end, in words")
+    can_copy: bool = Field(default=False, description="whether `GET /sessions/ID/request` has what it was asked with")
 
 
 class Halt(Asked):
@@ -236,14 +296,61 @@ class Comparison(Schema):
     failing: tuple[str, ...] = ()
 
 
-class FigureName(Schema):
-    """A figure of a camera, or of the pair, that has a history. `title`, `unit`: as a lab reads them."""
+class NamedFigure(Schema):
+    """A figure. `title`, `unit`: as a lab reads them."""
 
-    camera: str
     figure: str
     place: str
     title: str = ""
     unit: str = "1"
+
+
+class FigureName(NamedFigure):
+    """A figure of a camera, or of the pair, that has a history."""
+
+    camera: str
+
+
+class FigureOfFit(NamedFigure):
+    """A figure of a fit, with its uncertainty, and by the data folder's limits where one concerns it."""
+
+    side: Side | None = Field(description="null: of the pair")
+    value: float
+    std: float
+    good: tuple[float | None, float | None] | None = Field(default=None, description="the good band of its limit")
+    mark: Mark | None = Field(default=None, description="by its limit; null without one")
+
+
+class DraftedLimit(Schema):
+    """A drafted limit, with the names that a lab reads."""
+
+    figure: str
+    title: str
+    unit: str
+    side: Side | None
+    place: str
+    good: tuple[float | None, float | None]
+
+
+class DraftedLimits(Schema):
+    """Limits drafted from the history of a calibration's cameras. `words`: from what they were drafted."""
+
+    words: str
+    valid_days: float | None = Field(description="that of the data folder's limits")
+    limits: tuple[DraftedLimit, ...]
+
+
+class Revoke(Asked):
+    """Takes a certificate back."""
+
+    why: str = Field(min_length=1, max_length=400)
+
+
+class CalibrationDetail(CalibrationRecord):
+    """A calibration with what speaks against certifying it."""
+
+    warnings: tuple[str, ...] = ()
+    has_cameras: bool = Field(default=False, description="whether its camera files are kept")
 
 
 class SessionResume(Asked):
@@ -289,6 +396,27 @@ class StoredSession(Schema):
     )
 
 
+class ListedSession(StoredSession):
+    """A session with what its cameras and its newest results say of it."""
+
+    station: str = Field(default="", description="what the station calls itself")
+    tags: tuple[str, ...] = Field(default=(), description="the words of its notes that begin with #")
+    cameras: dict[Side, str] = Field(default={}, description="as each reported itself")
+    calibration_id: str | None = Field(default=None, description="of its newest fit")
+    mtf50_cy_per_px: dict[Side, float] = Field(
+        default={}, description="by camera: green, the mean over its edges, of the newest fit"
+    )
+    read_noise_e: dict[Side, float] = Field(default={}, description="by camera, of the newest fit")
+    verdict: DiagnosisVerdict | None = Field(default=None, description="of its newest diagnosis")
+
+
+class SessionWords(Asked):
+    """What a session is called, and the notes of it; what is left out stays."""
+
+    name: str | None = Field(default=None, max_length=120)
+    notes: str | None = Field(default=None, max_length=4000, description="a word that begins with # is a tag")
+
+
 class CaptureCount(Schema):
     """How many captures a session has of a kind and a side."""
 
@@ -297,10 +425,11 @@ class CaptureCount(Schema):
     captures: int
 
 
-class SessionDetail(StoredSession):
-    """A session with its station, its progress and its provenance."""
+class SessionDetail(ListedSession):
+    """A session with its progress and its provenance."""
 
-    station: str
+    can_copy: bool = Field(default=False, description="whether `GET /sessions/ID/request` has what it was asked with")
+    then: ThenState | None = Field(default=None, description="how far that is which follows its end")
     progress: Progress | None = Field(description="null unless this service runs it now")
     runs: tuple[RunRecord, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
     captures: tuple[CaptureCount, ...] = Field(description="how many there are of each kind and side")
@@ -308,13 +437,15 @@ class SessionDetail(StoredSession):
         description="kind -> id of the newest `fit` (also the id of its calibration and camera model), `validate`, "
         "`diagnose`, `report`"
     )
+    resolving: ResolveJournal | None = Field(
+        default=None, description="what was in doubt, taken and said while it was resolved; null: it never was"
+    )
 
 
-class StoredCapture(Schema):
+class RecordedCapture(Schema):
     """One capture. `document` is its entry in the recording set's manifest."""
 
     id: int
-    session_id: str
     name: str
     kind: str
     side: Side
@@ -322,6 +453,20 @@ class StoredCapture(Schema):
     document: dict[str, Any]
     preview: str = Field(description="path of its picture")
     frame: str = Field(description="path of its raw frame, .npy, uint16 (rows, cols)")
+
+
+RESOLVE_MINUTES = Field(
+    default=None, gt=0, le=1e5, description="with `resolve`: lab time that its captures may take, min; null: any"
+)
+RESOLVE_ROUNDS = Field(
+    default=None, ge=1, le=100, description="with `resolve`: how many captures it takes at most; null: 6"
+)
+
+
+class StoredCapture(RecordedCapture):
+    """One capture of a session."""
+
+    session_id: str
 
 
 class JobStart(Asked):
@@ -335,6 +480,8 @@ class JobStart(Asked):
         description="pipeline of a session: while rivals are left, take the capture that tells them apart and "
         "diagnose again",
     )
+    resolve_minutes: float | None = RESOLVE_MINUTES
+    resolve_rounds: int | None = RESOLVE_ROUNDS
     camera_model: str | None = Field(
         default=None,
         pattern=r"^[0-9a-f]{16}$",
@@ -359,6 +506,8 @@ class PipelineStart(CaptureStart):
         default=False,
         description="while rivals are left, take the capture that tells them apart and diagnose again",
     )
+    resolve_minutes: float | None = RESOLVE_MINUTES
+    resolve_rounds: int | None = RESOLVE_ROUNDS
 
 
 class PipelineResults(Schema):
@@ -455,6 +604,14 @@ class Recordings(Schema):
     warnings: tuple[str, ...] = ()
 
 
+class RecordingsDetail(Recordings):
+    """A recording set that was sent in, with how many captures it has of each kind and its results."""
+
+    counts: tuple[CaptureCount, ...]
+    verdict: DiagnosisVerdict | None = Field(default=None, description="of its newest diagnosis")
+    results: dict[str, str] = Field(description="kind -> id of the newest `fit`, `validate`, `diagnose`, `report`")
+
+
 # --- challenges -------------------------------------------------------------------------------------------------------
 
 
@@ -493,17 +650,92 @@ class Challenge(Schema):
     scored: Utc | None = Field(description="when it was scored; null: its truths are sealed")
 
 
+# --- the twin
+# ----------------------------------------------------------------------------------------------------------
+
+
+class SetAsked(Asked):
+    """Recordings: a session's, or some that were sent in."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"session_id": "20300101-120000-abcdef"}})
+
+    session_id: str | None = Field(default=None, pattern=r"^[0-9A-Za-z-]{1,40}$")
+    recordings_id: str | None = Field(default=None, pattern=r"^[0-9a-f]{16}$")
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.session_id is None) == (self.recordings_id is None):
+            raise ValueError("session_id, recordings_id: give one of both")
+        return self
+
+
+class LampAsked(Asked):
+    """The radiance of a lamp, W sr^-1 m^-2 nm^-1, over the wavelength."""
+
+    wavelength_nm: tuple[float, ...] = Field(min_length=2, max_length=10_000)
+    value: tuple[float, ...] = Field(min_length=2, max_length=10_000)
+
+
+class ChangesAsked(Asked):
+    """What is changed between the session that a model was fitted to and the one that is predicted; null: as in the
+    plan. Another lens is another camera model: send that in."""
+
+    f_number: float | None = None
+    temperature_c: float | None = Field(default=None, description="of the sensor, in all captures")
+    lamp: LampAsked | None = Field(default=None, description="in place of that of flats, chart and edges")
+    distance_mm: float | None = Field(default=None, description="of the scene")
+    exposure_factor: float | None = None
+    gain_db: float | None = None
+    radiance_factor: float | None = Field(default=None, description="on all light")
+
+
+class PredictionStart(Asked):
+    """What to predict."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "camera_model": "0123456789abcdef",
+                "plan": {"session_id": "20300101-120000-abcdef"},
+                "changes": {"f_number": 8, "radiance_factor": 4},
+            }
+        }
+    )
+
+    camera_model: str = Field(pattern=r"^[0-9a-f]{16}$")
+    plan: SetAsked = Field(description="its captures are planned again; only its manifest and spectra are used")
+    changes: ChangesAsked = ChangesAsked()
+    fitted: SetAsked | None = Field(
+        default=None, description="the recordings of the fit: levels of flats are predicted relative to theirs"
+    )
+    light_std_percent: float = Field(default=0.3, ge=0, le=100, description="standard deviation of the light to come")
+
+
+class StoredPrediction(Schema):
+    """A sealed prediction. `plan`: id of the session or recordings that were planned again."""
+
+    id: str
+    sha256: str = Field(description="of the sealed file; give it to someone else before you capture")
+    created: Utc
+    camera_model: str
+    plan: str
+    changes: dict[str, Any]
+    numbers: dict[Side, int] = Field(description="how many numbers are predicted")
+    names: dict[Side, tuple[str, ...]] = Field(description="the names that the session will test")
+    not_predicted: tuple[str, ...] = Field(default=(), description="why other numbers aren't predicted")
+
+
 # --- a station's devices ----------------------------------------------------------------------------------------------
 
 
 class DeviceState(Schema):
-    """One instrument of a station, and how its latest self-test in this service went."""
+    """One instrument of a station, and how its latest self-test went."""
 
     name: str = Field(description="its table in the station file: `monochromator`, `cameras.left`")
     driver: str = Field(description="`family.name` of what drives it")
     address: str
     state: Literal["unknown", "in use", "checking", "works", "fails"] = Field(
-        description="`unknown`: not checked since the service started; `in use`: a session works with it now"
+        description="`unknown`: never checked; `in use`: a session works with it now"
     )
     used_by: str | None = Field(default=None, description="id of the session that works with it now")
     checked: Utc | None = Field(default=None, description="when the latest self-test ended")
@@ -523,6 +755,6 @@ class ConnectedDevice(Schema):
 
 
 class DeviceCheck(Asked):
-    """How a device is checked."""
+    """How a device is checked, or all of a station."""
 
     transcript: bool = Field(default=False, description="keep what goes over its wire meanwhile")

@@ -20,6 +20,7 @@ from api.pictures import Pictures
 from api.public_text import PublicText
 from api.safety import StationSafety
 from api.security import Demand, Gate
+from api.then import ThenRunner
 from api.upload import Inbox
 from api.waiting import QueueRunner
 from lab.calibration import camera_models
@@ -58,6 +59,7 @@ class Service:
     stations: Path
     live: LiveSessions
     waiting: QueueRunner
+    then: ThenRunner
     quick_look: QuickLook
     pictures: Pictures
     jobs: JobRunner
@@ -148,9 +150,12 @@ class Service:
             run.model_copy(
                 update={
                     "instruments": {
-                        name: {key: self.public(value) for key, value in identity.items()}
-                        for name, identity in run.instruments.items()
-                    }
+                        name: one.model_copy(
+                            update={key: self.public(value) for key, value in one if isinstance(value, str)}
+                        )
+                        for name, one in run.instruments.items()
+                    },
+                    "changes": tuple(map(self.public, run.changes)),
                 }
             )
             for run in runs
@@ -184,6 +189,7 @@ READ = Depends(Demand(Permission.READ))
 OPERATE = Depends(Demand(Permission.OPERATE))
 CALIBRATE = Depends(Demand(Permission.CALIBRATE))
 ADMIN = Depends(Demand(Permission.ADMIN))
-SessionId = Annotated[str, PathParameter(pattern=r"^[0-9A-Za-z-]{1,40}$")]
-HexId = Annotated[str, PathParameter(pattern=r"^[0-9a-f]{16}$")]
+SESSION_ID, HEX_ID = r"^[0-9A-Za-z-]{1,40}$", r"^[0-9a-f]{16}$"
+SessionId = Annotated[str, PathParameter(pattern=SESSION_ID)]
+HexId = Annotated[str, PathParameter(pattern=HEX_ID)]
 RegistryId = Annotated[int, PathParameter(ge=1, le=2**31 - 1)]

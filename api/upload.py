@@ -36,6 +36,11 @@ _STALE_S = 86400.0
 _MODEL_FILES = 64
 
 
+def is_recordings(source: str) -> bool:
+    """Whether an id is one of recordings that were sent in, not of a session."""
+    return _ID.fullmatch(source) is not None
+
+
 def check_size(size_bytes: int, limit_bytes: int) -> None:
     """Raises TooMuch for an archive, stated or received, beyond the limit."""
     if size_bytes > limit_bytes:

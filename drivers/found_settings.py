@@ -7,19 +7,54 @@ Whoever connects next finds it there, and restores what it says before anything 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
+import socket
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
-from drivers.errors import InstrumentError
+from drivers.errors import InstrumentError, InUse
 from drivers.instrument import Setting
 
 _lock = threading.Lock()
+
+
+class Hold:
+    """That one driver alone, in whatever process of this computer, uses an instrument which would serve several.
+
+    A name of the system's is taken, which is free again when the process is gone; where the system has no such names,
+    nothing is held.
+    """
+
+    def __init__(self) -> None:
+        self._taken: socket.socket | None = None
+
+    def take(self, name: str, who: str) -> None:
+        """Hold the instrument of that name, once. Raises `InUse`."""
+        if self._taken is not None or not hasattr(socket, "AF_UNIX") or not sys.platform.startswith("linux"):
+            return
+        taken = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            taken.bind("\0calibench:" + hashlib.sha256(name.encode()).hexdigest())
+        except OSError as error:
+            taken.close()
+            raise InUse(
+                f"{who}: another driver on this computer uses it; close that one, or correct the address in the "
+                "station file"
+            ) from error
+        self._taken = taken
+
+    def let_go(self) -> None:
+        """Others may use it."""
+        taken, self._taken = self._taken, None
+        if taken is not None:
+            taken.close()
 
 
 class FoundSettings:
@@ -54,6 +89,11 @@ class FoundSettings:
     def last_first(self) -> Iterator[tuple[str, Setting]]:
         """(name, value) of each, what was changed last first."""
         return iter(list(reversed(self._values.items())))
+
+    @property
+    def values(self) -> dict[str, Setting]:
+        """The value of each, in the order in which they were changed."""
+        return dict(self._values)
 
     def get(self, name: str, otherwise: Setting) -> Setting:
         """What was found, or `otherwise` where it wasn't changed."""

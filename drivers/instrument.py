@@ -45,6 +45,10 @@ class Instrument(ABC):
         """Every setting that bears on what is measured, by its name, as the instrument reports it now."""
         return {}
 
+    def found(self) -> Mapping[str, Setting]:
+        """What a setting was before this driver changed it, by its name, while that isn't restored."""
+        return {}
+
     def departures(self) -> tuple[str, ...]:
         """What of it can't be set as a measurement wants it, in words: it belongs to all that is recorded with it."""
         return ()

@@ -44,6 +44,7 @@ from sim.parameters import Frozen
 
 if TYPE_CHECKING:
     from lab.formats.camera_file import CameraFile
+    from lab.resolve import ResolveLimits
     from sim.camera import Side
 
 JobKind = Goal | ChallengeWork
@@ -109,7 +110,7 @@ def run_job(
     root: str,
     database_url: str | None,
     job_id: str,
-    resolve: bool = False,
+    resolve: ResolveLimits | None = None,
     capturer: Capturer | None = None,
     camera_model: str | None = None,
 ) -> None:
@@ -146,7 +147,7 @@ def run_job(
         store.close()
 
 
-def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: bool) -> PipelineRequest:
+def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: ResolveLimits | None) -> PipelineRequest:
     """What a job asks of the pipeline. A pipeline on a session captures what is left of it, and computes every step
     anew."""
     page = store.root / "reports" / f"{job_id}.html"
@@ -278,20 +279,20 @@ class JobRunner:
         kind: JobKind,
         source: str,
         *,
-        resolve: bool = False,
+        resolve: ResolveLimits | None = None,
         capturer: Capturer | None = None,
         camera_model: str | None = None,
     ) -> str:
         """Queue a job on a session's id, a recording set's folder, or a challenge's; returns the job's id.
 
         `capturer`: how the job reaches the instruments; with one, the job runs in a thread of this process. `resolve`:
-        of a pipeline, take the captures that tell the remaining rivals apart. `camera_model`: id of one that stands in
-        for the fitted cameras of a validation or a diagnosis. Raises InputError for an unknown kind, and for `resolve`
-        or `camera_model` where the job can't take it.
+        of a pipeline, take the captures that tell the remaining rivals apart, within these limits. `camera_model`: id
+        of one that stands in for the fitted cameras of a validation or a diagnosis. Raises InputError for an unknown
+        kind, and for `resolve` or `camera_model` where the job can't take it.
         """
         if kind not in KINDS:
             raise InputError(f"job {kind!r}: no such work; choose from {', '.join(KINDS)}")
-        if resolve and (kind != "pipeline" or capturer is None):
+        if resolve is not None and (kind != "pipeline" or capturer is None):
             raise InputError(f"job {kind}: only a pipeline on a session's station can resolve; leave resolve out")
         if camera_model is not None and kind not in ("validate", "diagnose"):
             raise InputError(
@@ -342,9 +343,12 @@ class JobRunner:
                 raise InputError(f"job {job_id!r} isn't in {self.store.root}; list the jobs for their ids")
             return JobInfo.model_validate(row)
 
-    def jobs(self, after: str | None = None, limit: int | None = None) -> list[JobInfo]:
-        """Jobs, the newest first: `limit` at most, those that follow the job `after` in this order."""
+    def jobs(self, after: str | None = None, limit: int | None = None, source: str | None = None) -> list[JobInfo]:
+        """Jobs, the newest first: `limit` at most, those that follow the job `after` in this order. `source`: only
+        those on it."""
         asked = sa.select(JobRow).order_by(JobRow.created.desc(), JobRow.id.desc()).limit(limit)
+        if source is not None:
+            asked = asked.where(JobRow.source == source)
         with self.store.reading() as db:
             if after is not None:
                 last = db.get(JobRow, after)
@@ -359,10 +363,11 @@ class JobRunner:
         with self.store.reading() as db:
             return [JobInfo.model_validate(row) for row in db.scalars(asked)]
 
-    def count_jobs(self) -> int:
-        """How many jobs there are."""
+    def count_jobs(self, source: str | None = None) -> int:
+        """How many jobs there are, or on one source."""
+        asked = sa.select(sa.func.count()).select_from(JobRow)
         with self.store.reading() as db:
-            return db.scalars(sa.select(sa.func.count()).select_from(JobRow)).one()
+            return db.scalars(asked if source is None else asked.where(JobRow.source == source)).one()
 
     def count_states(self) -> dict[str, int]:
         """State -> how many jobs are in it."""

@@ -26,11 +26,10 @@ if TYPE_CHECKING:
     from lab.capture.station import Drivers, Station
     from lab.capture.store import Store
     from lab.diagnose import Diagnosis
-    from lab.diagnose.outcome.next_capture import CaptureProposal
-    from lab.diagnose.policy import DecisionPolicy
     from lab.formats.camera_file import CameraFile
     from lab.formats.recording_set import RecordingSet
-    from lab.formats.results import DiagnosisResult, FitResult, NextCapture, Resolution, ValidationResult
+    from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
+    from lab.resolve import ResolveLimits, Resolver
     from lab.workers import Workers
     from sim.camera import Side
 
@@ -99,7 +98,7 @@ class PipelineRequest:
     fit, validation, diagnosis : results to rest on in place of new ones
     improved : the cameras with the effects that `diagnosis` names, by side, for the report; where none are given, those
     that are kept with it models : camera files that replace the fitted cameras, by side, in validation and diagnosis
-    resolve : after the diagnosis, take the captures that tell the remaining rivals apart
+    resolve : after the diagnosis, take the captures that tell the remaining rivals apart, within these limits; None: no
     pictures : draw the residual pictures of the diagnosis
     bootstrap : healthy cameras that are drawn frame by frame for the threshold of the diagnosis
     workers : where they are drawn; None: in this computer's processes of the diagnosis
@@ -118,7 +117,7 @@ class PipelineRequest:
     diagnosis: DiagnosisResult | None = None
     improved: Mapping[Side, CameraFile] = field(default_factory=dict)
     models: Mapping[Side, CameraFile] = field(default_factory=dict)
-    resolve: bool = False
+    resolve: ResolveLimits | None = None
     pictures: bool = True
     bootstrap: int = 0
     workers: Workers | None = None
@@ -127,11 +126,21 @@ class PipelineRequest:
     def __post_init__(self) -> None:
         if (self.recordings is None) == (self.capture is None):
             raise ValueError("PipelineRequest: give either recordings or capture")
+        if self.resolve is None:
+            return
+        if "resolve" not in STEPS[self.goal] or self.capture is None:
+            raise InputError(
+                f"resolve: {self.goal} makes no diagnosis on a station's session; run the whole pipeline on one"
+            )
+        if self.diagnosis is not None:
+            raise InputError(
+                "resolve: a diagnosis that is given tells no rivals' predictions; leave it out, it is made anew"
+            )
 
     @property
     def steps(self) -> tuple[Step, ...]:
         """The steps that this request takes."""
-        left_out = {"capture": self.capture is None, "resolve": not self.resolve}
+        left_out = {"capture": self.capture is None, "resolve": self.resolve is None}
         return tuple(step for step in STEPS[self.goal] if not left_out.get(step, False))
 
 
@@ -294,6 +303,7 @@ class _Pipeline:
         self._validation: ValidationResult | None = None
         self._diagnosis: DiagnosisResult | None = None
         self._examined: Diagnosis | None = None
+        self._resolver: Resolver | None = None
         self._report: Path | None = None
 
     def run(self) -> PipelineResult:
@@ -444,7 +454,13 @@ class _Pipeline:
 
         self._diagnosis = self.request.diagnosis or self._kept("diagnose", DiagnosisResult)
         if self._diagnosis is None:
-            self._examined = self._diagnosed(self.recordings, "diagnose")
+            if self.request.resolve is not None:
+                from lab.resolve import Resolver
+
+                assert self.store is not None
+                assert self._session is not None
+                self._resolver = Resolver(self.store, self._session, self.request.resolve)
+            self._examined = self._diagnosed(self._with_resolved("diagnose"), "diagnose")
             self._diagnosis = self._examined.result
             self._keep("diagnose", self._diagnosis)
             self._keep_improved(self._examined)
@@ -461,6 +477,7 @@ class _Pipeline:
             pictures=self.request.pictures,
             bootstrap=self.request.bootstrap,
             workers=self.request.workers,
+            station=self.store.station(self._session) if self.store is not None and self._session is not None else None,
         )
         return replace(found, result=found.result.model_copy(update={"baseline": self._baseline}))
 
@@ -470,38 +487,47 @@ class _Pipeline:
         return ", ".join(dict.fromkeys(one.name for one in self.request.models.values())) or None
 
     def _resolve_step(self) -> None:
-        """Take the best capture that a station can take by itself, and diagnose with it again, until no rivals are left
-        or no capture is worth taking."""
-        from lab.diagnose.policy import DecisionPolicy
-        from lab.formats.results import Resolution
-
-        assert self._examined is not None
+        """Take the capture that tells most per second, and diagnose with it again, until no rivals are left, no capture
+        of the station is worth taking, or the budget is spent."""
+        assert self._resolver is not None
         assert self.store is not None
-        examined, recordings = self._examined, self.recordings
-        ties = _Ties(DecisionPolicy())
-        resolutions: list[Resolution] = []
-        while (proposal := ties.next_to_take(examined.proposals)) is not None:
-            capture = proposal.capture
-            self._say("resolve", f"{capture.capture}, to tell {' from '.join(capture.rivals)}")
-            name = f"{self.recordings.manifest.name} resolve".strip()
-            session = self._captured("resolve", CaptureRequest(plan=proposal.plan, name=name))
-            ties.taken(capture)
-            resolutions.append(
-                Resolution(
-                    capture=capture.capture,
-                    session=session,
-                    verdict_before=examined.result.verdict,
-                    effects_before=examined.result.effects,
-                )
-            )
-            folder = "resolve" if len(resolutions) == 1 else f"resolve-{len(resolutions)}"
+        assert self._examined is not None
+        resolver, name = self._resolver, f"{self.recordings.manifest.name} resolve".strip()
+        resolver.note(self._examined.result, self._examined.doubts)
+        choice = resolver.next(self._examined.result, self._examined.doubts)
+        while choice is not None:
+            self._say("resolve", f"{choice.first.capture.words}, to tell {' from '.join(choice.doubt.rivals)}")
+            resolver.begin(choice, self._examined.result, name)
+            self._examined = self._diagnosed(self._with_resolved("resolve"), "resolve")
+            resolver.note(self._examined.result, self._examined.doubts)
+            choice = resolver.next(self._examined.result, self._examined.doubts)
+            self._keep_resolved()
+        self._keep_resolved()
+        journal = resolver.journal
+        self._say("resolve", "done", 1.0, remark=f"resolve: {journal.end}: {journal.reason}")
+
+    def _with_resolved(self, step: Step) -> RecordingSet:
+        """The recordings with all captures of the resolving, which are taken first where they haven't been."""
+        recordings = self.recordings
+        for number, taken in enumerate(self._resolver.journal.resolutions if self._resolver is not None else (), 1):
+            assert self.store is not None
+            session = self._captured(step, CaptureRequest(session=taken.session))
+            folder = "resolve" if number == 1 else f"resolve-{number}"
             recordings = recordings.joined(session_recordings(self.store, session), folder)
-            again = self._diagnosed(recordings, "resolve")
-            examined = replace(again, result=again.result.model_copy(update={"resolutions": tuple(resolutions)}))
-            self._examined, self._diagnosis = examined, examined.result
-            self._keep("diagnose", examined.result)
-            self._keep_improved(examined)
-        self._say("resolve", "done", 1.0, remark=ties.verdict(examined.proposals))
+        return recordings
+
+    def _keep_resolved(self) -> None:
+        """Keep the present diagnosis with the journal."""
+        assert self._resolver is not None
+        assert self._examined is not None
+        journal = self._resolver.journal
+        told = {"resolutions": journal.resolutions, "resolve_end": journal.end, "resolve_reason": journal.reason}
+        self._examined = replace(self._examined, result=self._examined.result.model_copy(update=told))
+        if self._examined.result == self._diagnosis:
+            return
+        self._diagnosis = self._examined.result
+        self._keep("diagnose", self._diagnosis)
+        self._keep_improved(self._examined)
 
     def _report_step(self) -> None:
         from lab.calibration.limits import standing_limits
@@ -509,9 +535,8 @@ class _Pipeline:
         from lab.predict.both_models import predict_both
         from lab.report import provenance_of, write_report
 
-        runs = self.store.runs(self._session) if self.store is not None and self._session is not None else []
         file = self.request.report_file or self._session_files()
-        provenance = provenance_of(self.recordings, runs[-1].instruments if runs else None)
+        provenance = provenance_of(self.recordings)
         both = predict_both(
             self.recordings,
             self.fitted,
@@ -552,46 +577,3 @@ class _Pipeline:
         for side, content in cameras.items():
             write_camera(folder / "cameras" / f"{side}.toml", content)
         return folder / "report.html"
-
-
-class _Ties:
-    """The captures that were taken to settle ties between rivals."""
-
-    def __init__(self, policy: DecisionPolicy) -> None:
-        self._policy = policy
-        self._taken: set[tuple[Side, str]] = set()
-        #: By side and rivals: how probably the captures taken would have left the tie open, as they were predicted.
-        self._open: dict[tuple[Side, frozenset[str]], float] = {}
-
-    def taken(self, capture: NextCapture) -> None:
-        """Note that a capture was taken."""
-        tie = (capture.side, frozenset(capture.rivals))
-        self._taken.add((capture.side, capture.capture))
-        self._open[tie] = self._open.get(tie, 1.0) * (1.0 - capture.told_apart)
-
-    def _may_settle(self, proposal: CaptureProposal) -> bool:
-        """Whether a station can take the capture, it is worth taking, and the tie isn't given up."""
-        capture = proposal.capture
-        return (
-            proposal.plan is not None
-            and capture.distance >= self._policy.next_capture_distance
-            and (capture.side, capture.capture) not in self._taken
-            and self._open.get((capture.side, frozenset(capture.rivals)), 1.0) >= self._policy.resolve_open_probability
-        )
-
-    def next_to_take(self, proposals: tuple[CaptureProposal, ...]) -> CaptureProposal | None:
-        """The best capture that may settle a tie; None where there is none. `proposals`: best first."""
-        return next((proposal for proposal in proposals if self._may_settle(proposal)), None)
-
-    def verdict(self, proposals: tuple[CaptureProposal, ...]) -> str:
-        """Why nothing more is captured."""
-        if not proposals:
-            return "resolve: no rivals are left"
-        capture = proposals[0].capture
-        rivals = " from ".join(capture.rivals)
-        if (capture.side, frozenset(capture.rivals)) in self._open:
-            return (
-                f"resolve: the captures that were taken didn't tell {rivals}, and no other that the station takes by "
-                "itself would"
-            )
-        return f"resolve: no capture that the station takes by itself would tell {rivals}"

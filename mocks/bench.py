@@ -33,17 +33,19 @@ from mocks.conceal import SIDES, Concealed
 from mocks.light_path import FILTER_CUT_ON_NM, WAVELENGTH_NM, LightSettings, screen_radiance, sphere_radiance
 from mocks.radiometer import misread
 from mocks.targets import (
+    NOMINAL_STOP,
     SCREEN_BLACK,
     SCREEN_COLS,
     SCREEN_POSE,
     SCREEN_ROWS,
+    STOPS,
     TARGETS,
     ShownCells,
     UInt8Array,
     scene,
     station_targets,
 )
-from mocks.truth import AIR_C, COLS, ROWS, SELF_HEATING_C, Truth, hidden_truth
+from mocks.truth import AIR_C, COLS, ROWS, SELF_HEATING_C, HiddenCamera, Truth, hidden_truth
 from sim.camera import Side
 from sim.frame import (
     Exposure,
@@ -62,6 +64,7 @@ from sim.scene.render import Grid, cells, quadrilateral
 from sim.sensor.electrons import sample_from
 from sim.sensor.shot import draw_poisson
 from sim.spectrum import FloatArray, Spectrum
+from sim.stop_down import at_f_number, effects_at_f_number
 
 UInt16Array = NDArray[np.uint16]
 
@@ -132,7 +135,7 @@ class Bench:
         self._radiometer_rng = np.random.default_rng([seed, 100])
         self._noise = {side: np.random.default_rng([seed, 101 + k]) for k, side in enumerate(SIDES)}
         self._camera_locks = {side: threading.Lock() for side in SIDES}
-        self._transfers = {side: KeptTransfers() for side in SIDES}
+        self._transfers = {(side, stop): KeptTransfers() for side in SIDES for stop in STOPS}
         self._left_behind: dict[Side, FloatArray | float] = dict.fromkeys(SIDES, 0.0)
         self._lights: OrderedDict[tuple[object, ...], tuple[Scene, SceneLight]] = OrderedDict()
         self.clock = Clock(real_time_factor=real_time_factor)
@@ -142,6 +145,8 @@ class Bench:
         self._first_exposure_s: float | None = None
         self._light = LightSettings()
         self._placed = "cap"
+        self._stop = NOMINAL_STOP
+        self._stopped: dict[tuple[Side, str], HiddenCamera] = {}
         self._shown = ShownCells()
 
     # --- light path -------------------------------------------------------------------------------------------------
@@ -224,11 +229,15 @@ class Bench:
             return self._placed
 
     def place(self, name: str) -> None:
-        """Put a target in front of both cameras. Raises `BenchError` for a name that isn't in `targets`."""
+        """Put a target in front of both cameras, or turn their aperture rings to a stop of `STOPS`. Raises `BenchError`
+        for a name that isn't in `targets`."""
         if name not in self.targets:
             raise BenchError(f"no target {name!r} on this bench: it has {', '.join(self.targets)}")
         with self._lock:
-            self._placed = name
+            if name in STOPS:
+                self._stop = name
+            else:
+                self._placed = name
 
     def show(self, pattern: UInt8Array | None, cell_px: int = 1) -> None:
         """Show 0/1 cells on the screen (0 dark, anything else lit), each `cell_px` screen pixels square, the whole
@@ -287,7 +296,7 @@ class Bench:
         """
         if side not in self._truth.cameras:
             raise BenchError(f"no camera {side!r} on this bench: it has {', '.join(self._truth.cameras)}")
-        camera = self._truth.cameras[side]
+        camera = self._camera(side)
         begin_s = self.clock.now() if start_s is None else start_s
         seen, light = self._seen(side)
         source = self._drift(begin_s + 0.5 * exposure_s)
@@ -330,11 +339,11 @@ class Bench:
         """What stands before a camera now, and the electrons a second that its light makes, kept for the scenes seen
         last."""
         with self._lock:
-            placed, light, shown = self._placed, self._light, self._shown
-        camera = self._truth.cameras[side]
+            placed, light, shown, stop = self._placed, self._light, self._shown, self._stop
+        camera = self._camera(side)
         if not light.shutter_open and placed not in ("cap", "screen"):
             placed, light = "sphere", LightSettings()
-        key: tuple[object, ...] = (side, placed, {"cap": None, "screen": shown.serial}.get(placed, light))
+        key: tuple[object, ...] = (side, stop, placed, {"cap": None, "screen": shown.serial}.get(placed, light))
         with self._camera_locks[side]:
             with self._lock:
                 kept = self._lights.get(key)
@@ -348,13 +357,28 @@ class Bench:
                 camera.acting,
                 oversample=SCREEN_OVERSAMPLE if isinstance(seen, ScreenPattern) else OVERSAMPLE,
                 margin_px=MARGIN_PX,
-                transfers=self._transfers[side],
+                transfers=self._transfers[side, stop],
             )
             with self._lock:
                 self._lights[key] = seen, drawn
                 while len(self._lights) > _MOST_CACHED:
                     self._lights.popitem(last=False)
             return seen, drawn
+
+    def _camera(self, side: Side) -> HiddenCamera:
+        """A camera with its lens as the aperture ring stands."""
+        hidden = self._truth.cameras[side]
+        with self._lock:
+            stop = self._stop
+        if stop == NOMINAL_STOP:
+            return hidden
+        with self._lock:
+            if (side, stop) not in self._stopped:
+                f_number = STOPS[stop]
+                effects = effects_at_f_number(hidden.effects, hidden.model.lens.f_number, f_number)
+                model = at_f_number(hidden.model, f_number)
+                self._stopped[side, stop] = replace(hidden, model=model, effects=effects)
+            return self._stopped[side, stop]
 
     def _light_rate(self, side: Side) -> FloatArray:
         """Electrons a second that light makes in every pixel."""

@@ -9,6 +9,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -16,6 +17,8 @@ from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from drivers.camera.basler import pylon_library
 from drivers.contract.peer import Peer, RealInstrument
@@ -31,7 +34,7 @@ from mocks.scpi_meter import AREA_M2, MockScpiMeter
 from mocks.scpi_meter import calibration_csv as diode_calibration
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.stage import MockStage
-from mocks.tethered import TetheredCamera
+from mocks.tethered import TetheredCamera, write_dng
 from mocks.usb import UsbIpServer, stereo_pair
 from mocks.usb2000plus import MockUsb2000Plus
 from mocks.usb2000plus import calibration_csv as spectrometer_calibration
@@ -295,48 +298,261 @@ class VikyCamera(RealInstrument):
         super().__init__("VikyTL_DEV_red", {"producer": str(producer), "description": str(description)})
 
 
-class AravisFakeCamera(Peer):
-    """The fake GigE camera of the package aravis-tools, a process of its own, on loopback; one at a time on this
+class ProcessPeer(Peer):
+    """A program of others in the instrument's place, a process of its own on loopback; one at a time on this
     computer."""
+
+    def __init__(self, name: str, command: Sequence[str], environment: dict[str, str] | None = None) -> None:
+        self._command, self._environment = command, os.environ | (environment or {})
+        self._lock = (Path(tempfile.gettempdir()) / f"calibench-{name}.lock").open("w")
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        self.plug()
+
+    def _answers(self) -> bool:
+        """Whether it can be talked to."""
+        raise NotImplementedError
+
+    def plug(self) -> None:
+        self._process = subprocess.Popen(
+            self._command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env=self._environment,
+            start_new_session=True,  # what it starts in its turn is stopped and ended with it
+        )
+        until = time.monotonic() + 60.0
+        while time.monotonic() < until:
+            with contextlib.suppress(OSError):
+                if self._answers():
+                    return
+            time.sleep(0.05)
+        self.close()
+        raise RuntimeError(f"{self._command[0]} doesn't answer")
+
+    def unplug(self) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait(30)
+
+    def mute(self, silent: bool) -> None:
+        os.killpg(self._process.pid, signal.SIGSTOP if silent else signal.SIGCONT)
+
+    def slow(self, slowly: bool) -> bool:
+        return True  # it exposes in real time
+
+    def close(self) -> None:
+        self.unplug()
+        self._lock.close()
+
+
+class AravisFakeCamera(ProcessPeer):
+    """The fake GigE camera of the package aravis-tools."""
 
     program = "arv-fake-gv-camera-0.8"
 
     def __init__(self) -> None:
         if shutil.which(self.program) is None:
             raise InstrumentError(f"{self.program} isn't installed (scripts/install-aravis)")
-        self._lock = (Path(tempfile.gettempdir()) / "calibench-aravis.lock").open("w")
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
         self.address, self.settings = "127.0.0.1", {"timeout_s": 2.0}
-        self.plug()
+        super().__init__("aravis", [self.program, "-i", "127.0.0.1"])
 
-    def plug(self) -> None:
-        self._process = subprocess.Popen(
-            [self.program, "-i", "127.0.0.1"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        discovery = bytes.fromhex("42 01 00 02 00 00 00 01")  # GVCP: who is there
+    def _answers(self) -> bool:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
             asking.settimeout(0.1)
-            for _ in range(300):
-                asking.sendto(discovery, ("127.0.0.1", 3956))
-                with contextlib.suppress(OSError):
-                    if asking.recv(1024):
-                        return
-                    time.sleep(0.05)
-        raise RuntimeError(f"{self.program} doesn't answer")
+            asking.sendto(bytes.fromhex("42 01 00 02 00 00 00 01"), ("127.0.0.1", 3956))  # GVCP: who is there
+            return bool(asking.recv(1024))
 
-    def unplug(self) -> None:
-        self._process.kill()
-        self._process.wait(30)
+    def slow(self, slowly: bool) -> bool:
+        return False
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        found: int = probe.getsockname()[1]
+        return found
+
+
+def _listens(port: int) -> bool:
+    with socket.create_connection(("127.0.0.1", port), 1.0):
+        return True
+
+
+#: What the Alpaca simulators are like, as somebody left them: binned.
+ALPACA_DEVICES = """devices:
+  camera:
+    0: {name: Simulator Camera, description: "", driverinfo: Camera Simulator, driverversion: "1.0",
+        interfaceversion: 3, connected: false, cameraxsize: 640, cameraysize: 480, binx: 2, biny: 2,
+        startx: 8, starty: 4, numx: 200, numy: 100, maxbinx: 4, maxbiny: 4, canabortexposure: true,
+        canstopexposure: true, exposuremin: 0.001, exposuremax: 3600.0, gain: 1, gains: ["1", "2", "3"],
+        maxadu: 4095, sensortype: 2, bayeroffsetx: 1, bayeroffsety: 0, pixelsizex: 3.45, pixelsizey: 3.45,
+        ccdtemperature: -5.0, readoutmode: 0, readoutmodes: [Fast, Normal], offset: 1, camera_state: 0}
+  telescope: {0: {name: Telescope}}
+  focuser: {0: {name: Focuser}}
+  covercalibrator:
+    0: {name: Simulator Lamp, description: "", driverinfo: Cover Calibrator Simulator, driverversion: "1.0",
+        interfaceversion: 1, brightness: 7, calibratorchanging: false, calibratorstate: 3, covermoving: false,
+        coverstate: 1, maxbrightness: 255}
+"""
+
+
+class AlpacaSimulator(ProcessPeer):
+    """The server of the package alpaca-simulators: a camera and a lamp, both number 0."""
+
+    def __init__(self) -> None:
+        if find_spec("alpaca_simulators") is None:
+            raise InstrumentError("Alpaca: alpaca-simulators isn't installed (scripts/install-peers)")
+        self._folder = tempfile.TemporaryDirectory(prefix="calibench-peer-")
+        file = Path(self._folder.name) / "devices.yaml"
+        file.write_text(ALPACA_DEVICES, encoding="utf-8")
+        self._port = _free_port()
+        self.address, self.settings = f"127.0.0.1:{self._port}/0", {"timeout_s": 3.0}
+        super().__init__("alpaca", [sys.executable, "-m", "mocks.alpaca_simulator", str(self._port), str(file)])
+
+    def _answers(self) -> bool:
+        return _listens(self._port)
+
+    def close(self) -> None:
+        super().close()
+        self._folder.cleanup()
+
+
+class IndiSimulator(ProcessPeer):
+    """INDI's server with its simulated camera and lamp, as somebody left them: binned."""
+
+    def __init__(self) -> None:
+        if shutil.which("indiserver") is None:
+            raise InstrumentError("INDI: indiserver isn't installed (scripts/install-peers)")
+        self._folder = tempfile.TemporaryDirectory(prefix="calibench-peer-")
+        self._port = _free_port()
+        self.address, self.settings = f"127.0.0.1:{self._port}/CCD Simulator", {"timeout_s": 3.0}
+        command = ["indiserver", "-p", str(self._port), "indi_simulator_ccd", "indi_simulator_lightpanel"]
+        super().__init__("indi", command, {"HOME": self._folder.name})
+
+    def _answers(self) -> bool:
+        with socket.create_connection(("127.0.0.1", self._port), 1.0) as line:
+            line.settimeout(5.0)
+            line.sendall(b"<getProperties version='1.7' device='CCD Simulator'/>")
+            heard = b""
+            while b"SIM_YRES" not in heard:
+                piece = line.recv(1 << 16)
+                if not piece:
+                    return False
+                heard += piece
+            for name, numbers in (
+                ("SIMULATOR_SETTINGS", {"SIM_XRES": 512, "SIM_YRES": 512}),
+                ("POLLING_PERIOD", {"PERIOD_MS": 10}),
+            ):
+                ones = "".join(f"<oneNumber name='{one}'>{value}</oneNumber>" for one, value in numbers.items())
+                line.sendall(f"<newNumberVector device='CCD Simulator' name='{name}'>{ones}</newNumberVector>".encode())
+            time.sleep(0.2)
+        return True
+
+    def close(self) -> None:
+        super().close()
+        self._folder.cleanup()
+
+
+class LibraryPeer(Peer):
+    """A library's own simulated camera, in the process that the driver starts for it (`drivers.apart`).
+
+    `file`: what the driver opens; without it there is no such camera.
+    """
+
+    def __init__(self, served: str, file: Path, address: str, **settings: Any) -> None:
+        self._served, self._file = served, file
+        self.address, self.settings = address, settings
+
+    def _signal(self, number: signal.Signals) -> None:
+        """Give the driver's processes a signal."""
+        for entry in Path("/proc").iterdir():
+            with contextlib.suppress(OSError, ValueError):  # it ended meanwhile
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+                if parent == os.getpid() and self._served.encode() in (entry / "cmdline").read_bytes():
+                    os.kill(int(entry.name), number)
 
     def mute(self, silent: bool) -> None:
-        self._process.send_signal(signal.SIGSTOP if silent else signal.SIGCONT)
+        self._signal(signal.SIGSTOP if silent else signal.SIGCONT)
+
+    def unplug(self) -> None:
+        self._file.rename(self._file.with_suffix(".gone"))
+        self._signal(signal.SIGKILL)
+
+    def plug(self) -> None:
+        self._file.with_suffix(".gone").rename(self._file)
+
+    def slow(self, slowly: bool) -> bool:
+        return True  # it exposes in real time
+
+    def close(self) -> None:
+        self._signal(signal.SIGKILL)
+
+
+class VirtualCamera(LibraryPeer):
+    """libgphoto2's virtual camera, of the package gphoto2's wheel: it hands out one picture again and again."""
+
+    def __init__(self) -> None:
+        if find_spec("gphoto2") is None:
+            raise InstrumentError("gphoto2 cameras: gphoto2 isn't installed; install calibench[gphoto2]")
+        self._folder = tempfile.TemporaryDirectory(prefix="calibench-peer-")
+        self.picture = Path(self._folder.name) / "picture.jpg"  # the only ending that it looks for
+        codes = np.random.default_rng(1).integers(64, 4096, (48, 64), dtype=np.uint16)
+        write_dng(self.picture, codes, 0.0)
+        super().__init__("drivers.camera.gphoto2:Library", self.picture, "", timeout_s=3.0)
+        self.plug()
+
+    def unplug(self) -> None:
+        os.environ.pop("VCAMERADIR", None)
+        self._signal(signal.SIGKILL)
+
+    def plug(self) -> None:
+        os.environ["VCAMERADIR"] = self._folder.name
 
     def slow(self, slowly: bool) -> bool:
         return False
 
     def close(self) -> None:
         self.unplug()
-        self._lock.close()
+        self._folder.cleanup()
+
+
+#: Micro-Manager's own simulated camera and shutter, as somebody left them: binned, and mirrored.
+DEMO_CAMERA = """Property,Core,Initialize,0
+Device,Camera,DemoCamera,DCam
+Device,Shutter,DemoCamera,DShutter
+Property,Core,Initialize,1
+Property,Camera,Binning,2
+Property,Camera,TransposeCorrection,1
+Property,Camera,TransposeMirrorX,1
+Property,Camera,PixelType,16bit
+Property,Camera,BitDepth,12
+Property,Core,Camera,Camera
+Property,Core,Shutter,Shutter
+"""
+
+
+class DemoCamera(LibraryPeer):
+    """Micro-Manager's DemoCamera, of the package mm-test-adapters."""
+
+    def __init__(self) -> None:
+        found = find_spec("mm_test_adapters")
+        if found is None or found.origin is None or find_spec("pymmcore_plus") is None:
+            raise InstrumentError("Micro-Manager cameras: mm-test-adapters isn't installed; install calibench[dev]")
+        self._folder = tempfile.TemporaryDirectory(prefix="calibench-peer-")
+        file = Path(self._folder.name) / "demo.cfg"
+        file.write_text(DEMO_CAMERA, encoding="utf-8")
+        super().__init__(
+            "drivers.camera.micromanager:Core",
+            file,
+            f"{file}#Camera",
+            adapters=str(Path(found.origin).with_name("libs")),
+            timeout_s=3.0,
+            connect_timeout_s=20.0,
+        )
+
+    def close(self) -> None:
+        super().close()
+        self._folder.cleanup()
 
 
 def lit_bench() -> Bench:
@@ -391,6 +607,22 @@ def gentl() -> Peer:
 
 def aravis() -> Peer:
     return AravisFakeCamera()
+
+
+def alpaca() -> Peer:
+    return AlpacaSimulator()
+
+
+def indi() -> Peer:
+    return IndiSimulator()
+
+
+def gphoto2() -> Peer:
+    return VirtualCamera()
+
+
+def micromanager() -> Peer:
+    return DemoCamera()
 
 
 def raw_folder() -> Peer:

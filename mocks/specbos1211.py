@@ -279,11 +279,14 @@ class MockSpecbos1211(Grammar):
         return self._measured
 
     def _calculate_spectrum(self) -> bytes:
-        """A spectraval's: wavelength and value a line, if it was told to speak text."""
+        """A spectraval's: wavelength and value a line, if it was told to speak text.
+
+        Argyll's spotread takes 8000 bytes of 350..830 nm in steps of 1 nm, and asks again for what is longer.
+        """
         spectrum = self._spectrum()
         if not self._is_spectraval or self._settings["form"] != 2:
             raise _SpecbosRefusal(COMMAND)
-        lines = [f"{w:.1f} {v:.6e}" for w, v in zip(spectrum.wavelength_nm, spectrum.value, strict=True)]
+        lines = [f"{w:g} {v:.5e}" for w, v in zip(spectrum.wavelength_nm, spectrum.value, strict=True)]
         return "\r".join([*lines, ""]).encode("ascii") + ETX
 
     def _calculate(self, what: str) -> bytes:

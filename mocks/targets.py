@@ -69,8 +69,11 @@ BOARD_POSES: dict[str, tuple[tuple[float, float, float], tuple[float, float, flo
 }
 _TEXEL_MM = 0.5
 
+#: The stops of the lenses' aperture rings, which the operator turns; and the one at which they stand.
+STOPS, NOMINAL_STOP = {"f/4": 4.0, "f/5.6": 5.6, "f/8": 8.0}, "f/4"
+
 #: Names of all targets.
-TARGETS = ("cap", "sphere", "colorchecker", *EDGE_ANGLES_DEG, "screen", *BOARD_POSES)
+TARGETS = ("cap", "sphere", "colorchecker", *EDGE_ANGLES_DEG, "screen", *BOARD_POSES, *STOPS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,12 +236,13 @@ def station_targets(cameras: Mapping[Side, HiddenCamera]) -> dict[str, Any]:
     """Nominal layout of the targets in the frames, for the station file's `[targets]`: as good as a hand that places
     them and an eye that reads them off a first picture (corners to half a pixel, regions to the pixel). Keys by target:
 
-    - all: `kind` ("cap" "sphere" "colorchecker" "slanted_edge" "screen" "charuco")
+    - all: `kind` ("cap" "sphere" "colorchecker" "slanted_edge" "screen" "charuco" "aperture")
     - colorchecker: `chart`; `[targets.colorchecker.left]` `corners` (4 x [row, col], as in the recording set)
     - edge-N: `angle_deg`; `[[targets."edge-1".left.regions]]` `name` ("centre" "mid" "corner"), `region`
       [row0, col0, row1, col1], `angle_deg`, `field_mm` [row, col]
     - screen: `rows`, `cols`, `pixel_mm`; `[targets.screen.left]` `camera_px_per_screen_px`,
       `visible` [row0, col0, row1, col1] in screen pixels (what surely lies inside the frame)
+    - f/N: `f_number`
     - charuco-NN: `dictionary`, `squares` [rows, cols], `square_mm`, `marker_mm`, `pose`
     """
 
@@ -264,6 +268,8 @@ def station_targets(cameras: Mapping[Side, HiddenCamera]) -> dict[str, Any]:
             "marker_mm": MARKER_MM,
             "pose": name,
         }
+    for name, f_number in STOPS.items():
+        targets[name] = {"kind": "aperture", "f_number": f_number}
     return targets
 
 

@@ -23,14 +23,13 @@ from sim.effects.base import Effect
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
 from sim.effects.infrared_cut_filter import InfraredCutFilter
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
+from sim.effects.shutter_leakage import ShutterLeakage
 from sim.optics.filters import SODIUM_NM
 from sim.sensor.electrons import FixedPattern
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import ComplexArray, Image, image_of
 
 ROWS, COLS, PITCH_UM = 480, 640, 3.0
-#: Rows are exposed one after the other: light that flickers shows as bands.
-SHUTTER: Shutter = "rolling"
 #: Distance of the cameras, and from them to where targets stand (mm). Both look at the same point there.
 BASELINE_MM, DISTANCE_MM = 60.0, 900.0
 #: Every so many degrees the dark current doubles.
@@ -152,14 +151,19 @@ def _pattern(
     return FixedPattern(prnu=prnu / prnu.std() * prnu_percent / 100.0, dsnu_e=dsnu / dsnu.std() * dsnu_e)
 
 
-def _datasheet(shape: tuple[int, int]) -> dict[str, Any]:
+def _shutter(effects: tuple[Effect, ...]) -> Shutter:
+    """Rows are exposed one after the other: light that flickers shows as bands. But a store that leaks is there."""
+    return "global" if any(isinstance(effect, ShutterLeakage) for effect in effects) else "rolling"
+
+
+def _datasheet(shape: tuple[int, int], shutter: Shutter) -> dict[str, Any]:
     return {
         "rows": shape[0],
         "cols": shape[1],
         "pixel_pitch_um": PITCH_UM,
         "fill_factor": 0.8,
         "cfa": "RGGB",
-        "shutter": SHUTTER,
+        "shutter": shutter,
         "bit_depth": 12,
         "black_level_dn": 64.0,
         "white_level_dn": 4095.0,
@@ -199,7 +203,7 @@ _UNITS: dict[Side, dict[str, float]] = {
 def _camera(
     side: Side, rng: np.random.Generator, effects: tuple[Effect, ...], shape: tuple[int, int], plain: bool
 ) -> HiddenCamera:
-    sheet = _datasheet(shape)
+    sheet = _datasheet(shape, _shutter(effects))
     rows, cols = shape
     unit = _UNITS[side]
     vary = rng.uniform(0.99, 1.01, 6)
@@ -210,7 +214,7 @@ def _camera(
         pixel_pitch_um=PITCH_UM,
         fill_factor=sheet["fill_factor"],
         cfa="RGGB",
-        shutter=SHUTTER,
+        shutter=sheet["shutter"],
         bit_depth=12,
         black_level_dn=unit["black_level_dn"],
         white_level_dn=4095.0,

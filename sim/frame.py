@@ -146,7 +146,8 @@ def collected_electrons(
         mean *= rows[:, None]
     if isinstance(light.room, np.ndarray) or light.room:
         mean += light.room
-    mean *= charge.collected_s(exposure.exposure_s)
+    down = np.linspace(0.0, 1.0, camera.rows)[:, None]
+    mean *= charge.collected_s(exposure.exposure_s) + charge.leaked_s(down)
     np.add(charge.collect_light(mean), dark_electrons(camera, exposure, effects), out=mean)
     return charge.overflow_wells(charge.move_charge(mean))
 
@@ -176,7 +177,13 @@ def is_steady(camera: CameraModel, effects: Sequence[Effect]) -> bool:
 
 def grows_with_exposure(camera: CameraModel, effects: Sequence[Effect]) -> bool:
     """Return whether mean electrons are in proportion to the exposure that is asked for."""
-    return not laws_of(camera, effects) & {"charge.exposure_s", "light.rows", "charge.overflow", "light.unsteadiness"}
+    return not laws_of(camera, effects) & {
+        "charge.exposure_s",
+        "charge.leak_s",
+        "light.rows",
+        "charge.overflow",
+        "light.unsteadiness",
+    }
 
 
 def screen_light(
@@ -202,13 +209,6 @@ def collected_mosaic(
     rows = light_of(camera, effects).row_factors(len(electrons), exposure_s, elapsed_s)
     charge = charge_of(camera, effects)
     return charge.move_charge(charge.collect_light(electrons if rows is None else electrons * rows[:, None]))
-
-
-def charge_response(camera: CameraModel, shape: tuple[int, int], effects: Sequence[Effect]) -> FloatArray:
-    """Where one electron of the middle pixel of a frame (rows, cols) ends up."""
-    single = np.zeros(shape)
-    single[shape[0] // 2, shape[1] // 2] = 1.0
-    return charge_of(camera, effects).move_charge(single)
 
 
 def pair_gain_factor(camera: CameraModel, effects: Sequence[Effect]) -> float:
@@ -416,6 +416,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         codes.convert if codes.codes else None,
         (lambda electrons: np.asarray(charge.neighbour_correlation(electrons))) if charge.correlation else None,
         signal.filter_kernel(),
+        signal.gain_map(shape),
     )
 
 

@@ -251,10 +251,12 @@ class Image(State):
 class Charge(State):
     """Electrons in the pixels: where they come from and where they end up.
 
-    `exposure_s`: time asked for -> time in which light is collected. `collected`: electrons of light
-    (rows, cols) -> electrons, pixel by pixel; it depends on the place by a short period alone, as measurements ask it
-    on small tiles, and keeps each colour's mean, as levels don't ask it at all. `dark_current`: (e/s, sensor
-    temperature) -> e/s, of all pixels or of each (rows, cols). `defects`: pixels with additional dark current.
+    `exposure_s`: time asked for -> time in which light is collected. `leak_s`: place down the frame, 0 first row .. 1
+    last -> time in which light is collected besides, whatever is asked for. `collected`: electrons of light (rows,
+    cols) -> electrons, pixel by pixel and in proportion; it depends on the place by a short period alone, a part of
+    `mosaic.PERIOD_PX`, as measurements ask it on small tiles, and keeps each colour's mean, as levels don't ask it at
+    all. `dark_current`: (e/s, sensor temperature) -> e/s, of all pixels or of each (rows, cols). `defects`: pixels with
+    additional dark current.
     `transfer`: (fx, fy in cy/um, wavelength_nm) -> factor on the transfer function, 1 at zero frequency, alike for all
     colours. `kernels`: where the charge of a pixel ends up, (odd, odd) of sum 1, so that none is lost: they act on
     whole frames, and on transfer functions (`sim.point.mix_channels` for a mosaic). `exchange`: mean electrons (rows,
@@ -266,6 +268,7 @@ class Charge(State):
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
+    leak_s: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     collected: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     dark_current: tuple[Callable[[FloatArray | float, float | None], FloatArray | float], ...] = ()
     defects: tuple[Defects, ...] = ()
@@ -280,6 +283,10 @@ class Charge(State):
     def collected_s(self, exposure_s: float) -> float:
         """The time in which light is collected, given the time that was asked for."""
         return reduce(lambda value, law: law(value), self.exposure_s, exposure_s)
+
+    def leaked_s(self, down: FloatArray) -> FloatArray | float:
+        """The time in which light is collected beside the exposure, at places down the frame, 0..1."""
+        return sum((law(down) for law in self.leak_s), 0.0)
 
     def collect_light(self, electrons: FloatArray) -> FloatArray:
         """Mean electrons of light (rows, cols) as the pixels collect them."""
@@ -350,13 +357,15 @@ class Disturbance(Protocol):
 class Signal(State):
     """State of the electrons' read-out, up to the converter.
 
-    `response`: electrons -> electrons, point by point; none stay none. `offset_dn`: (elapsed_s, sensor temperature) ->
-    DN added to the black level. `lines`: noise that rows or columns share. `telegraph`: pixels that jump between two
-    levels. `disturbances`: signals that are added at random. `filters`: kernels (odd, odd) of sum 1 that the chip runs
-    over each colour's plane, signal and noise alike, before rounding.
+    `response`: electrons -> electrons, point by point; none stay none. `gains`: (row, col in px, which broadcast) ->
+    factor on what is read, noise alike, of mean 1 over the frame, as levels don't ask it. `offset_dn`: (elapsed_s,
+    sensor temperature) -> DN added to the black level. `lines`: noise that rows or columns share. `telegraph`: pixels
+    that jump between two levels. `disturbances`: signals that are added at random. `filters`: kernels (odd, odd) of sum
+    1 that the chip runs over each colour's plane, signal and noise alike, before rounding.
     """
 
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    gains: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     offset_dn: tuple[Callable[[float, float | None], float], ...] = ()
     lines: tuple[LineNoise, ...] = ()
     telegraph: tuple[Jumps, ...] = ()
@@ -366,6 +375,13 @@ class Signal(State):
     def read(self, electrons: FloatArray) -> FloatArray:
         """Apply the read-out's responses to signals in electrons, point by point."""
         return reduce(lambda value, law: law(value), self.response, electrons)
+
+    def gain_map(self, shape: tuple[int, int]) -> FloatArray | None:
+        """Factor (rows, cols) on what is read of every pixel; None where no law says one."""
+        if not self.gains:
+            return None
+        row, col = np.arange(float(shape[0]))[:, None], np.arange(float(shape[1]))[None, :]
+        return reduce(lambda value, law: value * law(row, col), self.gains, np.ones(shape))
 
     def shift_dn(self, elapsed_s: float, temperature_c: float | None) -> float:
         """DN added to the black level."""

@@ -28,6 +28,7 @@ SHADING = frozenset({"light.shading", "image.shading"})
 LEVEL = SHADING | {
     "light.level",
     "charge.exposure_s",
+    "charge.leak_s",
     "light.ambient_e_per_s",
     "charge.kernels",
     "charge.exchange",
@@ -176,6 +177,16 @@ class Uniform:
         """The time in which light is collected, given the time that was asked for."""
         return self._charge.collected_s(exposure_s)
 
+    @property
+    def leaks(self) -> bool:
+        """Return whether light is collected beside the exposure."""
+        return bool(self._charge.leak_s)
+
+    def leaked_s(self, points: FieldPoints) -> FloatArray:
+        """The time (points,) in which light is collected beside the exposure."""
+        row = points.y_um / self.camera.pixel_pitch_um + optical_axis_px(self.camera)[0]
+        return np.asarray(self._charge.leaked_s(row / (self.camera.rows - 1.0)) * np.ones(row.shape))
+
     def ambient_e(self, channel: str, exposure_s: float) -> float:
         """Electrons that light beside the source makes while the shutter is open, which is the time that light is
         collected.
@@ -218,6 +229,9 @@ class Uniform:
         for channel, rate in rates.items():
             ambient = (self._light.ambient(channel) * collected_s)[..., None]
             light = (rate * source_s)[..., None] * field.light
+            if self.leaks:
+                leaked = self.leaked_s(field) * field.light
+                light = light + (rate * _of_each(self._light.source, elapsed_s))[..., None] * leaked
             found[channel] = (light + ambient) * mixed.get(channel, np.ones(()))[..., None] + dark
         return found
 
@@ -310,6 +324,10 @@ class Uniform:
     def response(self, electrons: FloatArray) -> FloatArray:
         """Apply the read-out's responses to signals in electrons."""
         return self._signal.read(electrons)
+
+    def gain_map(self) -> FloatArray | None:
+        """Factor (rows, cols) on what is read of every pixel; None where it is the same for all."""
+        return self._signal.gain_map((self.camera.rows, self.camera.cols))
 
     def offset_dn(self, elapsed_s: float, temperature_c: float | None) -> float:
         """DN added to the black level, beside the mean of `added_e`."""

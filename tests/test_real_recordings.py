@@ -8,11 +8,14 @@ import pytest
 
 from benchmarks.real.__main__ import JSON, PAGE, main
 from benchmarks.real.compare import worse
+from benchmarks.real.extrapolation import extrapolate, split
 from benchmarks.real.judge import JudgedFigure, JudgedMeasurement, JudgedName, SetResult, found_at, judged
 from benchmarks.real.kept import kept_in
 from benchmarks.real.page import EXAMPLES, MARK, example_of, page_of
 from benchmarks.real.sets import declared_sets, sets_in
 from benchmarks.real.take_through import Cost, take_through
+from lab.capture_kinds.flat import FlatCapture
+from lab.formats.importers import read_foreign
 from lab.formats.results import CameraFit, DiagnosisResult, FitResult, NamedEffect, NoiseFit, SpectralFit
 from lab.formats.results.diagnosis import ParameterValue
 
@@ -160,3 +163,20 @@ def test_sets_of_a_folder(tmp_path: Path) -> None:
         "b": "raw-folder",
         "c": "emva1288",
     }
+
+
+def test_the_highest_levels_of_a_photon_transfer_set_are_predicted_from_the_lowest(tmp_path: Path) -> None:
+    """EMVA 1288's simulated camera, whose response bends by 2 % at saturation: lowest 60 % of the levels."""
+    source = DATA / "emva1288_simulated_crop"
+    if not source.is_dir():
+        pytest.skip(f"{source.name} isn't beside the checkout")
+    recordings = read_foreign("emva1288", source)
+    fitted, rest, low, high = split(recordings)
+    assert (low, high) == (11, 7)
+    brightest = max(c.photons_per_pixel for c in fitted.captures(FlatCapture, "left"))
+    assert brightest < min(c.photons_per_pixel for c in rest.captures(FlatCapture, "left"))
+    found = extrapolate("simulated", recordings, tmp_path)
+    scores = {q.quantity: q for q in found.quantities}
+    # a line through the fitted levels misses the highest by 1.5 %, and their variance by 9 %
+    assert scores["photon_transfer"].largest_of_95_percent < 0.5
+    assert scores["photon_transfer"].within_95_percent_interval == scores["noise"].within_95_percent_interval == 1.0

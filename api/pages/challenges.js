@@ -1,15 +1,10 @@
 // Challenges: recording sets of cameras that conceal something, made and scored by jobs; their truths are sealed until then.
 
-import { $, api, ask, element, may, post, show, time, told } from "./page.js";
+import { $, addView, api, ask, element, may, post, show, showView, time, told } from "./page.js";
 
-let after = () => {};
+const after = () => showView();
 
-export function challengesAre(changed) {
-  after = changed;
-  $("challenge-form").hidden = !may("calibrate");
-}
-
-export const nameOf = (one) => one.name || one.id;
+const nameOf = (one) => one.name || one.id;
 
 function row({ one, working, score }) {
   const made = Object.keys(one.seals).length;
@@ -63,15 +58,19 @@ async function scoreOf(one) {
   return scores.get(one.id);
 }
 
-// `jobs`: those that the page knows.
-export async function showChallenges(jobs) {
-  const known = await ask("/challenges?limit=50");
-  const working = new Set(jobs.filter((job) => ["queued", "running"].includes(job.state)).map((job) => job.challenge_id));
-  const told = await Promise.all(known.map(scoreOf));
-  show("challenges", known.map((one, at) => ({ id: one.id, one, working: working.has(one.id), score: told[at] })), row);
-  $("no-challenges").hidden = known.length > 0;
-  return new Map(known.map((one) => [one.id, nameOf(one)]));
-}
+addView({
+  pattern: /^\/challenges$/,
+  section: "view-challenges",
+  title: () => "Challenges",
+  async show() {
+    $("challenge-form").hidden = !may("calibrate");
+    const [known, jobs] = await Promise.all([ask("/challenges?limit=50"), ask("/jobs?limit=50")]);
+    const working = new Set(jobs.filter((job) => ["queued", "running"].includes(job.state)).map((job) => job.challenge_id));
+    const scores = await Promise.all(known.map(scoreOf));
+    show("challenges", known.map((one, at) => ({ id: one.id, one, working: working.has(one.id), score: scores[at] })), row);
+    $("no-challenges").hidden = known.length > 0;
+  },
+});
 
 $("challenge-form").addEventListener(
   "submit",

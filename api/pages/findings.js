@@ -4,8 +4,7 @@ import { chart, key, number } from "./charts.js";
 import { $, ask, element } from "./page.js";
 
 const CELL = 6; // px of a cell of a residual picture
-let asked = ""; // the session and the number of its jobs that are done
-let shown = ""; // the diagnosis that stands there
+let shown = ""; // the source and the diagnosis that stand there
 
 // Blue: darker than predicted, red: brighter; white: as predicted.
 function residuals(cells, limit, title) {
@@ -51,17 +50,14 @@ function drawProof({ title, caption, curve }) {
   return element("figure", {}, drawn, element("figcaption", {}, element("strong", { textContent: `${title}. ` }), caption, " ", ...key(series)));
 }
 
-// `jobs`: how many of the session are done; asked again where that changed.
-export async function showFindings(session, jobs) {
-  const wanted = `${session} ${jobs}`;
-  if (asked === wanted) return;
-  asked = wanted;
-  const newest = (await ask(`/sessions/${session}`)).results.diagnose ?? "";
-  if (asked !== wanted || newest === shown) return;
-  const found = newest ? await ask(`/sessions/${session}/findings`) : null;
-  if (asked !== wanted) return;
-  shown = newest;
+// `source`: {kind, id}; `newest`: the id of its newest diagnosis, if there is one.
+export async function showFindings(source, newest = "") {
+  const wanted = `${source.kind}/${source.id} ${newest}`;
+  if (shown === wanted) return;
+  const found = newest ? await ask(`/${source.kind}/${source.id}/findings`) : null;
+  shown = wanted;
   $("findings").hidden = !found;
+  $("no-findings").textContent = found ? "" : "Not diagnosed yet: start a diagnosis above.";
   if (!found) return;
   $("findings-headline").replaceChildren(element("strong", { textContent: found.verdict }), `: ${found.headline}`);
   $("findings-answers").replaceChildren(

@@ -51,6 +51,8 @@ async function asked(path, options = {}, patience = ANSWER_MS) {
 
 export const post = (path, body) => ask(path, { method: "POST", body: body === undefined ? undefined : JSON.stringify(body) });
 
+export const change = (path, body) => ask(path, { method: "PATCH", body: JSON.stringify(body) });
+
 export const put = (path, body) => ask(path, { method: "PUT", body: JSON.stringify(body) });
 
 export function element(tag, properties = {}, ...children) {
@@ -93,6 +95,121 @@ export const told = (place, action) => async (event) => {
     problem.textContent = error.message;
   }
 };
+
+// The options of a select, with what was chosen kept where it is still there.
+export function options(select, values, text = (value) => value) {
+  const kept = select.value;
+  if (JSON.stringify(values) === JSON.stringify([...select.options].map((one) => one.value))) return;
+  select.replaceChildren(...values.map((value) => element("option", { value, textContent: text(value) })));
+  if (values.includes(kept)) select.value = kept;
+}
+
+// A button or a link whose name says what it is for, as `Delete nightly`.
+export function named(tag, label, of, properties = {}) {
+  const made = element(tag, { textContent: label, ...properties });
+  made.setAttribute("aria-label", `${label} ${of}`);
+  return made;
+}
+
+// Cells whose names stand beside them where a narrow window shows rows as blocks.
+export function cells(row, ...labels) {
+  [...row.children].forEach((cell, at) => labels[at] && (cell.dataset.label = labels[at]));
+  return row;
+}
+
+// --- views ----------------------------------------------------------------------------------------------------------
+
+/**
+ * A view: the section that it shows, its title, and what fills it; `first` where it was gone to just now.
+ * @typedef {{pattern: RegExp, section: string, title: (...parts: string[]) => string,
+ *   show: (first: boolean, ...parts: string[]) => unknown}} View
+ */
+/** @type {View[]} */
+const views = [];
+/** @type {{view: View | undefined, parts: string[]}} */
+let current = { view: undefined, parts: [] };
+
+/** @param {View} view */
+export const addView = (view) => views.push(view);
+
+export const address = () => decodeURI(location.hash.replace(/^#/, "") || "/");
+export const goTo = (path) => (location.hash = `#${encodeURI(path)}`);
+
+// Shows what stands at the page's address, and asks anew what it shows.
+export async function showView(first = false) {
+  const path = address().replace(/\?.*$/, "");
+  const view = views.find((one) => one.pattern.test(path));
+  const parts = view ? view.pattern.exec(path).slice(1) : [];
+  const section = view?.section ?? "view-none";
+  if (first) {
+    current = { view, parts };
+    for (const one of document.querySelectorAll("section.view")) one.hidden = one.id !== section;
+    document.title = `${view?.title(...parts) ?? "No such view"} · calibench`;
+    for (const link of document.querySelectorAll("#nav a")) {
+      const at = decodeURI(link.hash.slice(1));
+      const here = at === "/" ? path === "/" : path.startsWith(at) || (at === "/calibrations" && path.startsWith("/calibration"));
+      if (here) link.setAttribute("aria-current", "page");
+      else link.removeAttribute("aria-current");
+    }
+    $("view-problem").textContent = "";
+  }
+  if (!view) return;
+  try {
+    await view.show(first, ...parts);
+    $("view-problem").textContent = "";
+  } catch (error) {
+    if (current.view === view) $("view-problem").textContent = error.message;
+  }
+}
+
+// What the address asks behind its question mark.
+export const query = () => new URLSearchParams(address().split("?")[1] ?? "");
+
+// --- long lists -----------------------------------------------------------------------------------------------------
+
+const PAGE = 50;
+
+// A list in pages. Its table's body is `id`; `no-ID`, `more-ID` and `count-ID` stand where there is none, ask for the next page, and say how many.
+export class Listing {
+  /** @param {string} id @param {string} path @param {(item: any) => HTMLElement} row @param {(items: any[]) => any[]} [shown] */
+  constructor(id, path, row, shown = (items) => items) {
+    Object.assign(this, { id, path, row, shown, items: [], asked: "", total: 0 });
+    $(`more-${id}`)?.addEventListener("click", told("view-problem", () => this.more()));
+  }
+
+  #address(after) {
+    const asked = new URLSearchParams(this.asked);
+    asked.set("limit", String(PAGE));
+    if (after) asked.set("after", after);
+    return `${this.path}?${asked}`;
+  }
+
+  // The first page anew; older ones that were asked for stay.
+  async refresh(asked = this.asked) {
+    if (asked !== this.asked) this.items = [];
+    this.asked = asked;
+    const { items, total } = await page(this.#address());
+    if (asked !== this.asked) return;
+    const last = this.items.findIndex((one) => one.id === items.at(-1)?.id);
+    this.items = [...items, ...(items.length < PAGE || last < 0 ? [] : this.items.slice(last + 1))];
+    this.total = total;
+    this.draw();
+  }
+
+  async more() {
+    const { items, total } = await page(this.#address(this.items.at(-1).id));
+    this.items = [...this.items, ...items];
+    this.total = total;
+    this.draw();
+  }
+
+  draw() {
+    show(this.id, this.shown(this.items), this.row);
+    $(`no-${this.id}`).hidden = this.items.length > 0;
+    $(`more-${this.id}`).hidden = this.items.length >= this.total;
+    $(`count-${this.id}`).textContent = this.total > this.items.length ? `${this.items.length} of ${this.total}` : "";
+  }
+}
 
 export const clock = (text) => `${time(text).slice(11)} UTC`;
 

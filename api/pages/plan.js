@@ -42,7 +42,15 @@ export function asked() {
   return { sequences: rows.size && chosen.length < rows.size ? chosen.map(([name]) => name) : null, parameters };
 }
 
-async function showEstimate(station, quick) {
+// What an earlier plan took, into the fields that stand there now.
+export function take({ sequences, parameters }) {
+  for (const [name, part] of rows) {
+    part.taken.checked = !sequences || sequences.includes(name);
+    for (const { field, parameter } of part.fields) field.value = [parameters[name]?.[parameter.name] ?? []].flat().join(", ");
+  }
+}
+
+export async function showEstimate(station, quick) {
   const number = ++latest;
   const wanted = asked();
   if (wanted.sequences?.length === 0) {

@@ -1,14 +1,7 @@
 // Recording sets: sent in by drag and drop or by the file chooser, worked on, fetched, deleted.
 
-import { $, api, ask, element, may, post, show, told } from "./page.js";
+import { $, Listing, addView, api, ask, cells, element, may, named, post, told } from "./page.js";
 import { takesFiles } from "./send.js";
-
-let after = () => {};
-
-export function recordingsAre(changed) {
-  after = changed;
-  $("drop").hidden = !may("calibrate");
-}
 
 takesFiles("drop", "recordings-problem", {
   path: () => {
@@ -16,31 +9,42 @@ takesFiles("drop", "recordings-problem", {
     return `/recordings${format ? `?format=${format}` : ""}`;
   },
   words: (made) => [`${made.name || made.id}: ${made.captures} captures`, ...made.warnings].join("; "),
-  after: () => after(),
+  after: () => list.refresh(),
 });
 
 function row(one) {
   const actions = element("td");
   const does = (label, action) => {
-    const button = element("button", { textContent: label });
-    button.setAttribute("aria-label", `${label} ${one.name || one.id}`);
-    button.addEventListener("click", told("recordings-problem", async () => (await action(), after())));
+    const button = named("button", label, one.name || one.id);
+    button.addEventListener("click", told("recordings-problem", async () => (await action(), list.refresh())));
     actions.append(button, " ");
   };
   if (may("calibrate")) for (const kind of ["fit", "diagnose", "report"]) does(kind[0].toUpperCase() + kind.slice(1), () => post(`/recordings/${one.id}/jobs`, { kind }));
-  const link = element("a", { href: `${api}/recordings/${one.id}/archive.zip`, textContent: "Download" });
-  link.setAttribute("aria-label", `Download ${one.name || one.id}`);
-  actions.append(link, " ");
+  actions.append(named("a", "Download", one.name || one.id, { href: `${api}/recordings/${one.id}/archive.zip` }), " ");
   if (may("calibrate")) {
     does("Delete", async () => {
       if (confirm(`Delete ${one.name || one.id} for ever? Results of it stay.`)) await ask(`/recordings/${one.id}`, { method: "DELETE" });
     });
   }
-  return element("tr", {}, element("td", { textContent: one.name || one.id, title: one.id }), element("td", { textContent: one.cameras.join(", ") }), element("td", { className: "number", textContent: one.captures }), actions);
+  const made = element(
+    "tr",
+    {},
+    element("td", {}, element("a", { href: `#/recordings/${one.id}`, textContent: one.name || one.id, title: one.id })),
+    element("td", { textContent: one.cameras.join(", ") }),
+    element("td", { className: "number", textContent: one.captures }),
+    actions,
+  );
+  return cells(made, "", "Cameras", "Captures");
 }
 
-export async function showRecordings() {
-  const known = await ask("/recordings?limit=50");
-  show("recordings", known, row);
-  $("no-recordings").hidden = known.length > 0;
-}
+const list = new Listing("recordings", "/recordings", row);
+
+addView({
+  pattern: /^\/recordings$/,
+  section: "view-recordings",
+  title: () => "Recording sets",
+  show() {
+    $("drop").hidden = !may("calibrate");
+    return list.refresh();
+  },
+});

@@ -1,11 +1,13 @@
-// Stations at a glance: a card each, with what runs there, its shutter, light and temperature, and a halt.
+// Stations at a glance: on every view a line each with shutter, light, screen and the age of that; at the desk a card each, with what runs
+// there and a halt; and a view each, with its instruments' health.
 
-import { $, LIVE, api, ask, clock, duration, element, forgetHalt, halt, may, mayHalt, post, tellHalts, told } from "./page.js";
+import { $, LIVE, addView, api, ask, cells, clock, duration, element, forgetHalt, halt, may, mayHalt, named, post, show, tellHalts, time, told } from "./page.js";
 
 // A browser keeps six connections to a service open; the streams leave some of them for requests.
 const STREAMS = 3;
 const cards = new Map(); // key of the card -> its parts
 const streams = new Map(); // session -> its event stream
+const known = new Map(); // session that runs -> what was last told of it
 let follower = () => {};
 let connected = true;
 
@@ -14,7 +16,7 @@ export function stationsAre(ended) {
 }
 
 export function leaveStations() {
-  for (const parts of cards.values()) parts.whole.remove();
+  for (const parts of cards.values()) forget(parts);
   cards.clear(); // another key may do other things
   for (const stream of streams.values()) stream.close();
   streams.clear();
@@ -57,11 +59,58 @@ function card(name, title) {
   halts.append(parts.halted);
   halts.hidden = !(name ? mayHalt() : may("operate"));
   actions.hidden = !may("operate");
+  parts.strip = stripItem(name, title, parts);
+  if (name) parts.title.replaceChildren(element("a", { href: `#/stations/${encodeURIComponent(name)}`, textContent: title }));
   parts.run = at("div", "run", element("p", {}, parts.name), parts.bar, parts.step, parts.remarks, actions);
   const fact = (label, value) => element("div", {}, element("dt", { textContent: label }), value);
   const facts = element("dl", { className: "facts" }, fact("Shutter", parts.shutter), fact("Light", parts.light), fact("Sensor", parts.temperature));
   parts.whole = element("article", { className: "station" }, element("header", {}, parts.title, parts.state), facts, parts.run, halts, parts.problem);
   return parts;
+}
+
+// A station's line on every view.
+function stripItem(name, title, parts) {
+  const strip = { name: element("a", { className: "name", textContent: name ?? title }), state: element("span", { className: "state" }), facts: element("span"), age: element("span", { className: "age" }) };
+  strip.whole = element("li", {}, element("span", {}, strip.name, " ", strip.state, " ", strip.facts, " ", strip.age));
+  if (mayHalt() && name) {
+    const button = named("button", "Halt", `${name}, now`, { className: "danger small" });
+    button.addEventListener("click", () => halt($("halt-told"), name));
+    strip.whole.append(button);
+  }
+  parts.seen = Date.now();
+  $("strip").append(strip.whole);
+  return strip;
+}
+
+// What the line says, from what the card says.
+function showStrip(parts) {
+  const { session, safety } = parts.known;
+  const { strip } = parts;
+  strip.name.href = session ? `#/sessions/${session.id}/live` : `#/stations/${encodeURIComponent(strip.name.textContent)}`;
+  strip.state.textContent = parts.state.textContent;
+  strip.state.className = parts.state.className;
+  const shutter = parts.shutter.textContent.split(" ")[0];
+  const light = parts.light.textContent;
+  const screen = session ? "in use" : safety?.state === "safe" ? "dark" : "not known";
+  const words = [`shutter ${shutter === "–" ? "not known" : parts.shutter.textContent.startsWith("closed") ? "closed" : parts.shutter.textContent}`, light === "–" ? "" : `light ${light}`, `screen ${screen}`];
+  strip.facts.textContent = words.filter(Boolean).join(" · ");
+  strip.facts.className = parts.shutter.className;
+  showAge(parts);
+}
+
+function showAge(parts) {
+  const { session, safety } = parts.known;
+  const at = session ? parts.seen : safety ? Date.parse(safety.at) : null;
+  const seconds = at === null ? null : Math.max(0, (Date.now() - at) / 1000);
+  parts.strip.age.textContent = seconds === null ? "" : `${duration(seconds)} old`;
+  parts.strip.age.classList.toggle("old", Boolean(session) && seconds > 60);
+}
+setInterval(() => document.hidden || cards.forEach(showAge), 1000);
+
+function forget(parts) {
+  parts.whole.remove();
+  parts.strip.whole.remove();
+  forgetHalt(parts.halted);
 }
 
 function showBench(parts, bench, safety) {
@@ -81,6 +130,9 @@ function showProgress(parts, p) {
   const step = p.total && p.state === "running" ? `step ${Math.min(p.done + 1, p.total)} of ${p.total}` : "";
   parts.step.textContent = [p.what, step, left(p.left_s)].filter(Boolean).join(" · ");
   if (p.bench) showBench(parts, p.bench);
+  parts.seen = Date.now();
+  if (parts.known) showStrip(parts);
+  document.dispatchEvent(new CustomEvent("progress", { detail: { id: p.session, words: parts.step.textContent } }));
   if (p.remark) parts.remarks.prepend(element("li", { textContent: `${p.what}: ${p.remark}` }));
 }
 
@@ -88,9 +140,13 @@ function follow(id, parts) {
   const stream = new EventSource(`${api}/sessions/${id}/events`);
   streams.set(id, stream);
   stream.addEventListener("progress", (event) => showProgress(parts, JSON.parse(event.data)));
-  stream.addEventListener("state", () => follower());
+  stream.addEventListener("state", (event) => {
+    known.set(id, JSON.parse(event.data));
+    follower();
+  });
   stream.addEventListener("end", () => {
     stream.close();
+    known.delete(id);
     streams.delete(id);
     follower();
   });
@@ -109,18 +165,24 @@ function showState(parts) {
 document.addEventListener("connection", (event) => {
   if (connected === event.detail) return;
   connected = event.detail;
-  for (const parts of cards.values()) showState(parts);
+  for (const parts of cards.values()) {
+    showState(parts);
+    showStrip(parts);
+  }
 });
 
-async function showRun(parts, session, safety) {
+function showRun(parts, session, safety) {
   parts.known = { session, safety };
   const begun = parts.session !== session?.id;
   parts.session = session?.id;
   parts.run.hidden = !session;
   showState(parts);
   parts.whole.classList.toggle("busy", Boolean(session));
-  if (!session) return showBench(parts, null, safety);
-  parts.name.textContent = session.name || session.id;
+  if (!session) {
+    showBench(parts, null, safety);
+    return showStrip(parts);
+  }
+  parts.name.replaceChildren(element("a", { href: `#/sessions/${session.id}/live`, textContent: session.name || session.id }));
   parts.buttons.Pause.disabled = session.state !== "running";
   parts.buttons.Resume.disabled = !["paused", "pausing"].includes(session.state);
   if (begun) {
@@ -128,36 +190,120 @@ async function showRun(parts, session, safety) {
     parts.remarks.replaceChildren();
     parts.step.textContent = "";
     parts.bar.value = 0;
+    parts.shutter.textContent = parts.light.textContent = "–";
   }
-  if (streams.has(session.id)) return;
-  if (streams.size < STREAMS) return follow(session.id, parts);
-  const progress = (await ask(`/sessions/${session.id}`)).progress;
-  if (progress) showProgress(parts, progress);
+  if (streams.has(session.id)) return showStrip(parts);
+  if (streams.size < STREAMS) follow(session.id, parts);
+  if (session.progress) showProgress(parts, session.progress);
+  showStrip(parts);
 }
 
-// A card for each station, and one for each session that runs somewhere else.
+// The sessions that run on these stations; those of `sessions` may run elsewhere.
+async function running(stations, sessions) {
+  const live = sessions.filter((s) => LIVE.includes(s.state));
+  const ids = new Set([...stations.map((s) => s.busy_with).filter(Boolean), ...live.map((s) => s.id)]);
+  for (const one of live) known.set(one.id, one);
+  for (const id of known.keys()) if (!ids.has(id)) known.delete(id);
+  await Promise.all([...ids].filter((id) => !streams.has(id)).map(async (id) => known.set(id, await ask(`/sessions/${id}`))));
+  return [...ids].map((id) => known.get(id)).filter((one) => one && LIVE.includes(one.state));
+}
+
+// A card and a line for each station, and for each of `sessions` that runs somewhere else.
 export async function showStations(stations, sessions) {
   tellHalts(stations);
-  const running = sessions.filter((s) => LIVE.includes(s.state));
+  const live = await running(stations, sessions);
   const wanted = new Map();
   for (const one of stations.filter((s) => !s.problem)) {
-    wanted.set(one.name, { title: one.title === one.name ? one.name : `${one.name}: ${one.title}`, name: one.name, safety: one.safety, session: running.find((s) => s.id === one.busy_with) });
+    wanted.set(one.name, { title: one.title === one.name ? one.name : `${one.name}: ${one.title}`, name: one.name, safety: one.safety, session: live.find((s) => s.id === one.busy_with) });
   }
   const shown = new Set([...wanted.values()].map((one) => one.session?.id));
-  for (const session of running) if (!shown.has(session.id)) wanted.set(session.id, { title: "elsewhere", name: null, session });
+  for (const session of live) if (!shown.has(session.id)) wanted.set(session.id, { title: "elsewhere", name: null, session });
   for (const [id, parts] of cards) {
-    if (!wanted.has(id)) {
-      parts.whole.remove();
-      forgetHalt(parts.halted);
-      cards.delete(id);
-    }
+    if (wanted.has(id)) continue;
+    forget(parts);
+    cards.delete(id);
   }
   for (const [id, one] of wanted) {
     if (!cards.has(id)) {
       cards.set(id, card(one.name, one.title));
       $("stations").append(cards.get(id).whole);
     }
-    await showRun(cards.get(id), one.session, one.safety);
+    showRun(cards.get(id), one.session, one.safety);
   }
-  return running;
 }
+
+// Cards stand at the desk; a station's own view has its card.
+export function placeCards(own = null) {
+  for (const [id, parts] of cards) (id === own ? $("station-run") : $("stations")).append(parts.whole);
+}
+
+// --- a station ------------------------------------------------------------------------------------------------------
+
+const CHECK_MS = 1000; // how often a check that is under way is looked at
+let station = null; // the name of the one that stands there
+
+function deviceRow(one) {
+  const actions = element("td");
+  if (may("operate")) {
+    const button = named("button", "Check", one.name, { disabled: ["checking", "in use"].includes(one.state) });
+    button.addEventListener("click", told("station-problem", () => check(`/${one.name}`)));
+    actions.append(button, " ");
+  }
+  if (one.transcript) actions.append(named("a", "Transcript", one.name, { href: one.transcript, target: "_blank", rel: "noopener" }));
+  const state = element("td", {}, element("span", { className: `state ${{ works: "finished", fails: "failed" }[one.state] ?? ""}`, textContent: one.state }));
+  if (one.words) state.append(element("div", { className: one.state === "fails" ? "reason" : "hint", textContent: one.words }));
+  const made = element(
+    "tr",
+    {},
+    element("td", { textContent: one.name }),
+    element("td", { textContent: one.identity || "not told yet" }),
+    element("td", { className: "small", textContent: `${one.driver} at ${one.address}` }),
+    state,
+    element("td", { className: "when", textContent: one.checked ? time(one.checked) : "never" }),
+    actions,
+  );
+  return cells(made, "", "Identity", "Driver", "", "Last check");
+}
+
+async function showDevices() {
+  const name = station;
+  const found = await ask(`/stations/${encodeURIComponent(name)}/devices`);
+  if (name !== station) return false;
+  show("devices", found.map((one) => ({ id: one.name, ...one })), deviceRow);
+  const counted = (state) => found.filter((one) => one.state === state).length;
+  const works = counted("works");
+  const words = [works ? `${works} of ${found.length} work` : "", counted("fails") ? `${counted("fails")} fail` : "", counted("checking") ? `${counted("checking")} being checked` : ""];
+  $("devices-told").textContent = words.filter(Boolean).join(", ") || "None was checked yet.";
+  $("check-all").disabled = counted("checking") > 0 || counted("in use") > 0;
+  return counted("checking") > 0;
+}
+
+async function check(device) {
+  const transcript = $("keep-transcript").checked;
+  await post(`/stations/${encodeURIComponent(station)}${device ? `/devices${device}` : ""}/check`, { transcript });
+  while (await showDevices()) await new Promise((resolve) => setTimeout(resolve, CHECK_MS));
+}
+$("check-all").addEventListener("click", told("station-problem", () => check("")));
+
+addView({
+  pattern: /^\/stations\/([^/]+)$/,
+  section: "view-station",
+  title: (name) => name,
+  async show(first, name) {
+    if (first) {
+      station = name;
+      $("station-title").textContent = name;
+      $("station-problem").textContent = "";
+      $("check-all").hidden = !may("operate");
+      $("keep-transcript").parentElement.hidden = !may("operate");
+    }
+    const one = await ask(`/stations/${encodeURIComponent(name)}`);
+    $("station-title").textContent = one.title === name ? name : `${name}: ${one.title}`;
+    $("station-problem").textContent = one.problem ?? "";
+    const fact = (label, value) => element("div", {}, element("dt", { textContent: label }), element("dd", { textContent: value }));
+    $("station-facts").replaceChildren(fact("Cameras", one.cameras.join(", ")), fact("Targets", one.targets.join(", ") || "none"), fact("Sequences", one.sequences.join(", ") || "none"));
+    $("station-sessions").href = `#/sessions?search=${encodeURIComponent(one.title)}`;
+    placeCards(name);
+    await showDevices();
+  },
+});

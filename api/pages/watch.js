@@ -12,13 +12,16 @@ export function watch(session) {
   if (watched === session?.id) return;
   watched = session?.id ?? null;
   drawn = "";
-  $("watch").hidden = !session;
   if (!session) return;
-  $("watch-title").textContent = `${session.name || session.id}: newest frame and curves`;
+  $("watch-none").hidden = false;
+  $("watch-step").textContent = $("watch-seen").textContent = "";
   for (const place of ["watch-frame", "watch-figures", "watch-histogram", "transfer", "sensitivity", "edges"]) $(place).replaceChildren();
 }
 
-export const watches = () => watched;
+// What the session that is shown does now.
+document.addEventListener("progress", ({ detail: { id, words } }) => {
+  if (id === watched) $("watch-step").textContent = words;
+});
 
 const share = (value) => (value === 0 ? "none" : value < 0.0001 ? "< 0.01 %" : `${number(100 * value, 3)} %`);
 
@@ -34,7 +37,12 @@ function drawFrame(capture, figures) {
   const worst = Math.max(...figures.channels.map((one) => one.saturated_share));
   const title = `Histogram of ${capture.name}: ${figures.channels.map((one) => `${one.channel} mean ${number(one.mean_dn, 4)} DN`).join(", ")}; saturated at most ${share(worst)}`;
   $("watch-histogram").replaceChildren(chart({ title, series, x: { label: "DN", from: 0, to: figures.bin_dn * series[0].points.length }, y: { label: "pixels", from: 0 } }));
-  $("watch-figures").replaceChildren(
+  drawChannels("watch-figures", figures);
+}
+
+// The mean and the saturated share of each channel, as rows of a table.
+export function drawChannels(place, figures) {
+  $(place).replaceChildren(
     ...figures.channels.map((one) =>
       element(
         "tr",
@@ -89,3 +97,5 @@ export async function showWatched() {
     busy = false;
   }
 }
+
+$("watch-side").addEventListener("change", () => showWatched().catch(() => {}));

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
+from fastapi.responses import HTMLResponse
 
+from api.certificate import Certificate, certificate, certificate_page, rejections
 from api.errors import Conflict, answers, known
 from api.keys import Permission, StoredKey
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
-from api.schemas import Certify, FigureName
-from api.security import Demand
-from api.service import READ, Here, HexId, Service
-from lab.calibration import life
-from lab.calibration.life import CalibrationRecord, History
+from api.schemas import CalibrationDetail, Certify, DraftedLimit, DraftedLimits, FigureName, FigureOfFit, Revoke
+from api.security import REPORT_POLICY, Demand
+from api.service import READ, Here, HexId, Service, SessionId
+from lab.calibration import camera_models, life
+from lab.calibration.figures import Figure, figures_of
+from lab.calibration.life import CalibrationRecord, DriftBoard, History
 from lab.calibration.limits import judged, standing_limits
+from lab.capture.store import Store
 from lab.errors import InputError
+from lab.formats.results import FitResult
 from lab.formats.results.figure_names import plain_name, unit_of
 
 router = APIRouter(tags=["calibrations"])
@@ -37,15 +43,112 @@ def list_calibrations(
 
 
 @router.get("/calibrations/{calibration_id}", dependencies=[READ], responses=answers(401, 404, 422))
-def get_calibration(service: Here, calibration_id: HexId) -> CalibrationRecord:
+def get_calibration(service: Here, calibration_id: HexId) -> CalibrationDetail:
     """One calibration. `judgements` of a candidate are by the limits of the data folder (`limits.toml`), where it has
-    some; those of another are as it was certified."""
+    some; those of another are as it was certified. `warnings`: what its session's newest diagnosis says against it."""
+    found = judged_calibration(service, calibration_id)
+    return CalibrationDetail(
+        **dict(found), warnings=rejections(service.store, found), has_cameras=_has_cameras(service, found.id)
+    )
+
+
+def judged_calibration(service: Service, calibration_id: str) -> CalibrationRecord:
+    """A calibration; a candidate by the limits of the data folder. 404 where there is none."""
     found = _known(service, calibration_id)
     standing = standing_limits(service.store.root) if found.limits is None else None
     if standing is None:
         return found
     by_limit = judged(life.figures(service.store, found.id), standing)
     return found.model_copy(update={"limits": standing, "judgements": by_limit})
+
+
+def _has_cameras(service: Service, calibration_id: str) -> bool:
+    try:
+        return bool(camera_models.record(service.store, calibration_id).sides)
+    except InputError:
+        return False
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
+@functools.lru_cache(maxsize=32)
+def _figures(store: Store, fit: str) -> tuple[Figure, ...]:
+    """Of a kept fit, which never changes, and is long."""
+    return figures_of(FitResult.model_validate(store.result(fit).document))
+
+
+def _told(service: Service, figures: tuple[Figure, ...]) -> list[FigureOfFit]:
+    limits = standing_limits(service.store.root)
+    found = []
+    for one in figures:
+        limit = next((limit for limit in (limits.limit if limits else ()) if limit.concerns(one)), None)
+        found.append(
+            FigureOfFit(
+                figure=one.name,
+                place=one.place,
+                title=one.title,
+                unit=one.unit,
+                side=one.side,
+                value=one.value,
+                std=one.std,
+                good=None if limit is None else limit.good,
+                mark=None if limit is None else limit.judge(one),
+            )
+        )
+    return found
+
+
+def _newest_figures(service: Service, source: str, what: str) -> list[FigureOfFit]:
+    newest = service.store.newest_results(source)
+    if "fit" not in newest:
+        raise Conflict(f"{what}: isn't fitted yet; start a job of the kind fit")
+    return _told(service, _figures(service.store, newest["fit"]))
+
+
+@router.get("/calibrations/{calibration_id}/figures", dependencies=[READ], responses=answers(401, 404, 422))
+def calibration_figures(service: Here, calibration_id: HexId) -> list[FigureOfFit]:
+    """Every number of a calibration that has an uncertainty, by the data folder's limits where one concerns it."""
+    return _told(service, life.figures(service.store, _known(service, calibration_id).id))
+
+
+@router.get("/sessions/{session_id}/figures", dependencies=[READ], responses=answers(401, 404, 409, 422))
+def session_figures(service: Here, session_id: SessionId) -> list[FigureOfFit]:
+    """The figures of a session's newest fit. 409 before there is one."""
+    service.session(session_id)
+    return _newest_figures(service, session_id, f"session {session_id}")
+
+
+@router.get("/recordings/{recordings_id}/figures", dependencies=[READ], responses=answers(401, 404, 409, 422))
+def recordings_figures(service: Here, recordings_id: HexId) -> list[FigureOfFit]:
+    """The figures of the newest fit of recordings that were sent in."""
+    return _newest_figures(service, str(service.recordings(recordings_id)), f"recordings {recordings_id}")
+
+
+# --- certifying -------------------------------------------------------------------------------------------------------
+
+
+@router.get("/calibrations/{calibration_id}/drafted-limits", dependencies=[READ], responses=answers(401, 404, 422))
+def drafted_limits(service: Here, calibration_id: HexId) -> DraftedLimits:
+    """Limits drafted from what the same cameras had before: where the next calibration of an unchanged camera lies with
+    99 %. They say what is usual; what a camera has to reach, somebody decides. Nothing is kept."""
+    found, number = life.drafted_limits(service.store, _known(service, calibration_id).id)
+    standing = standing_limits(service.store.root)
+    return DraftedLimits(
+        words=f"Drafted from {number} calibration{'s' if number > 1 else ''} of these cameras: what is usual for them.",
+        valid_days=standing.valid_days if standing else None,
+        limits=tuple(
+            DraftedLimit(
+                figure=one.figure,
+                title=plain_name(one.figure, one.place).replace(", *", ", every edge"),
+                unit=unit_of(one.figure),
+                side=one.side,
+                place=one.place,
+                good=one.good,
+            )
+            for one in found
+        ),
+    )
 
 
 @router.post("/calibrations/{calibration_id}/certify", responses=answers(401, 403, 404, 409, 422))
@@ -65,6 +168,72 @@ def certify_calibration(
     if limits is None:
         raise HTTPException(422, "limits: the data folder has no limits.toml; put one there, or send the limits")
     return life.certify(service.store, calibration_id, key.name, limits, accept_warnings=asked.accept_warnings)
+
+
+def _certified(service: Service, calibration_id: str) -> CalibrationRecord:
+    found = _known(service, calibration_id)
+    if found.certified is None:
+        raise Conflict(f"calibration {calibration_id} is a {found.state}; certify it, then it has a certificate")
+    return found
+
+
+@router.get(
+    "/calibrations/{calibration_id}/certificate",
+    dependencies=[READ],
+    response_class=HTMLResponse,
+    responses=answers(401, 404, 409, 422),
+)
+def certificate_of_calibration(service: Here, calibration_id: HexId) -> HTMLResponse:
+    """The certificate as a page to print, or to keep as a PDF: limits, figures with their uncertainties, verdict,
+    serial numbers, hash. 409 before it is certified."""
+    found = _certified(service, calibration_id)
+    try:
+        runs = service.public_runs(service.store.runs(found.session_id))
+    except InputError:  # the session was deleted
+        runs = ()
+    page = certificate_page(service.store, found, runs)
+    return HTMLResponse(service.public.within(page), headers={"Content-Security-Policy": REPORT_POLICY})
+
+
+@router.get(
+    "/calibrations/{calibration_id}/certificate.json", dependencies=[READ], responses=answers(401, 404, 409, 422)
+)
+def certificate_content(service: Here, calibration_id: HexId) -> Certificate:
+    """What the certificate states, and its hashes: whoever has it sees whether it was changed."""
+    return certificate(service.store, _certified(service, calibration_id))
+
+
+@router.post("/calibrations/{calibration_id}/revoke", responses=answers(401, 403, 404, 409, 422))
+def revoke_calibration(
+    service: Here,
+    calibration_id: HexId,
+    asked: Revoke,
+    key: Annotated[StoredKey, Depends(Demand(Permission.CALIBRATE))],
+) -> CalibrationRecord:
+    """Take a certificate back, with the reason, by the holder of the key. 409 for a calibration without one."""
+    found = _known(service, calibration_id)
+    try:
+        return life.revoke(service.store, found.id, key.name, asked.why)
+    except InputError as error:
+        raise Conflict(str(error)) from None
+
+
+@router.get("/drift", dependencies=[READ], responses=answers(401, 404, 422))
+def drift(
+    service: Here,
+    camera: Annotated[str, Query(max_length=400, description="as `/figures` names it")],
+    reference_c: Annotated[
+        float | None,
+        Query(ge=-200, le=200, description="deg C, to which dark currents are corrected; null: the usual one"),
+    ] = None,
+    newest: Annotated[int, Query(ge=1, le=200, description="how many calibrations, the newest")] = life.BOARD_COLUMNS,
+) -> DriftBoard:
+    """All figures of a camera, or of the pair, by its calibrations: in which band each lies, and whether it drifted."""
+    limits = standing_limits(service.store.root)
+    try:
+        return life.drift_board(service.store, camera, limits, reference_c=reference_c, newest=newest)
+    except InputError as error:
+        raise HTTPException(404, str(error)) from None
 
 
 @router.get("/figures", dependencies=[READ], responses=answers(401))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from typing import Annotated
 
-from fastapi import APIRouter, HTTPException, Request, Response
+from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from sse_starlette.sse import EventSourceResponse
 
@@ -14,10 +15,11 @@ from api.keys import Permission
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
-from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId, camera_model
+from api.service import ADMIN, CALIBRATE, HEX_ID, READ, SESSION_ID, Here, HexId, Service, SessionId, camera_model
 from lab.challenge.kept import WORK
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
+from lab.resolve import resolve_limits
 
 router = APIRouter()
 
@@ -46,7 +48,8 @@ def _submit(service: Service, start: JobStart, source: str) -> str:
     files."""
     if start.camera_model is not None and not camera_model(service, start.camera_model).sides:
         raise Conflict(f"camera model {start.camera_model}: no camera file was kept; fit again")
-    return service.jobs.submit(start.kind, source, resolve=start.resolve, camera_model=start.camera_model)
+    limits = resolve_limits(start.resolve, start.resolve_minutes, start.resolve_rounds)
+    return service.jobs.submit(start.kind, source, resolve=limits, camera_model=start.camera_model)
 
 
 @router.post(
@@ -77,8 +80,9 @@ def start_session_job(
         raise HTTPException(422, "camera_model: a pipeline fits its own; leave it out, or validate or diagnose with it")
     if start.resolve or info.state != "finished":
         Demand(Permission.ADMIN)(request, None, None)
+    limits = resolve_limits(start.resolve, start.resolve_minutes, start.resolve_rounds)
     station = service.station(start.station) if start.station is not None else service.store.station(session_id)
-    job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
+    job_id = service.jobs.submit("pipeline", session_id, resolve=limits, capturer=service.live.capturer(station))
     return accepted(service, job_id, response)
 
 
@@ -93,10 +97,11 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     """Start a session and the whole pipeline on it: capture, fit, validate, diagnose, resolve, report. The job's
     `session_id` is the session, which can be followed, paused and aborted as any other. 409 while another runs on the
     same instruments. The key's scope has to be `admin`, for this captures and computes."""
+    limits = resolve_limits(start.resolve, start.resolve_minutes, start.resolve_rounds)
     station = service.station(start.station)
     plan = start.plan(station)
     session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
-    job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
+    job_id = service.jobs.submit("pipeline", session_id, resolve=limits, capturer=service.live.capturer(station))
     return accepted(service, job_id, response)
 
 
@@ -119,14 +124,23 @@ def start_recordings_job(service: Here, recordings_id: HexId, start: JobStart, r
     "/jobs",
     tags=["jobs"],
     dependencies=[READ],
-    responses=answers(401, 422) | {200: {"headers": HEADERS}},
+    responses=answers(401, 404, 422) | {200: {"headers": HEADERS}},
 )
 def list_jobs(
-    service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
+    service: Here,
+    request: Request,
+    response: Response,
+    after: IdCursor = None,
+    limit: Limit = PAGE,
+    session_id: Annotated[str | None, Query(pattern=SESSION_ID, description="only those on this session")] = None,
+    recordings_id: Annotated[str | None, Query(pattern=HEX_ID, description="only those on these recordings")] = None,
 ) -> list[Job]:
-    """Jobs, the newest first, in pages."""
-    found = service.jobs.jobs(after, limit)
-    page_headers(request, response, service.jobs.count_jobs(), limit, [info.id for info in found])
+    """Jobs, the newest first, in pages: all, or those of one session or recording set."""
+    if session_id is not None and recordings_id is not None:
+        raise HTTPException(422, "session_id, recordings_id: a job has one source; leave one out")
+    source = session_id if recordings_id is None else str(service.recordings(recordings_id))
+    found = service.jobs.jobs(after, limit, source)
+    page_headers(request, response, service.jobs.count_jobs(source), limit, [info.id for info in found])
     return [_job(service, info) for info in found]
 
 

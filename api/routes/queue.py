@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
 from concurrent.futures import wait
+from datetime import datetime, timedelta
 from typing import Annotated
 
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter, Depends, Request, Response
 
 from api.errors import Conflict, answers
 from api.keys import Permission, StoredKey
+from api.routes.sessions import check_then, registered, stored_session
 from api.safety import key_of
-from api.schemas import Halt, Halted, HaltedStation, QueuePlace
+from api.schemas import Halt, Halted, HaltedStation, QueueEntry, QueuePlace, SessionStart, StoredSession
 from api.security import Demand
 from api.service import OPERATE, OVER, READ, Here, Service, SessionId
-from lab.capture.queue import QueuedSession, hold_queue, leave_queue, put_into_queue, queue
+from api.then import kept_request
+from lab.capture.catalogue import step_times
+from lab.capture.queue import hold_queue, leave_queue, put_into_queue, queue
+from lab.capture.records import now
 from lab.capture.station import Station
+from lab.capture.store import Store
 from lab.errors import InputError
 
 #: How long (s) a halt waits for the instruments' answers before it says that they haven't come.
@@ -24,24 +31,56 @@ ANSWER_S = 1.5
 router = APIRouter(tags=["sessions"])
 
 
-def _told(service: Service) -> list[QueuedSession]:
-    live = service.live
-    waiting = [one for one in queue(service.store) if live.find(one.id) is None]
-    return [
-        one.model_copy(update={"place": place, "held": service.public.or_none(one.held)})
-        for place, one in enumerate(waiting, start=1)
-    ]
+@functools.lru_cache(maxsize=1024)
+def _duration_s(store: Store, session_id: str, hour: int) -> float:
+    """How long a session that waits will take, learned anew every hour."""
+    times = step_times(store, store.station(session_id))
+    return sum(times.seconds(entry.step)[0] for entry in store.journal(session_id) if entry.finished is None)
+
+
+def _told(service: Service) -> list[QueueEntry]:
+    live, store = service.live, service.store
+    waiting = [one for one in queue(store) if live.find(one.id) is None]
+    at = now()
+    free: dict[str, datetime | None] = {}  # address -> when it is free; None: not known
+    for session in live.running():
+        left_s = session.latest.left_s if session.latest is not None else None
+        until = None if left_s is None else at + timedelta(seconds=left_s)
+        free |= dict.fromkeys(session.station.addresses, until)
+    told = []
+    for place, one in enumerate(waiting, start=1):
+        addresses = store.station(one.id).addresses
+        before = [free.get(address, at) for address in addresses]
+        start = end = None
+        if one.held is None and all(when is not None for when in before):
+            start = max(at, one.not_before or at, *(when for when in before if when is not None))
+            end = start + timedelta(seconds=_duration_s(store, one.id, int(at.timestamp()) // 3600))
+        if one.held is not None or one.not_before is None:  # who comes later on these instruments waits for it
+            free |= dict.fromkeys(addresses, end)
+        request = kept_request(store, one.id)
+        told.append(
+            QueueEntry(
+                **one.model_dump(exclude={"place", "held"}),
+                place=place,
+                held=service.public.or_none(one.held),
+                expected_start=start,
+                expected_end=end,
+                then=request.then.in_words if request is not None and request.then is not None else None,
+                can_copy=request is not None,
+            )
+        )
+    return told
 
 
 @router.get("/queue", dependencies=[READ], responses=answers(401))
-def list_queue(service: Here) -> list[QueuedSession]:
+def list_queue(service: Here) -> list[QueueEntry]:
     """The sessions that wait for their instruments, in their order. `held`: it doesn't start by itself, because the run
     before it on the same instruments ended badly, or because of a halt."""
     return _told(service)
 
 
 @router.put("/sessions/{session_id}/queue", dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422))
-def queue_session(service: Here, session_id: SessionId, asked: QueuePlace) -> list[QueuedSession]:
+def queue_session(service: Here, session_id: SessionId, asked: QueuePlace) -> list[QueueEntry]:
     """Let a session wait for its turn, move one that waits to another place or time, and release one that is held. The
     queue as it is then. 409 for a session that runs or is finished."""
     info = service.session(session_id)
@@ -54,7 +93,7 @@ def queue_session(service: Here, session_id: SessionId, asked: QueuePlace) -> li
 
 
 @router.delete("/sessions/{session_id}/queue", dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422))
-def unqueue_session(service: Here, session_id: SessionId) -> list[QueuedSession]:
+def unqueue_session(service: Here, session_id: SessionId) -> list[QueueEntry]:
     """Take a session out of the queue; it can be resumed by hand. The queue as it is then. 409 for a session that
     doesn't wait."""
     service.session(session_id)
@@ -65,6 +104,33 @@ def unqueue_session(service: Here, session_id: SessionId) -> list[QueuedSession]
     except InputError as error:
         raise Conflict(str(error)) from None
     return _told(service)
+
+
+@router.put("/sessions/{session_id}/request", dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422))
+def change_request(
+    service: Here, request: Request, session_id: SessionId, start: SessionStart, response: Response
+) -> StoredSession:
+    """Change what a session that waits, and never ran, will do: another one with a new id takes its place in the queue.
+    `Location` names it. 409 for a session that doesn't wait, or has run."""
+    info = service.session(session_id)
+    check_then(service, request, start)
+    station = service.station(start.station)
+    start.plan(station).steps(station)  # refused before anything changes
+    waits = next((one for one in queue(service.store) if one.id == session_id), None)
+    if waits is None or service.live.find(session_id) is not None or service.store.runs(session_id):
+        raise Conflict(
+            f"session {session_id} is {service.state(info)}; only one that waits in the queue, and never ran, can be "
+            "changed: copy it"
+        )
+    try:
+        service.store.delete_session(session_id)
+    except InputError as error:
+        raise Conflict(str(error)) from None
+    changed = registered(service, start, station)
+    put_into_queue(service.store, changed, start.not_before, waits.place, waits.held)
+    service.waiting.look_soon()
+    response.headers["Location"] = f"/api/v1/sessions/{changed}"
+    return stored_session(service, changed)
 
 
 def _stations(service: Service) -> dict[str, Station]:

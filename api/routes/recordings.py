@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import re
+from collections import Counter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 
 from api.archives import ARCHIVE, Form, Packed
 from api.errors import answers
+from api.frames import FOR_EVER, Npy, Picture, Stretch, Width, npy_of, picture_of
 from api.kept_sets import sent_set
-from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers, page_of
-from api.schemas import Recordings, SentAs
+from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers, page_of
+from api.preview import Form as PictureForm
+from api.schemas import CaptureCount, CaptureKind, RecordedCapture, Recordings, RecordingsDetail, SentAs
 from api.sending import BODY, arrived
-from api.service import CALIBRATE, READ, Here, HexId
+from api.service import CALIBRATE, READ, Here, HexId, RegistryId, Service
 from api.unpacking import TooMuch
 from api.upload import Foreign
+from lab.calibration.overview import verdict_of
+from lab.capture_kinds.base import Capture
 from lab.errors import InputError
 from lab.formats.importers.import_options import ImportOptions, chart_corners, grid
+from lab.quick_look.frame_figures import FrameFigures
+from sim.camera import Side
 
 router = APIRouter()
 
@@ -110,10 +117,130 @@ def list_recordings(
 
 
 @router.get("/recordings/{recordings_id}", tags=["recordings"], dependencies=[READ], responses=answers(401, 404, 422))
-def get_recordings(service: Here, recordings_id: HexId) -> Recordings:
-    """One recording set."""
+def get_recordings(service: Here, recordings_id: HexId) -> RecordingsDetail:
+    """One recording set, with its captures by kind and its results."""
+    folder = str(service.recordings(recordings_id))
+    found = service.pictures.recordings(recordings_id)
+    counts = Counter((capture.kind, capture.side) for capture in found.captures())
+    results = service.store.newest_results(folder)
+    return RecordingsDetail(
+        **_recordings(recordings_id, service.inbox.manifest(recordings_id)).model_dump(),
+        counts=tuple(CaptureCount(kind=kind, side=side, captures=n) for (kind, side), n in sorted(counts.items())),
+        verdict=verdict_of(service.store, results["diagnose"]) if "diagnose" in results else None,
+        results=results,
+    )
+
+
+# --- captures ---------------------------------------------------------------------------------------------------------
+
+
+def _capture(recordings_id: str, number: int, capture: Capture) -> RecordedCapture:
+    here = f"/api/v1/recordings/{recordings_id}/captures/{number}"
+    document = capture.model_dump(mode="json", exclude_none=True)
+    return RecordedCapture(
+        id=number,
+        name=capture.id,
+        kind=capture.kind,
+        side=capture.side,
+        exposure_s=document.get("exposure_s"),
+        document=document,
+        preview=f"{here}/preview.png",
+        frame=f"{here}/frame.npy",
+    )
+
+
+def _known_capture(service: Service, recordings_id: str, number: int) -> Capture:
     service.recordings(recordings_id)
-    return _recordings(recordings_id, service.inbox.manifest(recordings_id))
+    found = service.pictures.recordings(recordings_id).captures()
+    if number > len(found):
+        raise HTTPException(404, f"recordings {recordings_id}: no capture {number}; they have {len(found)}")
+    return found[number - 1]
+
+
+@router.get(
+    "/recordings/{recordings_id}/captures",
+    tags=["captures"],
+    dependencies=[READ],
+    responses=answers(401, 404, 422) | {200: {"headers": HEADERS}},
+)
+def list_recorded_captures(
+    service: Here,
+    request: Request,
+    response: Response,
+    recordings_id: HexId,
+    kind: Annotated[CaptureKind | None, Query(description="only of this kind")] = None,
+    side: Annotated[Side | None, Query(description="only of this camera")] = None,
+    order: Annotated[Literal["oldest", "newest"], Query(description="the manifest's first, or its last")] = "oldest",
+    after: NumberCursor = None,
+    limit: Limit = PAGE,
+) -> list[RecordedCapture]:
+    """The captures of a recording set, numbered from 1 in the manifest's order, in pages."""
+    service.recordings(recordings_id)
+    every = enumerate(service.pictures.recordings(recordings_id).captures(), start=1)
+    found = [(n, one) for n, one in every if kind in (None, one.kind) and side in (None, one.side)]
+    if order == "newest":
+        found.reverse()
+    page = [(n, one) for n, one in found if after is None or (n < after if order == "newest" else n > after)][:limit]
+    page_headers(request, response, len(found), limit, [str(n) for n, _ in page])
+    return [_capture(recordings_id, n, one) for n, one in page]
+
+
+@router.get(
+    "/recordings/{recordings_id}/captures/{number}",
+    tags=["captures"],
+    dependencies=[READ],
+    responses=answers(401, 404, 422),
+)
+def get_recorded_capture(service: Here, recordings_id: HexId, number: RegistryId) -> RecordedCapture:
+    """One capture of a recording set."""
+    return _capture(recordings_id, number, _known_capture(service, recordings_id, number))
+
+
+@router.get(
+    "/recordings/{recordings_id}/captures/{number}/preview.{picture}",
+    tags=["captures"],
+    dependencies=[READ],
+    response_class=Picture,
+    responses=answers(401, 404, 422) | {200: {"content": {"image/webp": {}}}},
+)
+def preview_recorded_capture(
+    service: Here,
+    request: Request,
+    recordings_id: HexId,
+    number: RegistryId,
+    picture: PictureForm,
+    width: Width = 480,
+    stretch: Stretch = False,
+) -> Response:
+    """A small picture, as of a session's capture."""
+    _known_capture(service, recordings_id, number)
+    return picture_of(service, request, recordings_id, number, picture, width, stretch)
+
+
+@router.get(
+    "/recordings/{recordings_id}/captures/{number}/frame.npy",
+    tags=["captures"],
+    dependencies=[READ],
+    response_class=Npy,
+    responses=answers(401, 404, 422),
+)
+def recorded_frame(service: Here, recordings_id: HexId, number: RegistryId) -> Response:
+    """The raw frame as .npy: uint16 (rows, cols)."""
+    _known_capture(service, recordings_id, number)
+    return npy_of(service, recordings_id, number)
+
+
+@router.get(
+    "/recordings/{recordings_id}/captures/{number}/figures",
+    tags=["captures"],
+    dependencies=[READ],
+    responses=answers(401, 404, 422),
+)
+def recorded_figures(service: Here, recordings_id: HexId, number: RegistryId, response: Response) -> FrameFigures:
+    """Histogram, mean and share of saturated pixels of each channel of the frame."""
+    _known_capture(service, recordings_id, number)
+    response.headers.update(FOR_EVER)
+    return service.pictures.figures(recordings_id, number)
 
 
 @router.get(

@@ -14,33 +14,40 @@ from sse_starlette.sse import EventSourceResponse
 from api.archives import ARCHIVE, Form, Packed
 from api.errors import answers, known
 from api.events import described, event, stream, watched
+from api.frames import FOR_EVER, Npy, Picture, Stretch, Width, npy_of, picture_of
 from api.kept_sets import session_set
+from api.keys import Permission
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers
 from api.preview import Form as PictureForm
 from api.schemas import (
     CaptureCount,
     CaptureKind,
+    ListedSession,
     SessionDetail,
     SessionResume,
     SessionStart,
+    SessionWords,
     StationState,
     StoredCapture,
     StoredSession,
 )
+from api.security import Demand
 from api.service import ADMIN, OPERATE, OVER, READ, Here, RegistryId, Service, SessionId, missing_session
-from lab.capture.durable_files import npy_bytes
+from api.then import check_webhook, keep_request, kept_request, then_of
+from lab.calibration.overview import SessionOverview, overviews, sessions_of_verdict, tags_of
 from lab.capture.plan import full_plan
 from lab.capture.queue import put_into_queue
 from lab.capture.records import CaptureInfo, SessionInfo
 from lab.capture.session import CaptureSession, Progress
+from lab.capture.station import Station
 from lab.errors import InputError
+from lab.formats.results.diagnosis import DiagnosisVerdict
 from lab.quick_look.curves import Curves
 from lab.quick_look.frame_figures import FrameFigures
+from lab.resolve import read_journal
 from sim.camera import Side
 
 router = APIRouter()
-#: A capture never changes, and its path has its session's random id in it.
-FOR_EVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 
 
 # --- stations ---------------------------------------------------------------------------------------------------------
@@ -81,7 +88,45 @@ def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     return fields | {"error": None if runs else service.public.or_none(info.error)}
 
 
-def _session(service: Service, session_id: str) -> StoredSession:
+def _listed(service: Service, info: SessionInfo, told: dict[str, SessionOverview]) -> dict[str, Any]:
+    overview = told.get(info.id, SessionOverview())  # it was deleted meanwhile
+    return _fields(service, info) | overview.model_dump() | {"tags": tags_of(info.notes)}
+
+
+def check_then(service: Service, request: Request, start: SessionStart) -> None:
+    """Raises 403 for a key that may not ask for what follows a session, and 422 for a webhook on a foreign host."""
+    if start.then is not None:
+        Demand(Permission.ADMIN)(request, None, None)
+        check_webhook(start.then.webhook, service.then.hosts)
+
+
+def registered(service: Service, start: SessionStart, station: Station) -> str:
+    """Register a session that doesn't run yet; its id. Raises InputError where the station can't take it."""
+    session = CaptureSession.start(
+        service.store,
+        station,
+        start.plan(station),
+        name=start.name,
+        notes=start.notes,
+        demands_certified=start.demands_certified,
+    )
+    keep_request(service.store, session.id, start)
+    return session.id
+
+
+@router.get("/sessions/{session_id}/request", tags=["sessions"], dependencies=[READ], responses=answers(401, 404, 422))
+def session_request(service: Here, session_id: SessionId) -> SessionStart:
+    """What a session was asked to start with, as `POST /sessions` takes it: to be copied, or edited while it waits. 404
+    where it wasn't started by a service."""
+    service.session(session_id)
+    found = kept_request(service.store, session_id)
+    if found is None:
+        raise HTTPException(404, f"session {session_id}: what it was asked with isn't kept; start one by hand")
+    return found
+
+
+def stored_session(service: Service, session_id: str) -> StoredSession:
+    """A session as most routes answer it."""
     return StoredSession(**_fields(service, service.session(session_id)))
 
 
@@ -92,12 +137,30 @@ def _session(service: Service, session_id: str) -> StoredSession:
     responses=answers(401, 422) | {200: {"headers": HEADERS}},
 )
 def list_sessions(
-    service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
-) -> list[StoredSession]:
-    """Sessions, newest first, in pages."""
-    found = service.store.sessions(after, limit)
-    page_headers(request, response, service.store.count_sessions(), limit, [info.id for info in found])
-    return [StoredSession(**_fields(service, info)) for info in found]
+    service: Here,
+    request: Request,
+    response: Response,
+    after: IdCursor = None,
+    limit: Limit = PAGE,
+    search: Annotated[
+        str,
+        Query(
+            max_length=200,
+            description="only those with each of these words in id, name, notes, the station's name or what their "
+            "instruments reported",
+        ),
+    ] = "",
+    verdict: Annotated[
+        DiagnosisVerdict | None, Query(description="only those whose newest diagnosis said this")
+    ] = None,
+) -> list[ListedSession]:
+    """Sessions, newest first, in pages: all, or those that are searched for."""
+    only = None if verdict is None else sessions_of_verdict(service.store, verdict)
+    found = service.store.sessions(after, limit, search=search, only=only)
+    total = service.store.count_sessions(search=search, only=only)
+    page_headers(request, response, total, limit, [info.id for info in found])
+    told = overviews(service.store, [info.id for info in found])
+    return [ListedSession(**_listed(service, info, told)) for info in found]
 
 
 @router.post(
@@ -107,26 +170,22 @@ def list_sessions(
     dependencies=[OPERATE],
     responses=answers(401, 403, 404, 409, 422),
 )
-def start_session(service: Here, start: SessionStart, response: Response) -> StoredSession:
+def start_session(service: Here, request: Request, start: SessionStart, response: Response) -> StoredSession:
     """Start a session, which runs in the background. 409 while another session runs on the same instruments; with
-    `queue` it waits for its turn instead."""
+    `queue` it waits for its turn instead. With `then` it is analysed when it has finished, and the key's scope has to
+    be `admin`."""
+    check_then(service, request, start)
     station = service.station(start.station)
-    plan = start.plan(station)
     if start.queue:
-        session_id = CaptureSession.start(
-            service.store,
-            station,
-            plan,
-            name=start.name,
-            notes=start.notes,
-            demands_certified=start.demands_certified,
-        ).id
+        session_id = registered(service, start, station)
         put_into_queue(service.store, session_id, start.not_before)
         service.waiting.look_soon()
     else:
+        plan = start.plan(station)
         session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
+        keep_request(service.store, session_id, start)
     response.headers["Location"] = f"/api/v1/sessions/{session_id}"
-    return _session(service, session_id)
+    return stored_session(service, session_id)
 
 
 @router.get("/sessions/{session_id}", tags=["sessions"], dependencies=[READ], responses=answers(401, 404, 422))
@@ -134,8 +193,9 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     """One session, with its provenance."""
     found = known(missing_session(session_id), lambda: service.store.details(session_id))
     return SessionDetail(
-        **_fields(service, found.info),
-        station=found.station,
+        **_listed(service, found.info, overviews(service.store, [session_id])),
+        can_copy=kept_request(service.store, session_id) is not None,
+        then=then_of(service.store, session_id),
         progress=service.progress(session_id) if found.info.closed is None else None,
         runs=service.public_runs(found.runs),
         captures=tuple(
@@ -143,7 +203,21 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
         ),
         results=service.store.newest_results(session_id),
+        resolving=read_journal(service.store, session_id),
     )
+
+
+@router.patch(
+    "/sessions/{session_id}",
+    tags=["sessions"],
+    dependencies=[OPERATE],
+    responses=answers(401, 403, 404, 422),
+)
+def describe_session(service: Here, session_id: SessionId, asked: SessionWords) -> StoredSession:
+    """Give a session another name or other notes, also while it runs."""
+    service.session(session_id)
+    service.store.describe_session(session_id, asked.name, asked.notes)
+    return stored_session(service, session_id)
 
 
 @router.delete(
@@ -183,7 +257,7 @@ def pause_session(service: Here, session_id: SessionId) -> StoredSession:
     """Pause at the end of the present step. The shutter closes, the screen goes dark."""
     service.session(session_id)
     service.live.pause(session_id)
-    return _session(service, session_id)
+    return stored_session(service, session_id)
 
 
 @router.post(
@@ -197,7 +271,7 @@ def resume_session(service: Here, session_id: SessionId, resume: SessionResume |
     """Continue after a pause, or continue a session that ended early. Finished steps aren't taken again."""
     service.session(session_id)
     service.live.resume(session_id, service.station(resume.station) if resume and resume.station else None)
-    return _session(service, session_id)
+    return stored_session(service, session_id)
 
 
 @router.post(
@@ -211,12 +285,12 @@ def abort_session(service: Here, session_id: SessionId) -> StoredSession:
     """End the run now. The present step is dropped, finished steps are kept, and the session can be resumed."""
     service.session(session_id)
     service.live.abort(session_id, "aborted over the network")
-    return _session(service, session_id)
+    return stored_session(service, session_id)
 
 
 async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> AsyncIterator[ServerSentEvent]:
     def look() -> StoredSession:
-        return _session(service, session_id)
+        return stored_session(service, session_id)
 
     seen = None
     live = service.live.find(session_id)
@@ -318,14 +392,6 @@ def get_capture(service: Here, session_id: SessionId, capture_id: RegistryId) ->
     return _capture(_known_capture(service, session_id, capture_id))
 
 
-class Picture(Response):
-    media_type = "image/png"
-
-
-class Npy(Response):
-    media_type = "application/x-npy"
-
-
 @router.get(
     "/sessions/{session_id}/captures/{capture_id}/preview.{picture}",
     tags=["captures"],
@@ -339,18 +405,13 @@ def preview_capture(
     session_id: SessionId,
     capture_id: RegistryId,
     picture: PictureForm,
-    width: Annotated[int, Query(ge=16, le=4096, description="px, at most")] = 480,
-    stretch: Annotated[bool, Query(description="white is the frame's own brightest, not the data sheet's")] = False,
+    width: Width = 480,
+    stretch: Stretch = False,
 ) -> Response:
     """A small picture, .png or .webp (a tenth of its bytes): black subtracted, one value per colour and mosaic cell,
     gamma-encoded, without white balance."""
     info = _known_capture(service, session_id, capture_id)
-    tag = f'"{session_id}-{capture_id}-{width}-{int(stretch)}-{picture}"'
-    headers = FOR_EVER | {"ETag": tag}
-    if request.headers.get("if-none-match") == tag:
-        return Response(status_code=304, headers=headers)
-    content = service.pictures.picture(session_id, info.id, width, stretch, picture)
-    return Picture(content, headers=headers, media_type=f"image/{picture}")
+    return picture_of(service, request, session_id, info.id, picture, width, stretch)
 
 
 @router.get(
@@ -363,8 +424,7 @@ def preview_capture(
 def capture_frame(service: Here, session_id: SessionId, capture_id: RegistryId) -> Response:
     """The raw frame as .npy: uint16 (rows, cols), checked against its SHA-256."""
     info = _known_capture(service, session_id, capture_id)
-    headers = FOR_EVER | {"Content-Disposition": f'attachment; filename="capture-{info.id}.npy"'}
-    return Npy(npy_bytes(service.store.frame(info.id)), headers=headers)
+    return npy_of(service, session_id, info.id)
 
 
 @router.get(

@@ -123,9 +123,23 @@ def check_device(
     another check, has the station's instruments."""
     station = service.station(name)
     _device(service, name, station, device)
-    service.checks.start(name, station, device, check is not None and check.transcript)
+    service.checks.start(name, station, [device], check is not None and check.transcript)
     response.headers["Location"] = f"/api/v1/stations/{name}/devices/{device}"
     return _device(service, name, station, device)
+
+
+@router.post(
+    "/stations/{name}/check", status_code=202, dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422)
+)
+def check_station(
+    service: Here, name: StationName, response: Response, check: DeviceCheck | None = None
+) -> list[DeviceState]:
+    """Let every device of a station work once, one after the other, as before a night: `Location` says where to look.
+    409 while a session, or another check, has the station's instruments."""
+    station = service.station(name)
+    service.checks.start(name, station, list(station.devices), check is not None and check.transcript)
+    response.headers["Location"] = f"/api/v1/stations/{name}/devices"
+    return [_device(service, name, station, device) for device in station.devices]
 
 
 @router.get(

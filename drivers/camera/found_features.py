@@ -31,6 +31,10 @@ class RememberedFeatures:
                 self._found.note(place, before)
         self._features.set(name, value)
 
+    def note(self, name: str, value: Setting) -> None:
+        """Keep what a feature was, where it was changed by other means."""
+        self._found.note(name, value)
+
     def entries(self, name: str) -> Collection[str]:
         return self._features.entries(name)
 
@@ -39,6 +43,11 @@ class RememberedFeatures:
 
     def execute(self, name: str) -> None:
         self._features.execute(name)
+
+    @property
+    def found(self) -> dict[str, Setting]:
+        """What was changed, by its place, as it was found."""
+        return self._found.values
 
     def restore(self) -> None:
         """Set all as it was found, what was changed last first. What the camera refuses is tried once more when the

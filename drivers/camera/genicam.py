@@ -206,6 +206,10 @@ class GenicamCamera(StreamingCamera):
         with self._used() as features:
             return snapshot(features)
 
+    def found(self) -> dict[str, Setting]:
+        with self._lock:
+            return {} if self._features is None else self._features.found
+
     def departures(self) -> tuple[str, ...]:
         with self._used():
             return tuple(f"{told}: its codes aren't the converter's" for told in self._departures)

@@ -14,7 +14,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,9 +23,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from drivers.camera.buffers import Grabbed
+from drivers.camera.genapi import GenApiFeatures, said
 from drivers.camera.genicam import GenicamCamera
 from drivers.errors import Disconnected, InstrumentError, InUse
-from drivers.instrument import Identity, Setting
+from drivers.instrument import Identity
 
 _T = TypeVar("_T")
 _logger = logging.getLogger(__name__)  # the library tells here what it also raises
@@ -45,51 +46,6 @@ def _library() -> Any:
             "GenTL cameras: harvesters isn't installed; install calibench with its extra gentl"
         ) from error
     return core
-
-
-def _said(error: Exception) -> str:
-    """What the library says, without its numbers and the place in its sources."""
-    said = str(error).removeprefix("GenTL exception: ").split(" : ")[0].split(" (Message from the source")[0]
-    return " ".join(said.split())
-
-
-class _Nodes:
-    """A camera's features through GenICam's reference GenApi."""
-
-    def __init__(self, nodes: Any, who: str) -> None:
-        from genicam import genapi, gentl
-
-        self._nodes, self._who, self._genapi, self._gentl = nodes, who, genapi, gentl
-
-    def _do(self, name: str, action: Callable[[Any], _T]) -> _T:
-        try:
-            return action(self._nodes.get_node(name))
-        except self._gentl.GenericException as error:
-            raise Disconnected(
-                f"{self._who}: feature {name}: {_said(error)}; plug it in again, the next call reconnects"
-            ) from error
-        except self._genapi.GenericException as error:
-            raise InstrumentError(
-                f"{self._who}: feature {name}: {_said(error)}; check that the camera is there and has it"
-            ) from error
-
-    def has(self, name: str) -> bool:
-        return bool(self._nodes.has_node(name)) and self._do(name, lambda node: bool(self._genapi.is_available(node)))
-
-    def get(self, name: str) -> Setting:
-        return self._do(name, lambda node: node.value)
-
-    def set(self, name: str, value: Setting) -> None:
-        self._do(name, lambda node: setattr(node, "value", value))
-
-    def entries(self, name: str) -> Collection[str]:
-        return self._do(name, lambda node: tuple(node.symbolics))
-
-    def limits(self, name: str) -> tuple[float, float]:
-        return self._do(name, lambda node: (float(node.min), float(node.max)))
-
-    def execute(self, name: str) -> None:
-        self._do(name, lambda node: node.execute())
 
 
 class _Producer:
@@ -240,7 +196,7 @@ class GentlCamera(GenicamCamera):
         for producer in _producers(None):
             yield from producer.cameras()
 
-    def _open(self) -> tuple[_Nodes, Identity]:
+    def _open(self) -> tuple[GenApiFeatures, Identity]:
         core = _library()
         if self._description is not None:
             try:
@@ -266,7 +222,7 @@ class GentlCamera(GenicamCamera):
         note = core.Callback()
         note.emit = self._note_incomplete
         self._acquirer.add_callback(self._acquirer.Events.INCOMPLETE_BUFFER, note)
-        nodes = _Nodes(self._acquirer.remote_device.node_map, f"camera {self.address}")
+        nodes = GenApiFeatures(self._acquirer.remote_device.node_map, f"camera {self.address}")
         told = self._acquirer.device
         versions = (name for name in ("DeviceFirmwareVersion", "DeviceVersion") if nodes.has(name))
         firmware = next((str(nodes.get(name)) for name in versions), "")
@@ -286,7 +242,7 @@ class GentlCamera(GenicamCamera):
             ) from error
         except (gentl.GenericException, genapi.GenericException) as error:
             raise Disconnected(
-                f"camera {self.address}: can't be opened ({_said(error)}); plug it in again, and close other programs "
+                f"camera {self.address}: can't be opened ({said(error)}); plug it in again, and close other programs "
                 "that use it"
             ) from error
 
@@ -345,7 +301,7 @@ class GentlCamera(GenicamCamera):
             return action()
         except (gentl.GenericException, genapi.GenericException) as error:
             raise Disconnected(
-                f"{self._who}: {doing} failed ({_said(error)}); plug it in again, the next call reconnects"
+                f"{self._who}: {doing} failed ({said(error)}); plug it in again, the next call reconnects"
             ) from error
 
     def _release(self) -> None:

@@ -15,6 +15,7 @@ import threading
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ _LOOK_S = 0.05
 
 
 @dataclass(frozen=True)
-class _Raw:
+class RawPicture:
     """What a raw file holds."""
 
     raw: NDArray[np.uint16]
@@ -85,7 +86,7 @@ class RawFolderCamera(Camera):
         self._who = f"camera folder {address}"
         self._lock = threading.RLock()
         self._stopped = threading.Event()
-        self._sample: _Raw | None = None
+        self._sample: RawPicture | None = None
         self._exposure_s: float | None = None
         self._gain_db = 0.0
         self._seen: frozenset[Path] | None = None
@@ -100,7 +101,8 @@ class RawFolderCamera(Camera):
                     f"{self._who}: no raw file in it; take one picture with the camera, so that its size and colour "
                     "filters are known"
                 )
-            self._sample = self._read(max(files, key=lambda file: file.stat().st_mtime))
+            latest = max(files, key=lambda file: file.stat().st_mtime)
+            self._sample = read_raw(latest, latest.name, self._who)
 
     def identity(self) -> Identity:
         with self._lock:
@@ -152,7 +154,7 @@ class RawFolderCamera(Camera):
             seen, self._seen = self._seen, None
             file = self._await_file(seen, self._exposure_s)
             self._record("received", file.name.encode())
-            found, sample = self._read(file), self._ready()
+            found, sample = read_raw(file, file.name, self._who), self._ready()
             if found.raw.shape != sample.raw.shape or found.cfa != sample.cfa:
                 raise Garbled(
                     f"{self._who}: {file.name} has {found.raw.shape} pixels of {found.cfa}, the files before had "
@@ -185,7 +187,7 @@ class RawFolderCamera(Camera):
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
-    def _ready(self) -> _Raw:
+    def _ready(self) -> RawPicture:
         if self._sample is None:
             self.connect()
         self._files()
@@ -248,21 +250,23 @@ class RawFolderCamera(Camera):
             if self._stopped.wait(_LOOK_S):
                 raise Interrupted(f"{self._who}: stopped while waiting for a file; start again")
 
-    def _read(self, file: Path) -> _Raw:
-        import rawpy
 
-        try:
-            with rawpy.imread(str(file)) as raw:
-                codes = np.array(raw.raw_image_visible, np.uint16)
-                names = raw.color_desc.decode("ascii")
-                if codes.ndim != 2:
-                    raise Garbled(f"{self._who}: {file.name} isn't one code a pixel; let the camera write raw files")
-                cfa = "MONO" if raw.raw_pattern is None else "".join(names[k] for k in np.ravel(raw.raw_pattern))
-                black = float(np.mean(raw.black_level_per_channel))
-                bits = max(int(raw.white_level).bit_length(), int(codes.max(initial=0)).bit_length())
-                return _Raw(codes, cfa, bits, black, float(raw.other.shutter_speed), float(raw.other.iso_speed))
-        except (rawpy.LibRawError, OSError, ValueError, TypeError) as error:
-            raise Garbled(
-                f"{self._who}: {file.name} can't be read ({' '.join(str(error).split())}); let the camera write raw "
-                "files, complete ones"
-            ) from error
+def read_raw(source: Path | BytesIO, name: str, who: str) -> RawPicture:
+    """What a raw file holds. Raises `Garbled` for one that LibRaw can't read. `name`: the file's in messages."""
+    import rawpy
+
+    try:
+        with rawpy.imread(str(source) if isinstance(source, Path) else source) as raw:
+            codes = np.array(raw.raw_image_visible, np.uint16)
+            names = raw.color_desc.decode("ascii")
+            if codes.ndim != 2:
+                raise Garbled(f"{who}: {name} isn't one code a pixel; let the camera write raw files")
+            cfa = "MONO" if raw.raw_pattern is None else "".join(names[k] for k in np.ravel(raw.raw_pattern))
+            black = float(np.mean(raw.black_level_per_channel))
+            bits = max(int(raw.white_level).bit_length(), int(codes.max(initial=0)).bit_length())
+            return RawPicture(codes, cfa, bits, black, float(raw.other.shutter_speed), float(raw.other.iso_speed))
+    except (rawpy.LibRawError, OSError, ValueError, TypeError) as error:
+        raise Garbled(
+            f"{who}: {name} can't be read ({' '.join(str(error).split())}); let the camera write raw files, complete "
+            "ones"
+        ) from error

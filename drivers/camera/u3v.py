@@ -18,7 +18,7 @@ import usb.core
 import usb.util
 
 from drivers.camera.buffers import Grabbed
-from drivers.camera.genapi import NodeMap
+from drivers.camera.genapi import GenApiFeatures
 from drivers.camera.gencp import (
     ABRM_DEVICE_VERSION,
     ABRM_MANUFACTURER,
@@ -95,7 +95,7 @@ class U3vCamera(GenicamCamera):
     """
 
     _records_bytes = True
-    nodes: NodeMap
+    nodes: GenApiFeatures
     _control: GenCp
 
     def __init__(self, address: str, *, device: usb.core.Device | None = None, **settings: Any) -> None:
@@ -106,7 +106,7 @@ class U3vCamera(GenicamCamera):
 
     # --- connection ---------------------------------------------------------------------------------------------------
 
-    def _open(self) -> tuple[NodeMap, Identity]:
+    def _open(self) -> tuple[GenApiFeatures, Identity]:
         """Find the camera, read its registers and XML."""
         try:
             self._device = self._given if self._given is not None else open_device(self.address)
@@ -127,7 +127,7 @@ class U3vCamera(GenicamCamera):
             serial_number=control.text(ABRM_SERIAL),
             firmware=control.text(ABRM_DEVICE_VERSION),
         )
-        self.nodes = NodeMap(read_xml(control, self._who), control)
+        self.nodes = GenApiFeatures.of_xml(read_xml(control, self._who), control, self._who)
         self._stop_streaming()
         return self.nodes, identity
 

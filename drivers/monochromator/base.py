@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers.errors import InstrumentError
-from drivers.instrument import Instrument
+from drivers.instrument import Instrument, Setting
 
 #: How often the shutter is told to close, and asked whether it is, before that is given up.
 SHUT_ATTEMPTS = 2
@@ -116,6 +116,9 @@ class Monochromator(Instrument):
         and `stop` follow in any case. Raises `InstrumentError` where it isn't reached.
         """
         return False
+
+    def settings(self) -> dict[str, Setting]:
+        return {"bandwidth_nm": self.bandwidth_nm(), "filter_place": self.selected_filter()}
 
     @abstractmethod
     def move_nm(self, wavelength_nm: float) -> None:

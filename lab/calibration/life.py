@@ -9,16 +9,18 @@ a later one of the same cameras is certified, and **expired** when its time is o
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
+from fnmatch import fnmatchcase
 from typing import Any, Literal
 
 import numpy as np
 import sqlalchemy as sa
-from scipy import special
+from scipy import special, stats
 
 from lab.calibration.figures import Figure, figures_of
-from lab.calibration.limits import CalibrationLimits, Judgement, Limit, Mark, judged
+from lab.calibration.limits import COVERAGE_FACTOR, CalibrationLimits, Judgement, Limit, Mark, judged
 from lab.capture.records import RunRecord, now
 from lab.capture.station import Station
 from lab.capture.store import Store
@@ -26,6 +28,7 @@ from lab.capture.tables import CalibrationRow, FigureRow, ResultRow, SessionRow
 from lab.errors import InputError
 from lab.fit.compare import FALSE_ALARM_RATE, Numbers, sidak_part, sigma_of_probability
 from lab.fit.noise.dark_current import SensorTemperature
+from lab.formats.recording_set import InstrumentSnapshot, Snapshots, differences
 from lab.formats.results import FitResult
 from lab.formats.results.figure_names import plain_name
 from sim.camera import Side
@@ -33,7 +36,7 @@ from sim.parameters import Frozen
 
 #: Fits that are entered as calibrations in one transaction.
 TOGETHER = 100
-CalibrationState = Literal["candidate", "certified", "superseded", "expired"]
+CalibrationState = Literal["candidate", "certified", "superseded", "expired", "revoked"]
 
 
 class CalibrationRecord(Frozen):
@@ -50,6 +53,9 @@ class CalibrationRecord(Frozen):
     expires: datetime | None = None
     superseded: datetime | None = None
     superseded_by: str | None = None
+    revoked: datetime | None = None
+    revoked_by: str | None = None
+    revoked_why: str | None = None
     limits: CalibrationLimits | None = None
     judgements: tuple[Judgement, ...] = ()
 
@@ -86,16 +92,61 @@ class History(Frozen):
     points: tuple[HistoryPoint, ...]
 
 
+class BoardColumn(Frozen):
+    """A calibration on the board."""
+
+    calibration_id: str
+    session_id: str
+    name: str
+    created: datetime
+    state: CalibrationState
+
+
+class BoardCell(Frozen):
+    """A figure in one calibration: `corrected` to the row's reference temperature or as it was measured; `mark`,
+    `significance_sigma` and `drifted` as in a history."""
+
+    value: float
+    std: float
+    corrected: bool
+    mark: Mark | None
+    significance_sigma: float | None
+    drifted: bool
+
+
+class BoardRow(Frozen):
+    """A figure over the board's calibrations; a cell is None where one doesn't have it. `reference_c`: the temperature
+    to which its values are corrected, by the `law`; None where no law is known."""
+
+    figure: str
+    place: str
+    title: str
+    unit: str
+    limit: Limit | None
+    reference_c: float | None = None
+    law: str = ""
+    cells: tuple[BoardCell | None, ...]
+
+
+class DriftBoard(Frozen):
+    """All figures of a camera by its newest calibrations, the oldest first."""
+
+    camera: str
+    false_alarm_rate: float
+    columns: tuple[BoardColumn, ...]
+    rows: tuple[BoardRow, ...]
+
+
 # --- cameras ----------------------------------------------------------------------------------------------------------
 
 
-def cameras_of(instruments: Mapping[str, Mapping[str, str]], station: Station) -> dict[Side, str]:
+def cameras_of(instruments: Snapshots, station: Station) -> dict[Side, str]:
     """Name of each camera of a run: maker, model and serial number as it reports them. Without a serial number it is
     known by its station and side."""
     found: dict[Side, str] = {}
     for side in station.sides:
-        identity = instruments.get(f"camera {side}", {})
-        parts = [identity.get(key, "") for key in ("maker", "model", "serial_number")]
+        one = instruments.get(f"camera {side}", InstrumentSnapshot())
+        parts = [one.maker, one.model, one.serial_number]
         where = [] if parts[2] else [f"({side} of {station.name or 'a station'})"]
         found[side] = " ".join([part for part in parts if part] + where)
     return found
@@ -106,25 +157,51 @@ def rig_of(cameras: Mapping[Side, str]) -> str:
     return json.dumps(dict(sorted(cameras.items())))
 
 
-def check_certified(store: Store, cameras: Mapping[Side, str]) -> None:
-    """Raises InputError unless the rig of these cameras has a certified calibration that isn't expired."""
+def check_certified(store: Store, instruments: Snapshots, station: Station) -> None:
+    """Raises InputError unless the rig of these cameras has a certified calibration that isn't expired, of which they
+    have the settings."""
     register(store)
+    cameras = cameras_of(instruments, station)
+    asked = _asked().order_by(CalibrationRow.created.desc())
     with store.reading() as db:
-        asked = _asked().where(CalibrationRow.rig == rig_of(cameras)).order_by(CalibrationRow.created.desc())
-        found = [_calibration(row, name) for row, name in db.execute(asked)]
-    if any(one.state == "certified" for one in found):
-        return
+        of_rig = db.execute(asked.where(CalibrationRow.rig == rig_of(cameras)))
+        found = [_calibration(row, name) for row, name in of_rig]
+        others = [_calibration(row, name) for row, name in ([] if found else db.execute(asked))]
+    for one in found:
+        if one.state == "certified":
+            _check_settings(store, one, instruments, cameras)
+            return
     expired = [one for one in found if one.state == "expired"]
     why = (
         f"its certified calibration {expired[0].id} expired on {expired[0].expires:%Y-%m-%d}"
         if expired and expired[0].expires
         else f"{len(found)} calibrations of it are known, none is certified"
     )
+    for other in [one for one in others if one.state == "certified" and one.cameras.keys() == cameras.keys()][:1]:
+        changed = [
+            f"{side} was {was}, is {cameras[side]}" for side, was in other.cameras.items() if was != cameras[side]
+        ]
+        why += f" (the newest certified one, {other.id}, is of other cameras: {'; '.join(changed)})"
     raise InputError(
         f"cameras {', '.join(cameras.values())}: the session demands a certified calibration, and {why}; certify one "
         "with "
         "`calibench calibrations certify ID`, or start without --certified"
     )
+
+
+def _check_settings(
+    store: Store, certified: CalibrationRecord, instruments: Snapshots, cameras: Mapping[Side, str]
+) -> None:
+    """Raises InputError where a camera is set otherwise than when the calibration was captured."""
+    if not store.has_session(certified.session_id) or not (runs := store.runs(certified.session_id)):
+        return
+    names = [f"camera {side}" for side in cameras]
+    then, now = ({name: of[name] for name in names if name in of} for of in (runs[-1].instruments, instruments))
+    if changed := differences(then, now):
+        raise InputError(
+            f"{'; '.join(changed)}: so the certified calibration {certified.id}, which the session demands, isn't of "
+            "these cameras as they are; set them as they were, or start without --certified and certify a new one"
+        )
 
 
 def check_nothing_rests_on(store: Store, session_id: str) -> None:
@@ -213,6 +290,8 @@ def _aware(at: datetime | None) -> datetime | None:
 def _state(row: Any, at: datetime) -> CalibrationState:
     if row.certified is None:
         return "candidate"
+    if row.revoked is not None:
+        return "revoked"
     if row.superseded is not None:
         return "superseded"
     expires = _aware(row.expires)
@@ -232,6 +311,9 @@ def _calibration(row: CalibrationRow, name: str) -> CalibrationRecord:
         expires=_aware(row.expires),
         superseded=_aware(row.superseded),
         superseded_by=row.superseded_by,
+        revoked=_aware(row.revoked),
+        revoked_by=row.revoked_by,
+        revoked_why=row.revoked_why,
         limits=None if row.limits is None else CalibrationLimits.model_validate(row.limits),
         judgements=tuple(Judgement.model_validate(one) for one in row.judgements or ()),
     )
@@ -338,6 +420,21 @@ def certify(
     return calibration(store, wanted.id)
 
 
+def revoke(store: Store, id: str, by: str, why: str) -> CalibrationRecord:
+    """Take a certificate back, with the reason; the calibration stays, and isn't certified again.
+
+    What it had superseded stays superseded. Raises InputError where it isn't certified, or was revoked already.
+    """
+    wanted = calibration(store, id)
+    with store.transaction() as db:
+        row = db.get_one(CalibrationRow, wanted.id, with_for_update=True)
+        if row.certified is None or row.revoked is not None or row.superseded is not None:
+            state = _state(row, now())
+            raise InputError(f"calibration {wanted.id}: is {state}; only what is certified, or has expired, is revoked")
+        row.revoked, row.revoked_by, row.revoked_why = now(), by[:100], why
+    return calibration(store, wanted.id)
+
+
 def _refusal(id: str, one: Judgement) -> str:
     where = " ".join(part for part in (one.side, one.figure, one.place) if part)
     if one.value is None:
@@ -354,6 +451,15 @@ def _refusal(id: str, one: Judgement) -> str:
         )
     )
 
+
+#: What a row of a history has of its calibration.
+_LIFE = (
+    CalibrationRow.created,
+    CalibrationRow.certified,
+    CalibrationRow.superseded,
+    CalibrationRow.expires,
+    CalibrationRow.revoked,
+)
 
 # --- history ----------------------------------------------------------------------------------------------------------
 
@@ -376,12 +482,13 @@ def history(
     isn't known."""
     register(store)
     of_figure = (FigureRow.camera == camera, FigureRow.name == figure, FigureRow.place == place)
-    life = (CalibrationRow.created, CalibrationRow.certified, CalibrationRow.superseded, CalibrationRow.expires)
-    columns = (*FigureRow.__table__.columns, CalibrationRow.session_id, *life)
+    columns = (*FigureRow.__table__.columns, CalibrationRow.session_id, *_LIFE)
     asked = sa.select(*columns).join(CalibrationRow, CalibrationRow.id == FigureRow.calibration_id)
     asked = asked.where(*of_figure).order_by(CalibrationRow.created, CalibrationRow.id)
     certificates = sa.select(CalibrationRow.limits).join(FigureRow, CalibrationRow.id == FigureRow.calibration_id)
-    certificates = certificates.where(*of_figure, CalibrationRow.certified.is_not(None))
+    certificates = certificates.where(
+        *of_figure, CalibrationRow.certified.is_not(None), CalibrationRow.revoked.is_(None)
+    )
     with store.reading() as db:
         rows = _once_a_session(db.execute(asked).all())
         stated = None if limits else db.scalars(certificates.order_by(CalibrationRow.certified.desc()).limit(1)).first()
@@ -438,7 +545,7 @@ def _points(rows: Sequence[Any], limit: Limit | None, threshold_sigma: float) ->
             significance_sigma=significance,
             drifted=significance is not None and significance > threshold_sigma,
         )
-        if reference is None or row.certified is not None:
+        if reference is None or (row.certified is not None and row.revoked is None):
             reference = row
 
 
@@ -453,3 +560,204 @@ def _significance(a: Figure, b: Figure) -> float:
     if std[0] == 0.0:
         return 0.0 if difference == 0.0 else sigma_of_probability(0.0)
     return sigma_of_probability(2.0 * float(special.ndtr(-abs(difference) / std[0])))
+
+
+# --- the drift board --------------------------------------------------------------------------------------------------
+
+#: Calibrations that a board shows, the newest, unless it is told.
+BOARD_COLUMNS = 20
+
+
+def drift_board(
+    store: Store,
+    camera: str,
+    limits: CalibrationLimits | None = None,
+    *,
+    reference_c: float | None = None,
+    newest: int = BOARD_COLUMNS,
+    false_alarm_rate: float = FALSE_ALARM_RATE,
+) -> DriftBoard:
+    """All figures of a camera by its `newest` calibrations, one of each session, and the one that is certified.
+
+    A cell is judged and compared as in `history`. Dark currents are shown at `reference_c` (deg C), by default the
+    median of the temperatures at which they were measured; a limit judges them as they were measured. Raises InputError
+    where the camera isn't known."""
+    register(store)
+    columns = _board_columns(store, camera, newest)
+    if not columns:
+        raise InputError(f"{camera[:100]}: no calibration of it is known; list the figures for the cameras' names")
+    ids = [one.id for one, _ in columns]
+    with store.reading() as db:
+        asked = sa.select(*FigureRow.__table__.columns, CalibrationRow.session_id, *_LIFE)
+        asked = asked.join(CalibrationRow, CalibrationRow.id == FigureRow.calibration_id)
+        asked = asked.where(FigureRow.camera == camera, FigureRow.calibration_id.in_(ids))
+        rows: dict[tuple[str, str], list[Any]] = {}
+        for row in db.execute(asked.order_by(CalibrationRow.created, CalibrationRow.id, FigureRow.id)):
+            rows.setdefault((row.name, row.place), []).append(row)
+    if limits is None:
+        valid = [one for one, _ in columns if one.limits is not None and one.revoked is None]
+        stated = max(valid, key=lambda one: _aware(one.certified) or now()).limits if valid else None
+        limits = None if stated is None else CalibrationLimits.model_validate(stated)
+    if reference_c is None:
+        measured = [row.temperature_c for of in rows.values() for row in of if row.temperature_c is not None]
+        reference_c = round(float(np.median(measured)), 1) if measured else None
+    at = now()
+    return DriftBoard(
+        camera=camera,
+        false_alarm_rate=false_alarm_rate,
+        columns=tuple(
+            BoardColumn(
+                calibration_id=one.id,
+                session_id=one.session_id,
+                name=name or one.session_id,
+                created=_aware(one.created) or at,
+                state=_state(one, at),
+            )
+            for one, name in columns
+        ),
+        rows=tuple(_board_row(of, ids, limits, reference_c, false_alarm_rate) for of in rows.values()),
+    )
+
+
+def _board_columns(store: Store, camera: str, newest: int) -> list[tuple[CalibrationRow, str]]:
+    """The camera's newest calibrations with their sessions' names, the oldest first: the newest of each session, and
+    the newest of all that was certified."""
+    has = sa.select(FigureRow.calibration_id).where(FigureRow.camera == camera)
+    with store.reading() as db:
+        found = list(db.execute(_asked().where(CalibrationRow.id.in_(has)).order_by(CalibrationRow.created)))
+    certified = [one.id for one, _ in found if one.certified is not None and one.revoked is None]
+    last = {one.session_id: one.id for one, _ in found}
+    kept = [of for of in found if last[of[0].session_id] == of[0].id or of[0].certified is not None]
+    shown = {one.id for one, _ in kept[-newest:]} | set(certified[-1:])
+    return [of for of in kept if of[0].id in shown]
+
+
+def _board_row(
+    rows: Sequence[Any],
+    ids: Sequence[str],
+    limits: CalibrationLimits | None,
+    reference_c: float | None,
+    false_alarm_rate: float,
+) -> BoardRow:
+    """The board's row of one figure, of which `rows` has those calibrations that have it."""
+    one = _figure(rows[-1])
+    limit = next((found for found in (limits.limit if limits else ()) if found.concerns(one)), None)
+    threshold = sigma_of_probability(sidak_part(false_alarm_rate, max(len(rows) - 1, 1)))
+    known = reference_c is not None and one.sensor is not None
+    cells = {
+        row.calibration_id: _cell(_figure(row), point, reference_c if known else None)
+        for row, point in zip(rows, _points(rows, limit, threshold), strict=True)
+    }
+    return BoardRow(
+        figure=one.name,
+        place=one.place,
+        title=plain_name(one.name, one.place),
+        unit=one.unit,
+        limit=limit,
+        reference_c=reference_c if known else None,
+        law=f"doubles every {one.sensor.doubling_c:.1f} ± {one.sensor.doubling_c_std:.1f} °C"
+        if known and one.sensor is not None
+        else "",
+        cells=tuple(cells.get(id) for id in ids),
+    )
+
+
+def _cell(figure: Figure, point: HistoryPoint, reference_c: float | None) -> BoardCell:
+    """A cell; a dark current whose temperature is known at `reference_c`, uncertain by the conversion, too."""
+    value, std, corrected = point.value, point.std, False
+    if reference_c is not None and figure.sensor is not None and figure.sensor.temperature_c is not None:
+        doublings, doublings_std = figure.sensor.doublings(SensorTemperature(temperature_c=reference_c))
+        factor = 2.0**doublings
+        value, std, corrected = factor * value, factor * math.hypot(std, math.log(2.0) * doublings_std * value), True
+    return BoardCell(
+        value=value,
+        std=std,
+        corrected=corrected,
+        mark=point.mark,
+        significance_sigma=point.significance_sigma,
+        drifted=point.drifted,
+    )
+
+
+# --- limits from the history ------------------------------------------------------------------------------------------
+
+#: Figures for which limits are drafted, by their names as a limit writes them, and which ends a drafted one has.
+DRAFTED: dict[str, Literal["both", "low", "high"]] = {
+    "noise conversion_gain_dn_per_e": "both",
+    "noise read_noise_e": "high",
+    "noise full_well_e": "low",
+    "noise dsnu_e": "high",
+    "noise prnu_percent": "high",
+    "noise linearity_error_percent": "high",
+    "noise dark_current_e_per_s": "high",
+    "mtf * mtf50_cy_per_px": "low",
+    "geometry camera_matrix": "both",
+    "stereo baseline_mm": "both",
+}
+#: Calibrations from which limits are drafted: the newest earlier ones, so many at most, and with the calibration itself
+#: where there are fewer than `DRAFTED_LEAST`.
+DRAFTED_FROM, DRAFTED_LEAST = 30, 3
+#: Probability that the next calibration of an unchanged camera lies within a drafted limit.
+DRAFTED_COVERAGE = 1.0 - FALSE_ALARM_RATE
+
+
+def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], int]:
+    """Limits drafted from what the cameras of a calibration had before it, and from how many calibrations.
+
+    The ends are those of a prediction interval for the next calibration of an unchanged camera (Student's t, Hahn and
+    Meeker 1991, section 4.8): mean +- t sqrt(s^2 (1 + 1/n)) with s at least the root mean square of the stated standard
+    deviations, and from a single calibration that alone; widened by the two standard deviations with which a figure is
+    judged. A draft says what is usual, not what a camera has to reach: somebody decides that."""
+    wanted = calibration(store, id)
+    rig = rig_of(wanted.cameras)
+    asked = _asked().where(CalibrationRow.rig == rig, CalibrationRow.revoked.is_(None))
+    with store.reading() as db:
+        known = [one for one, _ in db.execute(asked.order_by(CalibrationRow.created))]
+    last = {one.session_id: one.id for one in known}
+    earlier = [
+        one.id for one in known if last[one.session_id] == one.id and (_aware(one.created) or now()) < wanted.created
+    ]
+    ids = earlier[-DRAFTED_FROM:] if len(earlier) >= DRAFTED_LEAST else [*earlier, wanted.id]
+    by_figure: dict[tuple[str, Side | None, str], list[Figure]] = {}
+    for one in ids:
+        for figure in figures(store, one):
+            pattern = next((name for name in DRAFTED if fnmatchcase(figure.name, name)), None)
+            if pattern is not None and (pattern != "geometry camera_matrix" or figure.place in ("fx", "fy")):
+                by_figure.setdefault((figure.name, figure.side, figure.place), []).append(figure)
+    drafted: dict[tuple[str, Side | None, str], tuple[float, float]] = {}
+    for (name, side, place), found in by_figure.items():
+        pattern = next(of for of in DRAFTED if fnmatchcase(name, of))
+        low, high = _usual(found)
+        before = drafted.get((pattern, side, place))
+        drafted[pattern, side, place] = (low, high) if before is None else (min(low, before[0]), max(high, before[1]))
+    return tuple(
+        Limit(
+            figure=pattern,
+            side=side,
+            place=place,
+            good=(
+                None if DRAFTED[pattern] == "high" else low,
+                None if DRAFTED[pattern] == "low" else high,
+            ),
+        )
+        for (pattern, side, place), (low, high) in sorted(
+            drafted.items(), key=lambda item: ([*DRAFTED].index(item[0][0]), str(item[0][1]), item[0][2])
+        )
+    ), len(ids)
+
+
+def _usual(found: Sequence[Figure]) -> tuple[float, float]:
+    """Between which values the next one of an unchanged camera lies, with the interval in which it is judged."""
+    values = np.array([figure.value for figure in found])
+    std = math.sqrt(float(np.mean([figure.std**2 for figure in found])))
+    n = values.size
+    spread = max(float(values.std(ddof=1)) if n > 1 else 0.0, std)
+    quantile = (
+        stats.t.ppf((1.0 + DRAFTED_COVERAGE) / 2.0, n - 1) if n > 2 else stats.norm.ppf((1.0 + DRAFTED_COVERAGE) / 2.0)
+    )
+    half = float(quantile) * spread * math.sqrt(1.0 + 1.0 / n) + COVERAGE_FACTOR * std
+    mean = float(values.mean())
+    half = half or 1e-3 * abs(mean) or 1e-9  # without a stated or a seen spread: the fourth digit
+    step = 10.0 ** (math.floor(math.log10(half)) - 1)  # the ends are rounded outwards, to two digits of the half
+    digits = max(0, -round(math.log10(step)))
+    return round(math.floor((mean - half) / step) * step, digits), round(math.ceil((mean + half) / step) * step, digits)

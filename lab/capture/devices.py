@@ -66,10 +66,10 @@ class Device:
 
 
 class TargetDevice(Device):
-    """The stage: which target stands before the cameras. Movable to a target's name."""
+    """The stage: which target stands before the cameras, or which stop the lenses have. Movable to a target's name."""
 
-    def __init__(self, stage: Stage) -> None:
-        super().__init__("target")
+    def __init__(self, stage: Stage, name: str = "target") -> None:
+        super().__init__(name)
         self.stage = stage
         self.value: str | None = None  # None: not known
 
@@ -97,7 +97,7 @@ class LightSetting:
 
 
 class LightDevice(Device):
-    """The monochromator's grating and slits. Movable to a `LightSetting`."""
+    """The monochromator's grating and slits. Movable to a `LightSetting`, or a wavelength (nm) alone."""
 
     def __init__(self, monochromator: Monochromator) -> None:
         super().__init__("monochromator")
@@ -105,7 +105,9 @@ class LightDevice(Device):
         self.value: LightSetting | None = None
         self.bandwidth_nm = 0.0
 
-    def set(self, light: LightSetting) -> Status:
+    def set(self, setting: LightSetting | float) -> Status:
+        light = setting if isinstance(setting, LightSetting) else LightSetting(float(setting))
+
         def move() -> None:
             self.value = None
             if light.slit_um is not None:

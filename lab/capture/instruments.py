@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.camera.base import SensorInfo
 from drivers.errors import InstrumentError
-from drivers.instrument import Identity, Instrument
+from drivers.instrument import Instrument, Setting
 from drivers.monochromator.base import Monochromator
 from lab.capture.blocking_calls import STOP_S, in_thread
 from lab.capture.devices import (
@@ -35,7 +36,7 @@ from lab.capture.station import Drivers, Station
 from lab.capture_kinds.base import CaptureLimits, FixedExposure, Step
 from lab.capture_kinds.irradiance import irradiance_nm
 from lab.errors import DeviceError
-from lab.formats.recording_set import DataSheet
+from lab.formats.recording_set import DataSheet, InstrumentSnapshot
 from sim.camera import Side
 from sim.parameters import Frozen
 
@@ -77,6 +78,8 @@ class Instruments:
         sheets = {side: camera.datasheet for side, camera in station.cameras.items()}
         self.cameras = CamerasDevice(drivers.cameras, sheets, write_frame)
         self.target = TargetDevice(drivers.stage) if drivers.stage else None
+        #: The lenses' stop, which the stage's operator sets.
+        self.aperture = TargetDevice(drivers.stage, "aperture") if drivers.stage else None
         self.light = LightDevice(drivers.monochromator) if drivers.monochromator else None
         self.shutter = ShutterDevice(drivers.monochromator) if drivers.monochromator else None
         self.screen = ScreenDevice(drivers.display, cells) if drivers.display else None
@@ -104,20 +107,21 @@ class Instruments:
             temperature_c={side: value for side, value in taken.items() if value is not None},
         )
 
-    def connect(self, go_on: Callable[[], None] = lambda: None) -> dict[str, Identity]:
-        """Connect to every instrument and bring it into its safe state. Returns the identities by name.
+    def connect(self, go_on: Callable[[], None] = lambda: None) -> dict[str, InstrumentSnapshot]:
+        """Connect to every instrument and bring it into its safe state. Returns what each says of itself, by
+        name.
 
         `go_on` is called before each; what it raises ends the connecting.
 
         Raises DeviceError where an instrument doesn't answer, and where a camera's pixels or colour filters contradict
         its data sheet."""
-        found: dict[str, Identity] = {}
+        found: dict[str, InstrumentSnapshot] = {}
         for name, driver in self.drivers.all.items():
             go_on()
             try:
                 driver.connect()
                 driver.stop()
-                found[name] = driver.identity()
+                found[name] = _snapshot(driver)
             except InstrumentError as error:
                 raise DeviceError(named_complaint(name, error)) from error
         for side, camera in self.drivers.cameras.items():
@@ -203,6 +207,22 @@ class Instruments:
                 future.result(max(0.0, until - time.monotonic()))
             except Exception:
                 continue
+
+
+def _snapshot(driver: Instrument) -> InstrumentSnapshot:
+    """What a connected instrument says of itself. Raises InstrumentError."""
+
+    def told(values: Mapping[str, Setting]) -> dict[str, Setting]:
+        return {
+            key: str(one) if isinstance(one, float) and not math.isfinite(one) else one for key, one in values.items()
+        }
+
+    return InstrumentSnapshot(
+        **vars(driver.identity()),
+        settings=told(driver.settings()),
+        found=told(driver.found()),
+        departures=driver.departures(),
+    )
 
 
 def made_safe(

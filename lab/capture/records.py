@@ -9,6 +9,7 @@ from typing import Any, Literal
 from pydantic import ConfigDict
 
 from lab.capture_kinds.base import Step
+from lab.formats.recording_set import InstrumentSnapshot
 from sim.camera import Side
 from sim.parameters import Frozen
 
@@ -60,13 +61,17 @@ class ResultInfo(_Record):
 
 
 class RunRecord(Frozen):
-    """Provenance of one run of a session: when, after how many finished steps, with which instruments and which
-    versions."""
+    """Provenance of one run of a session: when, after how many finished steps, with which instruments and versions.
+
+    `changes`: what differs of the instruments from the run before, which was of the session `compared_with`.
+    """
 
     started: datetime
     steps_done: int = 0
-    instruments: dict[str, dict[str, str]]
+    instruments: dict[str, InstrumentSnapshot]
     versions: dict[str, str]
+    compared_with: str = ""
+    changes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ from bluesky.run_engine import RunEngine
 from bluesky.utils import DuringTask, FailedStatus, Msg, RunEngineInterrupted, TransitionError
 
 from drivers.errors import InstrumentError
-from drivers.instrument import Identity
 from lab.capture.blocking_calls import STOP_S, in_thread
 from lab.capture.instruments import BenchState, Instruments, SafeState
 from lab.capture.plan import CapturePlan, full_plan
@@ -37,6 +36,7 @@ from lab.capture.store import Store
 from lab.capture.take_step import Taken, repeats_ahead, take
 from lab.capture_kinds.base import Step
 from lab.errors import DeviceError, InputError
+from lab.formats.recording_set import Snapshots, differences
 from sim.parameters import Frozen
 
 T = TypeVar("T")
@@ -311,16 +311,14 @@ class CaptureSession:
                 return
             self._instruments = instruments
         try:
-            identities = instruments.connect(self._check_goes_on)
-            self._check_identities(identities)
+            found = instruments.connect(self._check_goes_on)
+            self._check_identities(found)
             if self.store.session(self.id).demands_certified:
-                from lab.calibration.life import cameras_of, check_certified
+                from lab.calibration.life import check_certified
 
-                check_certified(
-                    self.store, cameras_of({name: vars(one) for name, one in identities.items()}, self.station)
-                )
+                check_certified(self.store, found, self.station)
             instruments.check([entry.step for entry in self._entries if entry.finished is None])
-            self.store.set_state(self.id, "running", run=_provenance(identities, self._done), station=self.station)
+            self.store.set_state(self.id, "running", run=self._provenance(found), station=self.station)
             self._drive(instruments)
         except BaseException as error:
             failure = error
@@ -338,18 +336,36 @@ class CaptureSession:
         if self.safe.complaints:
             raise DeviceError(f"{self._ended_by or 'at its end'}; {UNSAFE}: {'; '.join(self.safe.complaints)}")
 
-    def _check_identities(self, identities: dict[str, Identity]) -> None:
+    def _check_identities(self, found: Snapshots) -> None:
         """Check that the session's instruments are the same. Raises InputError if one was exchanged since the previous
         run."""
         for run in self.store.runs(self.id)[-1:]:
-            for name, identity in identities.items():
-                before = run.instruments.get(name, {}).get("serial_number", "")
-                if before and identity.serial_number and before != identity.serial_number:
+            for name, one in found.items():
+                before = run.instruments[name].serial_number if name in run.instruments else ""
+                if before and one.serial_number and before != one.serial_number:
                     raise InputError(
-                        f"session {self.id}: {name} has the serial number {identity.serial_number}, the session began "
-                        "with "
+                        f"session {self.id}: {name} has the serial number {one.serial_number}, the session began with "
                         f"{before}; connect that one again or start a new session"
                     )
+
+    def _provenance(self, found: Snapshots) -> RunRecord:
+        """The record of this run; what differs of the instruments from the run before is told now."""
+        versions = {"python": platform.python_version()}
+        for package in PACKAGES:
+            with contextlib.suppress(PackageNotFoundError):
+                versions[package] = version(package)
+        session, before = self.store.run_before(self.id) or ("", None)
+        changes = () if before is None else differences(before.instruments, found)
+        for line in changes:
+            self._tell("connecting", "looking at the instruments", remark=f"{line} (in session {session})")
+        return RunRecord(
+            started=now(),
+            steps_done=self._done,
+            instruments=dict(found),
+            versions=versions,
+            compared_with=session,
+            changes=changes,
+        )
 
     def _drive(self, instruments: Instruments) -> None:
         """Run the plan to its end on a RunEngine of its own, across pauses."""
@@ -528,16 +544,3 @@ def _plain(error: BaseException, complaints: Sequence[str]) -> BaseException:
     if isinstance(error, InputError):
         return InputError(f"{error}{tail}")
     return error
-
-
-def _provenance(identities: dict[str, Identity], steps_done: int) -> RunRecord:
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        with contextlib.suppress(PackageNotFoundError):
-            versions[package] = version(package)
-    return RunRecord(
-        started=now(),
-        steps_done=steps_done,
-        instruments={name: vars(identity) for name, identity in identities.items()},
-        versions=versions,
-    )

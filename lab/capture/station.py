@@ -137,6 +137,17 @@ class Station(Frozen):
         return tuple(sorted(self.cameras))
 
     @property
+    def f_number(self) -> float:
+        """That of the cameras' data sheets. Raises InputError where one has none, or another one."""
+        stated = {camera.datasheet.f_number for camera in self.cameras.values()}
+        if len(stated) > 1 or None in stated:
+            raise InputError(
+                "station: the data sheets have no f_number, or not one and the same; "
+                "give it under [cameras.SIDE.datasheet]"
+            )
+        return float(stated.pop() or 0.0)
+
+    @property
     def devices(self) -> dict[str, Address]:
         """Its instruments by the name of their table: `monochromator`, `cameras.left`."""
         found: dict[str, Address | None] = {family: getattr(self, family) for family in _FAMILIES}

@@ -220,10 +220,26 @@ class Store:
             found = self._info(db, self._row(db, session_id))
         return self._now(found)
 
-    def sessions(self, after: str | None = None, limit: int | None = None) -> list[SessionInfo]:
-        """Sessions, the newest first: `limit` at most, those that follow the session `after` in this order."""
-        documents = (SessionRow.station, SessionRow.cameras, SessionRow.calibration, SessionRow.runs)
-        asked = sa.select(SessionRow).options(*map(defer, documents))
+    def sessions(
+        self,
+        after: str | None = None,
+        limit: int | None = None,
+        *,
+        search: str = "",
+        only: Sequence[str] | None = None,
+    ) -> list[SessionInfo]:
+        """Sessions, the newest first: `limit` at most, those that follow the session `after` in this order.
+
+        `search`: only those that have each of its words in their id, name, notes, their station's name or what their
+        instruments reported. `only`: ids of those that are asked for."""
+        documents = (
+            SessionRow.station,
+            SessionRow.cameras,
+            SessionRow.calibration,
+            SessionRow.runs,
+            SessionRow.request,
+        )
+        asked = _searched(sa.select(SessionRow).options(*map(defer, documents)), search, only)
         with self.reading() as db:
             if after is not None:
                 last = self._row(db, after)
@@ -232,10 +248,17 @@ class Store:
             found = self._infos(db, db.scalars(asked).all())
         return [self._now(one) for one in found]
 
-    def count_sessions(self) -> int:
-        """How many sessions there are."""
+    def count_sessions(self, *, search: str = "", only: Sequence[str] | None = None) -> int:
+        """How many sessions there are, of those that `sessions` answers."""
         with self.reading() as db:
-            return db.scalars(sa.select(sa.func.count()).select_from(SessionRow)).one()
+            return db.scalars(_searched(sa.select(sa.func.count()).select_from(SessionRow), search, only)).one()
+
+    def describe_session(self, session_id: str, name: str | None = None, notes: str | None = None) -> None:
+        """Give a session another name, or other notes; None leaves them."""
+        with self.transaction() as db:
+            row = self._row(db, session_id)
+            row.name = row.name if name is None else name
+            row.notes = row.notes if notes is None else notes
 
     def count_states(self) -> dict[str, int]:
         """State -> how many sessions the registry has in it."""
@@ -270,6 +293,19 @@ class Store:
         """Provenance: every run of a session, in order."""
         with self.reading() as db:
             return [RunRecord.model_validate(run) for run in self._row(db, session_id).runs]
+
+    def run_before(self, session_id: str) -> tuple[str, RunRecord] | None:
+        """The last run on the session's station so far, with its session's id: of this session, or of one that was
+        registered earlier. None: there is none."""
+        with self.reading() as db:
+            row = self._row(db, session_id)
+            station = row.station.get("name", "")
+            asked = sa.select(SessionRow.id, SessionRow.station, SessionRow.runs)
+            asked = asked.where(sa.tuple_(SessionRow.created, SessionRow.id) <= sa.tuple_(row.created, row.id))
+            for id, other, runs in db.execute(asked.order_by(SessionRow.created.desc(), SessionRow.id.desc())):
+                if runs and other.get("name", "") == station:
+                    return id, RunRecord.model_validate(runs[-1])
+        return None
 
     def set_state(
         self,
@@ -360,6 +396,15 @@ class Store:
                 for capture in captures
             )
         return True
+
+    def lab_time_s(self, session_id: str) -> float:
+        """Time that the finished steps of a session took, s, whatever lay between them."""
+        asked = sa.select(StepRow.started, StepRow.finished).where(
+            StepRow.session_id == session_id, StepRow.started.is_not(None), StepRow.finished.is_not(None)
+        )
+        with self.reading() as db:
+            rows = [(started, finished) for started, finished in db.execute(asked) if started and finished]
+        return float(sum((finished - started).total_seconds() for started, finished in rows))
 
     def sweep(self, session_id: str) -> list[str]:
         """Remove the files that no finished step links, as a crash leaves them; their paths. Needs the session's
@@ -453,11 +498,16 @@ class Store:
             files = files.where(sa.or_(FileRow.role != "frame", FileRow.id.in_(theirs)))
         with self.reading() as db:
             row = self._row(db, session_id)
+            runs = [RunRecord.model_validate(run) for run in row.runs]
+            told: dict[str, Any] = {"instruments": runs[-1].instruments} if runs else {}
+            if changes := tuple(line for run in runs for line in run.changes):
+                told["changes"] = changes
+            cameras: Any = {side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()}
             manifest = Manifest(
                 name=row.name or session_id,
                 notes=row.notes,
-                cameras={side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()},
-                # type: ignore[misc]
+                **told,
+                cameras=cameras,
                 captures=tuple(_capture(session_id, one) for one in db.scalars(asked.order_by(CaptureRow.id))),
             )
             where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in db.execute(files)}
@@ -580,6 +630,15 @@ class Store:
                 raise InputError(f"no API key is called {name!r}; list them for their names")
             db.delete(row)
         self._keys = (0.0, [])
+
+
+def _searched(asked: Any, search: str, only: Sequence[str] | None) -> Any:
+    """A query of sessions, confined to those that have all words of a text, and to some ids."""
+    for word in search.split():
+        places = (SessionRow.id, SessionRow.name, SessionRow.notes, SessionRow.station["name"].as_string())
+        reported = sa.cast(SessionRow.runs, sa.Text)
+        asked = asked.where(sa.or_(*(place.icontains(word, autoescape=True) for place in (*places, reported))))
+    return asked if only is None else asked.where(SessionRow.id.in_(only))
 
 
 def _captures_of(asked: Any, session_id: str, kind: str | None = None, side: str | None = None) -> Any:

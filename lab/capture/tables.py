@@ -20,6 +20,9 @@ class Base(DeclarativeBase):
 
 
 class SessionRow(Base):
+    """A session. `request`: what the service was asked to start it with; `then`, `then_state`: how far that is which
+    follows its end (see `api.then`)."""
+
     __tablename__ = "sessions"
     __table_args__ = (sa.Index("ix_sessions_created", "created", "id"),)
 
@@ -39,6 +42,9 @@ class SessionRow(Base):
     steps: Mapped[int] = mapped_column(default=0, server_default="0")
     queue_place: Mapped[int | None] = mapped_column(index=True)
     not_before: Mapped[datetime | None]
+    request: Mapped[dict[str, Any] | None]
+    then_state: Mapped[str | None] = mapped_column(sa.String(20), index=True)
+    then: Mapped[dict[str, Any] | None]
 
 
 class StepRow(Base):
@@ -133,6 +139,9 @@ class CalibrationRow(Base):
     expires: Mapped[datetime | None]
     superseded: Mapped[datetime | None]
     superseded_by: Mapped[str | None] = mapped_column(sa.String(40))
+    revoked: Mapped[datetime | None]
+    revoked_by: Mapped[str | None] = mapped_column(sa.String(100))
+    revoked_why: Mapped[str | None] = mapped_column(sa.Text)
 
 
 class FigureRow(Base):

@@ -53,6 +53,17 @@ def arrange(step: Step, instruments: Instruments) -> Plan[None]:
                 "'prompt' asks you)"
             )
         moves.append((instruments.target, setting.target))
+    if setting.aperture is not None:
+        if instruments.aperture is None:
+            raise InputError(
+                f"station: step {step.id!r} needs the lens at {setting.aperture!r} and there is no [stage] to ask for "
+                "it; add one (driver 'prompt' asks you)"
+            )
+        # Before all else: the same hand puts the target there.
+        if instruments.aperture.value != setting.aperture:
+            yield Msg("set", instruments.aperture, setting.aperture, group="aperture")
+            yield Msg("wait", None, group="aperture")
+            cameras.in_series = False
     if light is not None and instruments.shutter is not None:
         if setting.wavelength_nm is None:
             moves.append((instruments.shutter, False))

@@ -15,6 +15,7 @@ FILES = (
     "narrowband",
     "chart",
     "slanted_edge",
+    "stopped_edge",
     "white",
     "black",
     "checkerboard",

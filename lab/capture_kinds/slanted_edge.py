@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from lab.capture_kinds.base import (
     Capture,
@@ -19,6 +19,7 @@ from lab.capture_kinds.base import (
     planned_keys,
     spectrum_path,
 )
+from lab.errors import InputError
 from sim.parameters import Frozen, Quantity
 
 
@@ -52,8 +53,8 @@ class EdgeTarget(Target):
 
 
 class EdgeSequence(Sequence):
-    """`frames` of every knife edge of the station. A frame shows the edge in several regions; each region is a capture
-    of its own."""
+    """`frames` of every knife edge of the station, or of `edges` alone. A frame shows the edge in several regions; each
+    region is a capture of its own. `wavelength_nm`: of the light, 0 is white."""
 
     name: ClassVar[str] = "edge"
     purpose: ClassVar[str] = "MTF over the field and over orientations"
@@ -62,6 +63,8 @@ class EdgeSequence(Sequence):
 
     frames: Annotated[int, Quantity("1", "frames of each edge", lower=1, upper=1000)] = 4
     level: Level = 0.7
+    wavelength_nm: Annotated[float, Quantity("nm", "wavelength of the light; 0: white", lower=0.0, upper=5000.0)] = 0.0
+    edges: tuple[str, ...] = ()  # names of the targets; empty: all
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
@@ -69,51 +72,69 @@ class EdgeSequence(Sequence):
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
-        station.one(EdgeTarget)
-        made: list[Step] = []
-        for name, edge in station.list_targets(EdgeTarget).items():
-            lit = Setting(target=name, wavelength_nm=0.0)
-            found = exposure_step(f"edge/{name}", f"slanted edge {name}", lit, self.level)
-            light = spectrum_path(found.id)
-            made.append(found)
-            for frame in range(1, self.frames + 1):
-                id = f"edge/{name}/{frame}"
-                captures = []
-                for side in station.sides:
-                    layout = edge.left if side == "left" else edge.right
-                    for region in () if layout is None else layout.regions:
-                        keys = planned_keys(id, side) | {
-                            "id": f"{name}-{frame}-{region.name}-{side}",
-                            "kind": "slanted_edge",
-                            "region": region.region,
-                            "angle_deg": region.angle_deg,
-                            "light_radiance": light,
-                            "field_mm": region.field_mm,
-                        }
-                        captures.append(SlantedEdgeCapture.model_validate(keys))
-                made.append(
-                    Step(
-                        id=id,
-                        what=f"slanted edge {name} at {edge.angle_deg:g} deg, frame {frame} of {self.frames}",
-                        setting=lit,
-                        exposure=RelativeExposure(of=found.id),
-                        captures=tuple(captures),
-                    )
+        return edge_steps(self, station, "edge", SlantedEdgeCapture)
+
+
+def edge_steps(
+    sequence: EdgeSequence,
+    station: Equipment,
+    stem: str,
+    kind: type[EdgeCapture],
+    aperture: str | None = None,
+    **keys: Any,
+) -> tuple[Step, ...]:
+    """The steps of a sequence's edges, whose ids begin with `stem`; `keys`: further ones of the captures, `aperture`:
+    the lenses' stop. Raises InputError where the station lacks one of the edges."""
+    station.one(EdgeTarget)
+    there = station.list_targets(EdgeTarget)
+    if unknown := [name for name in sequence.edges if name not in there]:
+        raise InputError(f"edge.edges: the station has no knife edge {unknown[0]!r}; it has {', '.join(there)}")
+    light_nm = sequence.wavelength_nm
+    stem = f"{stem}/{light_nm:g}nm" if light_nm else stem
+    prefix = stem.partition("/")[2].replace("/", "-")
+    slit_um = station.limits.slit_um if light_nm else None
+    made: list[Step] = []
+    for name in sequence.edges or there:
+        edge = there[name]
+        lit = Setting(target=name, wavelength_nm=light_nm, slit_um=slit_um, aperture=aperture)
+        found = exposure_step(f"{stem}/{name}", f"slanted edge {name}", lit, sequence.level)
+        light = spectrum_path(found.id)
+        made.append(found)
+        for frame in range(1, sequence.frames + 1):
+            id = f"{stem}/{name}/{frame}"
+            captures = []
+            for side in station.sides:
+                layout = edge.left if side == "left" else edge.right
+                for region in () if layout is None else layout.regions:
+                    own = {
+                        "id": "-".join(filter(None, (prefix, name, str(frame), region.name, side))),
+                        "kind": get_args(kind.model_fields["kind"].annotation)[0],
+                        "region": region.region,
+                        "angle_deg": region.angle_deg,
+                        "light_radiance": light,
+                        "field_mm": region.field_mm,
+                    }
+                    captures.append(kind.model_validate(planned_keys(id, side) | own | keys))
+            made.append(
+                Step(
+                    id=id,
+                    what=f"slanted edge {name} at {edge.angle_deg:g} deg, frame {frame} of {sequence.frames}",
+                    setting=lit,
+                    exposure=RelativeExposure(of=found.id),
+                    captures=tuple(captures),
                 )
-        return tuple(made)
+            )
+    return tuple(made)
 
 
-class SlantedEdgeCapture(Capture):
+class EdgeCapture(Capture):
     """One straight edge in `region` (row0, col0, row1, col1, end excluded); None: the edges are searched for.
 
     `angle_deg`: from the vertical, nominal; positive turns the edge's top to the right.
     """
 
-    shows: ClassVar[str] = "a straight edge in each region"
-    sequence: ClassVar[type[Sequence] | None] = EdgeSequence
     shares_frame: ClassVar[bool] = True
 
-    kind: Literal["slanted_edge"]
     region: tuple[int, int, int, int] | None = None
     angle_deg: float | None = None
     dark_radiance: SpectrumPath | None = None
@@ -129,6 +150,15 @@ class SlantedEdgeCapture(Capture):
                 f"region {list(self.region)} isn't inside the frame of {rows} x {cols}; "
                 "give [row0, col0, row1, col1], end excluded"
             )
+
+
+class SlantedEdgeCapture(EdgeCapture):
+    """A straight edge, in the light of `light_radiance`, at the data sheet's f-number."""
+
+    shows: ClassVar[str] = "a straight edge in each region"
+    sequence: ClassVar[type[Sequence] | None] = EdgeSequence
+
+    kind: Literal["slanted_edge"]
 
 
 KIND = SlantedEdgeCapture

@@ -9,11 +9,13 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -24,7 +26,7 @@ from lab.challenge.truth import load, store
 from lab.cli.bench_process import mock_bench
 from lab.diagnose.visibility import visibility
 from lab.errors import InputError
-from lab.formats.results import DiagnosisResult
+from lab.formats.results import DiagnosisResult, NamedEffect, ResolveEnd
 from sim.camera import Side
 from sim.effects.library import effects as library
 from sim.effects.library import typical
@@ -41,10 +43,12 @@ SIZES: dict[str, str] = {
     "amplifier_glow": "left:glow_e_per_s=60,reach_mm=0.5",
     "astigmatism": "left:defocus_x_um=22",
     "axial_chromatic_aberration": "left:slope_um=15",
+    "bit_weights": "left:last_dn=0.3,second_dn=-0.2",
     "black_level_drift": "left:drift_dn_per_min=1",
     "blooming": "left:share_percent=20",
     "brighter_fatter": "left:loss_percent=10,shared_percent=10",
     "charge_diffusion": "left:length_um=1.2",
+    "coloured_line_noise": "left:noise_e=5,exponent=1",
     "column_noise": "left:offset_e=2",
     "coma": "left:w131_x_um=0.25",
     "cover_glass": "left:thickness_mm=15",
@@ -71,17 +75,21 @@ SIZES: dict[str, str] = {
     "on_chip_smoothing": "left:strength=0.3",
     "optical_low_pass_filter": "left:displacement_x_um=2,displacement_y_um=2",
     "other_f_number": "left:ratio=1.4",
+    "phase_detection_rows": "left:loss_percent=4,period=8,first_row=3",
     "pixel_aperture": "left:side_change_um=-0.7",
     "radiometer_nonlinearity": "both:exponent_percent=4",
     "random_telegraph_noise": "left:amplitude_e=40,share_percent=0.5",
+    "response_knee": "left:slope_percent=-10,knee_share=0.45",
     "row_noise": "left:noise_e=3",
     "screen_gamma": "both:exponent=1.8",
     "screen_pixel_structure": "both:amplitude_percent=20",
+    "shutter_leakage": "left:last_row_us=40",
     "source_bandwidth": "both:width_nm=6",
     "source_drift": "both:drift_percent_per_min=5",
     "spherical_aberration": "left:w040_um=0.15",
     "stereo_gain_mismatch": "both:gain_percent=5",
     "stray_light": "both:share_percent=0.6",
+    "taps": "left:gain_percent=1,offset_e=3",
     "veiling_glare": "left:share_percent=3",
     "vibration_blur": "both:amplitude_x_um=1.5",
     "vignetting": "left:corner_loss_percent=6",
@@ -112,6 +120,20 @@ RESOLVED = (
 )
 FIRST_SESSION = ("dark", "flat", "screen")
 
+#: Weak losses of contrast that are alike in all directions: `--isotropic` resolves each in three captures at most.
+ISOTROPIC: dict[str, tuple[str, ...]] = {
+    "defocus": ("defocus_um=6", "defocus_um=9", "defocus_um=13"),
+    "spherical_aberration": ("w040_um=0.07", "w040_um=0.1", "w040_um=0.14"),
+    "charge_diffusion": ("length_um=0.45", "length_um=0.6", "length_um=0.8"),
+    "pixel_aperture": ("side_change_um=-0.25", "side_change_um=-0.4", "side_change_um=-0.55"),
+    "optical_low_pass_filter": (
+        "displacement_x_um=0.8,displacement_y_um=0.8",
+        "displacement_x_um=1.1,displacement_y_um=1.1",
+        "displacement_x_um=1.4,displacement_y_um=1.4",
+    ),
+}
+MOST_CAPTURES = 3
+
 #: By how much the sensors get warmer (C) where the effect needs that.
 WARM_UP_C = {"dark_current_temperature": 6.0}
 
@@ -141,6 +163,8 @@ class LiveCase(Frozen):
     warm_up_c: float = 0.0  # by how much the sensors get warmer
     only: tuple[str, ...] = ()  # sequences to capture; empty: all
     resolve: bool = False  # `run --resolve`
+    rounds: int | None = None  # captures of that, at most
+    left_only: bool = False  # a station with the left camera alone
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -161,6 +185,15 @@ class FoundParameter(Frozen):
     interval: tuple[float, float] | None = None
 
 
+class ResolvedStage(Frozen):
+    """What stands after so many captures of `run --resolve`: names, their rivals, and these captures' lab time."""
+
+    named: tuple[str, ...]
+    rivals: tuple[str, ...]
+    captures: int
+    lab_s: float
+
+
 class LiveRun(Frozen):
     """The outcome of a case. `named`: effects with their sides; `first_named`, `first_rivals`: names and rivals before
     `--resolve` took its `captures`. `commit`: of the code, abbreviated; empty outside a checkout."""
@@ -178,6 +211,8 @@ class LiveRun(Frozen):
     first_named: tuple[str, ...] = ()
     first_rivals: tuple[str, ...] = ()
     captures: tuple[str, ...] = ()
+    stages: tuple[ResolvedStage, ...] = ()
+    resolve_end: ResolveEnd | None = None
     wall_s: float = 0.0
     error: str | None = None
 
@@ -215,6 +250,64 @@ def every_case() -> dict[str, LiveCase]:
     return {case.name: case for case in cases}
 
 
+def isotropic_cases() -> dict[str, LiveCase]:
+    """Name -> case: one camera with a weak loss of contrast that is alike in all directions, to resolve."""
+    cases = [
+        LiveCase(
+            name=f"isotropic-{effect}-{size}",
+            concealed=(f"left:{effect}:{values}",),
+            seed=100 + size,
+            only=FIRST_SESSION,
+            resolve=True,
+            rounds=MOST_CAPTURES,
+            left_only=True,
+        )
+        for size in range(max(map(len, ISOTROPIC.values())))
+        for effect, sizes in ISOTROPIC.items()
+        for values in sizes[size : size + 1]
+    ]
+    return {case.name: case for case in cases}
+
+
+def isotropic_table(runs: Mapping[str, LiveRun]) -> str:
+    """Markdown: how many are named right, by the concealed name alone, after each capture; then each case."""
+    done = [run for run in runs.values() if run.stages]
+    lines = [
+        "| captures | named right | with a rival left | another name | no name | lab time, s |",
+        "| --- " * 6 + "|",
+    ]
+    for captures in range(MOST_CAPTURES + 1):
+        counts = Counter(_standing(run, captures) for run in done)
+        lab_s = sum(_stage(run, captures).lab_s for run in done)
+        told = [f"{counts[one]} of {len(done)}" for one in ("right", "right, rivals", "wrong", "none")]
+        lines.append(f"| {captures} | {' | '.join(told)} | {lab_s:.0f} |")
+    lines += ["", "| concealed | before | captures | after | end |", "| --- " * 5 + "|"]
+    for run in runs.values():
+        first, last = (_words_of(run.stages[at]) if run.stages else run.error or "failed" for at in (0, -1))
+        taken = "; ".join(run.captures) or "none"
+        lines.append(f"| {run.case.concealed[0]} | {first} | {taken} | {last} | {run.resolve_end or '-'} |")
+    return "\n".join(lines)
+
+
+def _stage(run: LiveRun, captures: int) -> ResolvedStage:
+    return run.stages[min(captures, len(run.stages) - 1)]
+
+
+def _standing(run: LiveRun, captures: int) -> Literal["right", "right, rivals", "wrong", "none"]:
+    """How the names stand after so many captures, or at the end where there were fewer."""
+    stage = _stage(run, captures)
+    if not stage.named:
+        return "none"
+    if set(stage.named) - {*run.case.effects, *(library()[name].family.value for name in run.case.effects)}:
+        return "wrong"
+    return "right, rivals" if stage.rivals or set(stage.named) != set(run.case.effects) else "right"
+
+
+def _words_of(stage: ResolvedStage) -> str:
+    rivals = f" (rivals {', '.join(stage.rivals)})" if stage.rivals else ""
+    return f"{', '.join(stage.named) or 'nothing'}{rivals}"
+
+
 def drawn(seed: int, count: int = 3) -> tuple[LiveCase, ...]:
     """Random cases of single effects, for everyday tests. Of the session, only darks, flats, and the sequences that can
     show the effect are captured."""
@@ -240,9 +333,13 @@ def run_case(case: LiveCase, folder: Path) -> LiveRun:
     shutil.rmtree(folder, ignore_errors=True)
     try:
         with mock_bench(case.concealed, options) as station:
+            if case.left_only:
+                _leave_right_out(station)
             ends = ["--quick", "--station", str(station), "--out", str(folder), "--name", case.name]
             ends += [f"--only={name}" for name in case.only]
-            _command("run" if case.resolve else "capture", *ends, *(["--resolve"] if case.resolve else []))
+            ends += ["--resolve"] if case.resolve else []
+            ends += [] if case.rounds is None else [f"--resolve-rounds={case.rounds}"]
+            _command("run" if case.resolve else "capture", *ends)
         sessions = sorted((folder / "sessions").iterdir())
         file = folder / "diagnose.json" if not case.resolve else sessions[0] / "diagnose.json"
         if not case.resolve:
@@ -254,6 +351,13 @@ def run_case(case: LiveCase, folder: Path) -> LiveRun:
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return judged(case, found).model_copy(update={"wall_s": time.monotonic() - began_s})
+
+
+def _leave_right_out(station: Path) -> None:
+    """Take the right camera out of a station file."""
+    tables = re.split(r"\n(?=\[)", station.read_text(encoding="utf-8"))
+    kept = [table for table in tables if not table.startswith("[cameras.right")]
+    station.write_text("\n".join(kept), encoding="utf-8")
 
 
 def session_of(options: Sequence[str], folder: Path) -> DiagnosisResult:
@@ -312,7 +416,25 @@ def judged(case: LiveCase, found: DiagnosisResult) -> LiveRun:
         first_named=tuple(effect.name for effect in before),
         first_rivals=tuple(rival.name for effect in before for rival in effect.rivals),
         captures=tuple(resolution.capture for resolution in found.resolutions),
+        stages=tuple(_stages(found)) if case.resolve else (),
+        resolve_end=found.resolve_end,
     )
+
+
+def _stages(found: DiagnosisResult) -> Iterator[ResolvedStage]:
+    """What stood before each capture of the resolving, and at its end."""
+
+    def stage(effects: tuple[NamedEffect, ...], captures: int) -> ResolvedStage:
+        return ResolvedStage(
+            named=tuple(effect.name for effect in effects),
+            rivals=tuple(rival for effect in effects for rival in effect.alternatives),
+            captures=captures,
+            lab_s=round(sum(taken.spent_s or 0.0 for taken in found.resolutions[:captures]), 1),
+        )
+
+    for captures, taken in enumerate(found.resolutions):
+        yield stage(taken.effects_before, captures)
+    yield stage(found.effects, len(found.resolutions))
 
 
 def _outcome(
@@ -384,11 +506,14 @@ def main(
         Path | None, typer.Option("--page", metavar="FILE.md", help="write a table and a picture into this page")
     ] = None,
     cases: Annotated[bool, typer.Option("--cases", help="list the cases as JSON, and end")] = False,
+    isotropic: Annotated[
+        bool, typer.Option("--isotropic", help="instead: resolve weak isotropic losses of contrast, and print a table")
+    ] = False,
 ) -> None:
     """Conceal every effect on the mock bench, capture, diagnose, and report. Continues where an earlier run stopped."""
     from lab.challenge.live_page import write_page
 
-    every = every_case()
+    every = isotropic_cases() if isotropic else every_case()
     if cases:
         print(json.dumps({name: case.concealed for name, case in every.items()}, indent=1))
         return
@@ -396,7 +521,9 @@ def main(
     if unknown:
         raise InputError(f"--only {unknown[0]}: no such case; there are {', '.join(every)}")
     runs = run_all({name: case for name, case in every.items() if not only or name in only}, out)
-    if page is not None:  # with the results of earlier runs
+    if isotropic:
+        print(isotropic_table(runs))
+    if page is not None and not isotropic:  # with the results of earlier runs
         there = {name: out / "results" / f"{name}.json" for name in every}
         write_page({name: load(LiveRun, file) for name, file in there.items() if file.exists()}, page)
     right = sum(run.outcome in ("named", "healthy") for run in runs.values())

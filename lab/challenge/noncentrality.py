@@ -19,10 +19,10 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from lab.challenge.fair_strength import Directions, beyond, joined, oracle_share, separability, span, with_direction
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.library import measurements
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.predict.camera_model import camera_model
+from lab.measure.study import Study
 from sim.effects.library import candidates
 from sim.spectrum import FloatArray
 

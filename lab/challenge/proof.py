@@ -23,7 +23,7 @@ def refuse_scored(seed: int, page: Path) -> None:
         raise InputError(f"seed {seed}: was scored already, see {page}; leave --seed out for a fresh one")
 
 
-def _rate(rate: Rate) -> str:
+def rate_words(rate: Rate) -> str:
     if rate.share is None or rate.low is None or rate.high is None:
         return "none"
     return f"{rate.count} of {rate.of} ({100 * rate.low:.0f}..{100 * rate.high:.0f} %)"
@@ -48,12 +48,13 @@ def table(found: ChallengeScore) -> str:
         "| --- | --- | --- | --- |",
     ]
     lines += [
-        f"| {s.noncentrality} | {_rate(s.top_1)} | {_rate(s.alone)} | {_rate(s.unnamed)} |" for s in found.singles
+        f"| {s.noncentrality} | {rate_words(s.top_1)} | {rate_words(s.alone)} | {rate_words(s.unnamed)} |"
+        for s in found.singles
     ]
     if any(f.right.of for f in found.fair):
         lines += ["", "| separability | right | oracle | of the oracle |", "| --- | --- | --- | --- |"]
         lines += [
-            f"| {f.kind}, {f.separability} | {_rate(f.right)} | {_share(f.oracle)} | {_share(f.of_oracle)} |"
+            f"| {f.kind}, {f.separability} | {rate_words(f.right)} | {_share(f.oracle)} | {_share(f.of_oracle)} |"
             for f in found.fair
         ]
     lines += ["", "| also | |", "| --- | --- |"]
@@ -64,7 +65,7 @@ def table(found: ChallengeScore) -> str:
         ("healthy, a mismatch where there is none", found.false_alarms),
         ("outside the library above 25, the mismatch is seen", found.outside_located),
     ):
-        lines.append(f"| {what} | {_rate(rate)} |")
+        lines.append(f"| {what} | {rate_words(rate)} |")
     for what, share in (
         ("held-out excess chi2 removed, median", found.excess_removed_median),
         ("the same outside the library, median", found.outside_excess_removed_median),
@@ -107,8 +108,15 @@ def write_page(found: ChallengeScore, page: Path) -> None:
         section += f"\n\n![Right answers over separability, of the diagnosis and of the oracle]({curves.name})"
         page.parent.mkdir(parents=True, exist_ok=True)
         curves.write_text(power_curves(found), encoding="utf-8")
-    text = placed(text, found.purpose, section)
     row = f"| {found.purpose} | {found.seed} | {found.cases} | {found.size} | `{found.seals_sha256[:16]}` |"
+    text = with_seed(placed(text, found.purpose, section), row)
+    page.parent.mkdir(parents=True, exist_ok=True)
+    picture.write_text(confusion(found), encoding="utf-8")
+    page.write_text(text, encoding="utf-8")
+
+
+def with_seed(text: str, row: str) -> str:
+    """A page's text with a row in its list of seeds."""
     if row not in text:
         begin = text.find("<!-- seeds:end -->")
         if begin < 0:
@@ -118,9 +126,7 @@ def write_page(found: ChallengeScore, page: Path) -> None:
             )
             begin = text.find("<!-- seeds:end -->")
         text = f"{text[:begin]}{row}\n{text[begin:]}"
-    page.parent.mkdir(parents=True, exist_ok=True)
-    picture.write_text(confusion(found), encoding="utf-8")
-    page.write_text(text, encoding="utf-8")
+    return text
 
 
 def placed(text: str, name: str, section: str) -> str:

@@ -262,17 +262,17 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
             met=len(ran) == len(cases),
             sure=True,
         ),
-        _at_least("top-1 of single effects above 50", classes[0].top_1, 0.95).model_copy(
+        at_least("top-1 of single effects above 50", classes[0].top_1, 0.95).model_copy(
             update={"oracle": _oracle(s for s in singles if s.noncentrality[0] > STRONG)}
         ),
-        _at_least("right families above 25", families.right_families, 0.97),
-        _at_most("names of a wrong family", families.wrong_families, 0.01),
-        _at_least("both members of a compound named", both, 0.80).model_copy(update={"oracle": _oracle(compounds)}),
-        _at_least("rival sets cover the truth", cover, 0.95),
+        at_least("right families above 25", families.right_families, 0.97),
+        at_most("names of a wrong family", families.wrong_families, 0.01),
+        at_least("both members of a compound named", both, 0.80).model_copy(update={"oracle": _oracle(compounds)}),
+        at_least("rival sets cover the truth", cover, 0.95),
         _limit("rivals in a set, mean", size, 1.5, ""),
-        _at_least("95 % sets of models hold the truth", Rate.over(bool(s.set_holds) for s in weighed), 0.95),
-        _at_most("false names on healthy cameras", names, 0.01),
-        _at_least("outside the library, no cause named", abstained, 0.90),
+        at_least("95 % sets of models hold the truth", Rate.over(bool(s.set_holds) for s in weighed), 0.95),
+        at_most("false names on healthy cameras", names, 0.01),
+        at_least("outside the library, no cause named", abstained, 0.90),
         _between("95 % intervals of parameters hold", covered, 0.90, 0.98),
         Goal(
             name="held-out excess chi2 removed",
@@ -457,11 +457,11 @@ def _judged(name: str, wanted: str, rate: Rate, good: Callable[[float], bool], l
     return Goal(name=name, wanted=wanted, reached=_said(rate), met=good(rate.share), sure=inside or beyond)
 
 
-def _at_least(name: str, rate: Rate, limit: float) -> Goal:
+def at_least(name: str, rate: Rate, limit: float) -> Goal:
     return _judged(name, f">= {100 * limit:g} %", rate, lambda share: share >= limit, limit, 1.0)
 
 
-def _at_most(name: str, rate: Rate, limit: float) -> Goal:
+def at_most(name: str, rate: Rate, limit: float) -> Goal:
     return _judged(name, f"<= {100 * limit:g} %", rate, lambda share: share <= limit, 0.0, limit)
 
 

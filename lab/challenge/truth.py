@@ -28,6 +28,8 @@ SIZES: dict[str, tuple[int, int] | None] = {
 }
 Kind = Literal["healthy", "single", "compound", "outside"]
 Purpose = Literal["tuning", "proof", "fresh"]
+#: What is concealed: effects of the library, or laws that it doesn't have (`lab.challenge.unlisted`).
+Laws = Literal["listed", "unlisted"]
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -85,6 +87,7 @@ class Truths(Frozen):
     seed: int
     size: str
     cases: int
+    laws: Laws = "listed"
     truths: dict[str, SaltedTruth] = {}
 
 

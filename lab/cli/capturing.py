@@ -14,7 +14,7 @@ from rich.markup import escape
 from lab.cli.bench_process import mock_bench
 from lab.cli.console import check_writable, err, out, write_json
 from lab.cli.sources import Json, StoreFolder, open_store, run_here
-from lab.cli.tables import print_fit, print_sequences
+from lab.cli.tables import print_fit, print_resolving, print_sequences
 from lab.errors import InputError
 from lab.pipeline import Capturer, CaptureRequest, PipelineRequest, capture_here
 
@@ -101,6 +101,16 @@ def run(
             "--resolve", help="while rivals are left, take the capture that tells them apart and diagnose again"
         ),
     ] = False,
+    resolve_minutes: Annotated[
+        float | None,
+        typer.Option(
+            "--resolve-minutes", metavar="MIN", help="with --resolve: lab time that its captures may take (else any)"
+        ),
+    ] = None,
+    resolve_rounds: Annotated[
+        int | None,
+        typer.Option("--resolve-rounds", metavar="N", help="with --resolve: captures that it takes at most (else 6)"),
+    ] = None,
     only: Only = None,
     parameters: Set = None,
     conceal: Conceal = None,
@@ -109,7 +119,9 @@ def run(
     from lab.capture.catalogue import parse_parameters
     from lab.report import words
     from lab.report.answers import answers
+    from lab.resolve import resolve_limits
 
+    limits = resolve_limits(resolve, resolve_minutes, resolve_rounds)
     store = open_store(out_folder)
     session = CaptureRequest(
         session=resume,
@@ -118,8 +130,11 @@ def run(
         parameters=parse_parameters(parameters or ()),
         name=name,
     )
-    request = PipelineRequest("pipeline", capture=session, resolve=resolve)
-    verb = ["run", "--resolve"] if resolve else ["run"]  # what goes on then fits and diagnoses, too
+    request = PipelineRequest("pipeline", capture=session, resolve=limits)
+    verb = ["run"]  # what goes on then fits and diagnoses, too
+    verb += ["--resolve"] if resolve else []
+    verb += [] if resolve_minutes is None else [f"--resolve-minutes={resolve_minutes:g}"]
+    verb += [] if resolve_rounds is None else [f"--resolve-rounds={resolve_rounds}"]
     found = run_here(request, store, _capturer(store, station, conceal, verb))
     assert found.fit is not None
     assert found.validation is not None
@@ -131,8 +146,7 @@ def run(
         out.print(f"[bold]{question}[/]" if lines else "")
         for line in lines:
             out.print(escape(line))
-    for taken in found.diagnosis.resolutions:
-        out.print(f"Resolved with: {escape(taken.capture)} (session {taken.session})")
+    print_resolving(found.diagnosis)
     out.print(f"\nsession: {found.session}")
     out.print(f"report: {found.report}")
 

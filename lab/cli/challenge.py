@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +16,7 @@ from lab.cli.sources import Scheduler
 from lab.errors import InputError
 
 if TYPE_CHECKING:
+    from lab.challenge.truth import Laws
     from lab.workers import Workers
 
 commands = typer.Typer(
@@ -25,8 +27,9 @@ commands = typer.Typer(
 )
 
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, metavar="N", help="processes (all cores)")]
-#: The list of scored seeds, in a checkout of the project; an installation has none.
+#: The lists of scored seeds, in a checkout of the project; an installation has none.
 PROOF_PAGE = Path(__file__).resolve().parents[2] / "docs" / "proof.md"
+UNLISTED_PAGE = PROOF_PAGE.with_name("proof-unlisted.md")
 
 
 def _say(text: str, share: float) -> None:
@@ -61,6 +64,9 @@ def make_command(
     proof: Annotated[
         bool, typer.Option("--proof", help="a proof: its seed is scored once, and never tuned on")
     ] = False,
+    unlisted: Annotated[
+        bool, typer.Option("--unlisted", help="conceal laws that no list has, for a proof of discovery")
+    ] = False,
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
@@ -83,9 +89,10 @@ def make_command(
             "tune, or --proof"
         )
     if proof:
-        refuse_scored(seed, PROOF_PAGE)
+        refuse_scored(seed, UNLISTED_PAGE if unlisted else PROOF_PAGE)
     file = truths if truths is not None else out.parent / f"{out.resolve().name}.truths.json"
-    made = make(out, cases, seed, file, size, _workers(jobs, scheduler), cfa=cfa, progress=_say)
+    laws: Laws = "unlisted" if unlisted else "listed"
+    made = make(out, cases, seed, file, size, _workers(jobs, scheduler), cfa=cfa, laws=laws, progress=_say)
     print(f"{out}: {len(made.truths)} cases, sealed in seals.json; the truths, seed among them, are in {file}")
 
 
@@ -103,21 +110,27 @@ def score_command(
     scheduler: Scheduler = None,
 ) -> None:
     """Diagnose the cases without a result, open the seals, and score. Exit code 4 if a goal is missed."""
-    from lab.challenge.proof import table, write_page
+    from lab.challenge import proof, score, unlisted_score
     from lab.challenge.run import run_all
-    from lab.challenge.score import broken_seals, score
     from lab.challenge.truth import Seals, Truths, load, store
 
     seals = load(Seals, folder / "seals.json")
     cases = tuple(case for case in sorted(seals.seals) if (folder / case).is_dir())
     runs = run_all(folder, cases, _workers(jobs, scheduler), _say)
     opened = load(Truths, truths)  # only now that all diagnoses are written
-    found = score(opened, seals, runs, broken_seals(folder, seals, opened))
+    broken = score.broken_seals(folder, seals, opened)
+    found: score.ChallengeScore | unlisted_score.UnlistedScore
+    if opened.laws == "unlisted":
+        found = unlisted_score.score(opened, seals, runs, broken)
+        table, write_page = unlisted_score.table(found), partial(unlisted_score.write_page, found)
+    else:
+        found = score.score(opened, seals, runs, broken)
+        table, write_page = proof.table(found), partial(proof.write_page, found)
     if page is not None:
-        write_page(found, page)
+        write_page(page)
     if json is not None and str(json) != "-":
         store(found, json)
-    print(found.model_dump_json(indent=1) if str(json) == "-" else table(found))
+    print(found.model_dump_json(indent=1) if str(json) == "-" else table)
     if not found.reached:
         raise typer.Exit(EXIT_CHECK)
 
@@ -146,6 +159,10 @@ def calibrate_command(
         raise InputError("give either --each or --rule NAME=VALUE")
     seals, opened = load(Seals, folder / "seals.json"), load(Truths, truths)
     refuse_proof(opened)
+    if opened.laws == "unlisted":
+        raise InputError(
+            f"{truths}: conceals laws that no list has; rules are calibrated on a challenge of listed ones"
+        )
     cases = tuple(case for case in sorted(seals.seals) if (folder / case).is_dir())
     broken = broken_seals(folder, seals, opened)
     if each:

@@ -16,7 +16,7 @@ from lab.errors import NotDetermined
 from lab.pipeline import PipelineRequest
 
 if TYPE_CHECKING:
-    from lab.formats.recording_set import RecordingSet
+    from lab.formats.recording_set import RecordingSet, Snapshots
     from lab.formats.results import FitResult
 
 commands = typer.Typer()
@@ -78,7 +78,7 @@ def _write_maps(recordings: RecordingSet, folder: Path) -> None:
 def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) -> None:
     """Write the camera files of a fit. A line on stderr names each value that was neither fitted nor stated."""
     from lab.formats.camera_file import fitted_camera, write_camera
-    from lab.predict.camera_model import assumptions
+    from lab.formats.camera_model import assumptions
 
     make_folder(folder)
     for side, fitted in result.cameras.items():
@@ -109,13 +109,15 @@ def compare(
     ] = None,
     data: StoreFolder = None,
 ) -> None:
-    """Compare two calibrations: figures that changed beyond their uncertainty."""
+    """Compare two calibrations: figures that changed beyond their uncertainty, and instruments that changed."""
     from lab.fit.compare import FailRule, failures
     from lab.fit.compare import compare as compared
+    from lab.formats.recording_set import differences
 
     check_writable(json)
     rules = [FailRule.parse(text) for text in fail_on or ()]
-    result = compared(_calibration(a, data), _calibration(b, data))
+    (before, then), (after, now) = _calibration(a, data), _calibration(b, data)
+    result = compared(before, after).model_copy(update={"instruments": differences(then, now)})
     write_json(result, json)
     if report_folder is not None:
         from lab.report.compare import write_comparison
@@ -130,14 +132,17 @@ def compare(
         raise typer.Exit(EXIT_CHECK)
 
 
-def _calibration(source: str, data: Path | None) -> FitResult:
-    """A fit from the file that `--json` wrote, from the registry of sessions, or made now from recordings."""
+def _calibration(source: str, data: Path | None) -> tuple[FitResult, Snapshots]:
+    """A fit from the file that `--json` wrote, from the registry of sessions, or made now from recordings; and what the
+    instruments said of themselves, which a fit's file doesn't have."""
     from lab.formats.result_file import read_result
     from lab.formats.results import FitResult
 
     if Path(source).is_file():
-        return read_result(FitResult, Path(source))
+        return read_result(FitResult, Path(source)), {}
     if not Path(source).exists() and (store := existing_store(data)) is not None:
         for kept in store.results(source, "fit")[:1]:
-            return FitResult.model_validate(kept.document)
-    return _fit(recordings_of(source, data))
+            there = store.recording_set(source, ()).manifest.instruments if store.has_session(source) else {}
+            return FitResult.model_validate(kept.document), there
+    recordings = recordings_of(source, data)
+    return _fit(recordings), recordings.manifest.instruments

@@ -10,6 +10,19 @@ from rich.markup import escape
 from rich.table import Table
 
 from lab.cli.console import check_writable, out, warn, write_json
+from lab.cli.exchange import (
+    LENSFUN,
+    OF_A_CAMERA,
+    SPECTRA,
+    TILED,
+    ExportOptions,
+    export_camera,
+    export_spectra,
+    export_tiled,
+    import_lens,
+    import_spectra,
+    import_tiled,
+)
 from lab.cli.progress import progress_bar
 from lab.cli.sources import StoreFolder, store_to_read
 from lab.cli.tables import print_fit
@@ -34,11 +47,17 @@ def import_(
             "--from",
             metavar="KIND",
             help="emva1288, raw-folder, fits, slanted-edge, colorchecker, dot-grid, checkerboard, "
-            "photon-transfer-table or spectral-table",
+            "photon-transfer-table, spectral-table, spectra, lensfun or tiled",
         ),
     ],
     out_folder: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="the recording set to write; of a table, the fit's JSON")
+        Path,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="the recording set to write; of a table, the fit's JSON; of spectra, a CSV or a folder of them; of "
+            "lensfun, a camera file",
+        ),
     ],
     checkerboard: Annotated[
         str,
@@ -50,7 +69,11 @@ def import_(
     square_mm: Annotated[float, typer.Option(help="side of the checkerboard's squares, or spacing of the dots")] = 0.0,
     tap: Annotated[str, typer.Option(metavar="NAME", help="raw-folder, fits: this tap of the sensor alone")] = "",
     camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="a picture's camera.toml, where it isn't beside it")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="a picture's camera.toml, where it isn't beside it; lensfun: the camera file",
+        ),
     ] = None,
     exposure_s: Annotated[float | None, typer.Option(help="a picture's exposure")] = None,
     transfer: Annotated[
@@ -72,8 +95,11 @@ def import_(
     white_patch: Annotated[
         Path | None, typer.Option(metavar="FILE", help="colorchecker: radiance (CSV) of the white patch")
     ] = None,
+    lens: Annotated[
+        str, typer.Option(metavar="NAME", help="lensfun: the model of the lens, where the file has several")
+    ] = "",
 ) -> None:
-    """Turn another format into a recording set."""
+    """Turn another format into a recording set; spectra into CSV, a lens into a camera file."""
     from lab.formats import recording_set
     from lab.formats.importers import read_foreign
     from lab.formats.importers.import_options import ImportOptions, chart_corners, grid
@@ -93,6 +119,16 @@ def import_(
         white_patch=white_patch,
         tap=tap or None,
     )
+    if lens and kind != LENSFUN:
+        raise InputError(f"--from {kind} doesn't take --lens")
+    if kind in (SPECTRA, TILED):
+        if options.stated():
+            raise InputError(f"--from {kind} doesn't take {', '.join(options.stated())}; it takes none")
+        (import_spectra if kind == SPECTRA else import_tiled)(path, out_folder)
+        return
+    if kind == LENSFUN:
+        import_lens(path, options, lens, out_folder)
+        return
     if kind in (LEVEL_TABLE, MEAN_TABLE):
         _import_table(kind, path, options, out_folder)
         return
@@ -142,17 +178,62 @@ def sessions(data: StoreFolder = None) -> None:
 
 @commands.command()
 def export(
-    session: Annotated[str, typer.Argument(metavar="SESSION", help="a stored session's id")],
-    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="the recording set to write")],
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="a stored session's id; spectra: a CSV, or a recording set's folder, too; lensfun, rawtoaces, dcp, "
+            "icc and pyxel: a camera file",
+        ),
+    ],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="PATH",
+            help="the recording set (a folder) or the file to write; tiled: a catalogue's folder, or a server's URL",
+        ),
+    ],
+    kind: Annotated[
+        str,
+        typer.Option(
+            "--as",
+            metavar="KIND",
+            help="recording-set, tiled, spectra (.sp or .ti3), lensfun, rawtoaces, dcp, icc or pyxel",
+        ),
+    ] = "recording-set",
+    quantity: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="spectra: what the CSV holds: radiance, reflectance, transmittance or sensitivity"
+        ),
+    ] = "radiance",
+    exposure_s: Annotated[float, typer.Option(help="pyxel: the exposure")] = 0.01,
+    photons: Annotated[
+        float | None, typer.Option(help="pyxel: photons a pixel in it (without: half of a pixel's full well)")
+    ] = None,
+    wavelength_nm: Annotated[float, typer.Option(help="pyxel: wavelength of the light")] = 550.0,
+    channel: Annotated[str, typer.Option(metavar="R|G|B", help="pyxel: whose efficiency (without: green's)")] = "",
     data: StoreFolder = None,
 ) -> None:
-    """Write a stored session as a recording set."""
+    """Write a stored session as a recording set; spectra and cameras in the formats of other programs."""
     from lab.formats import recording_set
 
-    recordings = session_recordings(store_to_read(data), session)
+    if kind == SPECTRA:
+        export_spectra(source, Path(to), quantity, data)
+        return
+    if kind == TILED:
+        export_tiled(source, to, data)
+        return
+    if kind in OF_A_CAMERA:
+        export_camera(kind, source, Path(to), ExportOptions(exposure_s, photons, wavelength_nm, channel))
+        return
+    if kind != "recording-set":
+        raise InputError(f"--as {kind}: no such format; choose {', '.join((SPECTRA, TILED, *OF_A_CAMERA))}")
+    recordings = session_recordings(store_to_read(data), source)
     warn(recordings.warnings)
     with progress_bar("export") as advance:
-        folder = recording_set.write(recordings, to, progress=advance)
+        folder = recording_set.write(recordings, Path(to), progress=advance)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 

@@ -10,9 +10,18 @@ from rich.table import Table
 from lab.cli.console import out
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from lab.capture.catalogue import PlanEstimate, SequenceDescription
     from lab.formats.recording_set import RecordingSet
-    from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
+    from lab.formats.results import (
+        ComparisonResult,
+        DiagnosisResult,
+        FitResult,
+        RivalOdds,
+        Skipped,
+        ValidationResult,
+    )
 
 
 def print_sequences(catalogue: tuple[SequenceDescription, ...], found: PlanEstimate | None) -> None:
@@ -149,6 +158,30 @@ def print_diagnosis(diagnosis: DiagnosisResult) -> None:
     print_skipped(diagnosis.skipped)
 
 
+def print_resolving(diagnosis: DiagnosisResult) -> None:
+    """The journal of resolving: in doubt, taken, said; and how it ended."""
+
+    def odds(rivals: Sequence[RivalOdds]) -> str:
+        return ", ".join(f"{rival.name} {rival.probability:.2g}" for rival in rivals) or "none"
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("in doubt", "taken", "expected, nat", "expected, s", "took, s", "said", "session"):
+        table.add_column(heading)
+    for step in diagnosis.resolutions:
+        numbers = (step.information_nat, step.expected_s, step.spent_s)
+        table.add_row(
+            escape(odds(step.rivals)),
+            escape(step.capture + (f", then {step.then}" if step.then else "")),
+            *("" if number is None else f"{number:.3g}" for number in numbers),
+            escape("nothing yet" if step.rivals_after is None else odds(step.rivals_after)),
+            step.session,
+        )
+    if table.row_count:
+        out.print(table)
+    if diagnosis.resolve_end is not None:
+        out.print(f"resolving: [bold]{diagnosis.resolve_end}[/]: {escape(diagnosis.resolve_reason)}")
+
+
 def print_comparison(comparison: ComparisonResult, every: bool) -> None:
     from lab.formats.results.in_words import measured, shown_unit
 
@@ -179,4 +212,6 @@ def print_comparison(comparison: ComparisonResult, every: bool) -> None:
         "which an unchanged rig "
         f"passes in {100 * comparison.false_alarm_rate:g} % of all comparisons"
     )
+    for line in comparison.instruments:
+        out.print(f"instruments: {escape(line)}")
     print_skipped(comparison.skipped)

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lab.cli.console import check_writable, out, write_json
-from lab.cli.sources import Json, StoreFolder, camera_path, recordings_of
+from lab.cli.sources import Json, StoreFolder, camera_path, existing_store, recordings_of
 from lab.errors import InputError
 
 if TYPE_CHECKING:
@@ -39,6 +39,14 @@ def predict(
             help="f_number, temperature_c, lamp, lens, distance_mm, exposure_factor, gain_db, radiance_factor",
         ),
     ] = "",
+    fitted: Annotated[
+        str | None,
+        typer.Option(
+            "--fitted",
+            metavar="SET",
+            help="the recordings of the fit: levels of flats are predicted relative to theirs",
+        ),
+    ] = None,
     light_std_percent: Annotated[float, typer.Option(help="standard deviation of the light to come, per cent")] = 0.3,
     data: StoreFolder = None,
 ) -> None:
@@ -55,8 +63,9 @@ def predict(
         raise InputError(f"{model}: isn't there; name a camera file, or the folder of `diagnose --save`")
     recordings = recordings_of(plan, data)
     found = predicted(
-        _models(recordings, model), recordings, changes, model=str(model), light_std=light_std_percent / 100.0
-    )
+        _models(recordings, model), recordings, changes, model=str(model), light_std=light_std_percent / 100.0,
+        fitted=None if fitted is None else recordings_of(fitted, data),
+    )  # fmt: skip
     hashed = seal(found, out_file)
     for side, one in found.sides.items():
         for skipped in one.skipped:
@@ -118,24 +127,34 @@ def _print(found: TwinScore) -> None:
     out.print(table)
     out.print(f"chi2 {found.chi2:.1f} of {found.n} numbers; {found.missing} predicted numbers weren't measured")
     for effect in found.effects:
-        out.print(escape(f"{effect.side}: {effect.name}: {effect.verdict} (log likelihood {effect.gain:+.1f})"))
+        out.print(escape(f"{effect.side}: {effect.words}"))
 
 
 @commands.command()
 def budget(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="a camera file")],
     use: Annotated[str, typer.Option("--use", metavar="USE,...", help="MTF50, patches, variance, dark mean")],
+    station: Annotated[
+        Path | None,
+        typer.Option("--station", metavar="FILE", help="rank this station's sequences by error reduced for a minute"),
+    ] = None,
     json: Json = None,
+    data: StoreFolder = None,
 ) -> None:
-    """Which effects and parameters, at their present uncertainty, matter for a use, and how much each adds to its
-    variance."""
+    """Which effects and parameters, at their present uncertainty, matter for a use, how much each adds to its variance,
+    and which sequence of a station would reduce its error most for a minute of lab time."""
+    from lab.capture.catalogue import step_times
+    from lab.capture.station import read_station
     from lab.formats.camera_file import read_camera
     from lab.twin.budget import budget as budgeted
     from lab.twin.budget import parse_uses
 
     uses = parse_uses(use)
     check_writable(json)
-    found = budgeted(read_camera(model), uses)
+    there = None if station is None else read_station(station)
+    store = None if there is None else existing_store(data)
+    times = None if there is None or store is None else step_times(store, there)
+    found = budgeted(read_camera(model), uses, there, times)
     write_json(found, json)
     if str(json) == "-":
         return
@@ -146,4 +165,16 @@ def budget(
             table.add_column(heading, justify="left" if heading == "what" else "right")
         for part in one.contributions:
             table.add_row(escape(part.name), f"{part.share_percent:.1f} %", f"{part.std_percent:.3g} %")
+        out.print(table)
+        if not one.captures:
+            continue
+        table = Table(box=None, pad_edge=False)
+        for heading in ("sequence", "minutes", "then", "less for a minute"):
+            table.add_column(heading, justify="left" if heading == "sequence" else "right")
+        for gain in one.captures:
+            about = "" if gain.is_learned else "about "
+            table.add_row(
+                escape(gain.sequence), f"{about}{gain.minutes:.1f}", f"{gain.std_percent:.3g} %",
+                f"{gain.reduced_percent_per_minute:.2g} %",
+            )  # fmt: skip
         out.print(table)

@@ -16,8 +16,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
+from lab.capture_kinds.base import Equipment
 from lab.diagnose.outcome.merge_sides import merged
-from lab.diagnose.outcome.next_capture import CaptureProposal
+from lab.diagnose.outcome.next_capture import Doubt
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import diagnose_side
 from lab.formats.camera_file import CameraFile
@@ -36,12 +37,11 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The result, the improved model of every side that could be judged, and proposals for the next capture, best
-    first."""
+    """The result, the improved model of every side that could be judged, and what is left in doubt on each side."""
 
     result: DiagnosisResult
     improved: dict[Side, CameraFile]
-    proposals: tuple[CaptureProposal, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
 
 def diagnose(
@@ -67,6 +67,7 @@ def examine(
     bootstrap: int = 0,
     workers: Workers | None = None,
     policy: DecisionPolicy | None = None,
+    station: Equipment | None = None,
 ) -> Diagnosis:
     """Diagnose every side of the recordings. Measurements that they don't determine are listed in the result's
     `skipped`.
@@ -79,6 +80,7 @@ def examine(
     bootstrap   number of healthy cameras, drawn frame by frame, whose scores may raise the threshold.
     workers     where these are drawn; None: in the side's process.
     policy      the rules of decision; None: `DecisionPolicy()`.
+    station     where the next capture may be taken: its edges and f-numbers are those of the plans.
     """
     policy = policy or DecisionPolicy()
     shares = dict.fromkeys(recordings.sides, 0.0)
@@ -101,6 +103,7 @@ def examine(
             pictures=pictures,
             bootstrap=bootstrap,
             workers=workers,
+            station=station,
         )
         for side in recordings.sides
     }
@@ -111,5 +114,5 @@ def examine(
     if progress is not None:
         progress("done", 1.0)
     improved = {findings.side: findings.improved for findings in found if findings.improved is not None}
-    offered = sorted((p for findings in found for p in findings.proposals), key=lambda p: -p.capture.distance)
-    return Diagnosis(merged(recordings.source, found, policy), improved, tuple(offered))
+    doubts = tuple(findings.doubt for findings in found if findings.doubt is not None)
+    return Diagnosis(merged(recordings.source, found, policy), improved, doubts)

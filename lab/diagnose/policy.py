@@ -487,16 +487,15 @@ class DecisionPolicy(Frozen):
         ),
     ] = 2.0
     next_captures_listed: Annotated[int, Rule("report", "1", "captures that are listed", "chosen")] = 5
-    resolve_open_probability: Annotated[
+    resolve_least_share: Annotated[
         float,
         Rule(
             "report",
             "1",
-            "predicted probability that the captures taken leave a tie open, below which no more are taken",
-            "a tenth of `false_alarm_rate`: a tie that stays open all the same contradicts the predictions of its "
-            "captures",
+            "share of a doubt's entropy that a capture, or two together, must be expected to tell to be taken",
+            "rivals `next_capture_distance` apart are told to 0.32 of their entropy at equal odds, to 0.21 at 19 to 1",
         ),
-    ] = 0.001
+    ] = 0.2
 
     @classmethod
     def rules(cls) -> dict[str, Rule]:

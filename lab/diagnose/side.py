@@ -7,10 +7,11 @@ findings.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lab.capture_kinds.base import Equipment
 from lab.diagnose.discovery import discover, law_of, told
 from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
@@ -27,32 +28,19 @@ from lab.diagnose.outcome.described import (
     with_laws,
 )
 from lab.diagnose.outcome.detectability import detectability
+from lab.diagnose.outcome.doubts import names_in_doubt
 from lab.diagnose.outcome.effect_sets import side_models
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
 from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.outcome.mismatches import family_corrections, located, shown_in, unexplained, vetoed_names
 from lab.diagnose.outcome.misstated_light import misstated_light
-from lab.diagnose.outcome.next_capture import CaptureProposal, proposals
+from lab.diagnose.outcome.next_capture import Doubt, doubt_of
 from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import (
-    DiscoveredLaw,
-    ExaminedPlace,
-    FitResult,
-    HeldOut,
-    MeasurementFit,
-    Mismatch,
-    ResidualCurve,
-    ResidualPicture,
-    SideModels,
-    Skipped,
-    Unexplained,
-    VetoedName,
-    Visibility,
-)
+from lab.formats.results import DiagnosisLists, FitResult, HeldOut, Mismatch
 from lab.workers import Workers
 from sim.camera import Side
 
@@ -75,34 +63,26 @@ class NamedCandidate:
 class SideFindings:
     """The findings on one side.
 
+    lists  what the result lists of this side
     is_judged  whether any measurement is determined
     gain_is_known  whether a conversion gain is stated or measured; else electrons are those of 1 DN/e
     threshold  of an effect's score; None where no effect acts on the measurements
     improved   the improved model
+    doubt      rivals that are left, and the captures that would tell them apart
     settling   what to capture for a mismatch without a name, as a sentence
     """
 
     side: Side
-    skipped: tuple[Skipped, ...]
+    lists: DiagnosisLists
     is_judged: bool = False
     gain_is_known: bool = True
     threshold: float | None = None
-    mismatches: tuple[Mismatch, ...] = ()
     named: tuple[NamedCandidate, ...] = ()
     abstained: tuple[Candidate, ...] = ()
-    unexplained: tuple[Unexplained, ...] = ()
-    vetoed: tuple[VetoedName, ...] = ()
-    models: SideModels | None = None
     held_out: HeldOut | None = None
-    curves: tuple[ResidualCurve, ...] = ()
     improved: CameraFile | None = None
-    proposals: tuple[CaptureProposal, ...] = ()
+    doubt: Doubt | None = None
     settling: str | None = None
-    discovered: tuple[DiscoveredLaw, ...] = ()
-    places: tuple[ExaminedPlace, ...] = ()
-    measurements: tuple[MeasurementFit, ...] = ()
-    visibility: tuple[Visibility, ...] = ()
-    pictures: tuple[ResidualPicture, ...] = ()
 
 
 def diagnose_side(
@@ -116,6 +96,7 @@ def diagnose_side(
     pictures: bool = False,
     bootstrap: int = 0,
     workers: Workers | None = None,
+    station: Equipment | None = None,
 ) -> SideFindings:
     """Diagnose one side; arguments as of `lab.diagnose.examine`. Residual pictures take some seconds. Each draw of the
     bootstrap takes as long as summarising the recordings."""
@@ -131,7 +112,7 @@ def diagnose_side(
     model, skipped = measurement_model(recordings, side, fit, baseline, study)
     skipped = (*skipped, *unchecked(recordings, side))
     if model is None:
-        return SideFindings(side, skipped, unexplained=wrong)
+        return SideFindings(side, DiagnosisLists(skipped=skipped, unexplained=wrong))
     rng = np.random.default_rng(SEED)
     least = 0.0
     if bootstrap:
@@ -149,6 +130,9 @@ def diagnose_side(
     smooth = left_to_smooth(verdict, by_laws)
     improved, corrections = improved_model(recordings, side, fit, baseline, model, verdict.effects, smooth)
     corrections = corrected_by_laws(verdict, corrections, by_laws)
+    if improved.posterior is not None and verdict.named:
+        doubts = names_in_doubt(verdict, policy)
+        improved = replace(improved, posterior=improved.posterior.model_copy(update={"doubts": doubts}))
     improved = with_laws(improved, laws)
     fitted = fit.cameras.get(side) if fit is not None else None
     shape = (model.camera.rows, model.camera.cols)
@@ -168,29 +152,32 @@ def diagnose_side(
         ),
         *(() if departure is None else (departure,)),
     )
+    models = side_models(side, verdict.models, policy)
     return SideFindings(
         side=side,
-        skipped=skipped,
+        lists=DiagnosisLists(
+            skipped=skipped,
+            mismatches=tuple(found),
+            unexplained=left,
+            vetoed=tuple(vetoed_names(side, verdict)),
+            discovered=told(side, study, discovered),
+            models=() if models is None else (models,),
+            places=tuple(places(side, verdict, policy)),
+            measurements=tuple(measurement_fits(side, verdict)),
+            visibility=tuple(detectability(side, verdict, policy)),
+            pictures=tuple(residual_pictures(recordings, side, model, improved)) if pictures else (),
+            curves=tuple(residual_curves(side, verdict)),
+        ),
         is_judged=True,
         gain_is_known=model.gain_is_known,
         threshold=verdict.threshold if np.isfinite(verdict.threshold) else None,
-        mismatches=tuple(found),
         named=tuple(
             NamedCandidate(c, shown_in(verdict, c, policy), family_corrections(verdict, c, corrections, policy))
             for c in verdict.named
         ),
         abstained=verdict.abstained,
-        unexplained=left,
-        vetoed=tuple(vetoed_names(side, verdict)),
-        models=side_models(side, verdict.models, policy),
         held_out=held_out(verdict, laws, by_laws),
-        curves=tuple(residual_curves(side, verdict)),
         improved=improved,
-        proposals=proposals(recordings, side, verdict, policy),
+        doubt=doubt_of(recordings, side, verdict, policy, station),
         settling=settling_sentence(recordings, side, left),
-        discovered=told(side, study, discovered),
-        places=tuple(places(side, verdict, policy)),
-        measurements=tuple(measurement_fits(side, verdict)),
-        visibility=tuple(detectability(side, verdict, policy)),
-        pictures=tuple(residual_pictures(recordings, side, model, improved)) if pictures else (),
     )

@@ -30,13 +30,13 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from lab.errors import InputError
+from lab.formats.camera_model import camera_model
 from lab.formats.model_posterior import ModelPosterior
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
 from lab.formats.result_file import read_result, write_result
 from lab.formats.results import CameraFit
 from lab.formats.spectrum_csv import parse_spectrum
-from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Lens, Side
 from sim.effects.base import Effect
 from sim.effects.library import effect, effects
@@ -426,7 +426,7 @@ def _text(value: Any) -> str:
 
 
 def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> CameraFile:
-    """The camera that a fit found (`lab.predict.camera_model.camera_model`), with the fit's uncertainties, to be
+    """The camera that a fit found (`lab.formats.camera_model.camera_model`), with the fit's uncertainties, to be
     written as a file."""
     model = camera_model(recordings, side, fit)
     std = {}

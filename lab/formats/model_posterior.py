@@ -11,6 +11,8 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import model_validator
 
+from sim.effects.base import Effect
+from sim.effects.library import effect as library_effect
 from sim.parameters import Frozen
 from sim.spectrum import FloatArray
 
@@ -30,6 +32,48 @@ class FirstEstimates(Frozen):
     lamp_jitter: float  # relative standard deviation of a flat frame's mean
 
 
+class StoredEffect(Frozen):
+    """An effect by its name and fields, as a camera file has it."""
+
+    name: str
+    values: dict[str, float | int | str | tuple[float, ...] | None]
+
+    @classmethod
+    def of(cls, effect: Effect) -> Self:
+        """What is stored of an effect."""
+        return cls(name=effect.name, values=effect.model_dump())
+
+    def effect(self) -> Effect:
+        """The effect. Raises ValueError for one that the library doesn't have."""
+        found: Effect = library_effect(self.name).model_validate(self.values)
+        return found
+
+
+class RivalModel(Frozen):
+    """The camera with a rival in the place of a named effect (`name` empty: with nothing there). `effects`: all that
+    were named or stand in for them; `shift`: what the posterior means of the parameters differ by then."""
+
+    name: str
+    probability: float
+    effects: tuple[StoredEffect, ...]
+    shift: dict[str, float]
+
+
+class NameInDoubt(Frozen):
+    """A name, and what else may be meant.
+
+    effect, told : of the effect in the camera file, and as it was told: its name, or its family's
+    probability : of the effect among its rivals
+    named : names of all effects that the rivals' `effects` stand in for
+    """
+
+    effect: str
+    told: str
+    probability: float
+    named: tuple[str, ...]
+    rivals: tuple[RivalModel, ...]
+
+
 class ModelPosterior(Frozen):
     """Posterior mean (k,) and covariance (k, k) of a camera model's parameters.
 
@@ -43,6 +87,7 @@ class ModelPosterior(Frozen):
     names: tuple[str, ...]
     mean: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]
+    doubts: tuple[NameInDoubt, ...] = ()
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:

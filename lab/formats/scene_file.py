@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import InputError
+from lab.formats.cgats import parse_cgats
+from lab.formats.exr_scene import WEIGHT, read_exr
 from lab.formats.importers.images import decoded
 from lab.formats.spectrum_csv import parse_curve
 from sim.camera import CameraModel
@@ -27,7 +29,7 @@ from sim.spectrum import FloatArray, Spectrum, energy_from_photons
 LUMINANCE_CD_M2 = 100.0
 
 PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
-CUBES = (".npz", ".hdr")
+CUBES = (".npz", ".hdr", ".exr")
 
 #: Names of the quantity that a light's CSV or an .npz cube holds, in the column's or the array's name.
 RADIANCE, PHOTONS, RELATIVE, REFLECTANCE = "radiance_w_sr_m2_nm", "photons_s_sr_m2_nm", "relative", "reflectance"
@@ -51,15 +53,12 @@ MOST_SAMPLES = 2**29
 def read_light(file: Path, luminance_cd_m2: float | None = None) -> Spectrum:
     """Radiance (W sr^-1 m^-2 nm^-1) of a measured light.
 
+    CGATS (`.sp`, `.ti3`) of one spectrum: a radiance where its MEAS_TYPE says EMISSION, else relative.
     The CSV's header is `wavelength_nm,` and one of `radiance_w_sr_m2_nm`, `photons_s_sr_m2_nm` (s^-1 sr^-1 m^-2 nm^-1),
     which are taken as they are unless a luminance is asked for, and `relative`, which needs one.
     """
     with _about(file):
-        try:
-            text = file.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"can't be read as text ({_reason(error)}); give a CSV in UTF-8") from None
-        column, curve = parse_curve(text, (RADIANCE, PHOTONS, RELATIVE))
+        column, curve = _light_curve(file)
     lowest = int(np.argmin(curve.value))
     if curve.value[lowest] < 0:
         raise InputError(
@@ -76,6 +75,20 @@ def read_light(file: Path, luminance_cd_m2: float | None = None) -> Spectrum:
         return curve
     with _about(file):
         return at_luminance(curve, luminance_cd_m2)
+
+
+def _light_curve(file: Path) -> tuple[str, Spectrum]:
+    """The quantity that a light's file holds, by its name in a CSV, and the curve. InputError without the path."""
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"can't be read as text ({_reason(error)}); give a CSV in UTF-8") from None
+    if file.suffix.lower() not in (".sp", ".ti3"):
+        return parse_curve(text, (RADIANCE, PHOTONS, RELATIVE))
+    found = parse_cgats(text)
+    if len(found.spectra) > 1:
+        raise InputError(f"holds {len(found.spectra)} spectra; import it, and name the light's CSV")
+    return RADIANCE if found.quantity == "radiance" else RELATIVE, next(iter(found.spectra.values()))
 
 
 def light(name: str, luminance_cd_m2: float | None = None) -> Spectrum:
@@ -111,8 +124,10 @@ def read_picture(file: Path) -> NDArray[np.uint8]:
     return np.ascontiguousarray(codes, dtype=np.uint8)
 
 
-def read_cube(file: Path, white: Spectrum | None = None) -> SpectralImage:
-    """A spectral image from an .npz or an ENVI header (.hdr) with its data file beside it.
+def read_cube(file: Path, white: Spectrum | None = None, weights: Mapping[str, float] | None = None) -> SpectralImage:
+    """A spectral image from an .npz, an ENVI header (.hdr) with its data file beside it, or a spectral OpenEXR.
+
+    OpenEXR: the sum of its lights' radiances, each times its weight (`lab.formats.exr_scene`).
 
     .npz: `wavelength_nm` (bands,) and one of `radiance_w_sr_m2_nm`, `photons_s_sr_m2_nm`, `reflectance`, (rows, cols,
     bands).
@@ -121,10 +136,12 @@ def read_cube(file: Path, white: Spectrum | None = None) -> SpectralImage:
     """
     suffix = file.suffix.lower()
     if suffix not in CUBES:
-        raise InputError(f"{file}: a spectral cube can't be {suffix or 'without an ending'}; give .npz or ENVI's .hdr")
+        raise InputError(f"{file}: a spectral cube can't be {suffix or 'without an ending'}; give {', '.join(CUBES)}")
     if not file.is_file():
-        raise InputError(f"{file}: no such file; give a cube as .npz or ENVI's .hdr")
+        raise InputError(f"{file}: no such file; give a cube as {', '.join(CUBES)}")
     with _about(file):
+        if suffix == ".exr":
+            return read_exr(file, weights)
         quantity, wavelength_nm, values = _npz(file) if suffix == ".npz" else _envi(file)
         wavelengths = tuple(wavelength_nm.tolist())
         if values.dtype not in (np.float32, np.float64):
@@ -169,13 +186,21 @@ def scene(
         with _about(file):
             return PictureOnScreen.choose(parameters).show(codes, view, white)
     if suffix in CUBES:
-        image = read_cube(file, white)
+        weights, own = _weights(suffix, parameters or {})
+        image = read_cube(file, white, weights)
         with _about(file):
-            return Cube.choose(parameters).show(image, view)
+            return Cube.choose(own).show(image, view)
     raise InputError(
         f"scene {name!r} is not known: name one of {', '.join(SCENES)}, a picture ({' '.join(PICTURES)}) or a cube "
         f"({' '.join(CUBES)})"
     )
+
+
+def _weights(suffix: str, parameters: Mapping[str, object]) -> tuple[dict[str, float], dict[str, object]]:
+    """The weights of an OpenEXR scene's lights, by light, and the other parameters."""
+    lights = [key for key in parameters if suffix == ".exr" and key.startswith(WEIGHT)]
+    weights = {key.removeprefix(WEIGHT): float(str(parameters[key])) for key in lights}
+    return weights, {key: value for key, value in parameters.items() if key not in lights}
 
 
 @contextmanager

@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
-from lab.formats.recording_set import DataSheet
+from lab.formats.recording_set import DataSheet, RecordingSet
+from sim.spectrum import Spectrum
 
 # --- stated light --------------------------------------------------------------------------------------------------
 # How much light a flat's manifest states: photons a pixel, or else the time of exposure to one lamp.
@@ -48,6 +49,30 @@ def most_frequent_gain_db(flats: Sequence[FlatCapture]) -> float:
     flats."""
     gains = [flat.gain_db or 0.0 for flat in flats]
     return max(sorted(set(gains)), key=gains.count, default=0.0)
+
+
+#: Relative difference below which two radiances are readings of one lamp.
+SAME_LAMP = 0.02
+
+
+def lamps_of(recordings: RecordingSet, flats: Sequence[FlatCapture]) -> dict[str, int]:
+    """Return the number of the lamp of each radiance file that the flats name.
+
+    A lamp that is measured anew before every pass over the levels is one lamp: its spectra differ by less than
+    `SAME_LAMP`, in the sum of the magnitudes."""
+    found: list[Spectrum] = []
+    lamps: dict[str, int] = {}
+    for path in dict.fromkeys(flat.radiance for flat in flats if flat.radiance is not None):
+        spectrum = recordings.spectrum(path)
+        wavelength_nm, value = spectrum.arrays
+        for number, other in enumerate(found):
+            if np.abs(value - other.at(wavelength_nm)).sum() <= SAME_LAMP * np.abs(value).sum():
+                lamps[path] = number
+                break
+        else:
+            lamps[path] = len(found)
+            found.append(spectrum)
+    return lamps
 
 
 # --- photon numbers ------------------------------------------------------------------------------------------------

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.diagnose.outcome.improved_model import IN_CURVES
 from lab.formats.camera_file import CameraFile
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Check, DiagnosisResult, FitResult
-from lab.predict.camera_model import camera_model
 from lab.predict.validate import validate
 from sim.camera import Side
 from sim.spectrum import Spectrum
@@ -71,7 +70,7 @@ def predict_both(
     """
     if not improved or diagnosis is None:
         return None
-    discrepant = {item.side for item in diagnosis.unexplained if IN_CURVES in item.correction}
+    discrepant = {item.side for item in diagnosis.unexplained if item.corrects_curves}
     baseline: dict[Side, CameraFile] = {}
     for side, camera in improved.items():
         maker = camera_model(recordings, side, fit.cameras.get(side), maker_curves=True).quantum_efficiency

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, traced_table
+from lab.formats.provenance import installed_versions
 from lab.formats.raw_file import (
     Frame,
     RawMetadata,
@@ -26,7 +27,6 @@ from lab.formats.raw_file import (
     writer_of,
 )
 from lab.formats.scene_file import light, scene
-from lab.report.provenance import installed_versions
 from sim import frame as sim_frame
 from sim.camera import CameraModel, Lens
 from sim.effects.distortion import Distortion

@@ -14,13 +14,10 @@ from scipy import special
 
 from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.diagnose.inference.gaussian import chi2
-from lab.diagnose.measurements.chart import Patch as PatchLevel
-from lab.diagnose.measurements.chart import patch_covariance, patch_levels
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.psf.screen_kernel import expected_kernel
 from lab.formats.camera_file import CameraFile
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
     CameraFit,
@@ -34,8 +31,11 @@ from lab.formats.results import (
 )
 from lab.measure.edge_mtf import EdgeMtf
 from lab.measure.edges import measure_edge
+from lab.measure.gaussian import chi2
+from lab.measure.patches import Patch as PatchLevel
+from lab.measure.patches import patch_covariance, patch_levels
+from lab.measure.study import Study
 from lab.one_blas_thread import one_blas_thread
-from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.optics.illumination import relative_illumination
@@ -127,7 +127,7 @@ def _charts(
         raise NotDetermined("colorchecker", "the sensitivities weren't fitted: capture narrowband light")
     if fit.noise is None or fit.noise.conversion_gain_dn_per_e is None:
         raise NotDetermined("colorchecker", "the conversion gain wasn't fitted: capture flats in repeats")
-    study = Study(recordings, side, model)
+    study = Study(recordings, side, model, fitted=fit.noise)
     points = patch_levels(study)
     if not points:
         raise NotDetermined("colorchecker", "no unclipped patches of a ColorChecker24")

@@ -18,8 +18,10 @@ from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.measurements.library import measurement_title
 from lab.effect_titles import at_beginning, effect_title
 from lab.errors import InputError
+from lab.formats.provenance import Provenance, installed_versions, provenance_of
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set.snapshot import told
 from lab.formats.results import (
     Check,
     DiagnosisResult,
@@ -38,7 +40,6 @@ from lab.report.chart_data import ChartData, plotly_base64
 from lab.report.emva import data_sheets
 from lab.report.figures import by_side, geometry_figures, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
-from lab.report.provenance import Provenance, installed_versions, provenance_of
 from lab.report.stills import still
 from sim.camera import Side
 
@@ -161,6 +162,7 @@ def page_environment() -> jinja2.Environment:
         "stated": stated,
         "stated_as": lambda value, std, unit: "–" if value is None else measured(value, std, unit),
         "still": still,
+        "setting": told,
         "mood": diagnosis_page.mood,
     }
     return environment
@@ -277,6 +279,7 @@ def render_report(
         "skipped": list(skipped.values()),
         "warnings": recordings.warnings,
         "provenance": provenance,
+        "changes": recordings.manifest.changes,
         "notes": recordings.manifest.notes,
         "listed": recordings.captures(),
         "chart_data": ChartData(),

@@ -4,22 +4,29 @@ g = d use / d z at the model, by differences; the variance of the use is g' V g 
 group k of parameters adds is what knowing it exactly would take away (linear propagation, conditional covariance):
 
     added_k = g' V g - g_r' (V_rr - V_rk V_kk^-1 V_kr) g_r,   r: all others
+
+With a station, each sequence that it can take is ranked by what it would take away from the use's standard deviation
+for a minute of lab time (`lab.twin.lab_minutes`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
+from lab.capture.catalogue import StepTimes
+from lab.capture.station import Station
 from lab.diagnose.inference.refit import coordinates, moved
 from lab.diagnose.measurements.curves import freed_curve
 from lab.diagnose.measurements.noise import GAIN_STD, READ_STD
-from lab.diagnose.outcome.model_posterior import STEP, coordinate_name
+from lab.diagnose.outcome.model_posterior import STEP, coordinate_name, with_unnamed
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import ModelPosterior
 from lab.one_blas_thread import one_blas_thread
+from lab.twin.lab_minutes import LabCapture, lab_captures
 from lab.twin.predict import posterior_of
 from sim.camera import CameraModel
 from sim.effects.base import Effect
@@ -45,12 +52,26 @@ class Contribution(Frozen):
     std_percent: float
 
 
+class CaptureGain(Frozen):
+    """What a sequence of the station would make of a use's standard deviation. `is_learned`: its time rests on
+    sessions of this station; else it is that of typical instruments."""
+
+    sequence: str
+    minutes: float
+    is_learned: bool
+    std_percent: float
+    reduced_percent: float  # of the use, that the standard deviation falls by
+    reduced_percent_per_minute: float
+
+
 class UseBudget(Frozen):
-    """One use: its standard deviation (per cent, rms over its numbers), and the contributions, largest first."""
+    """One use: its standard deviation (per cent, rms over its numbers), the contributions, largest first, and the
+    sequences of a station, the one first that reduces it most for a minute."""
 
     use: str
     std_percent: float
     contributions: tuple[Contribution, ...]
+    captures: tuple[CaptureGain, ...] = ()
 
 
 class BudgetResult(Frozen):
@@ -123,23 +144,52 @@ def parse_uses(text: str) -> tuple[str, ...]:
 
 
 @one_blas_thread
-def budget(content: CameraFile, uses: tuple[str, ...]) -> BudgetResult:
-    """The budget of every use. Raises InputError where the model states no uncertainties."""
+def budget(
+    content: CameraFile, uses: tuple[str, ...], station: Station | None = None, times: StepTimes | None = None
+) -> BudgetResult:
+    """The budget of every use, and with a `station` what its sequences would make of it, at the step `times` that are
+    known there. Raises InputError where the model states no uncertainties."""
     posterior = posterior_of(content)
+    content = replace(content, effects=with_unnamed(content.effects, posterior))
     covariance = np.array(posterior.covariance)
-    return BudgetResult(model=content.name, uses=tuple(_use(content, posterior, covariance, use) for use in uses))
+    after = []
+    for one in lab_captures(content, posterior.first, station, times or StepTimes({})) if station is not None else ():
+        jacobian = _slopes(content, posterior, one.numbers(content), one.numbers).T
+        after.append((one, one.known_after(covariance, jacobian)))
+    return BudgetResult(
+        model=content.name, uses=tuple(_use(content, posterior, covariance, use, after) for use in uses)
+    )
 
 
-def _use(content: CameraFile, posterior: ModelPosterior, covariance: FloatArray, use: str) -> UseBudget:
+def _slopes(
+    content: CameraFile, posterior: ModelPosterior, base: FloatArray, numbers: Callable[[CameraFile], FloatArray]
+) -> FloatArray:
+    """Derivatives (k, n) of n numbers, `base` at the model, by the k parameters of the posterior."""
+    return np.array([_slope(content, posterior, name, base, numbers) for name in posterior.names])
+
+
+def _relative_std(gradient: FloatArray, covariance: FloatArray) -> float:
+    """Standard deviation of a use, rms over its m numbers, by their relative gradient (k, m)."""
+    return float(np.sqrt(max(np.mean(np.einsum("km,kl,lm->m", gradient, covariance, gradient)), 0.0)))
+
+
+def _use(
+    content: CameraFile,
+    posterior: ModelPosterior,
+    covariance: FloatArray,
+    use: str,
+    after: list[tuple[LabCapture, FloatArray]],
+) -> UseBudget:
     exposure_s = _exposure_s(content.camera)
 
     def numbers(changed: CameraFile) -> FloatArray:
         return USES[use](changed.camera, changed.effects, exposure_s)
 
     base = numbers(content)
-    gradient = np.array([_slope(content, posterior, name, base, numbers) for name in posterior.names])
+    gradient = _slopes(content, posterior, base, numbers)
     gradient = gradient / np.maximum(np.abs(base), 1e-12)  # (k, m), relative
-    whole = float(np.mean(np.einsum("km,kl,lm->m", gradient, covariance, gradient)))
+    std = _relative_std(gradient, covariance)
+    whole = std**2
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(posterior.names):
         if gradient[i].any():
@@ -150,17 +200,28 @@ def _use(content: CameraFile, posterior: ModelPosterior, covariance: FloatArray,
         inside = covariance[np.ix_(members, members)]
         between = covariance[np.ix_(rest, members)]
         left = covariance[np.ix_(rest, rest)] - between @ np.linalg.pinv(inside) @ between.T
-        remaining = float(np.mean(np.einsum("km,kl,lm->m", gradient[rest], left, gradient[rest])))
+        remaining = _relative_std(gradient[rest], left) ** 2
         share = (whole - remaining) / whole if whole > 0 else 0.0
-        alone = float(np.mean(np.einsum("km,kl,lm->m", gradient[members], inside, gradient[members])))
+        alone = _relative_std(gradient[members], inside)
         found.append(
             Contribution(
                 name=name, parameters=tuple(posterior.names[i] for i in members), share_percent=100.0 * share,
-                std_percent=100.0 * float(np.sqrt(max(alone, 0.0))),
+                std_percent=100.0 * alone,
             )
         )  # fmt: skip
     found.sort(key=lambda one: -one.share_percent)
-    return UseBudget(use=use, std_percent=100.0 * float(np.sqrt(max(whole, 0.0))), contributions=tuple(found))
+    gains = []
+    for one, known in after:
+        left = _relative_std(gradient, known)
+        gains.append(
+            CaptureGain(
+                sequence=one.words, minutes=one.minutes, is_learned=one.is_learned, std_percent=100.0 * left,
+                reduced_percent=100.0 * (std - left),
+                reduced_percent_per_minute=100.0 * (std - left) / max(one.minutes, 1e-3),
+            )
+        )  # fmt: skip
+    gains.sort(key=lambda one: -one.reduced_percent_per_minute)
+    return UseBudget(use=use, std_percent=100.0 * std, contributions=tuple(found), captures=tuple(gains))
 
 
 def _group(name: str) -> str:
@@ -211,6 +272,8 @@ def _slope(
         update["quantum_efficiency"] = curves
     elif name == "read":
         update["read_noise_e"] = camera.read_noise_e * np.sqrt(1.0 + READ_STD * step)
+    elif name == "black":
+        update["black_level_dn"] = camera.black_level_dn + step * first.black_level_std_dn
     elif name == "dark":
         update["dark_current_e_per_s"] = camera.dark_current_e_per_s + step * first.dark_current_std_dn_per_s / gain
     else:

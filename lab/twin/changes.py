@@ -3,9 +3,10 @@ carries it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import ValidationError
 
@@ -15,6 +16,7 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.spectrum_csv import parse_spectrum
 from lab.predict.simulate import with_lens
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
+from sim.effects.other_f_number import OtherFNumber
 from sim.optics.illumination import irradiance_factor
 from sim.optics.imaging import DiffractionLimited
 from sim.parameters import Frozen, Quantity
@@ -29,18 +31,23 @@ class Changes(Frozen):
 
     f_number: Annotated[float | None, Quantity("1", "f-number", lower=0.5, upper=64.0)] = None
     temperature_c: Annotated[float | None, Quantity("C", "sensor temperature", lower=-273.0, upper=200.0)] = None
-    lamp: Path | None = None
+    lamp: Path | Spectrum | None = None
     lens: Path | None = None
     distance_mm: Annotated[float | None, Quantity("mm", "distance of the scene", lower=1.0)] = None
     exposure_factor: Annotated[float | None, Quantity("1", "factor on exposures", lower=1e-4, upper=1e4)] = None
     gain_db: Annotated[float | None, Quantity("dB", "analogue gain", lower=-40.0, upper=80.0)] = None
     radiance_factor: Annotated[float | None, Quantity("1", "factor on the light", lower=1e-6, upper=1e6)] = None
 
+    @property
+    def changes_lens(self) -> bool:
+        """Whether the lens, or its aperture, is another one."""
+        return self.f_number is not None or self.lens is not None
+
     def spectrum(self) -> Spectrum | None:
         """The changed lamp's radiance, W sr^-1 m^-2 nm^-1; None: the plan's. Raises InputError for a file that can't be
         used."""
-        if self.lamp is None:
-            return None
+        if self.lamp is None or isinstance(self.lamp, Spectrum):
+            return self.lamp
         try:
             return parse_spectrum(self.lamp.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError) as error:
@@ -62,12 +69,18 @@ def parse_changes(text: str) -> Changes:
         if not equals or not value or key in values:
             raise InputError(f"--change {part}: give {key}=VALUE, once")
         values[key] = value
+    return checked_changes(values, "--change ")
+
+
+def checked_changes(values: Mapping[str, Any], where: str) -> Changes:
+    """The changes of these values. Raises InputError, beginning with `where`, for one that can't be used."""
     try:
         return Changes.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
+        first = next((one for one in error.errors() if one["type"] == "value_error"), error.errors()[0])
         told = first["msg"].removeprefix("Value error, ")
-        raise InputError(f"--change {first['loc'][0]}={first['input']}: {told}; correct it") from error
+        given = first["input"] if isinstance(first["input"], str | int | float) else "..."
+        raise InputError(f"{where}{first['loc'][0]}={given}: {told}; correct it") from error
 
 
 def carried(content: CameraFile, changes: Changes) -> CameraFile:
@@ -100,12 +113,15 @@ def carried(content: CameraFile, changes: Changes) -> CameraFile:
                 "dark_current_doubling_c in the camera file"
             )
     if changes.distance_mm is not None:
-        focal_mm = camera.lens.focal_length_mm
+        focal_mm = content.camera.lens.focal_length_mm
         if changes.distance_mm <= 2.0 * focal_mm:
             raise InputError(
                 f"distance_mm={changes.distance_mm:g}: isn't above twice the focal length, {focal_mm:g} mm; give a "
                 "larger one, or state focal_length_mm"
             )
+        # a near scene's image lies behind the focal plane: the cone is as much slimmer, for light and diffraction
+        works = OtherFNumber(ratio=1.0 + focal_mm / (changes.distance_mm - focal_mm))
+        content = replace(content, effects=(*content.effects, works))
     return content
 
 

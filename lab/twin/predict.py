@@ -16,25 +16,33 @@ import numpy as np
 from lab.capture_kinds.base import Capture
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import coordinates
-from lab.diagnose.measurements.block import Block, Effects, Label, Prediction
-from lab.diagnose.measurements.chart import CHART, reflectance_covariance
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
+from lab.diagnose.measurements.chart import CHART
 from lab.diagnose.measurements.dark_level import DARK, added_dark_e_per_s
+from lab.diagnose.measurements.flat_light import misstated_levels
+from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.measurements.noise import GAIN_STD, NOISE, READ_STD, shot_variance
-from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, USUAL_LAMP, NoiseGuess
 from lab.diagnose.measurements.slanted_edge import ASIDE, SLANTED_EDGE
-from lab.diagnose.measurements.study import Study
-from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian
+from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian, with_unnamed
 from lab.errors import InputError, NotDetermined
+from lab.fit import fit_recording_set
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
+from lab.measure.noise_figures import BLACK_FLOOR_DN, USUAL_LAMP, NoiseFigures
+from lab.measure.patches import reflectance_covariance
+from lab.measure.study import Study
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.changes import Changes, carried, doubling_std_c, reference_temperature_c
-from lab.twin.sealed import PredictedNumber, SealedPrediction, SidePrediction
-from lab.twin.session import future_session
+from lab.twin.relative_light import RelativeLight, rates_per_dose, relative_light
+from lab.twin.sealed import PredictedName, PredictedNumber, PredictedRival, SealedPrediction, SidePrediction
+from lab.twin.session import check_sensor, future_session
 from sim.camera import CameraModel, Side
+from sim.effects.base import Effects
+from sim.effects.empirical_law import EmpiricalLaw
 from sim.effects.model_discrepancy import ModelDiscrepancy
+from sim.effects.other_f_number import OtherFNumber
 from sim.sensor.electrons import dark_current_e_per_s, gain_dn_per_e
 from sim.spectrum import FloatArray
 
@@ -61,10 +69,13 @@ def predict(
     *,
     model: str = "",
     light_std: float = 0.003,
+    fitted: RecordingSet | None = None,
 ) -> SealedPrediction:
     """The prediction for every side that plan and models have in common.
 
     light_std : relative standard deviation of the light to come, beside what the plan states
+    fitted : the recordings that the models were fitted to. The means of flats are predicted relative to theirs, which
+        needs no radiance: photon numbers, or one lamp at several exposures
 
     Raises InputError for a change that a model can't carry, before anything is computed, and where nothing can be
     predicted."""
@@ -75,7 +86,7 @@ def predict(
     checked = {side: (carried(models[side], changes), posterior_of(models[side])) for side in sides}
     found = {}
     for side, (content, posterior) in checked.items():
-        found[side] = _side(content, posterior, plan, side, changes, light_std)
+        found[side] = _side(content, posterior, plan, side, changes, light_std, fitted)
     return SealedPrediction(
         model=model, plan=plan.source, changes=changes, sides=found,
         cameras={side: content.camera.model_dump_json() for side, (content, _) in checked.items()},
@@ -110,10 +121,12 @@ def posterior_of(content: CameraFile) -> ModelPosterior:
     return ModelPosterior.of(first, tuple(known), np.zeros(len(known)), np.diag(variances))
 
 
-def measured_blocks(study: Study) -> tuple[list[Block], list[Skipped]]:
+def measured_blocks(
+    study: Study, quantities: tuple[Measurement, ...] = QUANTITIES
+) -> tuple[list[Block], list[Skipped]]:
     """The blocks that the recordings determine, with the numbers that a twin predicts, and why others are missing."""
     blocks, skipped = [], []
-    for measurement in QUANTITIES:
+    for measurement in quantities:
         try:
             blocks.append(measurement.make(study))
         except NotDetermined as refused:
@@ -130,19 +143,34 @@ def is_predicted(block: Block, label: Label) -> bool:
 
 
 def _side(
-    content: CameraFile, posterior: ModelPosterior, plan: RecordingSet, side: Side, changes: Changes, light_std: float
+    content: CameraFile,
+    posterior: ModelPosterior,
+    plan: RecordingSet,
+    side: Side,
+    changes: Changes,
+    light_std: float,
+    fitted: RecordingSet | None,
 ) -> SidePrediction:
-    session = future_session(content, plan, side, changes)
+    light = None
+    if fitted is not None:
+        check_sensor(content, fitted.camera(side), fitted.source)
+        noise_fit = fit_recording_set(fitted, steps=("noise",)).cameras.get(side)
+        misstated = frozenset(id for level in misstated_levels(noise_fit) for id in level.captures)
+        light = relative_light(_study(content, posterior, fitted, side, misstated)[0], content.effects, posterior)
+    session = future_session(content, plan, side, changes, dn_per_photon=None if light is None else light.dn_per_dose())
     captures = session.captures(side=side)
     study, growth_std = _study(content, posterior, session, side)
-    blocks, skipped = measured_blocks(study)
+    blocks, skipped = measured_blocks(study, QUANTITIES if light is None else (*QUANTITIES, PHOTON_TRANSFER))
     if not blocks:
         raise InputError(
             f"{plan.source}: nothing can be predicted ({skipped[0].reason}); plan other captures or changes"
         )
     model = MeasurementModel(tuple(blocks), study.camera, gain_is_known=True, noise=study.noise)
     effects = content.effects
-    mean, covariance = _distribution(model, effects, posterior, growth_std, light_std)
+    for block in blocks:
+        if light is not None and block.measurement is PHOTON_TRANSFER:
+            light = light.about(rates_per_dose(study, block))
+    mean, covariance = _distribution(model, effects, posterior, growth_std, light_std, light)
     use = np.array([is_predicted(b, label) for b in blocks for label in b.labels])
     is_level = np.array([b.measurement.is_level for b in blocks for _ in b.labels])
     full = is_level & (mean > HIGHEST_SHARE * study.saturation_dn)
@@ -153,11 +181,7 @@ def _side(
         )
         skipped.append(Skipped(step="twin saturation", reason=reason, side=side))
         use &= ~full
-    without = {}
-    for i, effect in enumerate(effects):
-        if not isinstance(effect, ModelDiscrepancy):
-            rest = (*effects[:i], *effects[i + 1 :])
-            without[effect.name] = tuple((mean + model.mean(rest) - model.mean(effects))[use].tolist())
+    names = _names(model, content, posterior, mean, use)
     kept = covariance[np.ix_(use, use)]
     numbers = [n for n, used in zip(_numbers(study, model, effects, mean, covariance), use, strict=True) if used]
     lens = content.camera.lens
@@ -167,12 +191,56 @@ def _side(
         lens={"f_number": lens.f_number, "focal_length_mm": lens.focal_length_mm},
         numbers=tuple(numbers),
         covariance=tuple(float(f"{v:.9g}") for v in kept[np.tril_indices(len(kept))]),
-        without=without,
+        names=names,
         skipped=tuple(skipped),
     )
 
 
-def _study(content: CameraFile, posterior: ModelPosterior, session: RecordingSet, side: Side) -> tuple[Study, float]:
+def _names(
+    model: MeasurementModel, content: CameraFile, posterior: ModelPosterior, mean: FloatArray, use: np.ndarray
+) -> tuple[PredictedName, ...]:
+    """Every name of the model with what its rivals predict of the numbers in `use` (n,), of `mean` (n,) with it. Of a
+    model that knows no rivals: with nothing in its place."""
+    base = model.mean(content.effects)
+    columns = model.nuisance_jacobian(content.effects)
+    for block, at in zip(model.blocks, model.slices, strict=True):
+        if block.measurement is CHART:
+            columns |= _patch_columns(block, at, len(mean))
+
+    def numbers(acting: Effects, shift: Mapping[str, float]) -> tuple[float, ...]:
+        moved = sum((value * columns[name] for name, value in shift.items() if name in columns), np.zeros_like(mean))
+        return tuple(float(f"{v:.9g}") for v in (mean + model.mean(acting) - base + moved)[use])
+
+    found = []
+    for doubt in posterior.doubts:
+        kept = tuple(e for e in content.effects if e.name not in doubt.named)
+        rivals = [
+            PredictedRival(
+                name=one.name,
+                probability=one.probability,
+                numbers=numbers((*(e.effect() for e in one.effects), *kept), one.shift),
+            )
+            for one in doubt.rivals
+        ]
+        found.append(
+            PredictedName(effect=doubt.effect, told=doubt.told, probability=doubt.probability, rivals=tuple(rivals))
+        )
+    told = {doubt.effect for doubt in posterior.doubts}
+    for i, effect in enumerate(content.effects):
+        if effect.name not in told and not isinstance(effect, ModelDiscrepancy | EmpiricalLaw | OtherFNumber):
+            rest = (*content.effects[:i], *content.effects[i + 1 :])
+            absent = PredictedRival(name="", probability=0.0, numbers=numbers(rest, {}))
+            found.append(PredictedName(effect=effect.name, told=effect.name, probability=1.0, rivals=(absent,)))
+    return tuple(found)
+
+
+def _study(
+    content: CameraFile,
+    posterior: ModelPosterior,
+    session: RecordingSet,
+    side: Side,
+    misstated: frozenset[str] = frozenset(),
+) -> tuple[Study, float]:
     """The study of the session to come, whose figures are the model's; and the relative standard deviation of its dark
     current by the camera's own doubling temperature."""
     camera, first = content.camera, posterior.first
@@ -190,7 +258,7 @@ def _study(content: CameraFile, posterior: ModelPosterior, session: RecordingSet
     if now_c is not None and reference_c is not None and camera.dark_current_doubling_c is not None:
         rise = now_c - reference_c
         growth_std = abs(np.log(2.0) * rise / camera.dark_current_doubling_c**2) * doubling_std_c(content)
-    noise = NoiseGuess(
+    noise = NoiseFigures(
         black=camera.black_level_dn, dark_dn_per_s=dark * gain, dark_c=reference_c, gain=gain, gain_is_known=True,
         read_dn=float(np.hypot(np.sqrt(max(first.read_noise_dn**2 - 1.0 / 12.0, 0.0)) * amplified, 12.0**-0.5)),
         prnu=0.01 * camera.prnu_percent, jitter_dn=max(first.level_jitter_dn, BLACK_FLOOR_DN), jitter_freedom=0.0,
@@ -206,20 +274,26 @@ def _study(content: CameraFile, posterior: ModelPosterior, session: RecordingSet
         }
     )
     clipped = camera.black_level_dn + NEAR_FULL * camera.full_well_e * gain
-    return Study(session, side, seen, clipped, noise=noise), growth_std
+    return Study(session, side, seen, clipped, misstated, noise=noise), growth_std
 
 
 def _distribution(
-    model: MeasurementModel, effects: Effects, posterior: ModelPosterior, growth_std: float, light_std: float
+    model: MeasurementModel,
+    effects: Effects,
+    posterior: ModelPosterior,
+    growth_std: float,
+    light_std: float,
+    light: RelativeLight | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (n,) and covariance (n, n) of all numbers."""
     columns = {k: v for k, v in model.nuisance_jacobian(effects).items() if k != "warmth"}
-    coords = coordinates(effects, model.camera)
-    by_effect = effect_jacobian(model, effects, coords).T
+    acting = with_unnamed(effects, posterior)
+    coords = coordinates(acting, model.camera)
+    by_effect = effect_jacobian(model, acting, coords).T
     columns |= {
         name: column
         for c, column in zip(coords, by_effect, strict=True)
-        if (name := coordinate_name(effects, c)) in posterior.names
+        if (name := coordinate_name(acting, c)) in posterior.names
     }
     bare = MeasurementModel(tuple(_without_nuisances(b) for b in model.blocks), model.camera)
     covariance = bare.gaussian(effects).covariance - _forms(bare, effects)
@@ -230,6 +304,9 @@ def _distribution(
             charge_dn = np.maximum(model.mean(effects)[at] - black, 0.0)
             variance = (model.noise.gain * charge_dn + model.noise.read_dn**2) / (camera.rows * camera.cols)
             covariance[at, at] += np.diag(variance)
+        if block.measurement is NOISE:
+            change = _beyond_correction(block, model, effects) * model.mean(effects)[at]
+            covariance[at, at] += np.outer(change, change)
         if block.measurement is CHART:
             covariance[at, at] += light_std**2 * np.outer(block.scale, block.scale)
             patches = _patch_columns(block, at, len(covariance))
@@ -239,15 +316,38 @@ def _distribution(
                 tolerance = reflectance_covariance(names, channel, block.scale)
                 covariance[at, at] -= tolerance * np.outer(kept, kept)
                 columns |= {name: column for name, column in patches.items() if name in posterior.names}
+    shift = np.zeros(len(covariance))
+    mean_columns = dict(columns)
+    if light is not None:
+        rates = np.column_stack([columns.pop(name) for name in light.per_dose])
+        mean_columns = dict(columns)
+        shift += rates @ light.value
+        covariance += rates @ light.covariance @ rates.T
+        for name, by in zip(light.parameters, light.by.T, strict=True):
+            columns[name] = columns.get(name, 0.0) + rates @ by
     jacobian = np.column_stack([*columns.values(), np.zeros((len(covariance), 0))])
     mean, known = posterior.taken(list(columns))
     covariance += jacobian @ known @ jacobian.T
+    shift += sum((mean[k] * mean_columns[name] for k, name in enumerate(columns) if name in mean_columns), shift * 0.0)
     if growth_std:
         for block, at in zip(model.blocks, model.slices, strict=True):
             if "dark" in columns and block.measurement is DARK and model.noise is not None:
                 change = columns["dark"][at] / model.noise.dark_std * model.noise.dark_dn_per_s * growth_std
                 covariance[at, at] += np.outer(change, change)
-    return np.asarray(model.mean(effects) + jacobian @ mean), np.asarray(0.5 * (covariance + covariance.T))
+    return np.asarray(model.mean(effects) + shift), np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _beyond_correction(block: Block, model: MeasurementModel, effects: Effects) -> FloatArray:
+    """Relative standard deviation (n,) of variances beyond the levels of a correction, which holds its last factor
+    there: the range of its factors, in proportion to the way beyond."""
+    found = np.zeros(len(block.labels))
+    signal_e = np.array([label.x for label in block.labels]) / model.camera.conversion_gain_dn_per_e
+    for effect in effects:
+        if isinstance(effect, ModelDiscrepancy) and effect.along == "variance_signal_e":
+            first, last = effect.at[0], effect.at[-1]
+            way = np.maximum(signal_e - last, 0.0) / max(last - first, 1e-9)
+            found += way * float(np.ptp(effect.factor)) * effect.strength
+    return found
 
 
 def _forms(model: MeasurementModel, effects: Effects) -> FloatArray:
@@ -292,7 +392,7 @@ def _numbers(
             update: dict[str, float | None] = {"fixed": value}
             if block.measurement is NOISE:
                 update |= {"level_dn": float(levels[k]), "level_slope": float(slope[k])}
-            elif block.measurement in (DARK, CHART):
+            elif block.measurement in (DARK, CHART, PHOTON_TRANSFER):
                 temperature = capture.temperature_c
                 rate = noise.dark_dn_per_s + noise.gain * more(temperature)
                 later = rate if temperature is None else noise.dark_dn_per_s + noise.gain * more(temperature + STEP_C)

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 from scipy.stats import norm
 
 from lab.capture_kinds.base import Capture
-from lab.diagnose.inference.gaussian import chi2
+from lab.diagnose.measurements.block import Label
 from lab.diagnose.measurements.library import measurement_title
-from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.errors import InputError
+from lab.formats.camera_file import lens_cache, traced_table
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
+from lab.measure.gaussian import chi2
+from lab.measure.study import Study
 from lab.one_blas_thread import one_blas_thread
-from lab.twin.predict import is_predicted, measured_blocks
-from lab.twin.sealed import PredictedNumber, SealedPrediction, SidePrediction
+from lab.twin.predict import QUANTITIES, is_predicted, measured_blocks
+from lab.twin.sealed import PredictedName, PredictedNumber, SealedPrediction, SidePrediction, TwinNumber
 from sim.camera import CameraModel, Side
+from sim.optics.table import load_cached
 from sim.parameters import Frozen
 from sim.spectrum import FloatArray
 
@@ -27,27 +32,33 @@ WIDTH_95 = float(norm.ppf(0.975))
 #: Most relative change of an exposure, change of a temperature (C) and of a corner (px) that still is the session that
 #: was predicted.
 MOST_EXPOSURE, MOST_C, MOST_PX = 0.25, 3.0, 4.0
+#: Most relative difference of an f-number from that of the prediction.
+MOST_F_NUMBER = 0.02
 #: Least change of the logarithm of the likelihood that an effect makes for its name to be tested.
 LEAST_GAIN = 2.0
+#: Measurements whose numbers a prediction may hold.
+SCORED = (*QUANTITIES, PHOTON_TRANSFER)
+#: Probability from which on one of the rivals is the name.
+SURE = 0.95
+#: Probability that a rival has at least before a session: so sure is no diagnosis.
+LEAST_PROBABILITY = 1e-3
 #: Keys of the data sheet that have to be those of the prediction.
 SHEET = ("rows", "cols", "cfa", "bit_depth", "f_number")
 
 
-class ScoredNumber(Frozen):
+class ScoredNumber(TwinNumber):
     """One number: predicted, moved to the exposure and temperature that were really set, and measured."""
 
     side: Side
-    quantity: str
-    captures: tuple[str, ...]
-    channel: str
-    where: str
-    x: float
-    predicted: float
-    std: float
     measured: float
     deviation: float
     deviation_sigma: float
     deviation_percent: float
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether the measured number lies in the 95 % interval."""
+        return abs(self.deviation_sigma) <= WIDTH_95
 
 
 class QuantityScore(Frozen):
@@ -62,20 +73,59 @@ class QuantityScore(Frozen):
     chi2: float
 
 
+class TestedRival(Frozen):
+    """A rival of a name. `gain`: log likelihood of the numbers with it less that with the name; `before`, `after`: its
+    probability without and with these numbers."""
+
+    name: str
+    gain: float
+    before: float
+    after: float = 0.0
+
+
+TwinVerdict = Literal["survives", "withdrawn", "named", "untested"]
+
+
 class TestedEffect(Frozen):
-    """Whether an effect's name survives. `gain`: log likelihood of the numbers with it less that without it."""
+    """Whether a name survives.
+
+    name, effect : as it was told, an effect's or a family's, and the effect that stands for it in the model
+    gain : log likelihood of the numbers with it less that with nothing in its place
+    before : probability of the effect among its rivals, without these numbers
+    verdict : `survives`; `withdrawn`: the numbers are likelier without it, or a rival predicted them (`becomes`);
+        `named`: of a family, `becomes` is the effect that predicted them; `untested`: they show too little of it
+    probability : of `becomes`, else of the effect, among the rivals, with these numbers
+    """
 
     side: Side
     name: str
+    effect: str
     gain: float
-    verdict: Literal["survives", "withdrawn", "untested"]
+    before: float
+    verdict: TwinVerdict = "untested"
+    becomes: str | None = None
+    probability: float = 1.0
+    rivals: tuple[TestedRival, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """The verdict as a lab reads it, with the figures that it rests on."""
+        title = self.name.replace("_", " ")
+        other = (self.becomes or "").replace("_", " ")
+        was = next((rival.before for rival in self.rivals if rival.name == self.becomes), self.before)
+        shares = f"probability {self.probability:.3g}, before {was:.2g}"
+        if self.verdict == "named":
+            return f"{title}: is {other} ({shares})"
+        if self.verdict == "withdrawn" and self.becomes is not None:
+            return f"{title}: withdrawn: {other} predicted the session ({shares})"
+        return f"{title}: {self.verdict} (log likelihood {self.gain:+.1f})"
 
 
 class TwinScore(Frozen):
     """The result of `calibench twin score`."""
 
     format: Literal["calibench-twin-score"] = "calibench-twin-score"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     source: str
     quantities: tuple[QuantityScore, ...]
     effects: tuple[TestedEffect, ...]
@@ -97,9 +147,10 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
     whole, missing = 0.0, 0
     parts: dict[str, float] = {}
     for side, prediction in sealed.sides.items():
-        camera = CameraModel.model_validate(json.loads(sealed.cameras[side]))
+        camera = _camera(sealed, side)
         study = Study(_with_curves(recordings, prediction, camera, side), side, camera)
-        blocks, left_out = measured_blocks(study)
+        wanted = {number.quantity for number in prediction.numbers}
+        blocks, left_out = measured_blocks(study, tuple(m for m in SCORED if m.name in wanted))
         skipped += left_out
         measured = {
             _key(b.measurement.name, label): (float(v), label.x)
@@ -121,15 +172,36 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
         for name in dict.fromkeys(prediction.numbers[i].quantity for i in here):
             mine = np.array([prediction.numbers[i].quantity == name for i in here])
             parts[name] = parts.get(name, 0.0) + chi2((seen - moved)[mine], covariance[np.ix_(mine, mine)])
-        for name, values in prediction.without.items():
-            change = np.array([values[i] - prediction.numbers[i].predicted for i in here])
-            effects.append(_tested(side, name, seen - moved, change, covariance))
+        at = np.array([prediction.numbers[i].predicted for i in here])
+        for name in prediction.names:
+            changes = [np.array(rival.numbers)[here] - at for rival in name.rivals]
+            effects.append(_tested(side, name, seen - moved, changes, covariance))
         numbers += [_scored(side, prediction.numbers[i], m, v) for i, m, v in zip(here, moved, seen, strict=True)]
     return TwinScore(
         source=recordings.source, quantities=tuple(_quantity(name, numbers, value) for name, value in parts.items()),
         effects=tuple(effects), chi2=whole, n=len(numbers), numbers=tuple(numbers), missing=missing,
         skipped=tuple(skipped),
     )  # fmt: skip
+
+
+def _camera(sealed: SealedPrediction, side: Side) -> CameraModel:
+    """The changed camera of a side. A traced lens is sealed by its hash: its table is the one that is kept on this
+    computer, else traced from the file of the changes. Raises InputError where neither is that lens."""
+    content = json.loads(sealed.cameras[side])
+    imaging = content["lens"]["imaging"]
+    if imaging["kind"] == "traced_lens":
+        wanted = imaging["content_hash"]
+        table = load_cached(lens_cache(), wanted)
+        file = sealed.changes.lens
+        if table is None and file is not None and file.is_file():
+            table = traced_table(file)
+        if table is None or table.content_hash != wanted:
+            where = f"lens: {file}" if file is not None else f"the {side} camera's lens"
+            raise InputError(
+                f"{where}: isn't the traced lens that was sealed, {wanted}; give its file where it was then"
+            )
+        content["lens"]["imaging"] = {"kind": "traced_lens", "table": table}
+    return CameraModel.model_validate(content)
 
 
 def check_session(prediction: SidePrediction, recordings: RecordingSet, side: Side) -> None:
@@ -139,7 +211,10 @@ def check_session(prediction: SidePrediction, recordings: RecordingSet, side: Si
     isnt = f"{recordings.source}: isn't the session that was predicted:"
     for key in SHEET:
         there, wanted = getattr(stated, key), getattr(prediction.camera, key)
-        if there != wanted:
+        is_same = there == wanted
+        if key == "f_number" and there is not None and wanted is not None:  # a traced lens has it of its rays
+            is_same = abs(there / wanted - 1.0) <= MOST_F_NUMBER
+        if not is_same:
             raise InputError(f"{isnt} {key} of the {side} camera is {there}, predicted {wanted}; give that session")
     found = {c.id: c for c in recordings.captures(side=side)}
     for planned in prediction.captures:
@@ -175,10 +250,10 @@ def _with_curves(recordings: RecordingSet, prediction: SidePrediction, camera: C
     return recordings.under(recordings.manifest.model_copy(update={"cameras": cameras}))
 
 
-def _key(quantity: str, label: object) -> tuple[object, ...]:
+def _key(quantity: str, label: Label) -> tuple[object, ...]:
     return PredictedNumber(
         quantity=quantity, captures=label.captures, channel=label.channel, where=label.condition, x=label.x,
-        predicted=0.0, std=0.0  # type: ignore[attr-defined]
+        predicted=0.0, std=0.0,
     ).key  # fmt: skip
 
 
@@ -209,13 +284,70 @@ def _square(prediction: SidePrediction) -> FloatArray:
     return np.asarray(out + np.tril(out, -1).T)
 
 
-def _tested(side: Side, name: str, residual: FloatArray, change: FloatArray, covariance: FloatArray) -> TestedEffect:
-    gain = 0.5 * (chi2(residual - change, covariance) - chi2(residual, covariance))
-    told = 0.5 * chi2(change, covariance) >= LEAST_GAIN
-    verdict: Literal["survives", "withdrawn", "untested"] = (
-        "untested" if not told else "survives" if gain > 0 else "withdrawn"
+def _tested(
+    side: Side, name: PredictedName, residual: FloatArray, changes: list[FloatArray], covariance: FloatArray
+) -> TestedEffect:
+    """Weigh a name against its rivals, which change the prediction by `changes` (n,) each. Log likelihoods are tempered
+    by chi2 / n of the best of them where that is above 1: what none predicts counts for none."""
+    fits = [chi2(residual - change, covariance) for change in changes]
+    own = chi2(residual, covariance)
+    tempered = max(min(own, *fits) / len(residual), 1.0)
+    gains = [0.5 * (own - fit) / tempered for fit in fits]
+    is_told = any(0.5 * chi2(change, covariance) >= LEAST_GAIN for change in changes)
+    absent = -next((gain for rival, gain in zip(name.rivals, gains, strict=True) if not rival.name), 0.0)
+    rivals = [
+        TestedRival(name=rival.name, gain=gain, before=rival.probability)
+        for rival, gain in zip(name.rivals, gains, strict=True)
+        if rival.name
+    ]
+    plain = TestedEffect(side=side, name=name.told, effect=name.effect, gain=absent, before=name.probability)
+    return _judged(plain, rivals, is_told)
+
+
+def _judged(plain: TestedEffect, rivals: Sequence[TestedRival], is_told: bool) -> TestedEffect:
+    """The verdict on a name by its gain over nothing and the gains of its rivals over it."""
+    weights = {plain.effect: float(np.log(max(plain.before, LEAST_PROBABILITY)))}
+    weights |= {one.name: float(np.log(max(one.before, LEAST_PROBABILITY))) + one.gain for one in rivals}
+    top = max(weights.values())
+    whole = sum(np.exp(w - top) for w in weights.values())
+    after = {key: float(np.exp(w - top) / whole) for key, w in weights.items()}
+    likeliest = max(after, key=lambda key: after[key])
+    gain = {one.name: one.gain for one in rivals} | {plain.effect: 0.0}
+    verdict: TwinVerdict = "survives" if plain.gain > 0 else "withdrawn"
+    becomes = None
+    is_another = likeliest != plain.effect or plain.name != plain.effect
+    if not is_told:
+        verdict = "untested"
+    elif is_another and after[likeliest] >= SURE and plain.gain + gain[likeliest] > 0:
+        becomes = likeliest
+        verdict = "withdrawn" if plain.name == plain.effect else "named"
+    return plain.model_copy(
+        update={
+            "verdict": verdict,
+            "becomes": becomes,
+            "probability": after[becomes or plain.effect],
+            "rivals": tuple(one.model_copy(update={"after": after[one.name]}) for one in rivals),
+        }
     )
-    return TestedEffect(side=side, name=name, gain=gain, verdict=verdict)
+
+
+def together(tests: Sequence[Sequence[TestedEffect]]) -> tuple[TestedEffect, ...]:
+    """What several sessions say together of the names of one model: log likelihoods add up."""
+    found: dict[tuple[Side, str], list[TestedEffect]] = {}
+    for session in tests:
+        for one in session:
+            found.setdefault((one.side, one.effect), []).append(one)
+    whole = []
+    for members in found.values():
+        told = [one for one in members if one.verdict != "untested"]
+        first = members[0]
+        rivals = [
+            rival.model_copy(update={"gain": sum(r.gain for one in told for r in one.rivals if r.name == rival.name)})
+            for rival in first.rivals
+        ]
+        plain = first.model_copy(update={"gain": sum(one.gain for one in told)})
+        whole.append(_judged(plain, rivals, bool(told)))
+    return tuple(whole)
 
 
 def _scored(side: Side, number: PredictedNumber, moved: float, seen: float) -> ScoredNumber:
@@ -235,7 +367,7 @@ def _quantity(name: str, numbers: list[ScoredNumber], value: float) -> QuantityS
     return QuantityScore(
         quantity=name, n=len(mine), unit="1" if is_share else "%", median=float(np.median(away)),
         largest_of_95_percent=float(np.quantile(away, 0.95)),
-        within_95_percent_interval=float(np.mean([abs(n.deviation_sigma) <= WIDTH_95 for n in mine])), chi2=value,
+        within_95_percent_interval=float(np.mean([n.is_inside for n in mine])), chi2=value,
     )  # fmt: skip
 
 

@@ -18,14 +18,12 @@ from sim.camera import Side
 from sim.parameters import Frozen
 
 
-class PredictedNumber(Frozen):
-    """One number that will be measured: its place, its value, and how it follows what a session can't repeat exactly.
+class TwinNumber(Frozen):
+    """A predicted number: what is measured and where, its value and standard deviation.
 
-    quantity : the measurement: `chart`, `noise` (a temporal variance), `slanted_edge` (an MTF), `dark`
-    fixed : the part that neither exposure nor temperature changes
-    dark : the part by dark current, in proportion to the exposure, growing by exp(`warmth_per_c` x rise)
-    level_dn, level_slope : of a variance: the mean signal above black that it is predicted for, and its derivative by
-    that"""
+    quantity : the measurement: `chart`, `noise` (a temporal variance), `slanted_edge` (an MTF), `dark`,
+        `photon_transfer` (the mean of a flat)
+    """
 
     quantity: str
     captures: tuple[str, ...]
@@ -34,6 +32,17 @@ class PredictedNumber(Frozen):
     x: float
     predicted: float
     std: float
+
+
+class PredictedNumber(TwinNumber):
+    """One number that will be measured, and how it follows what a session can't repeat exactly.
+
+    fixed : the part that neither exposure nor temperature changes
+    dark : the part by dark current, in proportion to the exposure, growing by exp(`warmth_per_c` x rise)
+    level_dn, level_slope : of a variance: the mean signal above black that it is predicted for, and its derivative by
+        that
+    """
+
     fixed: float = 0.0
     dark: float = 0.0
     warmth_per_c: float = 0.0
@@ -43,20 +52,38 @@ class PredictedNumber(Frozen):
     @property
     def key(self) -> tuple[object, ...]:
         """What the same number of a recording set has in common with it."""
-        place = () if self.quantity == "noise" else (self.where, round(self.x, 3))
+        place = () if self.quantity in ("noise", "photon_transfer") else (self.where, round(self.x, 3))
         return self.quantity, self.captures, self.channel, *place
+
+
+class PredictedRival(Frozen):
+    """The numbers (n,) with a rival in the place of a named effect; `name` empty: with nothing there."""
+
+    name: str
+    probability: float
+    numbers: tuple[float, ...]
+
+
+class PredictedName(Frozen):
+    """A name that the session will test: the effect in the model, as it was told (its name, or its family's), its
+    probability among the rivals, and these."""
+
+    effect: str
+    told: str
+    probability: float
+    rivals: tuple[PredictedRival, ...]
 
 
 class SidePrediction(Frozen):
     """The predictions of one camera. `covariance`: the lower triangle (n (n + 1) / 2), row by row, of noise and
-    parameters together. `without`: the numbers (n,) as they would be without an effect, by its name."""
+    parameters together. `names`: what the session will say of each."""
 
     camera: DataSheet
     captures: tuple[AnyCapture, ...]
     lens: dict[str, float]
     numbers: tuple[PredictedNumber, ...]
     covariance: tuple[float, ...]
-    without: dict[str, tuple[float, ...]] = {}
+    names: tuple[PredictedName, ...] = ()
     skipped: tuple[Skipped, ...] = ()
 
 
@@ -64,7 +91,7 @@ class SealedPrediction(Frozen):
     """What `calibench twin predict` writes."""
 
     format: Literal["calibench-twin"] = "calibench-twin"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     model: str
     plan: str
     changes: Changes

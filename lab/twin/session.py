@@ -17,25 +17,37 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.recording_set.files import MemoryFiles
 from lab.twin.changes import Changes, light_factor
-from sim.camera import Side
+from lab.twin.relative_light import EVEN
+from sim.camera import CameraModel, Side
 from sim.frame import Exposure, dark_electrons, expected_electrons, is_steady, read_out
-from sim.scene.scenes import EdgeRegion, KnifeEdge, Scene
+from sim.scene import colorchecker
+from sim.scene.scenes import EdgeRegion, KnifeEdge, Scene, UniformField
 from sim.sensor import electrons as sensor
+from sim.sensor import mosaic
 from sim.spectrum import Spectrum
+from sim.uniform import electron_rate
 
 #: Kinds of captures whose measurements a twin predicts.
 PREDICTED = (DarkCapture, FlatCapture, ChartCapture, SlantedEdgeCapture)
 #: Seed of the drawn noise: the same model and plan give the same prediction.
 SEED = 1288
+#: Percentiles of an edge's region that stand for its sides, and the most of the dark one over the light one.
+EDGE_PERCENTILES, MOST_DARK_SHARE = (10.0, 90.0), 0.9
 #: What model and plan have to agree in.
 SENSOR = ("rows", "cols", "cfa", "bit_depth")
 
 
 def future_session(
-    content: CameraFile, plan: RecordingSet, side: Side, changes: Changes, seed: int = SEED
+    content: CameraFile,
+    plan: RecordingSet,
+    side: Side,
+    changes: Changes,
+    seed: int = SEED,
+    dn_per_photon: float | None = None,
 ) -> RecordingSet:
-    """The captures of one side that a twin predicts, with `changes`, as `content` draws them. Raises InputError where
-    the plan is of another camera, doesn't say where its edges are, or holds several gains."""
+    """The captures of one side that a twin predicts, with `changes`, as `content` draws them. `dn_per_photon`: the
+    level of flats of which only the photons are stated. Raises InputError where the plan is of another camera,
+    doesn't say where its edges are, or holds several gains."""
     stated = plan.camera(side)
     check_sensor(content, stated, plan.source)
     captures = [_changed(c, changes) for c in plan.captures(side=side) if isinstance(c, PREDICTED)]
@@ -49,16 +61,14 @@ def future_session(
     curves = {c: f"twin/{side}-{c}.csv" for c in content.camera.channels}
     spectra |= {path: content.camera.quantum_efficiency[c] for c, path in curves.items()}
     lens = content.camera.lens
-    sheet = stated.model_copy(
-        update={
-            "quantum_efficiency": curves,
-            "f_number": lens.f_number,
-            "focal_length_mm": lens.focal_length_mm,
-            "pixel_pitch_um": content.camera.pixel_pitch_um,
-        }
-    )
+    # a lens that isn't stated stays unstated: it is the session's, whatever the model took for it
+    of_lens = {"f_number": lens.f_number, "focal_length_mm": lens.focal_length_mm}
+    of_lens = {k: v for k, v in of_lens.items() if getattr(stated, k) is not None or changes.changes_lens}
+    pitch = {} if stated.pixel_pitch_um is None else {"pixel_pitch_um": content.camera.pixel_pitch_um}
+    sheet = stated.model_copy(update={"quantum_efficiency": curves} | of_lens | pitch)
     manifest = plan.manifest.model_copy(update={"cameras": {side: sheet}, "captures": tuple(captures)})
-    frames = _drawn(content, captures, spectra, plan.source, seed)
+    frames = _drawn(content, captures, spectra, plan, seed, dn_per_photon)
+    frames |= _charts(content, captures, frames, plan)
     return RecordingSet(manifest, files=MemoryFiles(frames, spectra, {}), source=plan.source)
 
 
@@ -83,11 +93,19 @@ def _changed(capture: Capture, changes: Changes) -> Capture:
         update["gain_db"] = changes.gain_db
     if changes.temperature_c is not None:
         update["temperature_c"] = changes.temperature_c
+    if isinstance(capture, FlatCapture) and capture.photons_per_pixel is not None:
+        more = (changes.exposure_factor or 1.0) * (changes.radiance_factor or 1.0)
+        update["photons_per_pixel"] = capture.photons_per_pixel * more
     return capture.model_copy(update=update)
 
 
 def _drawn(
-    content: CameraFile, captures: list[Capture], spectra: dict[str, Spectrum], source: str, seed: int
+    content: CameraFile,
+    captures: list[Capture],
+    spectra: dict[str, Spectrum],
+    plan: RecordingSet,
+    seed: int,
+    dn_per_photon: float | None,
 ) -> dict[str, np.ndarray[Any, Any]]:
     """A frame (rows, cols), DN, by its path. Captures of one path share one frame."""
     camera, effects, rng = content.camera, content.effects, np.random.default_rng(seed)
@@ -101,7 +119,7 @@ def _drawn(
     for path, members in by_frame.items():
         first = members[0]
         elapsed = 0.0 if first.time is None else first.time.timestamp() - start
-        scene = _scene(members, spectra, source)
+        scene = _scene(members, spectra, plan, content.camera, dn_per_photon)
         exposure = Exposure(scene, first.exposure_s, first.gain_db or 0.0, first.temperature_c, elapsed, placed="image")
         told = [c.model_dump(exclude={"id", "frame", "time"}) for c in members]
         key = repr(told) if is_steady(camera, effects) else path
@@ -114,13 +132,28 @@ def _drawn(
     return frames
 
 
-def _scene(members: list[Capture], spectra: dict[str, Spectrum], source: str) -> Scene:
+def _scene(
+    members: list[Capture],
+    spectra: dict[str, Spectrum],
+    plan: RecordingSet,
+    camera: CameraModel,
+    dn_per_photon: float | None,
+) -> Scene:
     """What stands before the camera. Raises InputError where the plan doesn't tell."""
-    first = members[0]
+    first, source = members[0], plan.source
+    if isinstance(first, FlatCapture) and first.radiance is None and first.photons_per_pixel is not None:
+        if dn_per_photon is None:
+            raise InputError(
+                f"{source}: {first.id} states photons and no radiance; give the fitted recordings (--fitted), "
+                "to which its level is relative"
+            )
+        level_e = dn_per_photon * first.photons_per_pixel / camera.conversion_gain_dn_per_e
+        brightest = max(electron_rate(camera, channel, EVEN) for channel in camera.channels)
+        return UniformField(EVEN.scale(level_e / brightest / first.exposure_s), first.kind)
     if not isinstance(first, SlantedEdgeCapture):
         scene = first.scene(spectra.__getitem__)
         if scene is None:
-            raise InputError(f"{source}: {first.id} has no radiance; state the light that it will have")
+            raise InputError(f"{source}: {first.id} has no radiance; state the light that it will have, or its photons")
         return scene
     regions = []
     for one in members:
@@ -130,4 +163,61 @@ def _scene(members: list[Capture], spectra: dict[str, Spectrum], source: str) ->
             raise InputError(f"{source}: {one.id} has no light_radiance; state the light that it will have")
         regions.append(EdgeRegion(one.region, one.angle_deg))
     light = spectra[first.light_radiance or ""]
-    return KnifeEdge(tuple(regions), light.scale(0.0), light)
+    return KnifeEdge(tuple(regions), light.scale(_dark_share(first, camera, plan)), light)
+
+
+def _planned(plan: RecordingSet, capture: Capture) -> np.ndarray[Any, Any] | None:
+    """The frame that the plan has of a capture; None where it is a plan alone."""
+    try:
+        return plan.frame(plan.capture(capture.id)).astype(float)
+    except (InputError, KeyError, OSError):
+        return None
+
+
+def _dark_share(edge: Capture, camera: CameraModel, plan: RecordingSet) -> float:
+    """Light of an edge's dark side over that of its light one, as the plan's frame shows it; 0 without one."""
+    frame = _planned(plan, edge)
+    if frame is None or not isinstance(edge, SlantedEdgeCapture) or edge.region is None:
+        return 0.0
+    row0, col0, row1, col1 = edge.region
+    dark, light = np.percentile(frame[row0:row1:2, col0:col1:2], EDGE_PERCENTILES) - camera.black_level_dn
+    return float(np.clip(dark / max(light, 1e-9), 0.0, MOST_DARK_SHARE))
+
+
+def _charts(
+    content: CameraFile, captures: list[Capture], drawn: dict[str, np.ndarray[Any, Any]], plan: RecordingSet
+) -> dict[str, np.ndarray[Any, Any]]:
+    """Frames of the chart in its surroundings, by path: those that the plan has, at the levels of the drawn ones. What
+    stands around the patches sends light into them, and no manifest says what that is."""
+    camera, found = content.camera, {}
+    for capture in captures:
+        frame = _planned(plan, capture) if isinstance(capture, ChartCapture) else None
+        if frame is None or not isinstance(capture, ChartCapture):
+            continue
+        black, new = camera.black_level_dn, drawn[capture.frame].astype(float)
+        out = np.empty_like(frame)
+        inside = _patch_centres(capture, frame.shape)
+        step = mosaic.step(camera.cfa)
+        for phases in mosaic.phases(camera.cfa).values():
+            mask = np.zeros(frame.shape, bool)
+            for row, col in phases:
+                mask[row::step, col::step] = True
+            there = mask & inside
+            factor = (new[there].mean() - black) / max(frame[there].mean() - black, 1e-9)
+            out[mask] = black + factor * (frame[mask] - black)
+        found[capture.frame] = np.clip(np.round(out), 0, camera.white_level_dn).astype(drawn[capture.frame].dtype)
+    return found
+
+
+def _patch_centres(capture: ChartCapture, shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
+    """Mask (rows, cols) of the middles of the patches."""
+    corners = np.array(capture.corners)
+    rows, cols = colorchecker.grid(capture.chart)
+    half = max(1, int(0.2 * np.min(np.ptp(corners, axis=0) / (rows, cols))))
+    mask = np.zeros(shape, bool)
+    for v, u in np.ndindex(rows, cols):
+        x, y = (u + 0.5) / cols, (v + 0.5) / rows
+        weights = np.array([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y])
+        row, col = np.round(weights @ corners).astype(int)
+        mask[max(row - half, 0) : row + half, max(col - half, 0) : col + half] = True
+    return mask

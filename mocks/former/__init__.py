@@ -9,18 +9,21 @@ from mocks.former.camera import ConcealedCamera
 from mocks.former.law import BIT_DEPTH, WAVELENGTH_NM, Law
 from mocks.former.laws import BESIDE, LISTED, OUTSIDE
 from mocks.former.session import WHOLE_SESSION, DrawnSession, Plan, record, record_pair
+from mocks.former.unlisted import UNLISTED, UnlistedLaw
 
 __all__ = [
     "BESIDE",
     "BIT_DEPTH",
     "LISTED",
     "OUTSIDE",
+    "UNLISTED",
     "WAVELENGTH_NM",
     "WHOLE_SESSION",
     "ConcealedCamera",
     "DrawnSession",
     "Law",
     "Plan",
+    "UnlistedLaw",
     "record",
     "record_pair",
 ]

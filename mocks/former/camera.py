@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import ndtr
 
-from mocks.former.law import BIT_DEPTH, WAVELENGTH_NM, Array, Law
+from mocks.former.law import BIT_DEPTH, WAVELENGTH_NM, Array, FrameTaken, Law
 from mocks.former.transfer import Transfer
 
 HC_J_NM = 1.98644586e-16
@@ -31,12 +31,16 @@ class ConcealedCamera:
     offset_mm           distance to the right of the pair's left camera
     pair_middle_mm      where boards stand that both cameras see
     bit_depth           of the converter; a code of another depth than 12 has as much more or less charge, so that the
-    full well stays"""
+    full well stays
+    amplification       of the signal before the converter, which then holds less charge
+    distance_mm         of the scene; None: so far that the image lies in the focal plane
+    """
 
     def __init__(
         self, seed: int, laws: Sequence[Law] = (), *, cfa: str | None = None, f_number: float | None = None,
         rows: int = 384, cols: int = 512, noise_draw: int = 0,
         side: str = "left", offset_mm: float = 0.0, pair_middle_mm: float = 0.0, bit_depth: int = BIT_DEPTH,
+        amplification: float = 1.0, distance_mm: float | None = None,
     ) -> None:  # fmt: skip
         self.side, self.offset_mm, self.pair_middle_mm = side, offset_mm, pair_middle_mm
         self.seed, self.noise_draw, self.rows, self.cols = seed, noise_draw, rows, cols
@@ -48,11 +52,14 @@ class ConcealedCamera:
         drawn_f_number = float(rng.choice([2.0, 2.8, 4.0, 5.6]))
         self.f_number = f_number or drawn_f_number
         self.focal_length_mm = float(rng.choice([6.0, 8.0, 12.0]))
+        magnification = 0.0 if distance_mm is None else self.focal_length_mm / (distance_mm - self.focal_length_mm)
+        #: Image distance over the aperture: of a near scene the image lies behind the focal plane.
+        self.working_f_number = self.f_number * (1.0 + magnification)
         self.lens_transmittance = float(rng.uniform(0.85, 0.95))
         self.bit_depth = bit_depth
         self.full_code_dn = 2**bit_depth - 1
         codes = 2.0 ** (bit_depth - BIT_DEPTH)
-        self.gain_dn_per_e = codes * float(rng.uniform(0.3, 0.6))
+        self.gain_dn_per_e = amplification * codes * float(rng.uniform(0.3, 0.6))
         self.read_noise_e = float(rng.uniform(1.5, 5.0))
         self.dark_e_per_s = float(rng.uniform(2.0, 20.0))
         self.dsnu_e = float(rng.uniform(0.5, 1.5))
@@ -120,7 +127,7 @@ class ConcealedCamera:
         for law in self.laws:
             radiance = law.radiance(radiance, kind)
         photons = radiance * WAVELENGTH_NM / HC_J_NM
-        irradiance = np.pi / (4 * self.f_number**2 + 1) * self.lens_transmittance * photons
+        irradiance = np.pi / (4 * self.working_f_number**2 + 1) * self.lens_transmittance * photons
         return float(
             (irradiance * self.quantum_efficiency[channel] * self.filter_transmittance[channel]).sum()
             * self.fill_factor
@@ -146,6 +153,8 @@ class ConcealedCamera:
         """Frame number `k` of images in e-/s by channel (before shading; None: no light), raw DN."""
         laws, shape, elapsed_s = self.laws, (self.rows, self.cols), STEP_S * k
         draw = k + DRAW_STEP * self.noise_draw
+        for law in laws:
+            law.frame = FrameTaken(draw, exposure_s, elapsed_s, temperature_c)
         rng = np.random.default_rng([self.seed, 2, draw])
         z = rng.standard_normal(shape)
         e: Array = np.zeros(shape)

@@ -3,6 +3,7 @@ spectra."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -21,6 +22,16 @@ REFERENCE_NM = 550.0  # at which laws that depend on the wavelength have their s
 OPTICAL = frozenset({"slanted_edge"})
 SPECTRAL = frozenset({"narrowband"})
 DARK = frozenset({"dark"})
+
+
+@dataclass(frozen=True)
+class FrameTaken:
+    """The frame that is exposed: `draw` selects its random numbers, `elapsed_s` is the time since the session began."""
+
+    draw: int
+    exposure_s: float
+    elapsed_s: float
+    temperature_c: float
 
 
 class Law:
@@ -56,6 +67,8 @@ class Law:
         #: Uniform random numbers 0..1 for directions, positions, phases and periods.
         self.uniform = rng.random(8)
         self.camera: ConcealedCamera
+        #: The frame that is exposed now.
+        self.frame: FrameTaken
 
     def bind(self, camera: ConcealedCamera) -> None:
         """Tell the law which camera it is built into."""

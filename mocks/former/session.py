@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from mocks.former.camera import STEP_S, ConcealedCamera
 from mocks.former.law import WAVELENGTH_NM, Array
 from mocks.former.scenes import TURN_DEG, BoardPose, board, chart, edge, pattern
 
+Lamp = Literal["halogen", "led", "tungsten"]
 BEGIN = datetime(2026, 3, 2, 9, tzinfo=UTC)
 LINE_SIGMA_NM = 4.2466  # a full width of 10 nm
 FLAT_LEVELS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.65, 0.8, 0.92)
@@ -36,6 +37,11 @@ class Plan:
     shuttle     flats up and down again
     exposures   edges at a quarter of the exposure in four times the light, too
     screen_cell_px, screen_turn_deg   the size of a screen's cells in the camera, and how far the screen is turned
+    lamp        of flats, chart and edges; exposures are those of the first lamp at its level
+    light       factor on that lamp, chart_light: on the chart's
+    longer      factor on the exposures of darks
+    temperature_c   of the sensor, in all captures; None: 25, and those of `warm`
+    gain_db     that is stated of the captures
     """
 
     kinds: tuple[str, ...] = ("dark", "flat", "narrowband", "chart", "slanted_edge", "screen")
@@ -46,6 +52,12 @@ class Plan:
     repeats: int = 3
     screen_cell_px: float = 4.0
     screen_turn_deg: float = TURN_DEG
+    lamp: Lamp = "halogen"
+    light: float = 1.0
+    chart_light: float = 0.3
+    longer: float = 1.0
+    temperature_c: float | None = None
+    gain_db: float | None = None
 
 
 WHOLE_SESSION = Plan()
@@ -81,9 +93,15 @@ def record_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan, name:
     return DrawnSession(manifest, {**one.frames, **two.frames}, {**one.spectra, **two.spectra}, one.targets)
 
 
-def lamp() -> Array:
-    """Spectral radiance of the flats, W sr^-1 m^-2 nm^-1."""
-    return 0.05 * np.exp((WAVELENGTH_NM - 560) / 400) * (1 + 0.1 * np.sin(WAVELENGTH_NM / 60))
+def lamp(kind: Lamp = "halogen") -> Array:
+    """Spectral radiance of the flats, W sr^-1 m^-2 nm^-1: a filtered halogen lamp, a white LED (a line of the chip and
+    the phosphor's band), a tungsten filament at 2856 K (Planck)."""
+    w = WAVELENGTH_NM
+    if kind == "led":
+        return 0.05 * (np.exp(-0.5 * ((w - 452) / 10) ** 2) + 0.7 * np.exp(-0.5 * ((w - 570) / 55) ** 2) + 0.01)
+    if kind == "tungsten":
+        return 0.05 * (560.0 / w) ** 5 * np.expm1(1.4388e7 / (560 * 2856)) / np.expm1(1.4388e7 / (w * 2856))
+    return 0.05 * np.exp((w - 560) / 400) * (1 + 0.1 * np.sin(w / 60))
 
 
 def line(centre_nm: float, peak: Array) -> Array:
@@ -101,9 +119,16 @@ class _Recorder:
         self.spectra: dict[str, Any] = {}
         self.targets: dict[str, Any] = {}
         self.captures: list[dict[str, Any]] = []
+        self.plan = WHOLE_SESSION
+
+    def lamp(self) -> Array:
+        """The plan's lamp. Lamps fill the camera alike, by its stated curves, so that exposures are the same."""
+        first, own = lamp("led"), lamp(self.plan.lamp)
+        alike = self.camera.nominal_rate(first) / self.camera.nominal_rate(own) if self.plan.lamp == "tungsten" else 1.0
+        return self.plan.light * alike * own
 
     def session(self, plan: Plan, name: str) -> DrawnSession:
-        camera = self.camera
+        camera, self.plan = self.camera, plan
         curves = {c: self.noted(q) for c, q in camera.stated_efficiency.items()}
         steps = {
             "dark": self.darks, "flat": self.flats, "narrowband": self.sweep, "chart": self.chart,
@@ -128,6 +153,9 @@ class _Recorder:
         temperature_c: float = 25.0, **more: Any
     ) -> None:  # fmt: skip
         """Expose and note `repeats` frames; `more`: what this kind of capture states besides."""
+        plan = self.plan
+        temperature_c = temperature_c if plan.temperature_c is None else plan.temperature_c
+        more |= {} if plan.gain_db is None else {"gain_db": plan.gain_db}
         for law in self.camera.laws:
             images = images and {c: image * law.scene_factor(kind) for c, image in images.items()}
         for _ in range(repeats):
@@ -149,12 +177,12 @@ class _Recorder:
 
     def darks(self, plan: Plan) -> None:
         for exposure_s in (0.001, 0.5, 2.0):
-            self.take("dark", None, exposure_s, max(plan.repeats, 3))
+            self.take("dark", None, plan.longer * exposure_s, max(plan.repeats, 3))
         for warmer_c in (35.0, 45.0) if plan.warm else ():
-            self.take("dark", None, 2.0, max(plan.repeats, 3), warmer_c)
+            self.take("dark", None, plan.longer * 2.0, max(plan.repeats, 3), warmer_c)
 
     def flats(self, plan: Plan) -> None:
-        light = lamp()
+        light = self.lamp()
         path, images = self.noted(light), self.camera.uniform(light)
         levels = (*FLAT_LEVELS, *FLAT_LEVELS[::-1]) if plan.shuttle else FLAT_LEVELS
         repeats = 2 if plan.shuttle else max(plan.repeats, 3)
@@ -172,7 +200,7 @@ class _Recorder:
             self.take("narrowband", images, exposure_s, wavelength_nm=w, bandwidth_nm=10, radiance=path)
 
     def chart(self, plan: Plan) -> None:
-        camera, light = self.camera, 0.3 * lamp()
+        camera, light = self.camera, plan.chart_light * self.lamp()
         box = round(0.14 * camera.rows), round(0.12 * camera.cols), round(0.86 * camera.rows), round(0.88 * camera.cols)
         row0, col0, row1, col1 = box
         corners = [[row0, col0], [row0, col1], [row1, col1], [row1, col0]]
@@ -181,7 +209,7 @@ class _Recorder:
         self.take("chart", images, exposure_s, 2, chart="ColorChecker24", corners=corners, radiance=path)
 
     def edges(self, plan: Plan) -> None:
-        camera, light = self.camera, lamp()
+        camera, light = self.camera, self.lamp()
         half = min(100, camera.rows // 2 - 4)
         region = [camera.rows // 2 - half, camera.cols // 2 - half, camera.rows // 2 + half, camera.cols // 2 + half]
         lights = [light]

@@ -38,7 +38,7 @@ class Transfer:
 
     def diffraction(self, frequency_cy_um: Array, wavelength_um: float) -> Array:
         """Overlap of two discs: the transfer function of a perfect lens."""
-        s = np.clip(np.abs(frequency_cy_um) * wavelength_um * self.camera.f_number, 0, 1)
+        s = np.clip(np.abs(frequency_cy_um) * wavelength_um * self.camera.working_f_number, 0, 1)
         return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
 
     def filtered(self, images: dict[str, Array], radiance: Array, over: int) -> dict[str, Array]:
@@ -105,7 +105,7 @@ class Transfer:
         """Autocorrelation of the aberrated pupil along a direction, complex; 20 x 20 nodes in the overlap."""
         node, weight = QUADRATURE
         # half the separation of the two pupils, in their radii
-        s = np.clip(frequency_cy_um * wavelength_nm / 1000 * self.camera.f_number, 0, 1)[:, None, None]
+        s = np.clip(frequency_cy_um * wavelength_nm / 1000 * self.camera.working_f_number, 0, 1)[:, None, None]
         top = np.sqrt(np.clip(1 - s * s, 0, None))
         v = top * node[None, :, None]
         reach = np.sqrt(np.clip(1 - v * v, 0, None)) - s

@@ -6,59 +6,28 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.effects.base import Effect
-from sim.effects.families import Family
-from sim.parameters import Quantity
+from sim.effects.converter import ConverterLaw, bit_error
 from sim.spectrum import FloatArray
 from sim.stages import Codes
 
 
-class AdcNonlinearity(Effect):
+class AdcNonlinearity(ConverterLaw):
     """A successive-approximation converter: where one of the three highest bits is set, the code is off by that bit's
     error; offset and gain as without: nothing at codes 0 and 2^bits. Jumps stand at multiples of 2^(bits-3).
     """
 
     name: ClassVar[str] = "adc_nonlinearity"
     title: ClassVar[str] = "ADC nonlinearity"
-    family: ClassVar[Family] = Family.CONVERTER
-    reference: ClassVar[str] = (
-        "IEEE Std 1241-2010, differential and integral nonlinearity of analogue-to-digital converters"
-    )
-    form_tolerance: ClassVar[float] = 0.1
-    invariances: ClassVar[frozenset[str]] = frozenset(
-        {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
-    )
     sentence: ClassVar[str] = (
         "The converter's bits have wrong weights: levels jump at fixed codes, and histograms have gaps or spikes there."
     )
 
-    error_dn: Annotated[
-        float,
-        Quantity("DN", "error of the highest bit's weight", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0),
-    ] = 0.0
+    error_dn: Annotated[float, bit_error("error of the highest bit's weight", -50.0, 50.0, 1.0)] = 0.0
     second_dn: Annotated[
-        float,
-        Quantity(
-            "DN",
-            "error of the second-highest bit's weight",
-            lower=-50.0,
-            upper=50.0,
-            prior=(0.0, 1.0),
-            absent=0.0,
-            dispensable=True,
-        ),
+        float, bit_error("error of the second-highest bit's weight", -50.0, 50.0, 1.0, dispensable=True)
     ] = 0.0
     third_dn: Annotated[
-        float,
-        Quantity(
-            "DN",
-            "error of the third-highest bit's weight",
-            lower=-50.0,
-            upper=50.0,
-            prior=(0.0, 1.0),
-            absent=0.0,
-            dispensable=True,
-        ),
+        float, bit_error("error of the third-highest bit's weight", -50.0, 50.0, 1.0, dispensable=True)
     ] = 0.0
 
     def on_codes(self, codes: Codes) -> Codes:

@@ -9,8 +9,7 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect
-from sim.effects.families import Family
+from sim.effects.converter import ConverterLaw
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Codes
@@ -20,21 +19,13 @@ PARTS = (4, 8, 16, 32)
 SHORTEST_DN = 16.0  # period: shorter ones are single codes
 
 
-class AdcRipple(Effect):
+class AdcRipple(ConverterLaw):
     """Code + a sin(2 pi code / p) + b cos(2 pi code / p): levels lie off by up to sqrt(a^2 + b^2), and codes are wider
     and narrower in turn, by 2 pi sqrt(a^2 + b^2) / p of their width.
     """
 
     name: ClassVar[str] = "adc_ripple"
     title: ClassVar[str] = "ADC ripple"
-    family: ClassVar[Family] = Family.CONVERTER
-    reference: ClassVar[str] = (
-        "IEEE Std 1241-2010, differential and integral nonlinearity of analogue-to-digital converters"
-    )
-    form_tolerance: ClassVar[float] = 0.1
-    invariances: ClassVar[frozenset[str]] = frozenset(
-        {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
-    )
     shapes: ClassVar[frozenset[str]] = frozenset({"period_dn"})
     sentence: ClassVar[str] = (
         "The converter's characteristic has a ripple: levels lie above and below their line in turn, at fixed codes, "

@@ -7,8 +7,7 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect
-from sim.effects.families import Family
+from sim.effects.converter import ConverterLaw
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Codes
@@ -19,7 +18,7 @@ PLACES = 64  # parts of the range, at whose borders a step is looked for first
 SMOOTH_OVER_DN = 4.0
 
 
-class AdcStep(Effect):
+class AdcStep(ConverterLaw):
     """Code + s from one code on; offset and gain as without: nothing at codes 0 and 2^bits.
 
     A comparator of a flash or subranging converter is off, or two ranges of a dual-gain read-out don't join. Unlike a
@@ -28,14 +27,6 @@ class AdcStep(Effect):
 
     name: ClassVar[str] = "adc_step"
     title: ClassVar[str] = "ADC step"
-    family: ClassVar[Family] = Family.CONVERTER
-    reference: ClassVar[str] = (
-        "IEEE Std 1241-2010, differential and integral nonlinearity of analogue-to-digital converters"
-    )
-    form_tolerance: ClassVar[float] = 0.1
-    invariances: ClassVar[frozenset[str]] = frozenset(
-        {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
-    )
     shapes: ClassVar[frozenset[str]] = frozenset({"code_dn"})
     sentence: ClassVar[str] = (
         "The converter's characteristic has a step at one code: levels on either side don't join, and codes are "

@@ -6,7 +6,7 @@ A first-order camera model leaves physics out. Each effect is one such piece: a 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar, Literal, Self, get_args, get_origin
 
@@ -189,3 +189,7 @@ class Effect(Frozen):
     def on_codes(self, codes: Codes) -> Codes:
         """Return `codes` with the effect's laws of the converter: DN to codes."""
         return codes
+
+
+#: Effects that act together, in the order in which they were found.
+Effects = Sequence[Effect]

@@ -7,9 +7,7 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.effects.base import Effect
-from sim.effects.families import Family
-from sim.parameters import Quantity
+from sim.effects.converter import ConverterLaw, bit_error
 from sim.spectrum import FloatArray
 from sim.stages import Codes
 
@@ -17,7 +15,7 @@ from sim.stages import Codes
 PERIOD = 8
 
 
-class BitWeights(Effect):
+class BitWeights(ConverterLaw):
     """The level from which on code k is given is off by the errors of those of its three lowest bits that are set, and
     by one more where both of the two lowest are: four free widths that repeat every four codes, and a fifth error that
     repeats every eight. Their mean over the codes is left out, as an offset is black level.
@@ -27,49 +25,18 @@ class BitWeights(Effect):
     """
 
     name: ClassVar[str] = "bit_weights"
-    family: ClassVar[Family] = Family.CONVERTER
-    reference: ClassVar[str] = (
-        "IEEE Std 1241-2010, differential nonlinearity and missing codes of analogue-to-digital converters"
-    )
-    form_tolerance: ClassVar[float] = 0.1
-    invariances: ClassVar[frozenset[str]] = frozenset(
-        {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
-    )
     sentence: ClassVar[str] = (
         "The converter's lowest bits have wrong weights: some codes come more often than their neighbours, and the "
         "pattern repeats every two, four or eight codes over the whole range."
     )
 
-    last_dn: Annotated[
-        float, Quantity("DN", "error of the lowest bit's weight", lower=-1.0, upper=2.0, prior=(0.0, 0.3), absent=0.0)
-    ] = 0.0
-    second_dn: Annotated[
-        float,
-        Quantity("DN", "error of the second-lowest bit's weight", lower=-2.0, upper=2.0, prior=(0.0, 0.3), absent=0.0),
-    ] = 0.0
+    last_dn: Annotated[float, bit_error("error of the lowest bit's weight", -1.0, 2.0, 0.3)] = 0.0
+    second_dn: Annotated[float, bit_error("error of the second-lowest bit's weight", -2.0, 2.0, 0.3)] = 0.0
     pair_dn: Annotated[
-        float,
-        Quantity(
-            "DN",
-            "further error where the two lowest bits are set",
-            lower=-2.0,
-            upper=2.0,
-            prior=(0.0, 0.3),
-            absent=0.0,
-            dispensable=True,
-        ),
+        float, bit_error("further error where the two lowest bits are set", -2.0, 2.0, 0.3, dispensable=True)
     ] = 0.0
     third_dn: Annotated[
-        float,
-        Quantity(
-            "DN",
-            "error of the third-lowest bit's weight",
-            lower=-4.0,
-            upper=4.0,
-            prior=(0.0, 0.3),
-            absent=0.0,
-            dispensable=True,
-        ),
+        float, bit_error("error of the third-lowest bit's weight", -4.0, 4.0, 0.3, dispensable=True)
     ] = 0.0
 
     def thresholds(self) -> FloatArray:

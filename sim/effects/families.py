@@ -20,6 +20,7 @@ class Family(StrEnum):
     CONVERTER = "converter"
     DEFECTIVE_PIXELS = "defective_pixels"
     LINE_NOISE = "line_noise"
+    READ_OUT_AREAS = "areas_of_read_out"
     DARK_SIGNAL = "dark_signal"
     CHARGE_BETWEEN_NEIGHBOURS = "charge_between_neighbours"
     FRAME_MEMORY = "memory_of_the_last_frame"
@@ -102,6 +103,10 @@ _TOLD = {
         "line noise",
         "Pixels of a row or a column share a part of their noise or offset.",
         "more repeats of the dark frames: what stays is the columns' pattern, what changes is noise",
+    ),
+    Family.READ_OUT_AREAS: _Told(
+        "areas of the read-out",
+        "Parts of the frame are read with another gain or another offset.",
     ),
     Family.DARK_SIGNAL: _Told(
         "dark signal and offset",

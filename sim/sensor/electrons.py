@@ -41,6 +41,7 @@ class ReadOut:
     neighbours    mean electrons -> correlation of the shot noise with each of four neighbours
     processing    kernel of a filter of each colour's DN before rounding
     offset_dn     added to the black level
+    gain          factor (rows, cols) on what is read of every pixel, its noise alike, before `added`
     """
 
     response: Callable[[FloatArray], FloatArray] | None = None
@@ -52,6 +53,7 @@ class ReadOut:
     codes: Callable[[FloatArray], FloatArray] | None = None
     neighbours: Callable[[FloatArray], FloatArray] | None = None
     processing: FloatArray | None = None
+    gain: FloatArray | None = None
 
 
 LINEAR = ReadOut()
@@ -251,13 +253,15 @@ def dn_moments(
         bent = read_out.response(mean)
         variance = variance * ((read_out.response(beyond) - bent) / (beyond - mean)) ** 2  # exactly 1 of a straight one
         mean = bent
-    mean = mean + read_out.added_e
     if fixed_pattern is not None:
         mean = mean + fixed_pattern.dsnu_e
         if fixed_pattern.column_e is not None:
             mean = mean + fixed_pattern.column_e
-    dn = zero_dn + gain * mean
-    noise_e2 = variance + camera.read_noise_e**2 + camera.row_noise_e**2 + read_out.added_e2
+    noise_e2 = variance + camera.read_noise_e**2
+    if read_out.gain is not None:
+        mean, noise_e2 = mean * read_out.gain, noise_e2 * np.square(read_out.gain)
+    dn = zero_dn + gain * (mean + read_out.added_e)
+    noise_e2 = noise_e2 + camera.row_noise_e**2 + read_out.added_e2
     dn2 = gain**2 * noise_e2
     if read_out.codes is not None:
         dn, dn2 = _convert_moments(read_out.codes, dn, dn2)
@@ -329,6 +333,8 @@ def sample_from(
             charge += fixed_pattern.single_dsnu_e[strip]
             if fixed_pattern.column_e is not None:
                 charge += fixed_pattern.column_e.astype(np.float32)
+        if read_out.gain is not None:
+            charge *= read_out.gain[strip].astype(np.float32)
         if added is not None:
             charge += added[strip]
         charge *= gain

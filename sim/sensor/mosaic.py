@@ -12,6 +12,9 @@ from sim.camera import Cfa
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
+#: A whole number of the periods by which pixels of one colour may collect light unlike each other, px.
+PERIOD_PX = 48
+
 
 def step(cfa: Cfa) -> int:
     """Period of the mosaic in px: 2, or 1 of a MONO sensor."""

@@ -85,7 +85,9 @@ def asked_by_the_client() -> set[tuple[str, str]]:
         paths = [re.sub(r"{.*?}", "{}", one.replace("{self.url}", "")) for one in texts if "/" in one]
         if call.func.attr == "get" and paths == ["{}/health"]:
             continue
-        how = ASKS.get(call.func.attr) or next((one for one in texts if one in ("GET", "PUT", "POST", "DELETE")), "GET")
+        how = ASKS.get(call.func.attr) or next(
+            (one for one in texts if one in ("GET", "PUT", "POST", "PATCH", "DELETE")), "GET"
+        )
         ending = ".{}" if call.func.attr == "_fetched" else ""
         found |= {(how, f"{path}{ending}") for path in paths}
     return found

@@ -23,16 +23,41 @@ from tests.api.routes.test_findings import diagnosis
 from tests.lab.calibration.test_life import fitted
 from tests.peers import missing
 
-PHONE, DESK = {"width": 420, "height": 860}, {"width": 1280, "height": 860}
+PHONE, TABLET, DESK, WIDE = ({"width": wide, "height": 860} for wide in (420, 768, 1280, 1440))
 READ_NOISE_E = (2.0, 2.01, 2.15)
 LIMITS = 'valid_days = 90\n[[limit]]\nfigure = "noise read_noise_e"\ngood = [1.9, 2.05]\nwarn = [1.8, 2.2]\n'
-PATIENCE_MS = 30_000.0
+PATIENCE_MS = 60_000.0
 #: Drops a file of that name and content on a place.
 DROP = """async ([name, content]) => {
     const data = new DataTransfer();
     data.items.add(new File([Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0))], name));
     document.getElementById("PLACE").dispatchEvent(new DragEvent("drop", {dataTransfer: data, bubbles: true, cancelable: true})) }"""  # noqa: E501
-FINISHED = "#sessions tr:first-child .state.finished"
+#: The views by their addresses, and what stands in each when it is complete. Words in capitals: ids.
+VIEWS = {
+    "/": "#plan-words:has-text('3 sequences')",
+    "/sessions": "#sessions tr:has(.state.finished)",
+    "/sessions?search=nightly&verdict=explained": "#sessions tr:has-text('explained')",
+    "/sessions/SESSION/live": "#transfer svg .c1",  # from the process that looks at the captures
+    "/sessions/SESSION/findings": "#findings-proofs figure:nth-child(2) svg .c3",
+    "/sessions/SESSION/figures": "#figures .mark",
+    "/sessions/SESSION/frames": "#captures img",
+    "/sessions/SESSION/frames/FRAME": "#inspect-profile svg .line",
+    "/sessions/SESSION/jobs": "#session-tabs [aria-current]:has-text('Jobs')",
+    "/recordings": "#recordings td",
+    "/recordings/SENT/findings": "#no-findings:not(:empty)",
+    "/recordings/SENT/figures": "#no-figures:not(:empty)",
+    "/recordings/SENT/frames": "#captures img",
+    "/recordings/SENT/frames/1": "#inspect-profile svg .line",
+    "/recordings/SENT/jobs": "#session-tabs [aria-current]:has-text('Jobs')",
+    "/calibrations": "#calibrations tr:nth-child(3)",
+    "/calibrations/FIT": "#calibration-judgements .mark",
+    "/drift": "#drift-rows .cell.drifted",
+    "/stations/fakes": "#devices tr:nth-child(5)",
+    "/jobs": "#no-jobs",
+    "/models": "#models tr",
+    "/challenges": "#no-challenges",
+    "/nothing": "#view-none a",
+}
 
 
 def chromium() -> str:
@@ -56,17 +81,17 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """A service with a finished session that was calibrated three times, the last one drifted; a session that is held;
-    a recording set."""
+    """A service with three finished sessions that were fitted, the last one drifted and diagnosed; a session that is
+    held; a recording set."""
     with serving(tmp_path_factory.mktemp("data")) as running, running.client() as client:
         (running.store.root / "limits.toml").write_text(LIMITS)
         asked = {"station": "fakes", "quick": True, "sequences": ["dark", "flat"], "name": "nightly"}
         waits = client.post(
             "/api/v1/sessions", json=asked | {"queue": True, "not_before": "2999-01-01T00:00:00Z"}
         ).json()
-        started = client.post("/api/v1/sessions", json=asked).json()
-        until_state(client, started["id"], "finished")
         for value in READ_NOISE_E:
+            started = client.post("/api/v1/sessions", json=asked).json()
+            until_state(client, started["id"], "finished")
             running.store.add_result("fit", started["id"], fitted(value).model_dump(mode="json"))
         running.store.add_result("diagnose", started["id"], diagnosis().model_dump(mode="json"))
         put_into_queue(running.store, waits["id"], held="halted by a test")
@@ -74,6 +99,12 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
             archive = sender.fetch_session(started["id"], running.store.root / "nightly.zip")
             sender.send_recordings(archive)
         yield running
+
+
+def views(ids: dict[str, str]) -> Iterator[tuple[str, str]]:
+    """Each view's address, and what stands in it."""
+    for address, there in VIEWS.items():
+        yield "/".join(ids.get(part, part) for part in address.split("/")), there
 
 
 class Watched:
@@ -94,27 +125,20 @@ class Watched:
     def log_in(self, running: Running, scope: str = "admin") -> None:
         self.page.fill("input[name=key]", running.keys[scope])
         self.page.press("input[name=key]", "Enter")
-        self.page.wait_for_selector("#history svg")
+        self.page.wait_for_selector("#view-desk:not([hidden])")
+        self.page.wait_for_selector("#strip li .state:not(:empty)")
 
-    def open_session(self) -> None:
-        self.page.click("#sessions tr:has(.state.finished) button:has-text('Open')")
-        self.page.wait_for_selector("#captures img")
-        self.page.wait_for_selector("#transfer svg .c1")  # from the process that looks at the captures
-        self.page.wait_for_selector("#findings-proofs figure:nth-child(2) svg .c3")
-        assert "infrared-cut filter" in self.page.inner_text("#findings-answers").lower()
-        assert len(self.page.query_selector_all("#findings-pictures canvas")) == 2  # before and after
+    def go(self, address: str, there: str = "") -> None:
+        """Go to a view; `there`: what stands in it then."""
+        self.page.evaluate("address => { location.hash = address }", address)
+        self.page.wait_for_selector(there or "section.view:not([hidden]) h2", state="attached" if there else "visible")
 
-    def serious(self) -> list[str]:
-        """What axe finds that is serious or critical."""
+    def faults(self) -> list[str]:
+        """What axe finds."""
         from axe_playwright_python.sync_playwright import Axe
 
         found = Axe().run(self.page).response["violations"]
-        return [
-            f"{one['id']} {node['target']}: {node['failureSummary']}"
-            for one in found
-            if one["impact"] in ("serious", "critical")
-            for node in one["nodes"]
-        ]
+        return [f"{one['id']} {node['target']}: {node['failureSummary']}" for one in found for node in one["nodes"]]
 
     def sideways_px(self) -> int:
         """By how much the page is wider than the window."""
@@ -157,24 +181,51 @@ class Watched:
         assert [line for line in self.complaints if "401" not in line] == []
 
 
-@pytest.mark.parametrize(("scheme", "viewport"), [("light", PHONE), ("dark", DESK)])
-def test_the_page_is_accessible(browser: Any, lab: Running, scheme: str, viewport: dict[str, int]) -> None:
-    """axe finds nothing serious in the log-in, the desk with all it can show, and the certificate; nothing runs off the
-    screen."""
+@pytest.fixture(scope="module")
+def ids(lab: Running) -> dict[str, str]:
+    """Ids of the diagnosed session and of a frame of it, of the recording set, and of the newest calibration."""
+    with lab.client() as client:
+        session = next(one for one in client.get("/api/v1/sessions").json() if one["verdict"] == "explained")
+        return {
+            "SESSION": session["id"],
+            "FRAME": str(client.get(f"/api/v1/sessions/{session['id']}/captures").json()[0]["id"]),
+            "SENT": client.get("/api/v1/recordings").json()[-1]["id"],
+            "FIT": client.get("/api/v1/calibrations").json()[0]["id"],
+        }
+
+
+@pytest.mark.parametrize(
+    ("scheme", "viewport"),
+    [("light", PHONE), ("dark", PHONE), ("light", TABLET), ("dark", TABLET), ("light", WIDE), ("dark", WIDE)],
+)
+def test_every_view_is_accessible_and_fits(
+    browser: Any, lab: Running, ids: dict[str, str], scheme: str, viewport: dict[str, int]
+) -> None:
+    """axe finds nothing in the log-in, in any view and in the certificate's dialog; nothing runs off the screen; the
+    halt is within reach wherever the page is scrolled to."""
     watched = Watched(browser, lab, scheme, viewport)
-    assert watched.serious() == [] and watched.sideways_px() == 0
+    assert watched.faults() == [] and watched.sideways_px() == 0
     watched.log_in(lab)
-    watched.open_session()
+    found: dict[str, Any] = {}
+    for address, there in views(ids):
+        watched.go(address, there)
+        watched.page.evaluate("scrollTo(0, document.body.scrollHeight)")
+        if faults := [*watched.faults(), *([f"{px} px wider"] if (px := watched.sideways_px()) else [])]:
+            found[address] = faults
+        assert watched.can_halt(), address
+        assert watched.page.inner_text("#view-problem") == "", address
+    assert found == {}
+    watched.go("/drift", "#drift-rows .cell.drifted")
+    watched.page.click("#drift-rows tr:has-text('read noise') button")
+    watched.page.wait_for_selector("#history .point")
     watched.page.click("#history-words")
-    watched.page.wait_for_selector("#recordings td")
-    watched.page.wait_for_selector("#queue .held")
-    watched.page.eval_on_selector(".station .run", "run => { run.hidden = false }")
-    watched.page.eval_on_selector("#live-problem", "one => { one.textContent = 'instrument: doesn\\'t answer' }")
-    assert watched.serious() == [] and watched.sideways_px() == 0
+    assert watched.faults() == [] and watched.sideways_px() == 0
+    watched.go("/calibrations", "#calibrations button")
     watched.page.click("#calibrations button")
     watched.page.wait_for_selector("#certify[open] .mark")
-    assert watched.serious() == [] and watched.sideways_px() == 0
-    assert watched.can_halt()  # wherever the page is scrolled to, and whatever is open
+    watched.page.click("#certify-draft")
+    watched.page.wait_for_selector("#certify-limits input")
+    assert watched.faults() == [] and watched.sideways_px() == 0 and watched.can_halt()
     watched.page.goto(f"{lab.url}/docs")
     watched.page.wait_for_selector("details")
     assert watched.sideways_px() == 0
@@ -184,64 +235,92 @@ def test_the_page_is_accessible(browser: Any, lab: Running, scheme: str, viewpor
 
 
 def test_a_session_by_keyboard_alone(browser: Any, lab: Running) -> None:
+    """Started, opened, looked at, halted by the key for it, resumed."""
     watched = Watched(browser, lab)
     keyboard = watched.page.keyboard
     assert watched.focused()["name"] == "key"
     keyboard.type(lab.keys["admin"])
     keyboard.press("Enter")
-    watched.page.wait_for_selector("#history svg")
+    watched.page.wait_for_selector("#plan-words:has-text('3 sequences')")
     watched.tab_to("name")
     keyboard.type("by keyboard")
     watched.tab_to("quick")
     keyboard.press("Space")
-    lab.bench.delay_s = 0.02
+    lab.bench.delay_s = 0.05
     watched.tab_to("Start a session")
     keyboard.press("Enter")
-    watched.page.wait_for_selector("#sessions tr:first-child td:has-text('by keyboard')")
-    watched.tab_to("Open")
+    watched.page.wait_for_selector(".station.busy a:has-text('by keyboard')")
+    watched.page.focus("#nav a:has-text('Sessions')")
+    keyboard.press("Enter")
+    watched.page.wait_for_selector("#sessions tr:has-text('by keyboard') .state.running")
+    watched.tab_to("by keyboard")
     # The list is drawn anew while the session goes on; the focus stays where it was.
-    steps = watched.page.inner_text("#sessions tr:first-child .number")
+    steps = watched.page.inner_text("#sessions tr:has-text('by keyboard') .number:nth-last-child(2)")
     watched.page.wait_for_function(
-        "seen => document.querySelector('#sessions tr:first-child .number').textContent !== seen", arg=steps
+        """seen => [...document.querySelectorAll('#sessions tr')].some((row) => row.textContent.includes('by keyboard')
+            && row.children[row.children.length - 2].textContent !== seen)""",
+        arg=steps,
     )
-    assert watched.focused()["text"] == "Open"
+    assert watched.focused()["text"] == "by keyboard"
+    keyboard.press("Enter")
+    watched.page.wait_for_selector("#panel-live:not([hidden]) #watch-histogram svg .line")
+    assert "step" in watched.page.inner_text("#watch-step")
+    watched.tab_to("Frames")
     keyboard.press("Enter")
     watched.page.wait_for_selector("#captures img")
-    watched.page.focus("#halt")
-    keyboard.press("Enter")
-    watched.page.wait_for_selector("#sessions tr:first-child .state.interrupted")
+    assert watched.focused()["text"] == "Frames"
+    keyboard.press("F9")
+    watched.page.wait_for_selector("#halt-told:has-text('shutter closed')")
+    watched.page.wait_for_selector("#session-facts .state.interrupted")
     lab.bench.delay_s = 0.0
     assert not lab.bench.opened  # the shutter
+    watched.page.focus("#session-title")
+    watched.tab_to("Resume")
+    keyboard.press("Enter")
+    watched.page.wait_for_selector("#session-facts .state.finished")
     watched.close()
 
 
-def test_two_stations_a_queue_and_recordings_that_are_dropped(browser: Any, lab: Running) -> None:
+def test_two_stations_a_queue_and_a_halt(browser: Any, lab: Running) -> None:
     other = STATION.replace('address = "', 'address = "other ').replace("a bench of fakes", "another bench")
     (lab.store.root / "stations" / "other.toml").write_text(other)
     watched = Watched(browser, lab)
     page = watched.page
     watched.log_in(lab)
     page.wait_for_selector(".station:nth-child(2)")
+    page.wait_for_selector("#strip li:nth-child(2)")
     lab.bench.delay_s = 0.05
-    page.fill("input[name=name]", "watched")
+    page.fill("#start-form input[name=name]", "watched")
     page.click("#start")
     page.wait_for_selector(".station.busy progress")
     assert len(page.query_selector_all(".station.busy")) == 1
     page.wait_for_selector(".station.busy dd:has-text('closed')")  # darks: the shutter
-    page.wait_for_selector("#watch-histogram svg .line")
+    page.wait_for_selector("#strip li:has-text('running'):has-text('shutter closed')")
     page.wait_for_selector("#start:has-text('Queue a session')")
-    page.fill("input[name=name]", "next")
+    page.fill("#start-form input[name=name]", "next")
     page.click("#start")
     page.click("#queue tr:has-text('next') button:has-text('Earlier')")
     page.wait_for_selector("#queue tr:first-child:has-text('1. next')")
+    page.click("#queue tr:has-text('next') button:has-text('Later')")
+    page.wait_for_selector("#queue tr:nth-child(2):has-text('2. next')")
     page.click("#queue tr:has-text('next') button:has-text('Remove')")
     page.wait_for_selector("#queue tr:has-text('next')", state="detached")
-    page.click(".station.busy button:has-text('Halt')")
-    page.wait_for_selector("#sessions tr:has-text('watched') .state.interrupted")
+    page.click(".station.busy a:has-text('watched')")
+    page.wait_for_selector("#panel-live:not([hidden])")
+    page.click("#strip li:has-text('running') button")  # on every view
+    page.wait_for_selector("#session-facts .state.interrupted")
     lab.bench.delay_s = 0.0
     assert not lab.bench.opened
-    page.wait_for_selector("#queue .reason:has-text('halted by admin')")
+    watched.go("/", "#queue .reason:has-text('halted by admin')")
+    (lab.store.root / "stations" / "other.toml").unlink()
+    watched.close()
 
+
+def test_recordings_that_are_dropped_have_a_view(browser: Any, lab: Running) -> None:
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    watched.go("/recordings", "#recordings tr")
     there = len(page.query_selector_all("#recordings tr"))
     page.set_input_files("#drop-file", lab.store.root / "nightly.zip")
     page.wait_for_selector(f"#recordings tr:nth-child({there + 1})")
@@ -252,36 +331,169 @@ def test_two_stations_a_queue_and_recordings_that_are_dropped(browser: Any, lab:
     page.evaluate(code, ["dropped.zip", base64.b64encode(content).decode()])
     page.wait_for_selector(f"#recordings tr:nth-child({there + 2})")
     assert page.inner_text("#recordings-problem") == ""
+    page.click("#recordings tr:first-child a:has-text('nightly')")
+    page.wait_for_selector("#view-source:not([hidden]) #session-facts:has-text('Captures')")
+    page.click("#session-tabs a:has-text('Frames')")
+    page.click("#captures figure:first-child a")
+    page.wait_for_selector("#inspect-readout:has-text('DN')")
+    page.go_back()
+    page.wait_for_selector("#captures img")
     page.on("dialog", lambda asked: asked.accept())
-    page.click("#recordings tr:first-child button:has-text('Delete')")
+    page.click("#session-actions button:has-text('Delete')")
+    page.wait_for_selector("#view-recordings:not([hidden])")
     page.wait_for_selector(f"#recordings tr:nth-child({there + 2})", state="detached")
-    (lab.store.root / "stations" / "other.toml").unlink()
     watched.complaints = [line for line in watched.complaints if "422" not in line]  # the refused one
     watched.close()
 
 
-def test_a_calibration_is_certified_and_a_drift_is_seen(browser: Any, lab: Running) -> None:
+def test_sessions_are_searched_named_and_two_compared(browser: Any, lab: Running, ids: dict[str, str]) -> None:
     watched = Watched(browser, lab)
     page = watched.page
     watched.log_in(lab)
-    assert page.input_value("#history-form select[name=figure]") == '["noise read_noise_e",""]'
-    assert len(page.query_selector_all("#history .point")) == 3 and len(page.query_selector_all("#history .band")) == 2
+    watched.go(f"/sessions/{ids['SESSION']}/frames", "#captures img")
+    page.fill("#session-notes input[name=notes]", "after the move #lens-b")
+    page.click("#session-notes button")
+    watched.go("/sessions", "#sessions a.tag:has-text('#lens-b')")
+    page.click("#sessions a.tag:has-text('#lens-b')")
+    page.wait_for_selector("#sessions tr:nth-child(2)", state="detached")
+    assert page.input_value("#sessions-search input[name=search]") == "#lens-b"
+    row = page.inner_text("#sessions tr")
+    assert "explained" in row and "0.25" in row and "2.15" in row and "a bench of fakes" in row
+    page.fill("#sessions-search input[name=search]", "no such thing")
+    page.press("#sessions-search input[name=search]", "Enter")
+    page.wait_for_selector("#no-sessions:has-text('None is like that')")
+    with lab.client() as client:  # another one that is fitted
+        asked = {"station": "fakes", "quick": True, "sequences": ["dark"], "name": "to compare"}
+        other = client.post("/api/v1/sessions", json=asked).json()["id"]
+        until_state(client, other, "finished")
+    fit = lab.store.add_result("fit", other, fitted(2.02).model_dump(mode="json"))
+    watched.go("/sessions", "#sessions tr:has-text('to compare') input:enabled")
+    assert page.is_disabled("#compare")
+    page.check("#sessions tr:has-text('to compare') input")
+    page.check("#sessions tr:has-text('#lens-b') input")
+    with page.expect_popup() as opened:
+        page.click("#compare")
+    opened.value.wait_for_selector("h1:has-text('changed')")
+    opened.value.close()
+    with lab.client() as client:
+        assert client.delete(f"/api/v1/sessions/{other}").status_code == 204
+    assert fit
+    watched.close()
+
+
+def test_a_figure_of_the_drift_board_has_its_history(browser: Any, lab: Running) -> None:
+    """Coloured by limits, a drift by its shape too; searched; a click tells the history."""
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab, "read")
+    watched.go("/drift", "#drift-rows .cell.drifted")
+    names = page.locator("#drift-rows th").all_inner_texts()
+    assert any("temporal dark noise (read noise)" in name and name.endswith(" e") for name in names)
+    assert "\u25c6" in page.inner_text("#drift-rows .cell.drifted")
+    page.fill("#drift-form input[name=search]", "mtf50")
+    page.wait_for_selector("#drift-rows tr:nth-child(2)", state="detached")
+    page.fill("#drift-form input[name=search]", "")
+    page.check("#drift-form input[name=attention]")
+    page.wait_for_selector("#drift-rows tr:nth-child(2)", state="detached")
+    page.focus("#drift-rows button")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#history .point")
+    assert len(page.query_selector_all("#history .point")) >= 3 and len(page.query_selector_all("#history .band")) == 2
     assert len(page.query_selector_all("#history path")) == 1  # the drift has a shape of its own
     assert "1 drifted" in page.inner_text("#history-words")
-    page.click("#calibrations tr:first-child button")  # 2.15 e: warn
+    watched.close()
+
+
+def test_a_frame_is_inspected(browser: Any, lab: Running, ids: dict[str, str]) -> None:
+    """The readout is the frame's own value in DN; the profile follows the cross, and so does the
+    difference of two frames."""
+    with lab.client() as client:
+        captures = client.get(f"/api/v1/sessions/{ids['SESSION']}/captures?kind=flat&side=left").json()
+    first, second = captures[0]["id"], captures[1]["id"]
+    frames = [lab.store.frame(id).astype(int) for id in (first, second)]
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab, "read")
+    watched.go(f"/sessions/{ids['SESSION']}/frames/{first}", "#inspect-readout:has-text('DN')")
+    rows, cols = frames[0].shape
+    row, col = rows // 2, cols // 2
+    assert page.inner_text("#inspect-readout").startswith(f"column {col}, row {row}: {frames[0][row, col]} DN")
+    page.focus("#inspect-canvas")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowDown")
+    assert f"column {col + 1}, row {row + 1}: {frames[0][row + 1, col + 1]} DN" in page.inner_text("#inspect-readout")
+    along = frames[0][row + 1, (col + 1) % 2 :: 2]  # of one channel
+    assert f"{along.size} pixels, at most {along.max()} DN" in page.inner_text("#inspect-profile")
+    page.keyboard.press("m")
+    page.keyboard.press("Shift+ArrowLeft")
+    assert "Profile along the line" in page.inner_text("#inspect-profile")
+    before = page.evaluate("document.getElementById('inspect-canvas').toDataURL()")
+    page.keyboard.press("+")
+    assert page.evaluate("document.getElementById('inspect-canvas').toDataURL()") != before
+    page.select_option("#inspect-form select[name=minus]", str(second))
+    difference = (frames[0] - frames[1])[row + 1, col + 1 - 10]
+    page.wait_for_selector(f"#inspect-readout:has-text('is {difference} DN')")
+    assert watched.faults() == []
+    watched.close()
+
+
+def test_every_instrument_is_checked_before_the_night(browser: Any, lab: Running) -> None:
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab, "operate")
+    watched.go("/stations/fakes", "#devices tr:nth-child(5)")
+    page.click("#check-all")
+    page.wait_for_selector("#devices-told:has-text('work')")
+    page.wait_for_selector("#devices tr:has-text('cameras.left'):has-text('fake camera left SN-1') .state.finished")
+    page.wait_for_selector("#check-all:enabled")
+    page.wait_for_selector("#station-run .station")  # what runs there, and its halt
+    watched.go("/", "#stations .station")
+    watched.close()
+
+
+def test_a_calibration_is_certified_and_revoked(browser: Any, lab: Running) -> None:
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    watched.go("/calibrations", "#calibrations tr:has-text('nightly')")
+    mine = "#calibrations tr:has-text('nightly')"
+    page.click(f":nth-match({mine}, 1) button")  # 2.15 e: warn
     page.wait_for_selector("#certify[open] .mark.warn")
+    assert "rejects the model" in page.inner_text("#certify-rejects")
     page.click("#certify-go")
     page.wait_for_selector("#certify-problem:not(:empty)")
     assert "is warn" in page.inner_text("#certify-problem")
     page.keyboard.press("Escape")
     page.wait_for_selector("#certify", state="hidden")
-    page.click("#calibrations tr:last-child button")
+    page.click(f":nth-match({mine}, 3) button")
     page.wait_for_selector("#certify[open] .mark.good")
     page.click("#certify-go")
-    page.wait_for_selector("#calibrations tr:last-child .state.certified")
-    assert "admin, " in page.inner_text("#calibrations tr:last-child")
-    page.wait_for_selector("#history .ring")
-    assert lab.store is not None
+    page.wait_for_selector(f"{mine} .state.certified")
+    assert "admin, " in page.inner_text(f"{mine}:has(.certified)")
+    page.click(f"{mine}:has(.certified) a:has-text('nightly')")
+    page.wait_for_selector("#calibration-actions button:has-text('Revoke')")
+    with page.expect_popup() as opened:
+        page.click("#calibration-actions a:has-text('Certificate')")
+    certificate = opened.value
+    certificate.wait_for_selector("h1:has-text('Certificate')")
+    words = certificate.inner_text("body")
+    assert "2.000 \u00b1 0.010 e" in words and "SN-1" in words and "admin" in words and "SHA-256" in words
+    assert "isn't diagnosed" in words
+    certificate.close()
+    page.click("#calibration-actions button:has-text('Revoke')")
+    page.keyboard.type("the lens was touched")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#calibration-facts .state.revoked")
+    assert "the lens was touched" in page.inner_text("#calibration-facts")
+    # Another one, against limits that are drafted from the history and edited.
+    watched.go("/calibrations", f"{mine} button")
+    page.click(f":nth-match({mine}, 2) button")
+    page.click("#certify-draft")
+    page.wait_for_selector("#certify-limits tr:has-text('read noise')")
+    for field in page.query_selector_all("#certify-limits tr:has-text('read noise') td:nth-child(4) input"):
+        field.fill("3")
+    page.click("#certify-go")
+    page.wait_for_selector(f"{mine} .state.certified")
     watched.complaints = [line for line in watched.complaints if "422" not in line]  # the refused one
     watched.close()
 
@@ -316,13 +528,59 @@ def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:
         page.uncheck(f"#plan-rows li:has(strong:text-is('{name}')) input[type=checkbox]")
     page.wait_for_selector("#plan-words:has-text('1 sequence, 40 captures')")
     page.click("#plan-rows li:first-child summary")
-    assert watched.serious() == []
+    assert watched.faults() == []
     page.fill("#plan-rows li:first-child label:has-text('frames at each exposure') input", "2")
     page.press("#plan-rows li:first-child label:has-text('frames at each exposure') input", "Tab")
     page.wait_for_selector("#plan-words:has-text('1 sequence, 20 captures')")
     page.fill("#start-form input[name=name]", "as planned")
     page.click("#start")
-    page.wait_for_selector("#sessions tr:has-text('as planned') td:has-text('/10')")
+    watched.go("/sessions", "#sessions tr:has-text('as planned') td:has-text('/10')")
+    watched.close()
+
+
+def test_what_waits_is_edited_and_copied_with_what_follows(browser: Any, lab: Running) -> None:
+    """What was asked with stands in the form again; the edited one keeps its place."""
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    page.wait_for_selector("#plan-words:has-text('3 sequences')")
+    page.fill("#start-form input[name=name]", "for the night")
+    page.fill("#start-form input[name=notes]", "cold #night")
+    page.fill("#start-form input[name=not_before]", "2999-01-01T20:00")
+    page.press("#then-words", "Enter")
+    assert page.is_disabled("#start-form input[name=compare]")
+    page.select_option("#start-form select[name=then]", "pipeline")
+    page.check("#start-form input[name=resolve]")
+    page.check("#start-form input[name=compare]")
+    page.wait_for_selector("#then-words:has-text('the whole pipeline, with a report, resolve, compare')")
+    assert watched.faults() == []
+    page.click("#start:has-text('Queue a session')")
+    row = "#queue tr:has-text('for the night')"
+    page.wait_for_selector(f"{row}:has-text('pipeline, resolve, compare')")
+    place = page.inner_text(f"{row} td").split(".")[0]
+    page.click(f"{row} a:has-text('Edit')")
+    page.wait_for_selector("#start:has-text('Keep the changes')")
+    page.wait_for_function("() => document.querySelector('#start-form input[name=name]').value === 'for the night'")
+    assert page.input_value("#start-form input[name=not_before]") == "2999-01-01T20:00"
+    assert page.is_checked("#start-form input[name=compare]")
+    page.fill("#start-form input[name=name]", "for the next night")
+    page.select_option("#start-form select[name=then]", "fit")
+    page.click("#start")
+    row = "#queue tr:has-text('for the next night')"
+    page.wait_for_selector(f"{row}:has-text('fit, compare')")
+    assert page.inner_text(f"{row} td").split(".")[0] == place
+    page.wait_for_selector("#start:not(:has-text('Keep the changes'))")
+    page.click(f"{row} a:has-text('Copy')")
+    page.wait_for_function(
+        "() => document.querySelector('#start-form input[name=name]').value === 'for the next night'"
+    )
+    page.fill("#start-form input[name=name]", "once more")
+    page.fill("#start-form input[name=not_before]", "2999-01-02T20:00")
+    page.click("#start:has-text('Queue a session')")
+    page.wait_for_selector("#queue tr:has-text('once more'):has-text('fit, compare')")
+    for name in ("for the next night", "once more"):
+        page.click(f"#queue tr:has-text('{name}') button:has-text('Remove')")
+        page.wait_for_selector(f"#queue tr:has-text('{name}')", state="detached")
     watched.close()
 
 
@@ -332,13 +590,15 @@ def test_a_challenge_is_made_and_deleted(browser: Any, lab: Running, monkeypatch
     watched = Watched(browser, lab)
     watched.log_in(lab, "calibrate")
     page = watched.page
+    watched.go("/challenges", "#challenge-form:not([hidden])")
     page.fill("#challenge-form input[name=name]", "since the upgrade")
     page.fill("#challenge-form input[name=cases]", "2")
     page.press("#challenge-form input[name=cases]", "Enter")
     page.wait_for_selector("#challenges tr:has-text('since the upgrade'):has-text('0/2')")
-    page.wait_for_selector("#jobs tr:has-text('make challenge'):has-text('since the upgrade') .state.done")
     page.wait_for_selector("#challenges .state:has-text('unfinished')")
-    assert watched.serious() == []
+    watched.go("/jobs", "#jobs tr:has-text('make challenge'):has-text('since the upgrade') .state.done")
+    watched.go("/challenges", "#challenges button:has-text('Delete'):not([disabled])")
+    assert watched.faults() == []
     page.on("dialog", lambda asked: asked.accept())
     page.click("#challenges button:has-text('Delete'):not([disabled])")
     page.wait_for_selector("#challenges tr", state="detached")
@@ -353,9 +613,9 @@ def test_a_camera_model_is_sent_in_and_deleted(browser: Any, lab: Running, tmp_p
     watched = Watched(browser, lab)
     watched.log_in(lab, "calibrate")
     page = watched.page
-    page.wait_for_selector("#models tr")  # those of the fits
+    watched.go("/models", "#models tr")  # those of the fits
     page.wait_for_selector("#model-drop-file")
-    page.focus("#history-form select[name=figure]")
+    page.focus("#models-title")
     for _ in range(20):  # the browser's own chooser, reached by the keyboard
         page.keyboard.press("Tab")
         if page.evaluate("document.activeElement.id") == "model-drop-file":
@@ -368,7 +628,7 @@ def test_a_camera_model_is_sent_in_and_deleted(browser: Any, lab: Running, tmp_p
     code = DROP.replace("PLACE", "model-drop")
     page.evaluate(code, ["wrong.zip", base64.b64encode(b"no archive").decode()])
     page.wait_for_selector("#models-problem:has-text('wrong.zip: archive: can')")
-    assert watched.serious() == [] and watched.sideways_px() == 0
+    assert watched.faults() == [] and watched.sideways_px() == 0
     page.evaluate(code, ["dropped.zip", base64.b64encode(content).decode()])
     page.wait_for_selector("#models tr:nth-child(2):has-text('sent')")
     assert page.inner_text("#models-problem") == ""
@@ -386,7 +646,6 @@ def test_a_halt_is_answered_beside_its_button_also_without_a_network(browser: An
     page = watched.page
     watched.log_in(lab, "calibrate")
     assert page.is_visible("#halt") and not page.is_visible("#start-form")
-    assert not page.query_selector("#sessions button:has-text('Resume')")
     page.click("#halt")
     page.wait_for_selector("#halt-told:has-text('shutter closed')")
     page.wait_for_selector(".station dd:has-text('closed')")
@@ -394,7 +653,7 @@ def test_a_halt_is_answered_beside_its_button_also_without_a_network(browser: An
     page.click(".station button:has-text('Halt')")
     page.wait_for_selector(".station .halted.unsafe:has-text('NOT CONFIRMED: go to the bench')")
     page.wait_for_selector(".station .state.unsafe:has-text('NOT CONFIRMED')")
-    assert watched.serious() == []
+    assert watched.faults() == []
     lab.bench.unplugged.clear()
     watched.context.set_offline(True)
     page.click("#halt")
@@ -417,43 +676,52 @@ def test_a_halt_is_answered_beside_its_button_also_without_a_network(browser: An
     watched.close()
 
 
-def test_a_key_that_may_only_read_gets_no_button_that_fails(browser: Any, lab: Running) -> None:
+def test_a_key_that_may_only_read_gets_no_button_that_fails(browser: Any, lab: Running, ids: dict[str, str]) -> None:
     watched = Watched(browser, lab)
     watched.log_in(lab, "read")
     page = watched.page
-    page.click("#sessions tr:has(.state.finished) button:has-text('Open')")
-    page.wait_for_selector("#captures img")
-    page.wait_for_selector("#queue tr")
-    words = {button.inner_text() for button in page.query_selector_all("main button") if button.is_visible()}
-    assert words <= {"Open", "Show more", "Back to the sessions"}
+    harmless = {
+        "Show more",
+        "Show older ones",
+        "Search",
+        "Compare the two chosen",
+        "Auto",
+        "+",
+        "\u2212",
+        "Fit",
+        "Mark",
+    }
+    for address, there in views(ids):
+        watched.go(address, "section.view:not([hidden]) h2")
+        if there != "#plan-words:has-text('3 sequences')":
+            page.wait_for_selector(there, state="attached")
+        words = {button.inner_text() for button in page.query_selector_all("main button") if button.is_visible()}
+        assert address == "/drift" or words <= harmless, address
     watched.close()
 
 
-def test_what_runs_stays_in_view_and_what_was_chosen_stays_chosen(browser: Any, lab: Running) -> None:
+def test_what_was_chosen_stays_chosen(browser: Any, lab: Running) -> None:
     other = STATION.replace('address = "', 'address = "other ').replace("a bench of fakes", "another bench")
     watched = Watched(browser, lab)
     page = watched.page
     watched.log_in(lab)
     lab.bench.delay_s = 0.1
-    page.fill("input[name=name]", "in view")
+    page.fill("#start-form input[name=name]", "in view")
     page.click("#start")
-    page.wait_for_selector(".station.busy button:has-text('Halt')")
-    page.wait_for_selector("#watch-title:has-text('in view')")
+    page.wait_for_selector(".station.busy a:has-text('in view')")
     assert page.evaluate("scrollY") == 0
     (lab.store.root / "stations" / "another.toml").write_text(other)  # before the chosen one in the list
     page.wait_for_selector("#start-station option:nth-child(2)", state="attached")
     assert page.input_value("#start-station") == "fakes"
-    row = "#sessions tr:has(.state.finished)"
-    opened = page.inner_text(row)
-    page.click(f"{row} button:has-text('Open')")
-    page.wait_for_selector("#captures img")
-    assert "in view" in page.inner_text("#watch-title")  # what runs, not what was opened
-    assert watched.can_halt() and watched.focused()["text"] in opened
-    box = page.query_selector("#watch-title").bounding_box()
-    assert 0 <= box["y"] <= DESK["height"]
+    watched.go("/sessions", "#sessions tr:has(.state.finished) a")
+    page.click("#sessions tr:has(.state.finished) a:not(.tag)")
+    page.wait_for_selector("#view-source:not([hidden])")
+    page.wait_for_selector("#strip li:has-text('running') a[href*='/live']")  # what runs is one click away
+    page.wait_for_selector("#session-title:focus")
+    assert watched.can_halt()
     watched.tab_to("Fit")
     page.click("#halt")
-    page.wait_for_selector("#sessions tr:has-text('in view') .state.interrupted")
+    page.wait_for_selector("#halt-told:has-text('shutter closed')")
     lab.bench.delay_s = 0.0
     (lab.store.root / "stations" / "another.toml").unlink()
     watched.close()
@@ -469,14 +737,16 @@ def test_sessions_beyond_the_first_page_are_reached(browser: Any, tmp_path: Path
         page = watched.page
         page.fill("input[name=key]", running.keys["read"])
         page.press("input[name=key]", "Enter")
-        page.wait_for_selector("#sessions tr:nth-child(50)")
+        page.wait_for_selector("#view-desk:not([hidden])")
+        watched.go("/sessions", "#sessions tr:nth-child(50)")
         page.click("#more-sessions")
         page.wait_for_selector("#sessions tr:nth-child(53):has-text('number 0')")
         page.wait_for_selector("#more-sessions", state="hidden")
         watched.close()
 
 
-def test_a_running_page_asks_for_little(browser: Any, lab: Running) -> None:
+@pytest.mark.parametrize("at", ["the desk", "the session"])
+def test_a_running_page_asks_for_little(browser: Any, lab: Running, at: str) -> None:
     """Below 60 requests and 2 MB in 30 s of the page's clock, while a session runs."""
     watched = Watched(browser, lab)
     page = watched.page
@@ -485,7 +755,9 @@ def test_a_running_page_asks_for_little(browser: Any, lab: Running) -> None:
     lab.bench.delay_s = 0.1
     page.click("#start")
     page.wait_for_selector(".station.busy progress")
-    page.wait_for_selector("#watch-histogram svg .line")
+    if at == "the session":
+        page.click(".station.busy .run a")
+        page.wait_for_selector("#watch-histogram svg .line")
     asked: list[Any] = []
     page.on("requestfinished", lambda request: asked.append(request))  # noqa: PLW0108 - the binding marks the function
     for _ in range(6):  # 30 s

@@ -77,6 +77,13 @@ ROUTES = [
     ("POST", "/camera-models", "calibrate"),
     ("DELETE", "/camera-models/{model_id}", "calibrate"),
     ("GET", "/camera-models/{model_id}/archive.{form}", "read"),
+    ("GET", "/camera-models/{model_id}/budget", "read"),
+    ("GET", "/predictions", "read"),
+    ("POST", "/predictions", "calibrate"),
+    ("GET", "/predictions/{prediction_id}", "read"),
+    ("GET", "/predictions/{prediction_id}/sealed.json", "read"),
+    ("DELETE", "/predictions/{prediction_id}", "calibrate"),
+    ("POST", "/predictions/{prediction_id}/score", "read"),
     ("GET", "/comparisons", "read"),
     ("GET", "/comparisons/page", "read"),
     ("GET", "/challenges", "read"),
@@ -96,6 +103,7 @@ UNUSABLE = {
     ("GET", "/comparisons"),
     ("GET", "/comparisons/page"),
     ("POST", "/challenges"),
+    ("GET", "/camera-models/{model_id}/budget"),
 }
 BODIES: dict[str, Any] = {
     "/sessions": {"station": "nowhere"},
@@ -105,6 +113,8 @@ BODIES: dict[str, Any] = {
     "/halt": {"station": "nowhere"},
     "/sessions/{session_id}/queue": {},
     "/stations/{name}/estimate": {},
+    "/predictions": {"camera_model": "0" * 16, "plan": {"recordings_id": "0" * 16}},
+    "/predictions/{prediction_id}/score": {"recordings_id": "0" * 16},
     "/challenges": {"cases": 0},
     "/challenges/{challenge_id}/jobs": {"kind": "score"},
 }
@@ -131,6 +141,7 @@ def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path:
         "sequence": "nothing",
         "model_id": "0" * 16,
         "challenge_id": "0" * 16,
+        "prediction_id": "0" * 16,
         "case": "case-0001",
         "form": "tar",
         "picture": "png",

@@ -16,7 +16,10 @@ from tests.api.conftest import Running
 @pytest.mark.parametrize(
     ("path", "said"),
     [
-        ("/api/v1/sessions?limt=3", "'limt': isn't a query parameter of /api/v1/sessions; it takes after, limit"),
+        (
+            "/api/v1/sessions?limt=3",
+            "'limt': isn't a query parameter of /api/v1/sessions; it takes after, limit, search, verdict",
+        ),
         ("/api/v1/stations?x=1", "'x': isn't a query parameter of /api/v1/stations; it takes none"),
     ],
 )

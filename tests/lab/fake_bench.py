@@ -16,7 +16,7 @@ import numpy as np
 from drivers.camera.base import Camera, Frame, SensorInfo
 from drivers.display.base import Display, Shown
 from drivers.errors import Disconnected, Refused
-from drivers.instrument import Identity
+from drivers.instrument import Identity, Setting
 from drivers.monochromator.base import Monochromator
 from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiometer
 from drivers.stage.base import Stage
@@ -78,6 +78,10 @@ class Bench:
         self.unplugged: set[str] = set()
         self.refused_nm: float | None = None
         self.log: list[str] = []
+        self.serials: dict[str, str] = {}
+        self.settings: dict[str, dict[str, Setting]] = {}
+        self.found: dict[str, dict[str, Setting]] = {}
+        self.departures: dict[str, tuple[str, ...]] = {}
         self.rng = np.random.default_rng(5)
 
     def check(self, name: str) -> None:
@@ -112,7 +116,16 @@ class _Fake:
         self.bench.check(self.who)
 
     def identity(self) -> Identity:
-        return Identity("fake", self.who, "SN-1")
+        return Identity("fake", self.who, self.bench.serials.get(self.who, "SN-1"))
+
+    def settings(self) -> dict[str, Setting]:
+        return self.bench.settings.get(self.who, {})
+
+    def found(self) -> dict[str, Setting]:
+        return self.bench.found.get(self.who, {})
+
+    def departures(self) -> tuple[str, ...]:
+        return self.bench.departures.get(self.who, ())
 
     def stop(self) -> None:
         self.bench.check(self.who)

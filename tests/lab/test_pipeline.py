@@ -14,31 +14,34 @@ import lab.diagnose
 import lab.fit
 import lab.predict.validate
 import lab.report
+import lab.resolve
+from lab.capture.catalogue import StepTimes
 from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.store import Store
 from lab.capture.take_step import DUMMY_FRAMES
 from lab.capture_kinds.dark import DarkSequence
+from lab.capture_kinds.stopped_edge import StoppedEdgeSequence
 from lab.diagnose import Diagnosis
-from lab.diagnose.outcome.next_capture import CaptureProposal
-from lab.diagnose.policy import DecisionPolicy
+from lab.diagnose.outcome.next_capture import Doubt
 from lab.errors import Cancelled, InputError
 from lab.formats import recording_set
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import DiagnosisResult, FitResult, NextCapture, ValidationResult
+from lab.formats.results import DiagnosisResult, DiagnosisVerdict, FitResult, ValidationResult
 from lab.pipeline import (
     STEPS,
     CaptureRequest,
     Goal,
     PipelineProgress,
     PipelineRequest,
+    PipelineResult,
     capture_here,
     run_pipeline,
     source_recordings,
 )
+from lab.resolve import ResolveLimits, read_journal
 from tests.lab import fake_bench
-
-DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
+from tests.lab.doubts import DARKS, doubt, offered
 
 
 @pytest.fixture
@@ -263,77 +266,208 @@ def test_only_with_a_station_is_anything_captured(store: Store) -> None:
 # --- resolving --------------------------------------------------------------------------------------------------------
 
 
-def proposal(capture: str, distance: float = 9.0, told_apart: float = 0.98, can_take: bool = True) -> CaptureProposal:
-    wanted = NextCapture(
-        side="left", capture=capture, rivals=("defocus", "coma"), distance=distance, told_apart=told_apart
-    )
-    return CaptureProposal(wanted, DARKS if can_take else None)
+TIE: DiagnosisVerdict = "partly_explained"
+UNTAKEN = offered("edges at f/8", plan=None)
+#: A quarter of an hour at the typical time of a pair of frames.
+LONG = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=900),))
 
 
-TIE = "partly_explained"
+def resolving(
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    doubts: list[list[Doubt]],
+    limits: ResolveLimits | None = None,
+    tell: Callable[[PipelineProgress], None] | None = None,
+    session: str = "",
+    verdict: DiagnosisVerdict = "explained",
+) -> tuple[PipelineResult, list[int]]:
+    """A pipeline whose diagnoses leave these doubts one after the other; and how many captures each diagnosis saw."""
+    seen: list[int] = []
+
+    def examine(recordings: RecordingSet, fitted: FitResult, tell: Any, **_: Any) -> Diagnosis:
+        left = doubts[len(seen)]
+        seen.append(len(recordings.captures()))
+        said = DiagnosisResult(source=recordings.source, verdict=TIE if left else verdict, next_capture="Take darks.")
+        return Diagnosis(said, {}, tuple(left))
+
+    monkeypatch.setattr(lab.diagnose, "examine", examine)
+    monkeypatch.setattr(
+        lab.resolve, "step_times", lambda *_: StepTimes({})
+    )  # typical times, whatever this computer does
+    capture = CaptureRequest(session=session) if session else CaptureRequest(plan=DARKS, name="one")
+    request = PipelineRequest("pipeline", capture=capture, resolve=limits or ResolveLimits())
+    return run_pipeline(request, tell, store=store, capturer=Bench(store)), seen
 
 
 @pytest.mark.parametrize(
-    ("proposed", "taken", "said"),
+    ("doubts", "limits", "taken", "end", "said"),
     [
-        pytest.param([[]], [], "no rivals are left", id="no tie"),
-        pytest.param([[proposal("darks")], []], ["darks"], "no rivals are left", id="settled by one"),
+        pytest.param([[]], None, [], "settled", "no rivals are left", id="no tie"),
+        pytest.param([doubt(offered("darks")), []], None, ["darks"], "settled", "no rivals are left", id="by one"),
         pytest.param(
-            [[proposal("darks", told_apart=0.9)], [proposal("darks"), proposal("more darks")], []],
-            ["darks", "more darks"],
-            "no rivals are left",
-            id="settled by two, none of them taken twice",
-        ),
-        pytest.param(
-            [[proposal("edges", can_take=False), proposal("darks")], []],
-            ["darks"],
-            "no rivals are left",
-            id="the best that the station takes by itself",
-        ),
-        pytest.param(
-            [[proposal("darks", distance=0.9 * DecisionPolicy().next_capture_distance)]],
-            [],
-            "no capture that the station takes by itself would tell defocus from coma",
-            id="not worth it",
-        ),
-        pytest.param(
-            [[proposal("darks", told_apart=0.98)], [proposal("more", told_apart=0.98)], [proposal("most")]],
+            [doubt(offered("darks")), doubt(offered("darks"), offered("more", 8.0)), []],
+            None,
             ["darks", "more"],
-            "the captures that were taken didn't tell defocus from coma",
-            id="given up: both failed with a probability of 0.0004",
+            "settled",
+            "no rivals are left",
+            id="by two, none of them taken twice",
+        ),
+        pytest.param(
+            [doubt(UNTAKEN, offered("darks", 8.0)), []], None, ["darks"], "settled", "no rivals", id="what it can take"
+        ),
+        pytest.param(
+            [doubt(offered("darks", 0.2), UNTAKEN)],
+            None,
+            [],
+            "this station can't",
+            "to tell defocus from coma, you need edges at f/8: a lens is lacking",
+            id="too little",
+        ),
+        pytest.param(
+            [doubt(offered("edges at f/8", plan=CapturePlan((StoppedEdgeSequence(f_number=8.0),))))],
+            None,
+            [],
+            "this station can't",
+            "you need edges at f/8: station: no target of kind 'aperture' with f_number = 8; it has none",
+            id="a device that isn't there",
+        ),
+        pytest.param(
+            [doubt(offered("darks", 0.2))],
+            None,
+            [],
+            "this station can't",
+            "no capture that can be predicted",
+            id="none",
+        ),
+        pytest.param(
+            [doubt(offered("darks")), doubt(offered("more"))],
+            ResolveLimits(rounds=1),
+            ["darks"],
+            "budget spent",
+            "1 captures were taken of 1; more would go on telling defocus from coma",
+            id="rounds",
+        ),
+        pytest.param(
+            [doubt(offered("long", plan=LONG), offered("darks", 6.0)), doubt(offered("long", plan=LONG))],
+            ResolveLimits(minutes=1.0),
+            ["darks"],
+            "budget spent",
+            "of 1 min are spent; long would go on telling defocus from coma, in ",
+            id="minutes",
         ),
     ],
 )
-def test_resolving_captures_and_diagnoses_until_nothing_can_settle_the_tie(
-    proposed: list[list[CaptureProposal]],
+def test_resolving_captures_and_diagnoses_until_it_is_settled(
+    doubts: list[list[Doubt]],
+    limits: ResolveLimits | None,
     taken: list[str],
+    end: str,
     said: str,
     store: Store,
     steps: list[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    seen: list[int] = []
-
-    def examine(recordings: RecordingSet, fitted: FitResult, tell: Any, **_: Any) -> Diagnosis:
-        at = len(seen)
-        seen.append(len(recordings.captures()))
-        verdict = "explained" if at == len(proposed) - 1 else TIE
-        return Diagnosis(DiagnosisResult(source=recordings.source, verdict=verdict), {}, tuple(proposed[at]))
-
-    monkeypatch.setattr(lab.diagnose, "examine", examine)
-    bench, remarks = Bench(store), []
-    request = PipelineRequest("pipeline", capture=CaptureRequest(plan=DARKS, name="one"), resolve=True)
-
-    def tell(progress: PipelineProgress) -> None:
-        if progress.remark:
-            remarks.append(progress.remark)
-
-    found = run_pipeline(request, tell, store=store, capturer=bench)
-    assert found.diagnosis is not None and found.diagnosis.verdict == "explained"
-    assert [one.capture for one in found.diagnosis.resolutions] == taken
-    assert all(one.verdict_before == TIE for one in found.diagnosis.resolutions)
-    assert [one.name for one in bench.asked] == ["one", *["one resolve"] * len(taken)]
+    remarks: list[str] = []
+    found, seen = resolving(
+        store, monkeypatch, doubts, limits, lambda progress: remarks.extend(filter(None, [progress.remark]))
+    )
+    told = found.diagnosis
+    assert told is not None and found.session is not None
+    assert [one.capture for one in told.resolutions] == taken
+    assert (told.resolve_end, said in told.resolve_reason) == (end, True)
+    assert all(one.verdict_before == TIE for one in told.resolutions)
+    assert all([r.name for r in one.rivals] == ["defocus", "coma"] for one in told.resolutions)
+    assert all(one.spent_s is not None for one in told.resolutions)
+    assert all(one.rivals_after is not None for one in told.resolutions)
+    assert [store.session(one.session).name for one in told.resolutions] == ["one resolve"] * len(taken)
     assert seen == [8 * (1 + number) for number in range(len(taken) + 1)]  # each diagnosis sees all captures before it
-    assert len(remarks) == 1 and said in remarks[0]
-    kept = store.results(found.session, "diagnose")
-    assert len(kept) == len(taken) + 1 and kept[0].document == found.diagnosis.model_dump(mode="json")
+    assert len(remarks) == 1 and remarks[0] == f"resolve: {end}: {told.resolve_reason}"
+    journal = read_journal(store, found.session)
+    assert journal is not None and (journal.resolutions, journal.end) == (told.resolutions, told.resolve_end)
+    assert store.results(found.session, "diagnose")[0].document == told.model_dump(mode="json")
+
+
+@pytest.mark.parametrize(
+    ("verdict", "said"),
+    [
+        ("unexplained", "no rivals are left, but a mismatch; Take darks"),
+        ("nothing_judged", "nothing is judged; Take darks"),
+    ],
+)
+def test_what_has_no_name_is_not_settled(
+    verdict: DiagnosisVerdict, said: str, store: Store, steps: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, _ = resolving(store, monkeypatch, [[]], verdict=verdict)
+    assert found.diagnosis is not None
+    assert (found.diagnosis.resolve_end, found.diagnosis.resolve_reason) == ("this station can't", said)
+
+
+@pytest.mark.parametrize("when", ["capture", "diagnosis"])
+def test_a_resolving_that_ended_in_the_middle_goes_on_where_it_was(
+    when: str, store: Store, steps: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends while the first capture is taken, or before the diagnosis with it; then it begins with that capture,
+    takes no frame twice, and keeps what was in doubt."""
+
+    class KilledError(BaseException):
+        pass
+
+    def kill(progress: PipelineProgress) -> None:
+        in_middle = progress.capture is not None and progress.capture.done == 2
+        if progress.step == "resolve" and (in_middle if when == "capture" else progress.what == "done"):
+            raise KilledError
+
+    first = [doubt(offered("darks", 6.0)), doubt(offered("more"))]
+    if when == "diagnosis":
+
+        def examine(recordings: RecordingSet, *_: Any, **__: Any) -> Diagnosis:
+            if len(recordings.captures()) > 8:
+                raise KilledError
+            return Diagnosis(DiagnosisResult(source="x", verdict=TIE), {}, tuple(first[0]))
+
+        monkeypatch.setattr(lab.diagnose, "examine", examine)
+        request = PipelineRequest("pipeline", capture=CaptureRequest(plan=DARKS, name="one"), resolve=ResolveLimits())
+        with pytest.raises(KilledError):
+            run_pipeline(request, store=store, capturer=Bench(store))
+    else:
+        with pytest.raises(KilledError):
+            resolving(store, monkeypatch, first, tell=kill)
+    base = next(one.id for one in store.sessions() if one.name == "one")
+    journal = read_journal(store, base)
+    assert journal is not None
+    (begun,) = journal.resolutions
+    assert (begun.capture, begun.rivals_after, journal.end) == ("darks", None, None)
+    done = store.session(begun.session).steps_done
+
+    found, seen = resolving(store, monkeypatch, [doubt(offered("darks"), offered("more")), []], session=base)
+    told = found.diagnosis
+    assert told is not None
+    assert seen == [16, 24]  # the first diagnosis sees the capture that was begun
+    assert [one.capture for one in told.resolutions] == ["darks", "more"]
+    assert told.resolutions[0].session == begun.session
+    assert told.resolutions[0].effects_before == begun.effects_before
+    assert [one.rivals_after is not None for one in told.resolutions] == [True, True]
+    assert told.resolve_end == "settled"
+    assert len(store.sessions()) == 3
+    assert done == (4 if when == "diagnosis" else 2)
+
+
+@pytest.mark.parametrize(
+    ("goal", "more", "said"),
+    [
+        ("fit", {}, "resolve: fit makes no diagnosis"),
+        ("capture", {"capture": CaptureRequest()}, "resolve: capture makes no diagnosis"),
+        (
+            "pipeline",
+            {"capture": CaptureRequest(), "diagnosis": DiagnosisResult(source="x", verdict=TIE)},
+            "a diagnosis that is given tells no rivals' predictions",
+        ),
+    ],
+)
+def test_without_a_diagnosis_of_its_own_nothing_is_resolved(
+    goal: Goal, more: dict[str, Any], said: str, small_set: Callable[..., RecordingSet]
+) -> None:
+    source = {} if "capture" in more else {"recordings": small_set()}
+    with pytest.raises(InputError, match=said) as refused:
+        PipelineRequest(goal, resolve=ResolveLimits(), **source, **more)
+    assert "\n" not in str(refused.value)

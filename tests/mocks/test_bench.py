@@ -17,10 +17,11 @@ import pytest
 from mocks.bench import Bench, BenchError, Clock
 from mocks.conceal import SIDES
 from mocks.light_path import WAVELENGTH_NM, LightSettings, sphere_radiance
-from mocks.targets import BOARD_POSES, BOARD_SQUARES, EDGE_ANGLES_DEG, SQUARE_MM, board_pose, corners_px
+from mocks.targets import BOARD_POSES, BOARD_SQUARES, EDGE_ANGLES_DEG, SQUARE_MM, STOPS, board_pose, corners_px
 from mocks.truth import hidden_truth
 from sim.camera import Side
 from sim.frame import Exposure, predict_frame
+from sim.optics.illumination import irradiance_factor
 from sim.point import edge_profile
 from sim.scene.scenes import UniformField
 from sim.sensor.electrons import dark_current_e_per_s
@@ -244,6 +245,22 @@ class TestFrames:
 
 
 class TestTargets:
+    @pytest.mark.parametrize("stop", ["f/5.6", "f/8"])
+    def test_a_stop_of_the_aperture_ring_takes_light_and_stays_until_the_next(self, bench: Bench, stop: str) -> None:
+        """Irradiance pi / (4 N^2 + 1) of the radiance; means over 1e5 pixels of a channel are known to 1e-4, and the
+        lamp to 4e-4."""
+        expected = irradiance_factor(STOPS[stop]) / irradiance_factor(4.0)
+        black = hidden_truth(1).cameras["left"].model.black_level_dn
+        try:
+            wide = bench.expose("left", 2e-3).mean() - black
+            bench.place(stop)
+            assert bench.placed == "sphere"
+            assert (bench.expose("left", 2e-3).mean() - black) / wide == pytest.approx(expected, rel=3e-3)
+            bench.place("f/4")
+            assert bench.expose("left", 2e-3).mean() - black == pytest.approx(wide, rel=2e-3)
+        finally:
+            bench.place("f/4")
+
     def test_every_target_has_a_layout(self, bench: Bench) -> None:
         assert set(bench.station_targets()) == set(bench.targets)
 

@@ -27,7 +27,7 @@ from mocks.former.laws import (
     NonlinearityLaw,
     OpticalLowPassFilterLaw,
     RowNoiseLaw,
-    TapGainLaw,
+    TreeRingsLaw,
 )
 
 #: Laws whose nominal strength is far above what small frames need, whatever the variant.
@@ -38,7 +38,7 @@ STRANGE: tuple[type[Law], ...] = (
     CoverGlassFringeLaw,
     DustShadowLaw,
     LampJumpLaw,
-    TapGainLaw,
+    TreeRingsLaw,
 )
 
 

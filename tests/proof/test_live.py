@@ -19,6 +19,8 @@ from lab.challenge.live import (
     LiveRun,
     drawn,
     every_case,
+    isotropic_cases,
+    isotropic_table,
     judged,
     run_all,
     run_case,
@@ -31,6 +33,19 @@ from mocks.conceal import NOT_SHOWN, parse
 from sim.camera import Side
 from sim.effects.library import effects as library
 from sim.effects.library import typical
+
+
+@pytest.mark.slow
+def test_a_weak_blur_is_settled_over_the_wire(tmp_path: Path) -> None:
+    """Screens alone leave the low-pass filter and charge diffusion; edges in light of one wavelength don't."""
+    run = run_case(isotropic_cases()["isotropic-charge_diffusion-1"], tmp_path / "session")
+    assert run.outcome == "named", run.error
+    assert run.stages[0].rivals
+    assert run.resolve_end == "settled"
+    assert run.stages[-1].named == ("charge_diffusion",)
+    assert run.stages[-1].rivals == ()
+    assert 1 <= len(run.captures) <= 3
+    assert "| 0 | 0 of 1 |" in isotropic_table({run.case.name: run})
 
 
 def day_seed() -> int:

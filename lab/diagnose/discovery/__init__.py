@@ -41,12 +41,12 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.code_density import WIDEST
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import DiscoveredLaw
+from lab.measure.study import Study
 from sim.camera import Side
+from sim.effects.base import Effects
 from sim.effects.empirical_law import PLACES, EmpiricalLaw
 from sim.spectrum import FloatArray
 

@@ -12,10 +12,11 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from lab.diagnose.discovery.profile import Look, Profile
-from lab.diagnose.inference.gaussian import ROUNDING
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Block, Effects
-from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.block import Block
+from lab.measure.gaussian import ROUNDING
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.effects.empirical_law import PLACES, Along, EmpiricalLaw, Of, Stage
 from sim.effects.library import list_changes
 from sim.spectrum import FloatArray

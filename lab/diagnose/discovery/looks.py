@@ -11,14 +11,14 @@ from scipy.linalg import helmert
 from scipy.signal import savgol_coeffs
 
 from lab.diagnose.discovery.profile import Look, Profile
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.code_density import CodeCounts, counted, prepared, widths
 from lab.diagnose.measurements.dark_frames import dark_frames
 from lab.diagnose.measurements.dark_readout import dark_readout
 from lab.diagnose.measurements.even_flats import flats
 from lab.diagnose.measurements.flat_lines import without_dark
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.effects.empirical_law import Along, Of, Stage
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray

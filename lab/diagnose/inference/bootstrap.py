@@ -15,13 +15,13 @@ import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
+from lab.measure.gaussian import chi2
 from lab.one_blas_thread import one_blas_thread
 from lab.predict.replay import Replay
 from lab.workers import Workers

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from lab.diagnose.inference.discrepancy import predictive_discrepancy
-from lab.diagnose.inference.gaussian import ROUNDING, chi2, conditional
 from lab.diagnose.inference.locate import Slice, log_tail
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
+from lab.measure.gaussian import ROUNDING, chi2, conditional
+from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 
 

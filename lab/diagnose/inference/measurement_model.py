@@ -20,11 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lab.diagnose.inference.gaussian import ROUNDING, BlockCovariance, Gaussian
-from lab.diagnose.measurements.block import Block, Effects, Prediction
-from lab.diagnose.measurements.noise_guess import NoiseGuess
+from lab.diagnose.measurements.block import Block, Prediction
+from lab.measure.gaussian import ROUNDING, BlockCovariance, Gaussian
+from lab.measure.noise_figures import NoiseFigures
 from sim.camera import CameraModel
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 from sim.spectrum import FloatArray
 
 #: Limits of the caches: covariance entries (160 MB), and predictions.
@@ -63,7 +63,7 @@ class MeasurementModel:
     always: tuple[Effect, ...] = ()
     unstated_jacobian: Mapping[str, FloatArray] = field(default_factory=dict)
     gain_is_known: bool = True
-    noise: NoiseGuess | None = None
+    noise: NoiseFigures | None = None
     _predictions: dict[tuple[int, ...], Prediction] = field(default_factory=dict)
     _covariances: dict[tuple[bytes, tuple[int, ...], tuple[float, float]], BlockCovariance] = field(
         default_factory=dict

@@ -10,14 +10,14 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 
-from lab.diagnose.inference.gaussian import Gaussian
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
+from lab.measure.gaussian import Gaussian
 from sim.camera import CameraModel
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
@@ -386,12 +386,7 @@ def _standard_deviations(
     """Of every effect's parameters, from (J'J + P^-1)^-1. With s the standard deviation of u = p^k, that of p is s / (k
     |p|^(k - 1)), and at most s^(1/k), which holds at p = 0. A flat prior between two bounds has their distance over
     sqrt(12)."""
-    low, high = np.array([c.bounds for c in coords]).T
-    prior_std = np.where(np.isfinite(prior_std), prior_std, (high - low) / np.sqrt(12.0))
-    curvature = jacobian.T @ jacobian + np.diag(1.0 / prior_std**2)
-    told = np.diag(curvature) > 0.0  # else the numbers don't depend on it, and nothing bounds it
-    size = np.sqrt(np.where(told, np.diag(curvature), 1.0))
-    covariance = np.linalg.pinv(curvature / np.outer(size, size)) / np.outer(size, size)
+    covariance, told = _covariance(jacobian, coords, prior_std)
     std: list[dict[str, float | None]] = [{} for _ in range(effects)]
     for k, c in enumerate(coords):
         if not told[k]:
@@ -407,6 +402,43 @@ def _standard_deviations(
             su if power == 1 else min(su / max(power * away ** (power - 1), 1e-12), su ** (1.0 / power))
         )
     return std
+
+
+def _covariance(
+    jacobian: FloatArray, coords: Sequence[Coordinate], prior_std: FloatArray
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """(J'J + P^-1)^-1 of coordinates (p, p), from the whitened Jacobian, and which of them anything bounds (p,). A flat
+    prior between two bounds has their distance over sqrt(12)."""
+    low, high = np.array([c.bounds for c in coords]).T
+    prior_std = np.where(np.isfinite(prior_std), prior_std, (high - low) / np.sqrt(12.0))
+    curvature = jacobian.T @ jacobian + np.diag(1.0 / prior_std**2)
+    told = np.diag(curvature) > 0.0  # else the numbers don't depend on it, and nothing bounds it
+    size = np.sqrt(np.where(told, np.diag(curvature), 1.0))
+    return np.linalg.pinv(curvature / np.outer(size, size)) / np.outer(size, size), told
+
+
+def displaced(model: MeasurementModel, effects: Effects, index: int) -> list[tuple[Effect, ...]]:
+    """The effects with member `index` moved by one standard deviation along each principal direction of its parameters'
+    posterior, within bounds: a set for each direction. Predictions by these, less that by `effects`, are a square root
+    of the covariance that the member's parameters give to a prediction."""
+    coords = coordinates(effects, model.camera)
+    own = [k for k, c in enumerate(coords) if c.index == index]
+    if not own:
+        return []
+    u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
+    low, high = (np.array(b) for b in zip(*(c.bounds for c in coords), strict=True))
+    typical = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])
+    jacobian = _prediction_jacobian(model, effects, coords, u, typical, high)[model.seen]
+    covariance, told = _covariance(model.seen_gaussian(effects).whiten(jacobian), coords, coordinate_prior(coords)[1])
+    scale = typical[own]
+    size, direction = np.linalg.eigh(covariance[np.ix_(own, own)] / np.outer(scale, scale))
+    found = []
+    for part in (direction * np.sqrt(np.maximum(size, 0.0))).T:
+        step = np.zeros(len(u))
+        step[own] = np.where(told[own], part * scale, 0.0)
+        inside = step if np.all((u + step >= low) & (u + step <= high)) else -step
+        found.append(moved(effects, coords, np.clip(u + inside, low, high)))
+    return found
 
 
 def _promised_gain(

@@ -16,9 +16,8 @@ from scipy.optimize import nnls
 
 from lab.diagnose.inference.closed_form import LinearProblem, LinearSet
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Effects
 from sim.camera import CameraModel
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 from sim.spectrum import FloatArray
 
 #: Ridge on unit columns in non-negative least squares, a relative change of 1e-8: without it, the active set cycles

@@ -16,9 +16,8 @@ from lab.diagnose.inference.closed_form import LinearProblem, LinearSet, posteri
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Fit, log_likelihood, refit
 from lab.diagnose.inference.score import Changes, Signatures, signatures_of
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 
 #: Largest number of effects that one step adds to a set.
 LARGEST_STEP = 3

@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 from sim.effects.library import may_change
 from sim.uniform import LEVEL
 

@@ -6,20 +6,19 @@ maker's sensitivity curves) enter by their Jacobian and a normal prior. The meas
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 from sim.effects.library import may_change
 from sim.spectrum import FloatArray
 
 if TYPE_CHECKING:
-    from lab.diagnose.measurements.study import Study
+    from lab.measure.study import Study
 
-Effects = Sequence[Effect]
 #: `Block.reach` of measurements by ln(level): a departure from linearity may change over a factor of exp(0.8) = 2.2 in
 #: level.
 LEVEL_REACH = 0.8

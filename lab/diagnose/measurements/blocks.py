@@ -10,13 +10,13 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.flat_light import misstated_levels
 from lab.diagnose.measurements.library import measurements
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.formats.camera_file import CameraFile
+from lab.formats.camera_model import assumptions, camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, FitResult, Skipped
 from lab.measure.levels import LEAST_REACH
-from lab.predict.camera_model import assumptions, camera_model
+from lab.measure.study import Study
 from sim.camera import Side
 from sim.effects.pixel_aperture import PixelAperture
 from sim.spectrum import FloatArray

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.boards import FEWEST_CORNERS, REFERENCE_NM, views_of
 from lab.diagnose.measurements.lateral_colour import COLOUR_FLOOR_PX, colour_shift_px, outward_shifts_px
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.measure.board_detection import BoardView, channel_corners
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 
 Array = NDArray[np.floating[Any]]

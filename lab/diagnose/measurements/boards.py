@@ -16,15 +16,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.errors import NotDetermined
 from lab.formats.results import Skipped
 from lab.measure.board_calibration import MODELS, Calibration, calibrate_robustly, free_intrinsics, observations_of
 from lab.measure.board_detection import BoardView, find_boards
 from lab.measure.bundle_adjustment import BundleAdjustment, Solution
 from lab.measure.pinhole import NAMES, intrinsics_of
+from lab.measure.study import Study
 from sim.camera import Side
+from sim.effects.base import Effects
 from sim.point import displaced_um
 from sim.spectrum import FloatArray
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.pattern_fit import BORDER, joint_covariance, patterns
-from lab.diagnose.measurements.reads import SHOWN
-from lab.diagnose.measurements.study import Study
+from lab.measure.reads import SHOWN
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.uniform import Uniform
 
 BORDER_FLOOR = 0.0015

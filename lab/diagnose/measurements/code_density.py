@@ -18,10 +18,10 @@ from scipy.special import ndtr
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.held_out import held_out_flats, held_out_of
-from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.errors import NotDetermined
+from lab.measure.study import Study, held_out_flats, held_out_of
+from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
@@ -164,11 +164,13 @@ class _Counts:
 def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
     """A plane's pixels by level, as `_Counts.groups`.
 
-    Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels. Its variance is proportional to the
-    signal above black, and scaled so that its mean is the measured mean square of the departures from the local mean.
+    Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels, and by as much beside it as its row is on
+    the whole. Its variance is proportional to the signal above black, and scaled so that its mean is the measured mean
+    square of the departures.
     """
     surface = ndimage.uniform_filter(plane, AROUND, mode="reflect")
-    own = AROUND**2 / (AROUND**2 - 1.0)
+    surface = surface + (plane - surface).mean(axis=1, keepdims=True)
+    own = AROUND**2 / (AROUND**2 - 1.0) / (1.0 - 1.0 / plane.shape[1])
     signal = max(float(surface.mean()) - study.noise.black, 1.0)
     variance = own * float(np.mean(np.square(plane - surface), dtype=float))
     # pixels are binned by level, in steps narrow beside the noise; the variance of the levels within a bin is added

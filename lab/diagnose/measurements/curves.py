@@ -9,10 +9,9 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from lab.diagnose.measurements.block import Effects
-from lab.diagnose.measurements.reads import acting
-from lab.diagnose.measurements.study import Study
-from sim.effects.base import Effect
+from lab.measure.reads import acting
+from lab.measure.study import Study
+from sim.effects.base import Effect, Effects
 from sim.spectrum import FloatArray, Spectrum, linear_shares
 from sim.uniform import SPECTRAL, Uniform, electron_rate
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_frames import CELL_FLOOR_DN, CELLS, cell_means, dark_frames
 from lab.diagnose.measurements.dark_level import dark_current_map
-from lab.diagnose.measurements.reads import ADDED, DARK_CURRENT
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import ADDED, DARK_CURRENT
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.sensor.lines import Lines
 from sim.uniform import Uniform
 

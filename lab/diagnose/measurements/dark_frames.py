@@ -15,20 +15,20 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lab.capture_kinds.dark import DarkCapture
-from lab.diagnose.measurements.held_out import held_out_of
-from lab.diagnose.measurements.line_spectra import Image, periodogram, pooled, pooled_along
-from lab.diagnose.measurements.pixel_outliers import (
+from lab.diagnose.measurements.line_spectra import periodogram, pooled, pooled_along
+from lab.errors import NotDetermined
+from lab.measure.pixel_outliers import (
     CLIP,
     MEDIAN_OF,
     SMOOTH_PX,
+    Image,
     from_surroundings,
     local_variance,
     robust_std,
     sound_pixels,
     without_lines,
 )
-from lab.diagnose.measurements.study import Study
-from lab.errors import NotDetermined
+from lab.measure.study import Study, held_out_of
 from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 

@@ -9,13 +9,14 @@ from functools import cache
 import numpy as np
 
 from lab.capture_kinds.base import Capture
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_frames import DarkStatistics, conditions, dark_frames
 from lab.diagnose.measurements.line_means import LineMeans
-from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, STATED_BLACK_DN, STATED_BLACK_SHARE
-from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.noise_figures import BLACK_FLOOR_DN, STATED_BLACK_DN, STATED_BLACK_SHARE
+from lab.measure.reads import DARK_CURRENT, LAG, LINES
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform, noise_values
 

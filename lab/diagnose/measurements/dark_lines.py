@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_frames import (
     CELL_FLOOR_DN,
     DarkStatistics,
@@ -17,9 +17,10 @@ from lab.diagnose.measurements.dark_frames import (
     fine_conditions,
 )
 from lab.diagnose.measurements.line_spectra import LEVEL_BAND, Bands, log_mean_bias, log_mean_variance
-from lab.diagnose.measurements.reads import ADDED, LINES
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import ADDED, LINES
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform

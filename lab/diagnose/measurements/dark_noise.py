@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_frames import DEFECTS, captures_of, dark_frames, too_coarse
 from lab.diagnose.measurements.dark_level import added_dark_e_per_s
-from lab.diagnose.measurements.pixel_outliers import CLIP
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.pixel_outliers import CLIP
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 

@@ -12,7 +12,7 @@ from scipy.special import gammaln
 
 from lab.diagnose.measurements.dark_frames import DarkCondition, conditions
 from lab.diagnose.measurements.dark_lines import LEAST_LINE_DN
-from lab.diagnose.measurements.study import Study
+from lab.measure.study import Study
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 

@@ -14,14 +14,15 @@ from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.halo_light import Surroundings, halo_light, harmonics
-from lab.diagnose.measurements.held_out import held_out_of
-from lab.diagnose.measurements.reads import REFLECTIONS, acting
-from lab.diagnose.measurements.study import Study, mean_frame
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.errors import NotDetermined
+from lab.measure.halo_light import Surroundings, halo_light, harmonics
+from lab.measure.plane_means import channel_pixels
+from lab.measure.reads import REFLECTIONS, acting
 from lab.measure.rounding import rounding_std_dn
+from lab.measure.study import Study, held_out_of, mean_frame
 from sim.camera import CameraModel
+from sim.effects.base import Effects
 from sim.frame import with_reflections
 from sim.point import even_share, optical_transfer, wide_contrast
 from sim.sensor import mosaic
@@ -187,7 +188,7 @@ def _dark_squares(
         difference = added[use]
         lights = np.maximum([float(frame[plane][use].mean()) - noise.black for frame in (shown, black)], 0.0)
         variance = (noise.gain * lights[1] + noise.read_dn**2) * (1 / len(part) + 1 / blacks)
-        means = [float(study.pixels_of(f, channel).mean()) for f in (shown, black)]
+        means = [float(channel_pixels(f, study.camera.cfa, channel).mean()) for f in (shown, black)]
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
                          float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import betainc, chdtrc, chdtri, gammaln, ndtr, xlogy
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_frames import (
     DEFECTS,
     TAIL_EDGES,
@@ -20,7 +20,8 @@ from lab.diagnose.measurements.dark_frames import (
     dark_frames,
     fine_conditions,
 )
-from lab.diagnose.measurements.study import Study
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 

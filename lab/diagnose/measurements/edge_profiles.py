@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.diagnose.measurements.held_out import held_out_of
-from lab.diagnose.measurements.study import Study
+from lab.capture_kinds.slanted_edge import EdgeCapture
+from lab.capture_kinds.stopped_edge import StoppedEdgeCapture
 from lab.errors import NotDetermined
 from lab.measure.edge_finding import Region
 from lab.measure.edge_mtf import EdgeMtf
 from lab.measure.edges import check_phases, find_edges, measure_edge
+from lab.measure.study import Study, held_out_of
 
 PLAIN = np.array([0.25])  # cy/px: where `measure_edge` evaluates its own MTF, which isn't used here
 
@@ -23,7 +23,7 @@ PLAIN = np.array([0.25])  # cy/px: where `measure_edge` evaluates its own MTF, w
 class MeasuredEdge:
     """One edge in one channel, measured on the mean of its seen or of its held-out repeats."""
 
-    part: tuple[SlantedEdgeCapture, ...]  # the repeats
+    part: tuple[EdgeCapture, ...]  # the repeats
     channel: str
     measured: EdgeMtf
     held_out: bool
@@ -43,8 +43,8 @@ class MeasuredEdge:
         return self.region, round(self.direction_deg), self.channel
 
 
-def measured_edges(study: Study) -> list[MeasuredEdge]:
-    """All edges of the slanted-edge captures, by region and channel. Edges are searched for where no region is stated.
+def measured_edges(study: Study, kind: type[EdgeCapture]) -> list[MeasuredEdge]:
+    """All edges of the captures of a kind, by region and channel. Edges are searched for where no region is stated.
 
     Raises NotDetermined where f-number or pixel pitch isn't stated, without slanted-edge captures, and where no edge is
     measured."""
@@ -53,7 +53,8 @@ def measured_edges(study: Study) -> list[MeasuredEdge]:
             "slanted_edge", "f-number or pixel pitch isn't stated: no diffraction to hold the edges against"
         )
     groups = study.groups(
-        SlantedEdgeCapture, lambda c: (c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm)
+        kind,
+        lambda c: (f_number_of(c), c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm),
     )
     if not groups:
         raise NotDetermined("slanted_edge", "no slanted-edge captures")
@@ -85,12 +86,17 @@ def measured_edges(study: Study) -> list[MeasuredEdge]:
     return edges
 
 
-def _found(study: Study, capture: SlantedEdgeCapture) -> list[Region]:
+def f_number_of(capture: EdgeCapture) -> float | None:
+    """The f-number of a capture; None: the data sheet's."""
+    return capture.f_number if isinstance(capture, StoppedEdgeCapture) else None
+
+
+def _found(study: Study, capture: EdgeCapture) -> list[Region]:
     """Regions of the edges that are found in a capture's frame."""
     return [f.region for f in find_edges(study.recordings.frame(capture), study.stated.cfa, study.saturation_dn)]
 
 
-def _direction_deg(study: Study, capture: SlantedEdgeCapture, region: Region, angle_deg: float) -> float:
+def _direction_deg(study: Study, capture: EdgeCapture, region: Region, angle_deg: float) -> float:
     """Direction of the edge's normal towards the light side, from x (columns) to y (rows)."""
     row0, col0, row1, col1 = region
     frame = np.asarray(study.recordings.frame(capture)[row0:row1, col0:col1], float)
@@ -101,7 +107,7 @@ def _direction_deg(study: Study, capture: SlantedEdgeCapture, region: Region, an
 
 
 def _fixed_share(
-    study: Study, group: Sequence[SlantedEdgeCapture], frames: int, channel: str, region: Region, measured: EdgeMtf
+    study: Study, group: Sequence[EdgeCapture], frames: int, channel: str, region: Region, measured: EdgeMtf
 ) -> float:
     """Share of the noise variance of a mean of `frames` frames that is fixed (PRNU): 1 - temporal variance / total
     variance.

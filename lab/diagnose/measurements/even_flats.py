@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from lab.capture_kinds.dark import DarkCapture
-from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.study import Study
+from lab.measure.study import Study, held_out_flats
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 

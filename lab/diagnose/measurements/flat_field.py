@@ -4,19 +4,20 @@ fall-off."""
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import ADDED
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
+from lab.diagnose.measurements.flat_lines import collect_rows
 from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import ADDED, COLLECTED, GAINS, LEAK, acting
+from lab.measure.study import Study, held_out_flats
 from sim.camera import CameraModel
+from sim.effects.base import Effects
 from sim.point import even_share
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -79,8 +80,9 @@ def shading_block(study: Study) -> Block:
     x_mm, y_mm = (_cell_means(v) * 1e-3 for v in (place.x_um, place.y_um))
 
     def predict(effects: Effects) -> Prediction:
-        base = _shaded(planes, place, effects, study)
-        axis = {name: _shaded(planes, off, effects, study) - base for name, off in moved.items()}
+        collected = _collected(study, effects)
+        base = _shaded(planes, place, effects, study, collected)
+        axis = {name: _shaded(planes, off, effects, study, collected) - base for name, off in moved.items()}
         return Prediction(base, axis | _row_light(planes, base, Uniform(camera, effects), camera.rows))
 
     radius = np.hypot(x_mm, y_mm)
@@ -90,8 +92,8 @@ def shading_block(study: Study) -> Block:
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures),
         p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | ADDED | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT, predict=predict,
-        scale=np.ones(len(planes) * ROWS * COLS),
+        reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT,
+        predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
 
@@ -223,19 +225,45 @@ def _cell_means(value: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("iajb,a,b->ij", parts, 0.5 * _SHARES, 0.5 * _SHARES).ravel())
 
 
-def _shaded(planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effects, study: Study) -> FloatArray:
-    """Predicted cells of all planes, each plane relative to its mean, (planes x cells,)."""
+def _shaded(
+    planes: Sequence[_ChannelCells],
+    place: FieldPoints,
+    effects: Effects,
+    study: Study,
+    collected: Mapping[str, FloatArray],
+) -> FloatArray:
+    """Predicted cells of all planes, each relative to its mean, (planes x cells,); `collected` of `_collected`."""
     model = Uniform(study.camera, effects)
     light = _cell_means(model.field(place).light)
     # a veil of scattered light reduces the contrast of the fall-off
     even = even_share(study.camera, effects)
     light = (1.0 - even) * light + even * light.mean()
     added = _cells(model.added_e - model.added_e.mean()).ravel() if model.adds_signal else 0.0
+    gains = model.gain_map()
+    leaked_s = _cell_means(model.leaked_s(place))
+    gain = 1.0 if gains is None else _cells(gains).ravel()
     found = []
     for plane in planes:
-        electrons = model.response(light / light.mean() * plane.level_e)
+        own = light * collected.get(plane.channel, 1.0)
+        if model.leaks:
+            own = own * (1.0 + leaked_s * float(np.mean([1.0 / c.exposure_s for c in plane.captures])))
+        electrons = model.response(own / own.mean() * plane.level_e) * gain
         found.append(electrons / electrons.mean() + added * plane.inverse_per_e)
     return np.concatenate(found)
+
+
+def _collected(study: Study, effects: Effects) -> dict[str, FloatArray]:
+    """Factor on the cells (cells,) of each channel by pixels that collect light unlike others of their colour, as rows
+    that repeat fall unevenly into cells."""
+    collecting = acting(effects, COLLECTED)
+    if not collecting:
+        return {}
+    step, rows = mosaic.step(study.camera.cfa), collect_rows(study.camera, collecting)
+    found = {}
+    for channel, phases in mosaic.phases(study.camera.cfa).items():
+        own = np.mean([rows[r::step, c] for r, c in phases], axis=0)
+        found[channel] = _cells(np.tile(own[:, None], COLS)).ravel()
+    return found
 
 
 def _row_light(planes: Sequence[_ChannelCells], base: FloatArray, model: Uniform, rows: int) -> dict[str, FloatArray]:

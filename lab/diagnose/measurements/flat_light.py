@@ -13,7 +13,7 @@ from sim.spectrum import Spectrum
 from sim.uniform import electron_rate
 
 if TYPE_CHECKING:
-    from lab.diagnose.measurements.study import Study
+    from lab.measure.study import Study
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,15 @@ import numpy as np
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_readout import OFFSETS_STD, DarkReadOut, dark_readout
 from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, FlatLevel, flats
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import COLLECTED, GAINS, acting
+from lab.measure.study import Study
+from sim.camera import CameraModel
+from sim.effects.base import Effects
+from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
+from sim.uniform import Uniform
 
 LINE_FLOOR = 1e-4  # relative standard deviation of a step beside noise
 #: Where the areas of two read-outs may meet, as shares of a side.
@@ -27,8 +32,7 @@ def line_block(study: Study) -> Block:
     of a plane of the mosaic, relative to the mean signal.
 
     What dark frames have of both is subtracted, and may be another in light by `OFFSETS_STD`. The standard deviation of
-    a step is measured at all other places. No effect predicts a step. Raises NotDetermined without unclipped
-    flats, and for frames too small.
+    a step is measured at all other places. Raises NotDetermined without unclipped flats, and for frames too small.
     """
     _, images = study.once(flats)
     if not images:
@@ -73,11 +77,42 @@ def line_block(study: Study) -> Block:
         f"in light: {name}": OFFSETS_STD * np.where(np.array(conditions) == name, subtracted, 0.0)
         for name in (dict.fromkeys(conditions) if dark is not None else ())
     }
+
+    def predict(effects: Effects) -> Prediction:
+        differing = acting(effects, COLLECTED | GAINS)
+        if not differing:
+            return Prediction(np.zeros(len(values)), jacobian)
+        found = []
+        for line in _lines(study.camera, differing):
+            found += [step for _, step, *_ in _steps(line, period, 0.0)] + [_stripes(line, period, 0.0)[0]]
+        return Prediction(np.tile(found, len(images)), jacobian)
+
     return Block(
         measurement=FLAT_LINES, reach=1.0, value=np.array(values), covariance=covariance, labels=tuple(labels),
-        reads=frozenset(), predict=lambda effects: Prediction(np.zeros(len(values)), jacobian),
+        reads=COLLECTED | GAINS, predict=predict,
         scale=np.ones(len(values)),
     )  # fmt: skip
+
+
+def _lines(camera: CameraModel, effects: Effects) -> tuple[FloatArray, FloatArray]:
+    """Return the means of the columns and of the rows of even light, each over its mean, as effects leave it."""
+    rows = collect_rows(camera, acting(effects, COLLECTED)).mean(axis=1)
+    gains = Uniform(camera, effects).gain_map()
+    if gains is None:
+        return np.ones(camera.cols), rows
+    return gains.mean(axis=0) / gains.mean(), rows * gains.mean(axis=1) / gains.mean()
+
+
+def collect_rows(camera: CameraModel, effects: Effects) -> FloatArray:
+    """Return what the rows collect of even light, (rows, period of the mosaic): means over the even and the odd pixels
+    of a row, each colour's plane over its mean.
+    """
+    even = {c: np.ones((camera.rows, mosaic.PERIOD_PX)) for c in camera.channels}
+    tile = collected_mosaic(camera, mosaic.assemble(even, camera.cfa), effects, exposure_s=1.0, elapsed_s=0.0)
+    for plane in mosaic.planes(tile, camera.cfa).values():
+        plane[...] = plane / plane.mean()
+    step = mosaic.step(camera.cfa)
+    return np.stack([tile[:, first::step].mean(axis=1) for first in range(step)], axis=1)
 
 
 def without_dark(

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_readout import DarkRowPower, dark_readout, row_profile
 from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, dark_level_dn
-from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import ADDED
 from lab.diagnose.measurements.row_light import PHASES, ROW_LIGHT
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import ADDED, LEAK
+from lab.measure.study import Study, held_out_flats
+from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.uniform import Uniform
+from sim.uniform import FieldPoints, Uniform
 
 MOST_FRAMES, MOST_LEVELS = 6, 8  # frames of a level; levels of a session
 WIDEN = 1.25  # ratio of the lower ends of successive frequency bands
@@ -120,8 +120,8 @@ def flicker_block(study: Study) -> Block:
         power = np.maximum(usual, LEAST_POWER)
         if model.varies_by_row:
             power = power + _added_power(model, study.camera.rows, levels, bands, step)
-        if dark is None and model.adds_signal:
-            power = power + _pattern_power(study, levels, model, bands, step)
+        if model.leaks or (dark is None and model.adds_signal):
+            power = power + _pattern_power(study, levels, model, bands, step, added=dark is None)
         mean = np.cbrt(power) * (1.0 - 2.0 / (9.0 * freedom))
         slope = mean / (3.0 * power)
         jacobian = {}
@@ -136,7 +136,8 @@ def flicker_block(study: Study) -> Block:
         labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s",
         tuple(c.id for c in level.captures), level.held_out)
                      for level in levels for f in frequency),
-        reads=ROW_LIGHT if dark is not None else ROW_LIGHT | ADDED, predict=predict, scale=np.ones(len(value)),
+        reads=ROW_LIGHT | LEAK if dark is not None else ROW_LIGHT | LEAK | ADDED, predict=predict,
+        scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -282,12 +283,18 @@ def _nearest(rows: FloatArray, by_phase: FloatArray) -> FloatArray:
 
 
 def _pattern_power(
-    study: Study, levels: Sequence[_Level], model: Uniform, bands: Sequence[range], step: int
+    study: Study, levels: Sequence[_Level], model: Uniform, bands: Sequence[range], step: int, *, added: bool
 ) -> FloatArray:
-    """Power (levels x bands,) that a fixed pattern of rows adds: it is a larger share of a low level than of the mean
-    of all."""
-    added = study.noise.gain * row_profile(model.added_e - model.added_e.mean(), step)
-    share = np.array([added / level.signal for level in levels])
+    """Power (levels x bands,) that fixed rows add, which are a larger share of a low level than of the mean of all:
+    what read-out adds (`added`), and light beside the exposure."""
+    rows = study.camera.rows
+    leaked = model.leaked_s(FieldPoints.at(study.camera, np.arange(float(rows)), np.zeros(rows)))
+    lit_s = np.array([level.captures[0].exposure_s for level in levels]) + leaked.mean()
+    share = (leaked - leaked.mean()) / lit_s[:, None]
+    share = share[:, : rows // step * step].reshape(len(levels), -1, step).mean(axis=2)
+    if added:
+        offsets = study.noise.gain * row_profile(model.added_e - model.added_e.mean(), step)
+        share = share + np.array([offsets / level.signal for level in levels])
     weight = np.array([float(level.weight.sum()) for level in levels])
     relative = (1.0 + share) / (1.0 + weight @ share)
     return np.concatenate(

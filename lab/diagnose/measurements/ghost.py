@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.pattern_fit import GHOST, joint_covariance, patterns
-from lab.diagnose.measurements.reads import REFLECTIONS, acting
-from lab.diagnose.measurements.study import Study
+from lab.measure.reads import REFLECTIONS, acting
+from lab.measure.study import Study
+from sim.effects.base import Effects
 
 GHOST_FLOOR = 1.5e-4
 

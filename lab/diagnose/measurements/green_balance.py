@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.even_flats import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
-from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN
-from lab.diagnose.measurements.reads import acting
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.noise_figures import BLACK_FLOOR_DN
+from lab.measure.reads import COLLECTED, acting
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -22,7 +23,7 @@ from sim.spectrum import FloatArray
 GREEN_FLOOR = 1e-4  # standard deviation of the ratio of equal greens beside noise
 GREEN_NOISE = 0.02  # ratios of a larger standard deviation aren't used
 CELLS = (3, 4)
-TILE_ROWS, TILE_COLS = 64, 4  # size of the uniform frame by which effects are predicted, px
+TILE_ROWS, TILE_COLS = mosaic.PERIOD_PX, 4  # size of the uniform frame by which effects are predicted
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,11 @@ def green_block(study: Study) -> Block:
     cells = len(value) - len(ratios)
 
     def predict(effects: Effects) -> Prediction:
-        differing = acting(effects, GREENS)
-        found = [_predicted_ratio(r, differing, study) if differing else 0.0 for r in ratios]
+        differing, moving = acting(effects, GREENS), acting(effects, KERNELS)
+        if moving:  # by how much depends on what the other colours hold
+            found = [_predicted_ratio(r, differing, study) for r in ratios]
+        else:
+            found = [_predicted_ratio(ratios[0], differing, study) if differing else 0.0] * len(ratios)
         return Prediction(np.concatenate([found, np.zeros(cells)]), {})
 
     return Block(
@@ -183,7 +187,8 @@ def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
 
 #: Quantities of the stages by which neighbouring pixels differ in uniform light. A light that changes from row to row
 #: isn't among them: a green is held against the mean of the rows above and below.
-GREENS = frozenset({"charge.collected", "charge.kernels"})
+KERNELS = frozenset({"charge.kernels"})
+GREENS = COLLECTED | KERNELS
 
 
 def _predicted_ratio(ratio: _Ratio, effects: Effects, study: Study) -> float:

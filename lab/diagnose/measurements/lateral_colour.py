@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.pattern_fit import ACROSS, RADIAL, RADIAL3, Pattern, patterns
-from lab.diagnose.measurements.reads import SHIFT
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import SHIFT
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.point import displaced_um
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import Uniform

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import LAG, acting
-from lab.diagnose.measurements.repeatability import RepeatedMeans, repeated_levels, steady
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.row_light import ROW_LIGHT, row_light_variance
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import LAG, acting
+from lab.measure.repeatability import RepeatedMeans, repeated_levels, steady
+from lab.measure.study import Study, held_out_flats
+from sim.effects.base import Effects
 from sim.uniform import Uniform
 
 #: Relative standard deviation of a steady lamp's light from frame to frame: data sheets of regulated halogen sources

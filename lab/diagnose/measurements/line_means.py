@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from lab.capture_kinds.base import Capture
-from lab.diagnose.measurements.block import Effects
-from lab.diagnose.measurements.study import Study
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform

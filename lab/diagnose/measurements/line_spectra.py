@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import digamma, polygamma
 
+from lab.measure.pixel_outliers import Image
 from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 
-Image = NDArray[np.float32]
 LEVEL_BAND = 0.04, 0.2  # cy/px, along both axes: frequencies over which the power of white noise is averaged
 
 

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
-from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import LEVEL_REACH, Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.flat_light import FlatLight, reading, relative_rates
-from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES, acting
-from lab.diagnose.measurements.repeatability import level_std, weighted_median
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.measurements.uniform_levels import UniformLevels
 from lab.errors import NotDetermined
+from lab.measure.reads import DARK_CURRENT, LAG, LINES, acting
+from lab.measure.repeatability import level_std, weighted_median
 from lab.measure.rounding import rounding_std_dn
+from lab.measure.study import Study, held_out_flats
+from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 from sim.uniform import LEVEL, SPECTRAL, electron_rate
 

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.curves import CurveJacobian
-from lab.diagnose.measurements.held_out import held_out_of
 from lab.diagnose.measurements.linearity import RADIOMETER_STD
-from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES, acting
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.measurements.uniform_levels import UniformLevels
 from lab.errors import NotDetermined
+from lab.measure.reads import DARK_CURRENT, LAG, LINES, acting
 from lab.measure.rounding import rounding_std_dn
+from lab.measure.study import Study, held_out_of
+from sim.effects.base import Effects
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import LEVEL, SPECTRAL
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.block import LEVEL_REACH, Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.temporal_noise import Repeats, flat_repeats
 from lab.errors import NotDetermined
 from lab.measure.rounding import variance_rounding_std
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform, noise_values

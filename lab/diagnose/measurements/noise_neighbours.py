@@ -7,11 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import block_diag
 
-from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.block import LEVEL_REACH, Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.temporal_noise import PAIRS, dark_repeats, flat_repeats
 from lab.errors import NotDetermined
+from lab.measure.study import Study
 from sim.camera import Cfa
+from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.sensor.electrons import solve_passed_share
 from sim.spectrum import FloatArray

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
-from lab.diagnose.measurements.block import Effects
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.measure.screen_registration import ScreenWarp, draw_by_area
+from lab.measure.study import Study
 from sim.camera import CameraModel
+from sim.effects.base import Effects
 from sim.frame import screen_light
 from sim.optics.diffraction import aperture_otf
 from sim.point import optical_transfer

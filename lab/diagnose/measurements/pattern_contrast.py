@@ -6,11 +6,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.pattern_fit import EVEN_TERMS, Pattern, even_powers, joint_covariance, patterns
-from lab.diagnose.measurements.reads import SHOWN
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import SHOWN
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.point import TRANSFER_AT, common_wavelengths, detected_transfer, mix_channels, mixes_colours, transfer_at
 from sim.spectrum import FloatArray
 from sim.uniform import electron_rate

@@ -29,8 +29,6 @@ from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
-from lab.diagnose.measurements.block import Effects
-from lab.diagnose.measurements.held_out import held_out_of
 from lab.diagnose.measurements.pattern_canvas import (
     BeyondPart,
     Canvas,
@@ -41,12 +39,12 @@ from lab.diagnose.measurements.pattern_canvas import (
     mask_points,
     pattern_window,
 )
-from lab.diagnose.measurements.reads import SHOWN, acting
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.reads import SHOWN, acting
 from lab.measure.screen_registration import ScreenWarp, register
+from lab.measure.study import Study, held_out_of
 from sim.camera import CameraModel
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 from sim.frame import with_reflections
 from sim.optics.diffraction import aperture_otf
 from sim.sensor import mosaic

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, special
 
 from lab.capture_kinds.white import WhiteCapture
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.pattern_fit import mean_rate
-from lab.diagnose.measurements.reads import SHOWN
-from lab.diagnose.measurements.study import Study, mean_frame
 from lab.errors import NotDetermined
+from lab.measure.reads import SHOWN
+from lab.measure.study import Study, mean_frame
+from sim.effects.base import Effects
 from sim.frame import screen_light
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray

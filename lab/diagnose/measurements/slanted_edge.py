@@ -7,15 +7,19 @@ nonlinear response included. A pair (channel, light) is called a sight.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.special import ndtr
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
+from lab.capture_kinds.stopped_edge import StoppedEdgeCapture
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.edge_estimator import (
     GRID_PX,
     IMAGINARY_AT,
@@ -29,11 +33,13 @@ from lab.diagnose.measurements.edge_estimator import (
     relative_covariance,
     spread_operator,
 )
-from lab.diagnose.measurements.edge_profiles import MeasuredEdge, measured_edges
-from lab.diagnose.measurements.reads import acting
-from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.edge_profiles import MeasuredEdge, f_number_of, measured_edges
+from lab.errors import NotDetermined
+from lab.measure.reads import acting
 from lab.measure.rounding import rounding_waves_dn
-from sim.effects.base import Effect
+from lab.measure.study import Study
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Effects
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.point import (
     MOST_SHARES,
@@ -49,6 +55,7 @@ from sim.point import (
 )
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
+from sim.stop_down import at_f_number, effects_at_f_number
 from sim.uniform import SHADING, SPECTRAL, Uniform, electron_rate
 
 # standard deviation of the OTF beside noise: numerical error of the estimator and of the model's wavelength sampling
@@ -97,33 +104,61 @@ def edge_block(study: Study) -> Block:
     curvature of the illumination across the edge, and spectra that aren't stated. Raises NotDetermined where f-number
     or pixel pitch isn't stated, and where no edge is measured.
     """
-    edges = _Edges(study)
-    x = edges.frequencies
+    return _block(SLANTED_EDGE, [_Edges(study, measured_edges(study, SlantedEdgeCapture), study.camera)])
+
+
+def stopped_edge_block(study: Study) -> Block:
+    """The same of edges at other f-numbers than the data sheet's. Raises NotDetermined as `edge_block` does, and for a
+    lens that is known at one aperture alone."""
+    edges = measured_edges(study, StoppedEdgeCapture)
+    found = []
+    for f_number in dict.fromkeys(f_number_of(edge.part[0]) for edge in edges):
+        try:
+            stopped = at_f_number(study.camera, f_number or study.camera.lens.f_number)
+        except ValueError as refused:
+            raise NotDetermined("stopped_edge", f"{refused}: nothing is predicted for f/{f_number:g}") from None
+        found.append(_Edges(study, [e for e in edges if f_number_of(e.part[0]) == f_number], stopped))
+    return _block(STOPPED_EDGE, found)
+
+
+def _block(measurement: Measurement, parts: list[_Edges]) -> Block:
+    """The block of edges at one f-number, or at several."""
+    sizes = [part.value.size for part in parts]
 
     def predict(effects: Effects) -> Prediction:
-        return Prediction(edges.predict(effects).ravel(), edges.jacobian)
+        jacobian = {}
+        for k, part in enumerate(parts):
+            before, after = sum(sizes[:k]), sum(sizes[k + 1 :])
+            for name, column in part.jacobian.items():
+                own = name if measurement is SLANTED_EDGE else f"{measurement.name} {k}: {name}"
+                jacobian[own] = np.pad(column, (before, after))
+        return Prediction(np.concatenate([part.predict(effects).ravel() for part in parts]), jacobian)
 
+    split = len(REAL_AT)
     return Block(
-        measurement=SLANTED_EDGE, reach=0.2, value=edges.value.ravel(),
-        covariance=edges.covariance,
+        measurement=measurement, reach=0.2, value=np.concatenate([part.value.ravel() for part in parts]),
+        covariance=block_diag(*(part.covariance for part in parts)),
         labels=tuple(
-            Label(float(f), e.channel, e.orientation + (ASIDE if k >= len(REAL_AT) else ""),
-            tuple(c.id for c in e.part), e.held_out)
-            for e in edges.edges for k, f in enumerate(x)
+            Label(float(f), e.channel, e.orientation + (ASIDE if k >= split else ""), tuple(c.id for c in e.part),
+                  e.held_out)
+            for part in parts for e in part.edges for k, f in enumerate(part.frequencies)
         ),
-        reads=TRANSFER_AT | CHANGING | {"image.transmittance"}, predict=predict,
-        scale=np.ones(edges.value.size),
+        reads=TRANSFER_AT | CHANGING | {"image.transmittance"}, predict=predict, scale=np.ones(sum(sizes)),
         # model discrepancies of real and imaginary parts are independent
-        along=np.tile(np.where(np.arange(len(x)) < len(REAL_AT), x, x + APART_CY_PER_PX), len(edges.edges)),
+        along=np.concatenate([
+            np.tile(p.frequencies + np.where(np.arange(len(p.frequencies)) < split, 0.0, APART_CY_PER_PX), len(p.edges))
+            for p in parts
+        ]),
     )  # fmt: skip
 
 
 class _Edges:
-    """The edges of one side: their measured OTFs and the model's predictions."""
+    """Edges of one side at one f-number, that of `camera`: their measured OTFs and the model's predictions. Effects are
+    stated for the study's f-number."""
 
-    def __init__(self, study: Study) -> None:
-        self._study, self._camera = study, study.camera
-        self.edges = measured_edges(study)
+    def __init__(self, study: Study, edges: list[MeasuredEdge], camera: CameraModel) -> None:
+        self._study, self._camera = study, camera
+        self.edges = edges
         lights = list(dict.fromkeys(e.part[0].light_radiance for e in self.edges))
         #: All channels in every light, as charge may come from neighbours of other channels.
         self._sights = [(c, light) for light in lights for c in study.channels]
@@ -203,7 +238,7 @@ class _Edges:
 
     def predict(self, effects: Effects) -> FloatArray:
         """Predicted OTFs of all edges at `frequencies`, (edges, frequencies)."""
-        key = tuple(effects)
+        key = effects_at_f_number(effects, self._study.camera.lens.f_number, self._camera.lens.f_number)
         return _kept(self._numbers_of, key, lambda: self._numbers(self._reported(key)))
 
     def _numbers(self, rows: FloatArray) -> FloatArray:
@@ -522,4 +557,11 @@ SLANTED_EDGE = Measurement(
     quantity="transfer function",
     conditions="orientation",
     conditions_words="edges at",
+)
+STOPPED_EDGE = replace(
+    SLANTED_EDGE,
+    name="stopped_edge",
+    title="transfer function of slanted edges at another f-number",
+    order=311,
+    make=stopped_edge_block,
 )

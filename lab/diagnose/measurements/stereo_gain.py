@@ -16,15 +16,16 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.white import WhiteCapture
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.boards import views_of
 from lab.diagnose.measurements.dark_squares import screen_block
 from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_variance
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.formats.camera_model import camera_model
 from lab.measure.board_detection import BoardView
-from lab.predict.camera_model import camera_model
+from lab.measure.study import Study
 from sim.camera import Side
+from sim.effects.base import Effects
 from sim.effects.veiling_glare import VeilingGlare
 from sim.frame import pair_gain_factor
 from sim.optics.illumination import relative_illumination

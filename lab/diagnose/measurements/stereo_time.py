@@ -7,15 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.boards import views_of
 from lab.diagnose.measurements.stereo_gain import SIDES, needs_both_sides
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.measure.board_calibration import Calibration, calibrate_robustly
 from lab.measure.board_detection import BoardView
 from lab.measure.bundle_adjustment import board_pose
 from lab.measure.pinhole import project
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.frame import right_delay_s
 from sim.spectrum import FloatArray
 

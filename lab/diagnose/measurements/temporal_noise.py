@@ -16,10 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.saturation import CLIPPED_SHARE
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.measure.study import CLIPPED_SHARE, Study, held_out_flats
 from sim.camera import Cfa
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from lab.capture_kinds.base import Capture
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.dark_level import added_dark_dn
 from lab.diagnose.measurements.line_means import LineMeans
-from lab.diagnose.measurements.study import Study
+from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 

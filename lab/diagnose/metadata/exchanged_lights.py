@@ -13,8 +13,8 @@ from lab.diagnose.measurements.chart import CHART
 from lab.diagnose.measurements.narrowband import NARROWBAND
 from lab.diagnose.metadata.lit_planes import LitPlanes, chart_planes, narrowband_planes, predicted
 from lab.diagnose.metadata.misstatement import Misstatement
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray

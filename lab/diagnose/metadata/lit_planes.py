@@ -12,9 +12,9 @@ import numpy as np
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.diagnose.measurements.chart import patch_boxes
 from lab.errors import InputError
 from lab.formats.recording_set import Frame, RecordingSet
+from lab.measure.patches import patch_boxes
 from sim.camera import CameraModel, Side
 from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic

@@ -9,8 +9,8 @@ from lab.diagnose.measurements.chart import CHART
 from lab.diagnose.measurements.narrowband import NARROWBAND
 from lab.diagnose.metadata.lit_planes import LitPlanes, chart_planes, narrowband_planes, predicted
 from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.predict.camera_model import camera_model
 from sim.camera import Cfa, Side
 from sim.spectrum import FloatArray
 

@@ -11,7 +11,13 @@ from sim.camera import Side
 
 
 def unchecked(recordings: RecordingSet, side: Side) -> Iterator[Skipped]:
-    """The bit depth, where no pixel reaches its highest bit, and the length of a board's squares."""
+    """The bit depth, where no pixel reaches its highest bit, and the length of a board's squares; and what the
+    instruments themselves said couldn't be set as a measurement wants it."""
+    own = f"camera {side}"
+    for name, one in recordings.manifest.instruments.items():
+        if name == own or (not name.startswith("camera ") and side == recordings.sides[0]):
+            for told in one.departures:
+                yield Skipped(step="instrument_settings", side=side if name == own else None, reason=told)
     camera = recordings.camera(side)
     highest = 0
     for capture in recordings.captures(side=side):

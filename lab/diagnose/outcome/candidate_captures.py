@@ -3,27 +3,33 @@ covariance."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lab.capture.plan import CapturePlan
+from lab.capture_kinds.base import Equipment
 from lab.capture_kinds.dark import DarkCapture, DarkSequence
 from lab.capture_kinds.flat import FlatSequence
 from lab.capture_kinds.narrowband import NarrowbandSequence
-from lab.capture_kinds.slanted_edge import EdgeSequence
+from lab.capture_kinds.screen import ScreenSequence
+from lab.capture_kinds.slanted_edge import EdgeSequence, EdgeTarget
+from lab.capture_kinds.stopped_edge import ApertureTarget, StoppedEdgeSequence
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.curves import CURVE_ROUGH_STD
 from lab.diagnose.measurements.narrowband import NARROWBAND_FLOOR
-from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN
-from lab.diagnose.measurements.repeatability import LAMP_FLOOR
+from lab.diagnose.outcome.expected_information import Forecast
 from lab.diagnose.outcome.settling_capture import FEW_REPEATS, MORE_REPEATS, repeats_of
 from lab.formats.recording_set import RecordingSet
+from lab.measure.noise_figures import BLACK_FLOOR_DN
+from lab.measure.repeatability import LAMP_FLOOR
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
+from sim.optics.imaging import DiffractionLimited
 from sim.point import optical_transfer
 from sim.spectrum import FloatArray, Spectrum
+from sim.stop_down import at_f_number, effects_at_f_number
 from sim.uniform import FieldPoints, Uniform, electron_rate
 
 #: Size of a capture that is assumed: pixels of a channel, repeats, and the brightest channel's electrons over the full
@@ -34,6 +40,11 @@ PIXELS, REPEATS, FILLED = 2e4, 4, 0.6
 VARIANCE_STD, EDGE_STD = 0.003, 0.004
 #: Prior standard deviation of a level that is a nuisance parameter, relative: so wide that it says nothing.
 NUISANCE_STD = 10.0
+#: Directions of knife edges (deg from the vertical) where no station says them, and wavelengths of their light beside
+#: white. A channel that sees less of a light than this share of the brightest isn't counted.
+EDGE_ANGLES_DEG, EDGE_LIGHTS_NM, DIMMEST_CHANNEL = (5.0, 50.0, 95.0, 140.0), (450.0, 550.0, 650.0), 0.02
+#: What a station lacks for a capture that no sequence takes.
+BY_HAND = "no sequence takes it; take it by hand and diagnose it with the session's captures"
 #: Length of a session (s), over which drifts show.
 SESSION_S = 3600.0
 
@@ -41,11 +52,19 @@ SESSION_S = 3600.0
 @dataclass(frozen=True)
 class Hypothesis:
     """A rival with the effects that act beside it, and the camera with its nuisance parameters at their posterior
-    means."""
+    means.
+
+    `displaced`: the same effects with the rival's parameters one posterior standard deviation away, a set for each
+    principal direction of these; `beside`: those that act beside the rival; `law_std`: relative standard deviation of
+    what its law changes.
+    """
 
     name: str
     effects: tuple[Effect, ...]
     camera: CameraModel
+    displaced: tuple[tuple[Effect, ...], ...] = ()
+    beside: tuple[Effect, ...] | None = None
+    law_std: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -55,15 +74,30 @@ class CandidateCapture:
     words: str
     predict: Callable[[Hypothesis], FloatArray]  # (n,): its numbers under a hypothesis
     covariance: FloatArray  # (n, n)
-    plan: CapturePlan | None = None  # the sequence that takes it; None: a station can't by itself
+    plan: CapturePlan | None = None  # the sequence that takes it; None: no sequence does
+    needs: str = BY_HAND  # what a station lacks where `plan` is None
+
+    def forecast(self, rivals: Sequence[Hypothesis]) -> Forecast:
+        """What rivals predict of it, with what their parameters and their laws leave open."""
+        mean = np.array([self.predict(h) for h in rivals])
+        jacobian, law_error = [], []
+        for h, own in zip(rivals, mean, strict=True):
+            moved = [self.predict(replace(h, effects=effects)) - own for effects in h.displaced]
+            jacobian.append(np.reshape(moved, (len(moved), -1)).T if moved else np.zeros((len(own), 0)))
+            without = None if h.beside is None or h.law_std == 0.0 else self.predict(replace(h, effects=h.beside))
+            law_error.append(np.zeros((len(own), 0)) if without is None else h.law_std * (own - without)[:, None])
+        return Forecast.of(mean, jacobian, law_error, self.covariance)
 
 
-def candidate_captures(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Iterator[CandidateCapture]:
-    """All captures that are considered, in order: narrowband, edges, flats, darks, and those of the session again."""
+def candidate_captures(
+    recordings: RecordingSet, side: Side, model: MeasurementModel, station: Equipment | None = None
+) -> Iterator[CandidateCapture]:
+    """All captures that are considered, in order: narrowband, edges, flats, darks, and those of the session again.
+    `station`: the edges and the f-numbers of the plans are its own; None: those of any station."""
     camera = model.camera
     lamp = _lamp(recordings, side)
     yield from _narrowband(camera)
-    yield from _edges(camera, model, lamp)
+    yield from _edges(camera, model, lamp, station)
     yield from _exposure_series(camera, lamp)
     yield from _steady(camera, lamp)
     yield from _darks(camera)
@@ -119,9 +153,11 @@ def _narrowband(camera: CameraModel) -> Iterator[CandidateCapture]:
         )
 
 
-def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iterator[CandidateCapture]:
-    """Slanted edges: at four orientations, in the lamp's and in narrowband light, at the lens's and at twice its
-    f-number."""
+def _edges(
+    camera: CameraModel, model: MeasurementModel, lamp: Spectrum, station: Equipment | None
+) -> Iterator[CandidateCapture]:
+    """Slanted edges: at all orientations and at each, in the lamp's and in narrowband light, at the lens's f-number and
+    at others."""
     frequency = np.arange(1, 17) * 0.05
     block = next((b for b in model.blocks if b.measurement.name == "slanted_edge"), None)
     std = np.full(frequency.shape, EDGE_STD)
@@ -129,30 +165,73 @@ def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iter
         x, variance = np.array([label.x for label in block.labels]), np.diag(block.covariance)
         places = np.unique(x)
         std = np.interp(frequency, places, [float(np.sqrt(variance[x == place].min())) for place in places])
-    angles = np.deg2rad([5.0, 50.0, 95.0, 140.0])
-    fx, fy = np.outer(np.cos(angles), frequency), np.outer(np.sin(angles), frequency)
-    lights = {"the lamp's light": lamp} | {
-        f"light of {nm:g} nm": Spectrum.of((nm - 10.0, nm, nm + 10.0), (0.0, 1e-3, 0.0)) for nm in (450.0, 550.0, 650.0)
+    edges = _edge_angles(station)
+    lights = {("the lamp's light", 0.0): lamp} | {
+        (f"light of {nm:g} nm", nm): Spectrum.of((nm - 10.0, nm, nm + 10.0), (0.0, 1e-3, 0.0)) for nm in EDGE_LIGHTS_NM
     }
-    for stops, at in ((1.0, ""), (2.0, " at twice the f-number")):
-        for name, light in lights.items():
-            channels_lit = [c for c in camera.channels if electron_rate(camera, c, light) > 0]
+    usual = camera.lens.f_number
+    stops = [usual]
+    if isinstance(camera.lens.imaging, DiffractionLimited):
+        stops += [f for f in _stops(station, usual) if f != usual]
+    for (light_words, nm), light in lights.items():
+        rate = {c: electron_rate(camera, c, light) for c in camera.channels}
+        brightest = max(rate.values())
+        lit = {c: float(np.sqrt(brightest / one)) for c, one in rate.items() if one > DIMMEST_CHANNEL * brightest > 0.0}
+        for f_number in stops if lit else ():
+            at = "" if f_number == usual else f" at f/{f_number:g}"
+            for which in [tuple(edges), *((one,) for one in edges)]:
+                angles = np.deg2rad([edges[name] for name in which])
+                fx, fy = np.outer(np.cos(angles), frequency), np.outer(np.sin(angles), frequency)
 
-            def predict(
-                h: Hypothesis, stops: float = stops, light: Spectrum = light, channels: list[str] = channels_lit
-            ) -> FloatArray:
-                lens = h.camera.lens.model_copy(update={"f_number": stops * h.camera.lens.f_number})
-                stopped = h.camera.model_copy(update={"lens": lens})
-                return np.concatenate(
-                    [np.real(optical_transfer(stopped, c, light, fx, fy, h.effects)).ravel() for c in channels]
+                def predict(
+                    h: Hypothesis,
+                    f_number: float = f_number,
+                    light: Spectrum = light,
+                    channels: tuple[str, ...] = tuple(lit),
+                    fx: FloatArray = fx,
+                    fy: FloatArray = fy,
+                ) -> FloatArray:
+                    stopped = h.camera if f_number == usual else at_f_number(h.camera, f_number)
+                    effects = effects_at_f_number(h.effects, usual, f_number)
+                    return np.concatenate(
+                        [np.real(optical_transfer(stopped, c, light, fx, fy, effects)).ravel() for c in channels]
+                    )
+
+                noise = np.concatenate([np.tile(dimmer * std, len(which)) for dimmer in lit.values()])
+                one = f" at {edges[which[0]]:.3g} degrees" if len(which) == 1 else ""
+                every = "" if one else f" at {_listed(edges.values())} degrees"
+                yield CandidateCapture(
+                    f"{'a slanted edge' if one else 'slanted edges'}{one or every} in {light_words}{at}",
+                    predict,
+                    np.diag(np.square(noise)),
+                    _edge_plan(nm, f_number, usual, which if one and station is not None else ()),
                 )
 
-            n = len(channels_lit) * fx.size
-            is_usual = stops == 1.0 and light is lamp
-            plan = CapturePlan((EdgeSequence(frames=2 * REPEATS),)) if is_usual else None
-            if n:
-                words = f"slanted edges at 5, 50, 95 and 140 degrees in {name}{at}"
-                yield CandidateCapture(words, predict, np.diag(np.square(np.tile(std, n // len(std)))), plan)
+
+def _edge_angles(station: Equipment | None) -> dict[str, float]:
+    """The knife edges of a station by name, with their angles (deg) from the vertical; those of any station where it
+    has none."""
+    there = station.list_targets(EdgeTarget) if station is not None else {}
+    return {name: edge.angle_deg for name, edge in there.items()} or {f"edge {a:g}": a for a in EDGE_ANGLES_DEG}
+
+
+def _stops(station: Equipment | None, usual: float) -> tuple[float, ...]:
+    """The f-numbers that a station's lenses are set to; without any, twice the usual one."""
+    there = station.list_targets(ApertureTarget) if station is not None else {}
+    return tuple(sorted({stop.f_number for stop in there.values()} - {usual})) or (2.0 * usual,)
+
+
+def _edge_plan(wavelength_nm: float, f_number: float, usual: float, edges: tuple[str, ...]) -> CapturePlan:
+    if f_number == usual:
+        return CapturePlan((EdgeSequence(frames=REPEATS, wavelength_nm=wavelength_nm, edges=edges),))
+    stopped = StoppedEdgeSequence(frames=REPEATS, wavelength_nm=wavelength_nm, edges=edges, f_number=f_number)
+    return CapturePlan((stopped,))
+
+
+def _listed(values: Iterable[float]) -> str:
+    """Numbers in words: 5, 50 and 95."""
+    *first, last = (f"{value:.3g}" for value in values)
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _exposure_series(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateCapture]:
@@ -251,11 +330,15 @@ def _again(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Ite
     """Every measurement again with the same captures. Those of dark frames with few repeats get more, which reduces
     their covariance."""
     darks = {c.id: c for c in recordings.captures(DarkCapture, side)}
+    screens = {c.id for kind in ScreenSequence.kinds().values() for c in recordings.captures(kind, side)}
     repeats = repeats_of(darks.values())
+    fitted: dict[tuple[Effect, ...], FloatArray] = {}
     for block, at in zip(model.blocks, model.slices, strict=True):
 
         def predict(h: Hypothesis, at: slice = at) -> FloatArray:
-            return model.fitted_mean(tuple(e for e in h.effects if e not in model.always))[at]
+            if h.effects not in fitted:
+                fitted[h.effects] = model.fitted_mean(tuple(e for e in h.effects if e not in model.always))
+            return fitted[h.effects][at]
 
         title = block.measurement.title
         names = {name for label in block.labels for name in label.captures}
@@ -265,4 +348,6 @@ def _again(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Ite
             words = f"the dark frames of {title} again, {MORE_REPEATS} at each setting in place of {repeats}"
             yield CandidateCapture(words, predict, block.covariance * repeats / MORE_REPEATS, plan)
         else:
-            yield CandidateCapture(f"the captures of {title} again, with as many repeats", predict, block.covariance)
+            words = f"the captures of {title} again, with as many repeats"
+            plan = CapturePlan((ScreenSequence(frames=REPEATS),)) if names <= screens else None
+            yield CandidateCapture(words, predict, block.covariance, plan)

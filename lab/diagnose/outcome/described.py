@@ -13,12 +13,12 @@ from lab.diagnose.discovery.profile import PredictiveTable
 from lab.diagnose.discovery.words import place_in_words
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.discrepancy import Discrepancy
-from lab.diagnose.inference.gaussian import Gaussian, chi2
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Unexplained
+from lab.measure.gaussian import Gaussian, chi2
 from sim.camera import Side
 from sim.effects.empirical_law import EmpiricalLaw
 from sim.effects.library import list_changes

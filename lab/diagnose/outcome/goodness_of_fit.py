@@ -7,13 +7,13 @@ from collections.abc import Collection, Iterator, Mapping
 import numpy as np
 
 from lab.diagnose.inference.decide import Verdict
-from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.inference.held_out import held_out_residual
 from lab.diagnose.inference.locate import chi2_by_slice
-from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import ExaminedPlace, HeldOut, MeasurementFit, ResidualCurve
+from lab.measure.gaussian import chi2
 from sim.camera import Side
+from sim.effects.base import Effects
 from sim.effects.library import list_changes
 from sim.spectrum import FloatArray
 

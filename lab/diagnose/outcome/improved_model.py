@@ -16,10 +16,11 @@ from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.curves import freed_curve
 from lab.diagnose.outcome.model_posterior import model_posterior
 from lab.formats.camera_file import CameraFile
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
+from lab.formats.results.diagnosis import IN_CURVES
 from lab.measure.stated_light import most_frequent_gain_db
-from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.effects.model_discrepancy import ModelDiscrepancy
@@ -35,8 +36,6 @@ PLACES: tuple[tuple[Applied, str, str], ...] = (
     ("noise", "level", "charge.variance_e2"),
     ("response", "level", "signal.response"),
 )
-#: Where a correction of the sensitivities stands, in words.
-IN_CURVES = "in the sensitivity curves"
 #: Share of the largest signal below which the discrepancy's relative size isn't known.
 LEAST_CONTRAST = 0.05
 #: Limits of the factors: a Gaussian process doesn't know that a quantity is positive.
@@ -92,7 +91,12 @@ def improved_model(
             corrections.append(Correction(block.measurement.name, None, said))
             continue
         at = model.slices[one.index]
-        x, factor, each = _factor(block, discrepancy[at], model.fitted_mean(effects)[at])
+        fitted = model.fitted_mean(effects, kernels)[at]
+        if kind == "noise":  # the camera keeps its gain: the correction holds what the fit moved that by, too
+            stated = model.mean(effects)[at]
+            x, factor, each = _factor(block, fitted - stated, stated)
+        else:
+            x, factor, each = _factor(block, discrepancy[at], model.fitted_mean(effects)[at])
         if kind == "sensitivity":
             for channel, (wavelength_nm, by) in each.items():
                 if channel in curves:
@@ -107,7 +111,8 @@ def improved_model(
     unknown = "" if model.gain_is_known else ", conversion gain unknown: electrons of 1 DN/e are DN"
     name = f"{recordings.manifest.name} {side}{unknown}".strip()
     gain_db = most_frequent_gain_db(recordings.captures(FlatCapture, side))
-    posterior = model_posterior(model, effects, improved, kernels, gain_db)
+    is_corrected = any(one.kind == "noise" for one in corrections)
+    posterior = model_posterior(model, effects, improved, kernels, gain_db, is_corrected)
     return CameraFile(name, improved, tuple(acting), posterior=posterior), tuple(corrections)
 
 

@@ -15,18 +15,14 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
 from lab.effect_titles import effect_title
 from lab.formats.results import (
+    DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
-    DiscoveredLaw,
     HeldOut,
     Member,
-    Mismatch,
     NamedEffect,
     ParameterValue,
     Rival,
-    SideModels,
-    Unexplained,
-    VetoedName,
 )
 from lab.formats.results.in_words import measured
 from sim.camera import Side
@@ -45,49 +41,32 @@ LEAST_CAPTURES = (
 
 def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -> DiagnosisResult:
     """One result of all sides. An effect that several sides show is one entry, with its weighted mean parameters."""
-    mismatches = tuple(m for f in found for m in f.mismatches)
+    lists = DiagnosisLists.joined([f.lists for f in found])
     effects = tuple(_named(found, policy))
-    unexplained = tuple(u for f in found for u in f.unexplained)
-    vetoed = tuple(v for f in found for v in f.vetoed)
-    discovered = tuple(d for f in found for d in f.discovered)
     verdict: DiagnosisVerdict = "unexplained"
     if not any(f.is_judged for f in found):
         verdict = "nothing_judged"
-    elif not effects and not unexplained and not mismatches and not discovered:
+    elif not effects and not lists.unexplained and not lists.mismatches and not lists.discovered:
         verdict = "no_mismatch"
     elif effects:
-        is_whole = not unexplained and not discovered and not any(e.members and e.law == "inexact" for e in effects)
+        is_inexact = any(e.members and e.law == "inexact" for e in effects)
+        is_whole = not lists.unexplained and not lists.discovered and not is_inexact
         verdict = "explained" if is_whole else "partly_explained"
-    models = tuple(f.models for f in found if f.models is not None)
     held_out = _held_out(found)
-    offered = tuple(proposal.capture for f in found for proposal in f.proposals)
+    offered = tuple(capture for f in found if f.doubt is not None for capture in f.doubt.listed(policy))
     return DiagnosisResult(
+        **dict(lists),
         source=source,
         verdict=verdict,
-        mismatches=mismatches,
         effects=effects,
-        unexplained=unexplained,
-        vetoed=vetoed,
-        discovered=discovered,
-        models=models,
         held_out=held_out,
         next_capture=LEAST_CAPTURES
         if verdict == "nothing_judged"
         else next_sentence(offered, " ".join(f.settling for f in found if f.settling) or None, policy),
         next_captures=offered,
-        places=tuple(p for f in found for p in f.places),
-        measurements=tuple(m for f in found for m in f.measurements),
-        visibility=tuple(v for f in found for v in f.visibility),
-        pictures=tuple(p for f in found for p in f.pictures),
         threshold=max((f.threshold for f in found if f.threshold is not None), default=None),
         false_alarm_rate=policy.false_alarm_rate if any(f.is_judged for f in found) else None,
-        curves=tuple(c for f in found for c in f.curves),
-        skipped=tuple(  # parts of one measurement give the same reason
-            dict.fromkeys(s for f in found for s in f.skipped)
-        ),
-        summary=tuple(
-            _summary(verdict, mismatches, effects, unexplained, discovered, vetoed, models, held_out, policy)
-        ),
+        summary=tuple(_summary(verdict, lists, effects, held_out, policy)),
         policy=policy.told(),
     )
 
@@ -251,7 +230,7 @@ def _mean(values: list[tuple[float, float | None]], is_shared: bool) -> tuple[fl
 
 def _held_out(found: Sequence[SideFindings]) -> HeldOut | None:
     """Sum over the sides on which something was found; over all, where nothing was."""
-    told = [f for f in found if f.named or f.unexplained or f.discovered]
+    told = [f for f in found if f.named or f.lists.unexplained or f.lists.discovered]
     parts = [f.held_out for f in told or found if f.held_out is not None]
     if not parts:
         return None
@@ -268,12 +247,8 @@ def _held_out(found: Sequence[SideFindings]) -> HeldOut | None:
 
 def _summary(
     verdict: DiagnosisVerdict,
-    mismatches: Sequence[Mismatch],
+    lists: DiagnosisLists,
     effects: Sequence[NamedEffect],
-    unexplained: Sequence[Unexplained],
-    discovered: Sequence[DiscoveredLaw],
-    vetoed: Sequence[VetoedName],
-    models: Sequence[SideModels],
     held_out: HeldOut | None,
     policy: DecisionPolicy,
 ) -> list[str]:
@@ -290,18 +265,18 @@ def _summary(
     lines += [
         f"{measurement_title(m.measurement)} of the {m.side} camera departs from the baseline: {m.where} "
         f"({m.significance_sigma:.1f} sigma)."
-        for m in mismatches
+        for m in lists.mismatches
     ]
     lines += [e.statement for e in effects]
     lines += [
         f"Not explained: {measurement_title(u.measurement)} of the {u.side} camera, {u.where}: {u.shape}."
         f"{' ' if u.would_help else ''}{u.would_help}"
-        for u in unexplained
+        for u in lists.unexplained
     ]
-    lines += [d.statement for d in discovered]
-    lines += dict.fromkeys(u.check for u in unexplained if u.check)
-    lines += [v.statement for v in vetoed]
-    lines += set_sentences(models, effects, unexplained, policy)
+    lines += [d.statement for d in lists.discovered]
+    lines += dict.fromkeys(u.check for u in lists.unexplained if u.check)
+    lines += [v.statement for v in lists.vetoed]
+    lines += set_sentences(lists.models, effects, lists.unexplained, policy)
     if held_out is not None and held_out.chi2_after != held_out.chi2_before:
         before, after = f"{held_out.chi2_before:.0f}", f"{held_out.chi2_after:.0f}"
         way = "falls" if held_out.chi2_after < held_out.chi2_before else "rises"

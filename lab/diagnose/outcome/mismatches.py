@@ -9,7 +9,6 @@ from scipy.special import chdtri
 
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.discrepancy import Discrepancy
-from lab.diagnose.inference.gaussian import Gaussian, chi2
 from lab.diagnose.inference.locate import Slice, describe
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.outlying import OutlyingLevel
@@ -20,6 +19,7 @@ from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Mismatch, Unexplained, VetoedName
+from lab.measure.gaussian import Gaussian, chi2
 from sim.camera import Side
 from sim.effects.base import Effect
 

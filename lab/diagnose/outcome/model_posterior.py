@@ -17,23 +17,29 @@ import numpy as np
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Coordinate, coordinate_prior, coordinates, moved
-from lab.diagnose.measurements.chart import CHART, reflectance_covariance
-from lab.diagnose.measurements.noise import GAIN_STD
-from lab.diagnose.measurements.noise_guess import NoiseGuess
+from lab.diagnose.measurements.chart import CHART
+from lab.diagnose.measurements.noise import GAIN_STD, NOISE
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
+from lab.measure.noise_figures import NoiseFigures
+from lab.measure.patches import reflectance_covariance
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.library import effects as library
+from sim.effects.nonlinearity import Nonlinearity
 from sim.sensor.electrons import gain_dn_per_e
 from sim.spectrum import FloatArray
 
 #: Nuisance parameters, and beginnings of their names, that stay with the camera and its place before the chart from
 #: session to session. Others belong to one session: its edges' light, its lamp's flicker.
-LASTING = ("gain", "black", "dark", "chart:scale", "chart:x", "chart:y")
-LASTING_PREFIXES = ("curve:", "read", "level:", "form ")
+LASTING = ("gain", "read", "black", "dark", "chart:scale", "chart:x", "chart:y")
+LASTING_PREFIXES = ("curve:", "read:", "level:", "form ")
 #: Step of a difference by an effect's parameter, as a share of its typical size.
 STEP = 0.02
 #: Prior standard deviation of a coordinate without one, in typical sizes.
 WIDE = 100.0
+#: Laws that every camera follows a little: where none is named, their size is what the recordings leave open, so that
+#: a level beyond those that were fitted is told with its doubt.
+EVERYWHERE: tuple[Effect, ...] = (Nonlinearity(),)
 
 
 def model_posterior(
@@ -42,11 +48,13 @@ def model_posterior(
     camera: CameraModel,
     discrepancies: Mapping[int, FloatArray] | None = None,
     gain_db: float = 0.0,
+    is_corrected: bool = False,
 ) -> ModelPosterior | None:
     """The posterior of the parameters of `model` with `effects`, about `camera`, the improved model.
 
     discrepancies : covariances of model discrepancies by block, which stand beside the effects
-    gain_db : amplification for which the estimates of `model` hold
+    is_corrected : whether the improved model has a correction of the noise, which holds what gain and read noise were
+    moved by gain_db : amplification for which the estimates of `model` hold
 
     Returns None for a model without first estimates.
     """
@@ -59,13 +67,15 @@ def model_posterior(
         for name, column in model.nuisance_jacobian(effects).items()
         if name in LASTING or name.startswith(LASTING_PREFIXES)
     }
-    coords = coordinates(effects, model.camera)
-    by_effects = effect_jacobian(model, effects, coords)[seen]
+    everywhere = tuple(e for e in EVERYWHERE if e.name not in {one.name for one in effects})
+    acting = (*effects, *(e for e in everywhere if model.affected(type(e)).any()))
+    coords = coordinates(acting, model.camera)
+    by_effects = effect_jacobian(model, acting, coords)[seen]
     patch_names, by_patches, patch_prior = _patches(model)
     _, wide = coordinate_prior(coords) if coords else (np.zeros(0), np.zeros(0))
-    typical = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])
+    typical = np.array([c.typical(float(getattr(acting[c.index], c.name))) for c in coords])
     width = np.where(np.isfinite(wide), wide, WIDE * typical)
-    names = (*nuisance, *(coordinate_name(effects, c) for c in coords), *patch_names)
+    names = (*nuisance, *(coordinate_name(acting, c) for c in coords), *patch_names)
     size = len(nuisance)
     prior = np.zeros((len(names), len(names)))
     prior[:size, :size] = np.eye(size)
@@ -74,25 +84,49 @@ def model_posterior(
     prior[size + len(coords) :, size + len(coords) :] = patch_prior
     columns = [np.column_stack([*nuisance.values(), np.zeros((seen.sum(), 0))]), by_effects, by_patches[seen]]
     jacobian = np.column_stack(columns) @ prior
-    gaussian = model.seen_gaussian(effects)
-    for index, kernel in given.items():
-        inside = seen[model.slices[index]]
-        gaussian = gaussian.with_discrepancy(index, kernel[np.ix_(inside, inside)])
-    with_effects = np.column_stack([gaussian.shared_jacobian, by_effects * width])
-    gaussian = replace(gaussian, shared_jacobian=with_effects)
-    white = gaussian.whiten(np.column_stack([jacobian, model.seen_value - gaussian.mean]))
-    mean = white[:, :-1].T @ white[:, -1]
-    covariance = prior - white[:, :-1].T @ white[:, :-1]
-    mean[at_effects] = 0.0  # the file states them at their best values
+
+    def projected(kernels: Mapping[int, FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Posterior mean (k,) and covariance (k, k) beside these discrepancies."""
+        gaussian = model.seen_gaussian(effects)
+        for index, kernel in kernels.items():
+            inside = seen[model.slices[index]]
+            gaussian = gaussian.with_discrepancy(index, kernel[np.ix_(inside, inside)])
+        with_effects = np.column_stack([gaussian.shared_jacobian, by_effects * width])
+        gaussian = replace(gaussian, shared_jacobian=with_effects)
+        white = gaussian.whiten(np.column_stack([jacobian, model.seen_value - gaussian.mean]))
+        return white[:, :-1].T @ white[:, -1], prior - white[:, :-1].T @ white[:, :-1]
+
+    mean, covariance = projected(given)
+    if is_corrected:  # with the correction that the file has, the noise tells the gain as ever
+        noise = {i for i in given if model.blocks[i].measurement is NOISE}
+        covariance = projected({i: kernel for i, kernel in given.items() if i not in noise})[1]
+    stated = np.array([c.index < len(effects) for c in coords], bool)
+    mean[at_effects[stated]] = 0.0  # the file states them at their best values
+    if np.any(np.abs(mean[at_effects[~stated]]) > width[~stated]):  # it stands in for something else
+        mean[at_effects[~stated]] = 0.0
     moves = _from_first(model.noise, camera, gain_db)
     for i, name in enumerate(names):
-        if name.startswith("curve:"):
-            mean[i] = 0.0  # the file's curves have taken it up
+        if name.startswith("curve:") or (is_corrected and (name in ("gain", "read") or name.startswith("read:"))):
+            mean[i] = 0.0  # the file's curves, and its correction of the noise, have taken it up
         mean[i] += moves.get(name, 0.0)
     return ModelPosterior.of(_first(model.noise), names, mean, covariance)
 
 
-def _first(noise: NoiseGuess) -> FirstEstimates:
+def lasting_means(
+    model: MeasurementModel, effects: Sequence[Effect], discrepancies: Mapping[int, FloatArray]
+) -> dict[str, float]:
+    """Posterior means of the nuisance parameters that stay, and of the patches' reflectances, with other effects."""
+    weighted = model.weighted_residual(effects, discrepancies)
+    found = {
+        name: float(column @ weighted)
+        for name, column in model.nuisance_jacobian(effects).items()
+        if name in LASTING or name.startswith(LASTING_PREFIXES)
+    }
+    names, by_patches, prior = _patches(model)
+    return found | dict(zip(names, (prior @ (by_patches.T @ weighted)).tolist(), strict=True))
+
+
+def _first(noise: NoiseFigures) -> FirstEstimates:
     return FirstEstimates(
         dark_temperature_c=noise.dark_c,
         read_noise_dn=noise.read_dn,
@@ -103,7 +137,7 @@ def _first(noise: NoiseGuess) -> FirstEstimates:
     )
 
 
-def _from_first(noise: NoiseGuess, camera: CameraModel, gain_db: float) -> dict[str, float]:
+def _from_first(noise: NoiseFigures, camera: CameraModel, gain_db: float) -> dict[str, float]:
     """What the first estimates differ by from what `camera` states, in prior standard deviations, by the nuisance
     parameter's name."""
     gain = gain_dn_per_e(camera, gain_db)
@@ -112,6 +146,13 @@ def _from_first(noise: NoiseGuess, camera: CameraModel, gain_db: float) -> dict[
         "black": (noise.black - camera.black_level_dn) / noise.black_std,
         "dark": (noise.dark_dn_per_s - camera.dark_current_e_per_s * gain) / noise.dark_std,
     }
+
+
+def with_unnamed(effects: Sequence[Effect], posterior: ModelPosterior) -> tuple[Effect, ...]:
+    """The effects, and those that nobody named whose sizes a posterior knows, at none."""
+    there = {e.name for e in effects}
+    more = dict.fromkeys(name.partition(".")[0] for name in posterior.names if "." in name)
+    return (*effects, *(library()[name]() for name in more if name in library() and name not in there))
 
 
 def coordinate_name(effects: Sequence[Effect], coordinate: Coordinate) -> str:

@@ -6,7 +6,7 @@ capture c is the one in which the two nearest rivals k, l lie furthest apart:
     argmax over c of min over k, l of D,   D = 1/2 |L^-1 (m_k(c) - m_l(c))|^2,   L L' = covariance of m(c)
 
 The covariance holds noise, floors and nuisance parameters. Two rivals are then told apart with
-probability Phi(sqrt(D / 2)).
+probability Phi(sqrt(D / 2)). So captures are listed in the report; `lab/resolve.py` chooses by what they tell a second.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
 from scipy.special import ndtr
 
 from lab.capture.plan import CapturePlan
+from lab.capture_kinds.base import Equipment
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import refit
+from lab.diagnose.inference.refit import displaced, refit
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.curves import freed_curve
 from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
+from lab.diagnose.outcome.expected_information import Forecast
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import visibility
 from lab.formats.recording_set import RecordingSet
@@ -55,48 +56,68 @@ LEAST_DISTANCE = 0.02
 
 
 @dataclass(frozen=True)
-class CaptureProposal:
-    """A capture, what it would tell, and the sequence that takes it (None: a station can't by itself)."""
+class OpenCapture:
+    """A capture that may tell rivals apart: what they predict of it, and the sequence that takes it (None: no sequence
+    does; `needs` says what is lacking then)."""
 
-    capture: NextCapture
+    words: str
+    forecast: Forecast
     plan: CapturePlan | None
+    needs: str
 
 
-def proposals(
-    recordings: RecordingSet, side: Side, verdict: Verdict, policy: DecisionPolicy
-) -> tuple[CaptureProposal, ...]:
-    """Captures to take next, best first; none where no rivals are left."""
+@dataclass(frozen=True)
+class Doubt:
+    """The rivals of one side, their probabilities, which sum to 1, and what could be captured to tell them apart."""
+
+    side: Side
+    rivals: tuple[str, ...]
+    odds: tuple[float, ...]
+    captures: tuple[OpenCapture, ...]
+
+    def listed(self, policy: DecisionPolicy) -> tuple[NextCapture, ...]:
+        """The captures in which the two nearest rivals lie furthest apart, the best first."""
+        found = []
+        for capture in self.captures:
+            apart = capture.forecast.distances()
+            pairs = {(k, l): float(apart[k, l]) for k, l in combinations(range(len(self.rivals)), 2)}  # noqa: E741
+            one, other = min(pairs, key=lambda pair: pairs[pair])
+            distance = pairs[one, other]
+            found.append(
+                NextCapture(
+                    side=self.side,
+                    capture=capture.words,
+                    rivals=(self.rivals[one], self.rivals[other]),
+                    distance=distance,
+                    told_apart=float(ndtr(np.sqrt(0.5 * distance))),
+                )
+            )
+        found.sort(key=lambda item: -item.distance)
+        # a capture that neither rival changes tells nothing: an f-number for darks
+        found = [item for item in found if item.distance >= LEAST_DISTANCE] or found[:1]
+        return tuple(found[: policy.next_captures_listed])
+
+
+def doubt_of(
+    recordings: RecordingSet, side: Side, verdict: Verdict, policy: DecisionPolicy, station: Equipment | None = None
+) -> Doubt | None:
+    """What a verdict leaves in doubt, and the captures that could be taken, by the sequences of `station`; None where
+    no rivals are left."""
     rivals = _rivals(verdict, policy)
     if len(rivals) < 2:
-        return ()
-    found = []
-    for candidate in candidate_captures(recordings, side, verdict.model):
-        lower = cholesky(candidate.covariance, lower=True)
-        white = {h.name: solve_triangular(lower, candidate.predict(h), lower=True) for h in rivals}
-        pairs = {(a, b): 0.5 * float(np.sum(np.square(white[a] - white[b]))) for a, b in combinations(white, 2)}
-        nearest = min(pairs, key=lambda pair: pairs[pair])
-        found.append((pairs[nearest], nearest, candidate))
-    found.sort(key=lambda item: -item[0])
-    # a capture that neither rival changes tells nothing: an f-number for darks
-    found = [item for item in found if item[0] >= LEAST_DISTANCE] or found[:1]
-    return tuple(
-        CaptureProposal(
-            NextCapture(
-                side=side,
-                capture=candidate.words,
-                rivals=nearest,
-                distance=distance,
-                told_apart=float(ndtr(np.sqrt(0.5 * distance))),
-            ),
-            candidate.plan,
-        )
-        for distance, nearest, candidate in found[: policy.next_captures_listed]
-    )
+        return None
+    total = sum(p for p, _ in rivals)
+    hypotheses = [h for _, h in rivals]
+    captures = [
+        OpenCapture(candidate.words, candidate.forecast(hypotheses), candidate.plan, candidate.needs)
+        for candidate in candidate_captures(recordings, side, verdict.model, station)
+    ]
+    return Doubt(side, tuple(h.name for h in hypotheses), tuple(p / total for p, _ in rivals), tuple(captures))
 
 
-def _rivals(verdict: Verdict, policy: DecisionPolicy) -> list[Hypothesis]:
+def _rivals(verdict: Verdict, policy: DecisionPolicy) -> list[tuple[float, Hypothesis]]:
     """The effect whose rivals are likeliest, and these rivals, each fitted in its place: as many as together hold
-    `next_capture_share`."""
+    `next_capture_share`; with their probabilities."""
     model, least = verdict.model, policy.least_rival_probability
 
     def rival_probability(candidate: Candidate) -> float:
@@ -107,8 +128,8 @@ def _rivals(verdict: Verdict, policy: DecisionPolicy) -> list[Hypothesis]:
         return []
     chosen = max(candidates, key=rival_probability)
     beside = tuple(e for e in verdict.effects if e.name != chosen.effect.name)
-    found = [_hypothesis(model, chosen.effect.name, (*beside, chosen.effect))]
     own = dict(chosen.members).get(chosen.effect.name, chosen.probability)
+    found = [(own, _hypothesis(model, (*beside, chosen.effect)))]
     held = [
         (own, chosen.effect.name),
         *((p, name) for name, p in chosen.alternatives if name in library()),
@@ -120,15 +141,23 @@ def _rivals(verdict: Verdict, policy: DecisionPolicy) -> list[Hypothesis]:
         scores = signatures(model, model.camera, beside, [library()[name]]).scores()
         if scores:
             fit = refit(model, (*beside, scores[0].start), policy, passes=2)
-            found.append(_hypothesis(model, name, fit.effects))
+            found.append((p, _hypothesis(model, fit.effects)))
     return found
 
 
-def _hypothesis(model: MeasurementModel, name: str, effects: tuple[Effect, ...]) -> Hypothesis:
+def _hypothesis(model: MeasurementModel, effects: tuple[Effect, ...]) -> Hypothesis:
+    """The rival that is the last of `effects`, beside the others."""
     estimates = model.nuisance_estimates(effects)
     curves = {c: freed_curve(q, c, estimates) for c, q in model.camera.quantum_efficiency.items()}
     camera = model.camera.model_copy(update={"quantum_efficiency": curves})
-    return Hypothesis(name, (*model.always, *effects), camera)
+    return Hypothesis(
+        effects[-1].name,
+        (*model.always, *effects),
+        camera,
+        tuple((*model.always, *moved) for moved in displaced(model, effects, len(effects) - 1)),
+        (*model.always, *effects[:-1]),
+        effects[-1].form_tolerance,
+    )
 
 
 def next_sentence(found: Sequence[NextCapture], settling: str | None, policy: DecisionPolicy) -> str | None:

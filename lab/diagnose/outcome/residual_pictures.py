@@ -16,11 +16,11 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.chart import PATCH_COLOUR_STD, PATCH_STD, patch_boxes
 from lab.errors import NotDetermined
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ResidualPicture
+from lab.measure.patches import PATCH_COLOUR_STD, PATCH_STD, patch_boxes
 from lab.predict.replay import Replay
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect

@@ -38,9 +38,8 @@ from lab.formats.results import ChannelNoise, Emva1288, NoiseFit, PhotonTransfer
 from lab.measure.dark_pixels import DarkPixels, read_noise_distribution, stack_of
 from lab.measure.levels import MeasuredLevel, defective_pixels, rounded_c
 from lab.measure.mishaps import alike_planes, copied_frames, exchanged_frames
-from lab.measure.stated_light import StatedLight, light_of, most_frequent_gain_db, why_not
+from lab.measure.stated_light import StatedLight, lamps_of, light_of, most_frequent_gain_db, why_not
 from sim.camera import Side
-from sim.spectrum import Spectrum
 
 # --- noise fit -----------------------------------------------------------------------------------------------------
 # The noise fit of one camera: all figures, by channel too, with the points of its plots.
@@ -241,7 +240,6 @@ def remark_on_planes(e: Evaluation) -> None:
 
 
 MIN_SIZE_PX = 16
-SAME_LAMP = 0.02  # relative difference below which two radiances are one lamp, measured twice
 C = TypeVar("C", bound=Capture)
 
 
@@ -317,23 +315,12 @@ def _lamps_of(
 ) -> dict[str, Hashable]:
     """The lamp of each flat, by its id. A lamp that is measured before every pass over the levels is one lamp; measured
     photons compare whatever the lamp."""
-    seen: list[tuple[str, Spectrum]] = []
-    names: dict[str | None, str | None] = {None: None}
-    for path in dict.fromkeys(flat.radiance for flat in flats):
-        if path is None:
-            continue
-        spectrum = recordings.spectrum(path)
-        wavelength_nm = np.array(spectrum.wavelength_nm)
-        value = np.array(spectrum.value)
-        for name, other in seen:
-            if np.abs(value - other.at(wavelength_nm)).sum() <= SAME_LAMP * np.abs(value).sum():
-                names[path] = name
-                break
-        else:
-            seen.append((path, spectrum))
-            names[path] = path
+    names = lamps_of(recordings, flats)
     measured = {flat.id for flat in flats if light[flat.id].unit == "photons" and flat.photons_per_pixel is None}
-    return {flat.id: (None if flat.id in measured else names[flat.radiance], *light[flat.id].lamp) for flat in flats}
+    return {
+        flat.id: (None if flat.id in measured or flat.radiance is None else names[flat.radiance], *light[flat.id].lamp)
+        for flat in flats
+    }
 
 
 def _dark_levels(

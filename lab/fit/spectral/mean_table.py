@@ -72,6 +72,7 @@ KNOWN = (*NEEDED, RADIANCE, PHOTODIODE, RESPONSIVITY, CENTRE, WIDTH, SPECTRUM, "
 GRID_NM = 1.0  # on which lights and curves stand
 FINE_POINTS = 10  # of a measured spectrum in a step of the grid
 LINE_SHARE = 0.1  # of a measured spectrum's maximum: samples above it make the line's centre
+BELOW_DARK_SIGMA = 6.0  # noise alone puts one mean in 1e9 further below the dark
 CLIPPED_SHARE = 0.95  # of the range above black: a mean above it may be of a clipped plane
 
 
@@ -297,7 +298,11 @@ def _power(row: TableRow) -> float:
 def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _TableLight | None:
     """Return the light of a row with its rate; None where its mean may be clipped."""
     channel, power = _channel(row, camera), _power(row)
-    exposure_s, mean = row.value("exposure_s", 1e-9), row.value("mean_dn")
+    exposure_s, mean, mean_std = (
+        row.value("exposure_s", 1e-9),
+        row.value("mean_dn", -np.inf),
+        row.value("mean_std_dn", 1e-9),
+    )
     if power <= 0.0:
         raise InputError(f"{row.file}: row {row.number}: no light; leave the row out, or write kind dark")
     own = [dark for dark in darks if _channel(dark, camera) == channel]
@@ -306,7 +311,12 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Tabl
     black, black_std = camera.black_level_dn or 0.0, 0.0
     if own:
         nearest = min(own, key=lambda dark: abs(dark.value("exposure_s") - exposure_s))
-        black, black_std = nearest.value("mean_dn"), nearest.value("mean_std_dn")
+        black, black_std = nearest.value("mean_dn", -np.inf), nearest.value("mean_std_dn")
+    if mean < black - BELOW_DARK_SIGMA * np.hypot(mean_std, black_std):
+        raise InputError(
+            f"{row.file}: row {row.number}: mean_dn {mean:g} is more than {BELOW_DARK_SIGMA:g} standard deviations "
+            f"below the dark, {black:g} DN; give means and darks with the same offset"
+        )
     if mean > black + CLIPPED_SHARE * (camera.saturation_dn - black):
         return None
     line = _line(row)
@@ -316,7 +326,7 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Tabl
         line.bandwidth_nm,
         power,
         (mean - black) / exposure_s,
-        float(np.hypot(row.value("mean_std_dn", 1e-9), black_std)) / exposure_s,
+        float(np.hypot(mean_std, black_std)) / exposure_s,
         line.spectrum,
     )
 

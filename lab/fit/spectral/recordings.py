@@ -31,6 +31,7 @@ from lab.fit.spectral.sensitivity import (
 )
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
+from lab.measure.plane_means import PlaneMean, plane_means
 from lab.measure.weighted_lines import DarkLine, dark_line
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
@@ -146,14 +147,9 @@ class SpectralCaptures:
         x = (cols - 0.5 * (self.camera.cols - 1)) * scale
         return float(np.mean(1.0 / (1.0 + y[:, None] ** 2 + x**2) ** 2))
 
-    def _pixel_values(self, capture: Capture) -> dict[str, FloatArray]:
-        """Return the values, DN, of the pixels of each channel in the region."""
-        frame = self.recordings.frame(capture)[self.region]
-        period = step(self.camera.cfa)  # the region starts on whole periods
-        return {
-            channel: np.concatenate([frame[r::period, c::period].ravel() for r, c in at]).astype(float)
-            for channel, at in phases(self.camera.cfa).items()
-        }
+    def _means(self, capture: Capture) -> dict[str, PlaneMean]:
+        """Return the mean of each channel in the region, which starts on whole periods of the mosaic."""
+        return plane_means(self.recordings.frame(capture)[self.region], self.camera.cfa, self.camera.saturation_dn)
 
     def _pixel_count(self, channel: str) -> int:
         """Count the pixels of a channel in the region."""
@@ -181,11 +177,9 @@ class SpectralCaptures:
         """Fit the dark means of the region against exposure, by gain and channel."""
         found: dict[tuple[float, str], list[tuple[float, float, float]]] = {}
         for dark in self.recordings.captures(DarkCapture, self.side):
-            for channel, values in self._pixel_values(dark).items():
+            for channel, one in self._means(dark).items():
                 own = found.setdefault((dark.gain_db or 0.0, channel), [])
-                own.append(
-                    (dark.exposure_s, float(values.mean()), float(np.hypot(values.std(), 0.3) / np.sqrt(values.size)))
-                )
+                own.append((dark.exposure_s, one.mean_dn, one.mean_std_dn))
         for key, rows in found.items():
             self.darks[key] = dark_line(*np.array(rows).T)
 
@@ -193,24 +187,22 @@ class SpectralCaptures:
         """Return the conversion gain, DN/e, at a gain in dB."""
         return self.gain * 10.0 ** ((gain_db or 0.0) / 20.0)
 
-    def _electron_rate(self, capture: Capture, channel: str, values: FloatArray) -> tuple[float, float, bool, float]:
+    def _electron_rate(self, capture: Capture, channel: str, found: PlaneMean) -> tuple[float, float, bool, float]:
         """Return the electrons per second, their standard deviation, whether the capture saturates, and its share of
         saturation.
 
-        `values` (pixels,), DN.
+        `found`: the channel's mean in the region.
         """
         gain = self._dn_per_e(capture.gain_db)
         dark, dark_std = self._dark(capture.gain_db or 0.0, channel, capture.exposure_s)
-        signal = float(values.mean()) - dark
+        signal = found.mean_dn - dark
         limit = self.camera.saturation_dn - dark
         if self.noise is not None and self.noise.full_well_e is not None:
             limit = min(limit, self.noise.full_well_e * gain)
-        clipped = (
-            float(np.mean(values >= self.camera.saturation_dn)) > CLIPPED_LIMIT or signal > SATURATED_SHARE * limit
-        )
+        clipped = found.clipped_share > CLIPPED_LIMIT or signal > SATURATED_SHARE * limit
         scale = 1.0 / (gain * capture.exposure_s)
         # The pixels differ by shot noise, read noise and PRNU
-        std = float(np.hypot(np.hypot(values.std(), 0.3) / np.sqrt(values.size), dark_std))
+        std = float(np.hypot(found.mean_std_dn, dark_std))
         return signal * scale, std * scale, clipped, signal / limit
 
     def _lights(self) -> tuple[FloatArray, dict[str, FloatArray]]:
@@ -253,10 +245,8 @@ class SpectralCaptures:
         weights = trapezoid_weights(self.wave)
         rates: dict[tuple[str, str], list[tuple[float, float, bool, float]]] = {}
         for capture in self.narrowband:
-            for channel, values in self._pixel_values(capture).items():
-                rates.setdefault((channel, self.path(capture)), []).append(
-                    self._electron_rate(capture, channel, values)
-                )
+            for channel, one in self._means(capture).items():
+                rates.setdefault((channel, self.path(capture)), []).append(self._electron_rate(capture, channel, one))
         result = {}
         for channel in phases(self.camera.cfa):
             good: list[tuple[FloatArray, float, float]] = []
@@ -311,8 +301,8 @@ class SpectralCaptures:
                 used.setdefault(flat.radiance, []).append(flat)
         for path, flats in used.items():
             for flat in flats:
-                for channel, values in self._pixel_values(flat).items():
-                    rate, std, clipped, share = self._electron_rate(flat, channel, values)
+                for channel, one in self._means(flat).items():
+                    rate, std, clipped, share = self._electron_rate(flat, channel, one)
                     if not clipped and FLAT_RANGE[0] < share < FLAT_RANGE[1]:
                         rates.setdefault((channel, path), []).append((rate, std))
         weights = trapezoid_weights(self.wave)

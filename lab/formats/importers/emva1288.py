@@ -22,7 +22,7 @@ import numpy as np
 from lab.errors import InputError
 from lab.formats.foreign_text import read_foreign_text
 from lab.formats.importers.images import IMAGES, ImageFiles, read_camera_file, read_image
-from lab.formats.importers.stated_settings import contradictions
+from lab.formats.importers.stated_settings import held_against_frames
 from lab.formats.recording_set import Manifest, RecordingSet
 
 NS = 1e-9
@@ -201,7 +201,8 @@ def read_emva1288(path: Path) -> RecordingSet:
             "captures": captures,
         }
     )
-    warnings += contradictions(manifest, frames, str(file))
+    manifest, said = held_against_frames(manifest, frames, str(file))
+    warnings += said
     files = ImageFiles(file.parent, frames, shift)
     return RecordingSet(manifest, source=str(path), warnings=tuple(warnings), files=files)
 

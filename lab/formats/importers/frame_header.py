@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import logging
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,16 +23,20 @@ from pydantic import ValidationError
 from lab.errors import InputError
 from lab.formats.importers.fits_file import fits_header, is_fits
 from lab.formats.raw_file import TiffDescription
-from lab.formats.recording_set import RAWS
+from lab.formats.recording_set import RAWS, InstrumentSnapshot
+from lab.formats.recording_set.snapshot import Value
 
 #: Bytes of a JPEG or PNG file in which its EXIF is looked for: it stands before the picture.
 HEAD_BYTES = 1 << 20
+#: EXIF's WhiteBalance in words.
+WHITE_BALANCE = {0: "auto", 1: "manual"}
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
 @dataclass(frozen=True)
 class FrameHeader:
-    """How a frame was taken, by its own file. None: not stated. `source`: what states it, in a word."""
+    """How a frame was taken, by its own file. None: not stated. `source`: what states it, in a word; `camera`: which
+    camera did, and how it was set."""
 
     source: str
     exposure_s: float | None = None
@@ -40,6 +44,7 @@ class FrameHeader:
     iso: float | None = None
     gain_db: float | None = None
     temperature_c: float | None = None
+    camera: InstrumentSnapshot | None = None
 
     @property
     def is_marked(self) -> bool:
@@ -71,6 +76,8 @@ def frame_header(file: Path) -> FrameHeader | None:
 
 
 def _of_raw(file: Path) -> FrameHeader | None:
+    with file.open("rb") as stream:  # most raws are TIFF
+        told = _of_tiff(stream)
     with rawpy.imread(str(file)) as raw:
         taken = getattr(raw, "other", None)  # older versions don't tell it
         if taken is None:
@@ -80,6 +87,7 @@ def _of_raw(file: Path) -> FrameHeader | None:
             exposure_s=_above_zero(taken.shutter_speed),
             f_number=_above_zero(taken.aperture),
             iso=_above_zero(taken.iso_speed),
+            camera=told.camera if told is not None else None,
         )
 
 
@@ -103,7 +111,23 @@ def _of_tiff(stream: Any) -> FrameHeader | None:
         exposure_s=_above_zero(tags.get("ExposureTime")),
         f_number=_above_zero(tags.get("FNumber")),
         iso=_above_zero(tags.get("PhotographicSensitivity", tags.get("ISOSpeedRatings"))),
+        camera=_camera(tags),
     )
+
+
+def _camera(tags: Mapping[str, Any]) -> InstrumentSnapshot | None:
+    """The camera that EXIF names, with what else it says of its settings; None where it names none."""
+    maker, model, serial = (_text(tags.get(name)) for name in ("Make", "Model", "BodySerialNumber"))
+    if not (maker or model or serial):
+        return None
+    settings: dict[str, Value] = {name: text for name in ("LensModel", "Software") if (text := _text(tags.get(name)))}
+    if (balance := tags.get("WhiteBalance")) in WHITE_BALANCE:
+        settings["WhiteBalance"] = WHITE_BALANCE[balance]
+    return InstrumentSnapshot(maker=maker, model=model, serial_number=serial, settings=settings)
+
+
+def _text(value: Any) -> str:
+    return " ".join(str(value).split("\0")[0].split()) if isinstance(value, str) else ""
 
 
 def _above_zero(value: Any) -> float | None:

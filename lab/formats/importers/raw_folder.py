@@ -40,7 +40,7 @@ from lab.formats.importers.images import (
 )
 from lab.formats.importers.index_file import Index, capture_of_row, read_index
 from lab.formats.importers.readout import Readout, Tap, TapFiles, parse_taps, readout
-from lab.formats.importers.stated_settings import contradictions
+from lab.formats.importers.stated_settings import held_against_frames
 from lab.formats.recording_set import DataSheet, FolderFiles, Manifest, RecordingError, RecordingSet, parse_manifest
 from sim.camera import Side
 
@@ -197,7 +197,8 @@ def _recording_set(
     warnings = _by_row(warnings, numbers)
     remarks += [remark for one in readouts.values() for remark in one.remarks]
     remarks += remarks_on(path, _spectra(manifest))
-    remarks += contradictions(manifest, images, where)
+    manifest, said = held_against_frames(manifest, images, where)
+    remarks += said
     by_frame = {capture["frame"]: readouts[capture["side"]] for capture in captures if capture["side"] in readouts}
     return RecordingSet(
         manifest,

@@ -21,7 +21,7 @@ from lab.errors import InputError
 from lab.formats.foreign_text import read_foreign_csv
 from lab.formats.importers.images import IMAGES, decoded, described_sides, has_alpha, read_image
 from lab.formats.importers.import_options import ImportOptions
-from lab.formats.importers.stated_settings import contradictions
+from lab.formats.importers.stated_settings import held_against_frames
 from lab.formats.recording_set import DataSheet, Frame, Manifest, RecordingSet
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.scene.colorchecker import reflectances
@@ -303,5 +303,5 @@ def _recordings(
             "captures": [capture | {"side": "left", "frame": stored, "exposure_s": options.exposure_s}],
         }
     )
-    notes = (*notes, *contradictions(manifest, {stored: path}, str(path)))
-    return RecordingSet(manifest, {stored: frame}, spectra, source=str(path), warnings=notes)
+    manifest, said = held_against_frames(manifest, {stored: path}, str(path))
+    return RecordingSet(manifest, {stored: frame}, spectra, source=str(path), warnings=(*notes, *said))

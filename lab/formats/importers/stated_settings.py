@@ -15,7 +15,7 @@ from pathlib import Path
 from lab.capture_kinds.base import Capture
 from lab.errors import InputError
 from lab.formats.importers.frame_header import FrameHeader, frame_header
-from lab.formats.recording_set import Manifest
+from lab.formats.recording_set import InstrumentSnapshot, Manifest, differences
 
 #: Longest exposure that is taken without a header that says it (that of a sequence's darks), and of one with light that
 #: isn't told, s.
@@ -36,9 +36,9 @@ UNIT_FACTORS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 FEWEST_ROWS, FEWEST_OFF = 4, 2
 
 
-def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -> list[str]:
-    """One line for each quantity of `manifest` that the frames' own files contradict, and for exposures that are hardly
-    meant in seconds.
+def held_against_frames(manifest: Manifest, images: Mapping[str, Path], where: str) -> tuple[Manifest, list[str]]:
+    """The manifest with the cameras that the frames' own files name; and one line for each quantity of it that these
+    files contradict, and for exposures that are hardly meant in seconds.
 
     `images`: the file of each frame by its path. Raises InputError where the exposures can't be right: `where` names
     what lists them."""
@@ -48,6 +48,24 @@ def contradictions(manifest: Manifest, images: Mapping[str, Path], where: str) -
         for capture in manifest.captures
         if (header := headers[capture.frame]) is not None
     ]
+    lines = _contradictions(manifest, seen, images, where)
+    there: dict[str, InstrumentSnapshot] = {}
+    for side in manifest.cameras:
+        name = f"camera {side}"
+        named = [(one, one.header.camera) for one in seen if one.capture.side == side and one.header.camera is not None]
+        for one, camera in named:
+            first = there.setdefault(name, camera)
+            who = {name: camera.model_copy(update={"settings": {}})}  # lens and white balance may differ
+            if changed := differences({name: first}, who):
+                lines.append(f"{one.file}: {changed[0]}, as in {named[0][0].file.name}: give each camera its own side")
+                break
+    return manifest.model_copy(update={"instruments": there}) if there else manifest, lines
+
+
+def _contradictions(
+    manifest: Manifest, seen: Sequence[_HeaderSeen], images: Mapping[str, Path], where: str
+) -> list[str]:
+    """The lines of `held_against_frames` on quantities."""
     timed = [one for one in seen if one.capture.exposure_s is not None and one.header.exposure_s is not None]
     off = [one for one in timed if not same_exposure(one.capture.exposure_s, one.header)]
     if off and (unit := _unit(off)):

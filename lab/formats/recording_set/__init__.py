@@ -11,6 +11,7 @@ from lab.formats.recording_set.frame_files import RAWS, Frame, Target, load_fram
 from lab.formats.recording_set.manifest import DataSheet, Manifest, RecordingError, manifest_json, parse_manifest
 from lab.formats.recording_set.reading import read
 from lab.formats.recording_set.recordings import RecordingSet
+from lab.formats.recording_set.snapshot import InstrumentSnapshot, Snapshots, differences
 from lab.formats.recording_set.writing import write
 
 __all__ = [
@@ -19,13 +20,16 @@ __all__ = [
     "DataSheet",
     "FolderFiles",
     "Frame",
+    "InstrumentSnapshot",
     "Manifest",
     "RecordingError",
     "RecordingFiles",
     "RecordingSet",
+    "Snapshots",
     "Target",
     "archive",
     "clipped_share",
+    "differences",
     "inspect",
     "load_frame",
     "manifest_json",

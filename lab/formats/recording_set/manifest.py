@@ -15,6 +15,7 @@ from pydantic import Field, ValidationError, field_validator
 
 from lab.capture_kinds.base import CAPTURES, AnyCapture, Capture, Open
 from lab.errors import InputError, one_line
+from lab.formats.recording_set.snapshot import InstrumentSnapshot
 from sim.camera import Cfa, Shutter, Side
 
 #: Rows and columns of a frame, at most: no sensor has more, and a manifest can't ask for any amount of memory.
@@ -62,13 +63,16 @@ class DataSheet(Open):
 
 
 class Manifest(Open):
-    """The file `manifest.json`."""
+    """The file `manifest.json`. `instruments`: by the names of a station's, `camera left` one of them; `changes`: what
+    differs of them from the session before, a line each."""
 
     format: Literal["calibench-recording"] = "calibench-recording"
     version: Literal[1] = 1
     name: str = ""
     notes: str = ""
     cameras: dict[Side, DataSheet]
+    instruments: dict[str, InstrumentSnapshot] = {}
+    changes: tuple[str, ...] = ()
     captures: tuple[AnyCapture, ...]
 
 

@@ -6,6 +6,7 @@
 from lab.formats.results.blur import MtfCurve, PsfKernel, PsfSymmetry
 from lab.formats.results.comparison import Change, ComparisonResult, ProjectionChange
 from lab.formats.results.diagnosis import (
+    DiagnosisLists,
     DiagnosisResult,
     DiagnosisVerdict,
     DiscoveredLaw,
@@ -23,7 +24,10 @@ from lab.formats.results.diagnosis import (
     ResidualCurve,
     ResidualPicture,
     Resolution,
+    ResolveEnd,
+    ResolveJournal,
     Rival,
+    RivalOdds,
     SideModels,
     Unexplained,
     VetoedName,
@@ -74,6 +78,7 @@ __all__ = [
     "DarkCurrentLaws",
     "Defect",
     "DepthUncertainty",
+    "DiagnosisLists",
     "DiagnosisResult",
     "DiagnosisVerdict",
     "DiscoveredLaw",
@@ -111,7 +116,10 @@ __all__ = [
     "ResidualCurve",
     "ResidualPicture",
     "Resolution",
+    "ResolveEnd",
+    "ResolveJournal",
     "Rival",
+    "RivalOdds",
     "SideModels",
     "Skipped",
     "SpectralFit",

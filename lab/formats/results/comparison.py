@@ -68,6 +68,8 @@ class ComparisonResult(Frozen):
     threshold_sigma: float
     changes: tuple[Change, ...]
     projection: tuple[ProjectionChange, ...] = ()
+    #: What differs of the instruments, a line each, where both calibrations know theirs.
+    instruments: tuple[str, ...] = ()
     skipped: tuple[Skipped, ...] = ()
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 from lab.formats.results.skipped import Skipped
@@ -10,6 +11,8 @@ from sim.parameters import Frozen
 
 #: `nothing_judged`: the recordings determine no measurement.
 DiagnosisVerdict = Literal["no_mismatch", "explained", "partly_explained", "unexplained", "nothing_judged"]
+#: Where a correction of the sensitivities stands, in words.
+IN_CURVES = "in the sensitivity curves"
 
 
 class Mismatch(Frozen):
@@ -106,6 +109,11 @@ class Unexplained(Frozen):
     correction: str = ""  # the model discrepancy, or the discovered law, in words
     would_help: str = ""  # captures that would help where nothing predicts it, as a sentence
     check: str = ""  # stated values, of the camera or of captures, that the recordings contradict, as sentences
+
+    @property
+    def corrects_curves(self) -> bool:
+        """Whether the model discrepancy is a factor on the sensitivity curves."""
+        return IN_CURVES in self.correction
 
 
 class DiscoveredLaw(Frozen):
@@ -297,14 +305,50 @@ class ResidualPicture(Frozen):
     after: tuple[tuple[float, ...], ...]
 
 
+class RivalOdds(Frozen):
+    """A rival and its probability among the rivals."""
+
+    name: str
+    probability: float
+
+
+#: How resolving ended.
+ResolveEnd = Literal["settled", "this station can't", "budget spent"]
+
+
 class Resolution(Frozen):
-    """One capture that `run --resolve` took: what it is, the session that holds its frames, and the diagnosis before
-    it."""
+    """One step of resolving: what was in doubt on a side, the capture that was taken, and what the diagnosis said.
+
+    `session` holds its frames; `verdict_before`, `effects_before`: the diagnosis before it. `rivals`, `rivals_after`:
+    what was and what is in doubt, or the names that stand there; None while no diagnosis has said it yet. `then`: the
+    capture that is planned after it, as only both together tell. `information_nat`: expected information of the capture
+    (of both), `expected_s` and `spent_s`: lab time that was expected and that it took.
+    """
 
     capture: str
     session: str
     verdict_before: DiagnosisVerdict
     effects_before: tuple[NamedEffect, ...]
+    side: Side = "left"
+    rivals: tuple[RivalOdds, ...] = ()
+    then: str = ""
+    information_nat: float | None = None
+    expected_s: float | None = None
+    spent_s: float | None = None
+    rivals_after: tuple[RivalOdds, ...] | None = None
+
+
+class ResolveJournal(Frozen):
+    """The journal of resolving one session. `budget_min`: lab time that its captures may take (None: any),
+    `most_rounds`: how many they may be. `end`, `reason`: how it ended and why; None while it goes on."""
+
+    format: Literal["calibench-resolve-journal"] = "calibench-resolve-journal"
+    version: Literal[1] = 1
+    budget_min: float | None = None
+    most_rounds: int | None = None
+    resolutions: tuple[Resolution, ...] = ()
+    end: ResolveEnd | None = None
+    reason: str = ""
 
 
 class PolicyRule(Frozen):
@@ -317,31 +361,45 @@ class PolicyRule(Frozen):
     meaning: str
 
 
-class DiagnosisResult(Frozen):
+class DiagnosisLists(Frozen):
+    """What a diagnosis lists of one side, or of all: each entry names its side."""
+
+    mismatches: tuple[Mismatch, ...] = ()
+    unexplained: tuple[Unexplained, ...] = ()
+    vetoed: tuple[VetoedName, ...] = ()
+    discovered: tuple[DiscoveredLaw, ...] = ()  # the most significant first, for each side
+    models: tuple[SideModels, ...] = ()
+    places: tuple[ExaminedPlace, ...] = ()
+    measurements: tuple[MeasurementFit, ...] = ()
+    visibility: tuple[Visibility, ...] = ()
+    pictures: tuple[ResidualPicture, ...] = ()
+    curves: tuple[ResidualCurve, ...] = ()
+    skipped: tuple[Skipped, ...] = ()
+
+    @staticmethod
+    def joined(parts: Sequence[DiagnosisLists]) -> DiagnosisLists:
+        """Join the lists of several sides. Parts of one measurement are skipped for the same reason, which is listed
+        once."""
+        every = {name: tuple(x for part in parts for x in getattr(part, name)) for name in DiagnosisLists.model_fields}
+        return DiagnosisLists.model_validate(every | {"skipped": tuple(dict.fromkeys(every["skipped"]))})
+
+
+class DiagnosisResult(DiagnosisLists):
     """What the first model left out, and how much better the improved model predicts."""
 
     format: Literal["calibench-diagnosis"] = "calibench-diagnosis"
     version: Literal[1] = 1
     source: str
     verdict: DiagnosisVerdict
-    mismatches: tuple[Mismatch, ...] = ()
     effects: tuple[NamedEffect, ...] = ()
-    unexplained: tuple[Unexplained, ...] = ()
-    vetoed: tuple[VetoedName, ...] = ()
-    discovered: tuple[DiscoveredLaw, ...] = ()  # the most significant first, for each side
-    models: tuple[SideModels, ...] = ()
     held_out: HeldOut | None = None
     next_capture: str | None = None
     next_captures: tuple[NextCapture, ...] = ()  # best first, for each side
     resolutions: tuple[Resolution, ...] = ()  # in the order in which they were taken
-    places: tuple[ExaminedPlace, ...] = ()
-    measurements: tuple[MeasurementFit, ...] = ()
-    visibility: tuple[Visibility, ...] = ()
-    pictures: tuple[ResidualPicture, ...] = ()
+    resolve_end: ResolveEnd | None = None  # how resolving ended; None: nothing was to be resolved
+    resolve_reason: str = ""
     threshold: float | None = None
     false_alarm_rate: float | None = None
-    curves: tuple[ResidualCurve, ...] = ()
-    skipped: tuple[Skipped, ...] = ()
     summary: tuple[str, ...] = ()  # the diagnosis in sentences
     policy: tuple[PolicyRule, ...] = ()  # the rules of decision
     baseline: str | None = None  # names of the camera files that it began with, where not with the fitted cameras

@@ -17,6 +17,7 @@ from mocks.former.laws.charge import (
     InterPixelCapacitanceLaw,
     LeakyShutterLaw,
     LightLeakLaw,
+    PhaseDetectionRowsLaw,
     ResponseTailLaw,
     SmearLaw,
     TapGainLaw,
@@ -138,6 +139,10 @@ LISTED: tuple[type[Law], ...] = (
     BitWeightsLaw,
     ResponseKneeLaw,
     ColouredLineNoiseLaw,
+    PhaseDetectionRowsLaw,
+    TapGainLaw,
+    TapOffsetLaw,
+    LeakyShutterLaw,
 )
 
 #: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.
@@ -153,8 +158,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     AbsorptionBandLaw,
     RedLeakLaw,
     PolarisedLightLaw,
-    TapGainLaw,
-    TapOffsetLaw,
     LightLeakLaw,
     PeriodicBandingLaw,
     TreeRingsLaw,
@@ -163,7 +166,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     DefectInterpolationLaw,
     DigitalGainLaw,
     LossyCodesLaw,
-    LeakyShutterLaw,
     MotionLaw,
     TrefoilLaw,
     HaloLaw,

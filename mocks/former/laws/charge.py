@@ -98,16 +98,55 @@ class GreenImbalanceLaw(Law):
         return out
 
 
-class TapGainLaw(Law):
-    """The right half of the sensor is read by another amplifier, with another gain."""
+class PhaseDetectionRowsLaw(Law):
+    """Half-masked pixels for autofocus. Variants: whole rows, all of their pixels alike, every 8; every 12, the colour
+    that isn't green alone (mono: all); every 16, pairs of pixels masked left and right, which fall off to opposite
+    sides of the field."""
 
-    name, unit, nominal, limits = "tap_gain", "%", 1.0, (0.02, 8.0)
-    families = frozenset({"response_to_light", "field_of_light"})
+    name = effect = "phase_detection_rows"
+    variants, unit, nominal, limits = 3, "%", 4.0, (0.05, 60.0)
+
+    @property
+    def _period(self) -> int:
+        return (8, 12, 16)[self.variant]
+
+    @property
+    def _first(self) -> int:
+        return int(self.uniform[2] * self._period)
 
     def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
-        out = electrons.copy()
-        out[:, out.shape[1] // 2 :] *= 1 + self.strength / 100
-        return out
+        masked = np.zeros(electrons.shape)
+        masked[self._first :: self._period] = self.strength / 100.0
+        if self.variant == 1 and self.camera.cfa != "MONO":
+            green = np.array([c == "G" for c in self.camera.cfa]).reshape(2, 2)
+            masked *= ~np.tile(green, (electrons.shape[0] // 2, electrons.shape[1] // 2))
+        if self.variant == 2:
+            left = 1.0 - 2.0 * (np.arange(electrons.shape[1]) // 2 % 2)
+            masked *= 1.0 + 0.4 * left * self.camera.field_position[0]
+        return electrons * (1.0 - masked)
+
+    def library_parameters(self) -> dict[str, float]:
+        if self.variant == 1 and self.camera.cfa != "MONO":
+            return {"loss_percent": 0.5 * self.strength, "colour_percent": self.strength}
+        return {"loss_percent": self.strength}
+
+
+class TapGainLaw(Law):
+    """Parts of the sensor are read by amplifiers of other gains, which noise shares. Variants: the right half; four
+    strips, each of another; the lower half."""
+
+    name, effect = "tap_gain", "taps"
+    variants, unit, nominal, limits = 3, "%", 1.0, (0.02, 8.0)
+
+    def response(self, electrons: Array) -> Array:
+        rows, cols = electrons.shape
+        strips = 4 if self.variant == 1 else 2
+        tap = 2 * np.arange(rows)[:, None] // rows if self.variant == 2 else strips * np.arange(cols) // cols
+        change = (0.0, 1.0, -0.5, 0.7) if self.variant == 1 else (0.0, 1.0)
+        return electrons * (1.0 + self.strength / 100.0 * np.array(change)[tap])
+
+    def library_parameters(self) -> dict[str, float]:
+        return {} if self.variant == 1 else {"gain_percent": self.strength}
 
 
 class TreeRingsLaw(Law):
@@ -148,14 +187,22 @@ class ExposureOffsetLaw(Law):
 
 
 class LeakyShutterLaw(Law):
-    """Light is still collected while rows wait for read-out, longer the later the row (related to the exposure
-    offset)."""
+    """Light is still collected while rows wait for read-out, longer the later the row. Variants: read from the top;
+    from the bottom; from the top, in bursts of eight rows."""
 
-    name, unit, nominal, limits = "leaky_shutter", "us", 60.0, (0.5, 5000.0)
-    families = frozenset({"field_of_light", "response_to_light"})
+    name, effect = "leaky_shutter", "shutter_leakage"
+    variants, unit, nominal, limits = 3, "us", 60.0, (0.5, 5000.0)
 
     def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
-        return electrons + rate_e_per_s * self.strength * 1e-6 * (np.arange(len(electrons)) / len(electrons))[:, None]
+        waits = np.arange(len(electrons)) / len(electrons)
+        if self.variant == 1:
+            waits = waits[::-1]
+        if self.variant == 2:
+            waits = np.floor(waits * len(electrons) / 8.0) * 8.0 / len(electrons)
+        return electrons + rate_e_per_s * self.strength * 1e-6 * waits[:, None]
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"last_row_us": self.strength}
 
 
 class SmearLaw(Law):

@@ -164,13 +164,18 @@ class BlackLevelTemperatureLaw(Law):
 
 
 class TapOffsetLaw(Law):
-    """The right half of the sensor is read by another amplifier, with another black level."""
+    """Parts of the sensor are read by amplifiers of other black levels. Variants: the right half; four strips."""
 
-    name, unit, nominal, limits, shown_by = "tap_offset", "e", 1.0, (0.02, 30.0), DARK
-    families = frozenset({"dark_signal", "line_noise"})
+    name, effect = "tap_offset", "taps"
+    variants, unit, nominal, limits, shown_by = 2, "e", 1.0, (0.02, 30.0), DARK
 
     def noise_e(self, shape: tuple[int, int], k: int) -> Array:
-        return np.where(np.arange(shape[1]) < shape[1] // 2, 0.0, self.strength)[None, :] * np.ones((shape[0], 1))
+        tap = (4 if self.variant == 1 else 2) * np.arange(shape[1]) // shape[1]
+        level = np.array((0.0, 1.0, -0.5, 0.7) if self.variant == 1 else (0.0, 1.0))[tap]
+        return self.strength * np.broadcast_to(level, shape)
+
+    def library_parameters(self) -> dict[str, float]:
+        return {} if self.variant == 1 else {"offset_e": self.strength}
 
 
 class RowNoiseLaw(Law):

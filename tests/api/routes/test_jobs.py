@@ -23,6 +23,7 @@ from lab.errors import InputError
 from lab.formats.results import CameraFit, DiagnosisResult, FitResult, NoiseFit, ReportFile, ValidationResult
 from lab.pipeline import PipelineProgress, PipelineRequest, Tell
 from tests.api.conftest import Running, events, serving, until, until_state
+from tests.lab.doubts import doubt, offered
 
 FIT = FitResult(source="x", cameras={"left": CameraFit(noise=NoiseFit(read_noise_e=2.0, read_noise_e_std=0.1))})
 PAGE = "<!doctype html><title>a report</title><script>1</script>"
@@ -188,6 +189,48 @@ def test_a_pipeline_captures_and_brings_all_results_and_the_report(running: Runn
             started = other.post(again, json={"kind": "pipeline"})
             assert started.status_code == 202
         until(client, f"/api/v1/jobs/{started.json()['id']}", lambda now: now["state"] == "done")
+
+
+def test_a_pipeline_resolves_and_its_session_tells_the_journal(
+    running: Running, quick_steps: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = [doubt(offered("more darks")), []]
+    ready = iter([*left, []])
+
+    def examine(*_: object, **__: object) -> Diagnosis:
+        found = tuple(next(ready))
+        return Diagnosis(DiagnosisResult(source="x", verdict="unexplained" if found else "explained"), {}, found)
+
+    monkeypatch.setattr(lab.diagnose, "examine", examine)
+    with running.client("admin") as client:
+        asked = {"station": "fakes", "quick": True, "sequences": ["dark"], "resolve": True, "resolve_minutes": 20}
+        job = client.post("/api/v1/pipelines", json=asked).json()
+        until(client, f"/api/v1/jobs/{job['id']}", lambda now: now["state"] == "done")
+        told = client.get(f"/api/v1/jobs/{job['id']}/result").json()["diagnosis"]
+        journal = client.get(f"/api/v1/sessions/{job['session_id']}").json()["resolving"]
+        (step,) = journal["resolutions"]
+        assert client.get(f"/api/v1/sessions/{step['session']}").json()["resolving"] is None
+    assert (journal["budget_min"], journal["most_rounds"]) == (20.0, 6)
+    assert (journal["end"], journal["reason"]) == ("settled", "no rivals are left")
+    assert step["capture"] == "more darks" and step["rivals_after"] == []
+    assert step["rivals"] == [{"name": "defocus", "probability": 0.7}, {"name": "coma", "probability": 0.3}]
+    assert told["resolutions"] == journal["resolutions"] and told["resolve_end"] == "settled"
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"resolve": True, "resolve_minutes": -5}, "greater than 0"),
+        ({"resolve": True, "resolve_rounds": 0}, "greater than or equal to 1"),
+        ({"resolve_minutes": 5}, "go with resolve"),
+    ],
+)
+def test_a_budget_that_cannot_be_kept_starts_nothing(running: Running, more: dict[str, Any], said: str) -> None:
+    with running.client("admin") as client:
+        before = client.get("/api/v1/sessions").json()
+        response = client.post("/api/v1/pipelines", json={"station": "fakes", "sequences": ["dark"]} | more)
+        assert response.status_code == 422 and said in response.text
+        assert client.get("/api/v1/sessions").json() == before
 
 
 def test_cancelling_a_pipeline_ends_its_capture_and_another_goes_on_from_there(

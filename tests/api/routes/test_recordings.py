@@ -76,7 +76,7 @@ def test_recordings_are_taken_in_and_worked_on(
         found = response.json()
         assert found["name"] == "two darks" and found["captures"] == 2 and found["cameras"] == ["left"]
         path = response.headers["location"]
-        assert client.get(path).json() == found
+        assert client.get(path).json().items() >= {key: of for key, of in found.items() if key != "warnings"}.items()
         assert client.get("/api/v1/recordings").json() == [found]
         assert kept(running) == [found["id"]]
         job = client.post(f"{path}/jobs", json={"kind": "fit"})

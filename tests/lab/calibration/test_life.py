@@ -3,6 +3,7 @@ one."""
 
 from __future__ import annotations
 
+import math
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from pydantic import ValidationError
+from scipy import stats
 
 from lab.calibration import life
 from lab.calibration.figures import Figure, figures_of
@@ -22,7 +24,7 @@ from lab.capture.plan import CapturePlan
 from lab.capture.records import RunRecord, now
 from lab.capture.session import CaptureSession
 from lab.capture.store import Store
-from lab.capture.tables import Base, CalibrationRow
+from lab.capture.tables import Base, CalibrationRow, ResultRow
 from lab.capture_kinds.dark import DarkSequence
 from lab.cli import main
 from lab.errors import InputError
@@ -254,6 +256,7 @@ def test_a_session_that_demands_a_certified_calibration_runs_only_with_one(store
     with pytest.raises(InputError, match="demands a certified calibration, and 0 calibrations"):
         first.run()
     assert store.session(first.id).state == "failed" and not bench.opened
+    bench.settings["camera left"] = {"PixelFormat": "BayerRG12", "ExposureTime": 100.0}
     free = CaptureSession.start(store, STATION, DARKS, connect=bench.drivers)
     assert free.run().state == "finished"
     of_it = store.add_result("fit", free.id, fitted(2.0).model_dump(mode="json"))
@@ -261,6 +264,17 @@ def test_a_session_that_demands_a_certified_calibration_runs_only_with_one(store
         session().run()
     life.certify(store, of_it, "ada", limits(valid_days=30))
     assert session().run().state == "finished"
+    bench.settings["camera left"] = {"PixelFormat": "BayerRG10", "ExposureTime": 200.0}
+    with pytest.raises(
+        InputError, match="camera left: PixelFormat was BayerRG12, is BayerRG10: so the certified"
+    ) as told:
+        session().run()
+    assert "\n" not in str(told.value) and "ExposureTime" not in str(told.value)
+    bench.settings["camera left"] = {"PixelFormat": "BayerRG12", "ExposureTime": 300.0}
+    bench.serials["camera left"] = "SN-2"
+    with pytest.raises(InputError, match=f"{of_it}, is of other cameras: left was fake camera left SN-1, is .* SN-2"):
+        session().run()
+    bench.serials.clear()
     assert (
         CaptureSession(store, first.id, connect=bench.drivers).run().state == "finished"
     )  # a resumed one is looked at anew
@@ -316,3 +330,86 @@ def test_from_the_command_line(
     assert "yes" in said("history", "m c L1", "noise read_noise_e", code=4)  # the newest drifted
     file.write_text('[[limit]]\nfigure = "x"\ngood = [2.0, 1.0]\n')
     assert "limits.toml: limit.0" in said("show", second, code=2)
+
+
+def test_a_revoked_certificate_is_no_reference(store: Store) -> None:
+    """The third differs from the second, which was certified and revoked, not from the first."""
+    first, second = calibrated(store, 2.0), calibrated(store, 2.4)
+    life.certify(store, second, "ada", limits())
+    assert life.revoke(store, second, "bob", "a finger on the lens").state == "revoked"
+    with pytest.raises(InputError, match="is revoked; only what is certified"):
+        life.revoke(store, second, "bob", "again")
+    with pytest.raises(InputError, match="is candidate; only what is certified"):
+        life.revoke(store, first, "bob", "never was")
+    with pytest.raises(InputError, match="is revoked, only a candidate"):
+        life.certify(store, second, "ada", limits())
+    calibrated(store, 2.0)
+    points = life.history(store, "m c L1", "noise read_noise_e").points
+    assert [point.reference_id for point in points] == [None, first, first] and not points[2].drifted
+
+
+def test_a_board_has_every_figure_of_a_camera(store: Store) -> None:
+    """One column a session, marks and drifts as in the histories."""
+    ids = [calibrated(store, value) for value in (2.0, 2.01, 2.6)]
+    life.certify(store, ids[0], "ada", limits())
+    board = life.drift_board(store, "m c L1")
+    assert [column.calibration_id for column in board.columns] == ids
+    assert [column.state for column in board.columns] == ["certified", "candidate", "candidate"]
+    rows = {row.figure: row for row in board.rows}
+    noise = [cell for cell in rows["noise read_noise_e"].cells if cell is not None]
+    history = life.history(store, "m c L1", "noise read_noise_e")
+    assert (
+        [(cell.value, cell.mark, cell.drifted) for cell in noise]
+        == [(point.value, point.mark, point.drifted) for point in history.points]
+        == [(2.0, "good", False), (2.01, "good", False), (2.6, "warn", True)]
+    )
+    assert rows["mtf edge-1 G mtf50_cy_per_px"].limit is None
+    narrow = life.drift_board(store, "m c L1", newest=1)
+    assert [column.calibration_id for column in narrow.columns] == [ids[0], ids[2]]  # the certified one, too
+    with pytest.raises(InputError, match="no calibration of it is known"):
+        life.drift_board(store, "nobody")
+
+
+def test_a_board_corrects_dark_currents_to_one_temperature(store: Store) -> None:
+    """A current that doubles every 7.2 C is the same at 31 and at 38.2 C: 1 and 2 e/s."""
+    for current, temperature_c in ((1.0, 31.0), (2.0, 38.2)):
+        fit = fitted(2.0)
+        noise = fit.cameras["left"].noise
+        assert noise is not None
+        warm = noise.model_copy(
+            update={
+                "dark_current_e_per_s": current, "dark_current_e_per_s_std": 0.01, "dark_temperature_c": temperature_c
+            }
+        )  # fmt: skip
+        id = calibrated(store, 2.0)
+        camera = fit.cameras["left"].model_copy(update={"noise": warm})
+        with store.transaction() as db:
+            kept = fit.model_copy(update={"cameras": {"left": camera}})
+            db.get_one(ResultRow, id).document = kept.model_dump(mode="json")
+    board = life.drift_board(store, "m c L1", reference_c=31.0)
+    row = next(row for row in board.rows if row.figure == "noise dark_current_e_per_s")
+    assert row.reference_c == 31.0 and row.law == "doubles every 7.2 ± 1.4 °C"
+    one, two = (cell for cell in row.cells if cell is not None)
+    assert (one.value, two.value) == pytest.approx((1.0, 1.0)) and one.corrected and two.corrected
+    # sigma of the factor: ln 2 hypot(7.2 x 1.4 / 7.2^2, sqrt(2) x 0.1 / 7.2) = 0.1355; the current's own 0.01/2
+    assert two.std == pytest.approx(
+        math.hypot(0.005, math.log(2.0) * math.hypot(1.4 / 7.2, math.sqrt(2.0) * 0.1 / 7.2))
+    )
+
+
+def test_limits_are_drafted_from_what_is_usual(store: Store) -> None:
+    """Of values 2.0, 2.1, 2.2, 2.3 an unchanged camera's next one lies within t(3) s sqrt(1 + 1/4) of the mean."""
+    for value in (2.0, 2.1, 2.2, 2.3):
+        calibrated(store, value)
+    newest = calibrated(store, 5.0)
+    found, number = life.drafted_limits(store, newest)
+    assert number == 4  # not from itself
+    limit = next(one for one in found if one.figure == "noise read_noise_e" and one.side == "left")
+    half = float(stats.t.ppf(0.995, 3)) * float(np.std([2.0, 2.1, 2.2, 2.3], ddof=1)) * math.sqrt(1.25) + 2.0 * STD
+    low, high = limit.good
+    assert low is None and high == pytest.approx(2.15 + half, abs=0.01 * 10 ** math.ceil(math.log10(half)))
+    assert limit.judge(Figure(name="noise read_noise_e", value=5.0, std=STD)) == "bad"
+    sharp = next(one for one in found if "mtf50" in one.figure)
+    assert sharp.figure == "mtf * mtf50_cy_per_px" and sharp.good[1] is None
+    alone, number = life.drafted_limits(store, calibrated(store, 2.0, {"left": "X1", "right": "X2"}))
+    assert number == 1 and alone

@@ -76,7 +76,7 @@ def test_narrowband_captures_have_the_irradiance(tmp_path: Path) -> None:
         # by hand: a photon of 500 nm has 3.97289e-19 J
         photons = light / (3.97289e-19 * 500 / one.wavelength_nm)
         assert one.photon_irradiance_per_m2_s == pytest.approx(photons, rel=1e-5)
-    assert store.runs(session.id)[-1].instruments["photodiode"]["model"] == "photodiode"
+    assert store.runs(session.id)[-1].instruments["photodiode"].model == "photodiode"
     store.close()
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from drivers.camera.base import SensorInfo
 from drivers.errors import InstrumentError, NoAnswer
 from drivers.instrument import Identity
 from lab.capture import nexus
@@ -30,7 +31,7 @@ from lab.capture_kinds.flat import FlatSequence
 from lab.capture_kinds.narrowband import NarrowbandSequence
 from lab.capture_kinds.screen import ScreenSequence
 from lab.errors import DeviceError, InputError
-from lab.formats.recording_set import inspect
+from lab.formats.recording_set import inspect, read, write
 from tests.lab import fake_bench
 from tests.lab.fake_bench import BLACK, SLOPE, Bench
 
@@ -84,11 +85,65 @@ def test_a_whole_calibration(store: Store) -> None:
     assert [p.done for p in told if p.state == "running"] == list(range(info.steps))
     assert all(p.left_s is not None for p in told if p.state == "running" and p.done > 0)
     (run,) = store.runs(session.id)
-    assert run.instruments["camera left"]["serial_number"] == "SN-1"
+    assert run.instruments["camera left"].serial_number == "SN-1"
     assert {"python", "bluesky", "numpy"} <= set(run.versions)
     recordings = store.recording_set(session.id)
     assert {c.bandwidth_nm for c in recordings.captures("narrowband")} == {9.48}
     assert all(c.temperature_c == 25.0 and c.time is not None for c in recordings.captures())
+
+
+def test_a_session_has_a_snapshot_of_its_instruments_and_says_what_changed(store: Store, tmp_path: Path) -> None:
+    bench, told = Bench(), []
+    bench.settings["camera left"] = {"PixelFormat": "BayerRG12", "BalanceRatio[Red]": 1.0, "ExposureTime": 100.0}
+    bench.found["camera left"] = {"BalanceRatio[Red]": 1.8}
+    bench.departures["camera left"] = ("Gamma = 0.8: its codes aren't the converter's",)
+    first = begin(store, bench, DARKS)
+    first.run()
+    recordings = store.recording_set(first.id)
+    there = recordings.manifest.instruments["camera left"]
+    assert (there.serial_number, there.settings["BalanceRatio[Red]"], there.found) == (
+        "SN-1",
+        1.0,
+        {"BalanceRatio[Red]": 1.8},
+    )
+    assert there.departures == ("Gamma = 0.8: its codes aren't the converter's",)
+    assert {"monochromator", "display", "stage"} <= set(recordings.manifest.instruments)
+    assert read(write(recordings, tmp_path / "set")).manifest.instruments == recordings.manifest.instruments
+    assert (store.runs(first.id)[0].compared_with, store.runs(first.id)[0].changes) == ("", ())
+
+    bench.settings["camera left"] = {"PixelFormat": "BayerRG10", "BalanceRatio[Red]": 1.0, "ExposureTime": 300.0}
+    bench.serials["spectroradiometer"] = "SN-2"
+    second = begin(store, bench, DARKS, told.append)
+    second.run()
+    (run,) = store.runs(second.id)
+    changes = (
+        "spectroradiometer: serial number was SN-1, is SN-2",
+        "camera left: PixelFormat was BayerRG12, is BayerRG10",
+    )
+    assert (run.compared_with, run.changes) == (first.id, changes)
+    assert store.recording_set(second.id).manifest.changes == changes
+    assert [p.remark for p in told if p.remark] == [f"{line} (in session {first.id})" for line in changes]
+    assert all(p.done == 0 for p in told if p.remark)  # before the first capture
+
+
+@pytest.mark.parametrize(
+    ("sensor", "said"),
+    [
+        (SensorInfo(fake_bench.ROWS, fake_bench.COLS, "BayerRG8", "RGGB", 8), "its codes have 8 bits, .* says 12"),
+        (SensorInfo(12, 16, "BayerRG12", "RGGB", 12), "has 12 x 16 pixels"),
+    ],
+)
+def test_a_camera_that_contradicts_its_data_sheet_takes_no_capture(
+    store: Store, monkeypatch: pytest.MonkeyPatch, sensor: SensorInfo, said: str
+) -> None:
+    bench = Bench()
+    monkeypatch.setattr(fake_bench.FakeCamera, "sensor", lambda self: sensor)
+    session = begin(store, bench, DARKS)
+    with pytest.raises(DeviceError, match=said) as caught:
+        session.run()
+    assert "\n" not in str(caught.value)
+    assert (bench.shots, store.captures(session.id)) == (0, [])
+    assert_safe(bench)
 
 
 def test_blueskys_documents_are_kept(store: Store) -> None:

@@ -49,7 +49,7 @@ def test_darks_of_an_emulated_pair_are_a_recording_set(tmp_path: Path) -> None:
     assert [(c.side, c.exposure_s) for c in recordings.captures("dark")].count(("left", 0.01)) == 2
     assert len(recordings.captures()) == 2 * 2 * 2
     assert recordings.frame(recordings.captures("dark", "right")[0]).shape == (1040, 1024)
-    assert store.runs(session.id)[-1].instruments["camera left"]["model"] == "Emulation"
+    assert store.runs(session.id)[-1].instruments["camera left"].model == "Emulation"
     store.close()
 
 
@@ -80,5 +80,5 @@ def test_darks_of_a_gige_camera_are_a_recording_set(tmp_path: Path) -> None:
     captures = recordings.captures("dark", "left")
     assert [capture.exposure_s for capture in captures] == pytest.approx([0.001, 0.01, 0.01, 0.001])
     assert recordings.frame(captures[0]).shape == (512, 512)
-    assert store.runs(session.id)[-1].instruments["camera left"]["maker"] == "Aravis"
+    assert store.runs(session.id)[-1].instruments["camera left"].maker == "Aravis"
     store.close()

@@ -186,7 +186,7 @@ def test_provenance_grows_run_by_run(store: Store) -> None:
     for number in range(2):
         run = RunRecord(started=now(), instruments={"stage": {"model": f"m{number}"}}, versions={"python": "3"})
         store.set_state(session, "running", run=run)
-    assert [run.instruments["stage"]["model"] for run in store.runs(session)] == ["m0", "m1"]
+    assert [run.instruments["stage"].model for run in store.runs(session)] == ["m0", "m1"]
 
 
 def test_a_session_without_a_process_is_interrupted(store: Store) -> None:

@@ -23,6 +23,7 @@ from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession
 from lab.capture_kinds.dark import DarkSequence
 from lab.cli import bench_process, capturing, diagnosis, fitting
+from lab.cli.exit_codes import EXIT_INPUT
 from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
 from lab.diagnose.effect_list import EffectList, effect_list
@@ -44,6 +45,7 @@ from lab.formats.results import (
 )
 from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult
 from lab.predict import validate as validation
+from lab.resolve import ResolveLimits
 from sim.effects.library import effects
 from tests.lab import fake_bench
 
@@ -240,6 +242,21 @@ def test_diagnosis_with_a_stored_fit(
     assert "not what --json wrote" in capsys.readouterr().err
 
 
+def test_compare_tells_what_differs_of_the_instruments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store, bench, sessions = open_store(tmp_path), fake_bench.Bench(), []
+    plan = CapturePlan((DarkSequence(exposures_s=(0.001,), frames=2),))
+    for serial in ("SN-1", "SN-2"):
+        bench.serials["spectroradiometer"] = serial
+        session = CaptureSession.start(store, fake_bench.station(), plan, connect=bench.drivers).run().id
+        store.add_result("fit", session, FitResult(source=session, cameras={}).model_dump(mode="json"))
+        sessions.append(session)
+    store.close()
+    assert cli.main(["compare", *sessions, "--data", str(tmp_path)]) == 0
+    assert "instruments: spectroradiometer: serial number was SN-1, is SN-2" in capsys.readouterr().out
+    assert cli.main(["compare", sessions[1], sessions[1], "--data", str(tmp_path)]) == 0
+    assert "instruments" not in capsys.readouterr().out
+
+
 def test_a_report_says_what_is_stored_and_takes_it(
     flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -406,7 +423,14 @@ def test_the_main_job_says_where_the_report_is_and_what_it_says(
 ) -> None:
     fit = FitResult(source="s", cameras={"left": CameraFit(noise=NoiseFit(conversion_gain_dn_per_e=0.4))})
     taken = Resolution(capture="dark frames", session="session-2", verdict_before="partly_explained", effects_before=())
-    diagnosed = DiagnosisResult(source="s", verdict="no_mismatch", next_capture="Darks.", resolutions=(taken,))
+    diagnosed = DiagnosisResult(
+        source="s",
+        verdict="no_mismatch",
+        next_capture="Darks.",
+        resolutions=(taken,),
+        resolve_end="settled",
+        resolve_reason="no rivals are left",
+    )
     asked: list[PipelineRequest] = []
 
     def pipeline(request: PipelineRequest, *_: object) -> PipelineResult:
@@ -421,20 +445,40 @@ def test_the_main_job_says_where_the_report_is_and_what_it_says(
         )
 
     monkeypatch.setattr(capturing, "run_here", pipeline)
-    assert cli.main(["run", "--quick", "--name", "mine", "--resolve"]) == 0
+    assert cli.main(["run", "--quick", "--name", "mine", "--resolve", "--resolve-minutes", "20"]) == 0
     session = CaptureRequest(quick=True, name="mine")
-    assert asked == [PipelineRequest("pipeline", capture=session, resolve=True)]
+    assert asked == [PipelineRequest("pipeline", capture=session, resolve=ResolveLimits(20.0))]
     shown = capsys.readouterr().out
     for words in (
         "system gain K",
         "0.4 DN/e",
         "The baseline model explains",
-        "Resolved with: dark frames (session session-2)",
+        "dark frames",
+        "session-2",
+        "resolving: settled: no rivals are left",
         "Next capture: Darks.",
         "session: session-1",
         "report: somewhere/report.html",
     ):
         assert words in shown
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--resolve", "--resolve-minutes=-5"], "resolve minutes: -5 isn't above 0"),
+        (["--resolve", "--resolve-rounds=0"], "resolve rounds: 0 is below 1"),
+        (["--resolve-minutes=5"], "go with resolve"),
+    ],
+)
+def test_a_budget_that_cannot_be_kept_is_one_line_before_anything_moves(
+    options: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(capturing, "run_here", lambda *_: pytest.fail("something moved"))
+    assert cli.main(["run", *options]) == EXIT_INPUT
+    shown = capsys.readouterr().err
+    assert said in shown
+    assert len(shown.splitlines()) == 1
 
 
 def test_only_the_mock_bench_conceals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from lab.diagnose.measurements.dark_frames import dark_frames
-from lab.diagnose.measurements.noise_guess import TemporalVariance
-from lab.diagnose.measurements.study import Study, mean_frame
 from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.measure.mishaps import exchanged_frames
-from lab.predict.camera_model import camera_model
+from lab.measure.noise_figures import TemporalVariance
+from lab.measure.study import Study, mean_frame
 
 SIDE_PX = 128
 BLACK_DN, READ_DN, GAIN = 64.0, 3.0, 0.4

@@ -13,9 +13,9 @@ from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.fit.noise.noise_fit import fit_noise
+from lab.formats.camera_model import assumptions, camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
-from lab.predict.camera_model import assumptions, camera_model
 from sim.effects.base import Effect
 from sim.effects.nonlinearity import Nonlinearity
 from tests.lab.diagnose.on_blocks import measured_model, names, rendered, sigmas, study, verdict

@@ -14,10 +14,10 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.measurements.blocks import measurement_model
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.predict.camera_model import camera_model
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Plan
 
 

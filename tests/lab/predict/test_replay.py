@@ -9,10 +9,10 @@ import pytest
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.challenge.recordings import recordings_of
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.predict.camera_model import camera_model
+from lab.measure.study import Study
 from lab.predict.replay import Replay
 from mocks.former import ConcealedCamera, Plan
 from sim.effects.library import effect

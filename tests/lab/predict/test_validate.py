@@ -14,9 +14,9 @@ from lab.errors import Cancelled
 from lab.fit import fit_recording_set
 from lab.fit.psf.screen_kernel import expected_kernel
 from lab.formats.camera_file import fitted_camera
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, ValidationResult
-from lab.predict.camera_model import camera_model
 from lab.predict.validate import validate
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed_laws

@@ -21,7 +21,7 @@ def test_charts_are_drawn_anew_for_paper(
 
     recordings = small_set()
     file = tmp_path / "report.html"
-    file.write_text(render_report(recordings, *made_up(), provenance_of(recordings, {})))
+    file.write_text(render_report(recordings, *made_up(), provenance_of(recordings)))
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
         # As a print sees it that is made before the script has drawn: the first screen's two charts are there.
@@ -55,7 +55,7 @@ def test_axe_finds_nothing_and_a_phone_needs_no_scroll_sideways(
 
     recordings = small_set()
     file = tmp_path / "report.html"
-    file.write_text(render_report(recordings, *made_up(), provenance_of(recordings, {})))
+    file.write_text(render_report(recordings, *made_up(), provenance_of(recordings)))
     found: list[Any] = []
     sideways: list[int] = []
     with sync_playwright() as playwright:

@@ -15,7 +15,7 @@ import pytest
 
 from lab.calibration.limits import CalibrationLimits
 from lab.errors import InputError
-from lab.formats.recording_set import DataSheet, RecordingSet
+from lab.formats.recording_set import DataSheet, InstrumentSnapshot, RecordingSet
 from lab.formats.results import (
     CameraFit,
     DiagnosisResult,
@@ -27,6 +27,7 @@ from lab.formats.results import (
     PolicyRule,
     ResidualCurve,
     Resolution,
+    RivalOdds,
     SideModels,
     SpectralFit,
     Unexplained,
@@ -103,8 +104,17 @@ class Page(HTMLParser):
 @pytest.fixture
 def page(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> Page:
     recordings = small_set()
-    instruments = {"monochromator": {"model": "Cornerstone 260", "serial": "C-1"}}
-    return Page(render_report(recordings, *made_up(), provenance_of(recordings, instruments)))
+    there = {
+        "monochromator": InstrumentSnapshot(model="Cornerstone 260", serial_number="C-1"),
+        "camera left": InstrumentSnapshot(
+            settings={"BalanceRatio[Red]": 1.0, "Gamma": 0.8},
+            found={"BalanceRatio[Red]": 1.8},
+            departures=("Gamma = 0.8: its codes aren't the converter's",),
+        ),
+    }
+    manifest = recordings.manifest.model_copy(update={"instruments": there, "changes": ("camera left: it differs",)})
+    recordings = recordings.under(manifest)
+    return Page(render_report(recordings, *made_up(), provenance_of(recordings)))
 
 
 def test_page_needs_nothing_from_elsewhere(page: Page) -> None:
@@ -135,7 +145,11 @@ def test_page_says_what_the_results_say(page: Page) -> None:
         "the lamp drifted by 0.08 % between repeats",
         "baseline 60.020 ± 0.021 mm",
         "no bernoulli captures of pose p2; capture one",
-        "serial C-1",
+        "serial number C-1",
+        "Settings of the camera left: 2 before the first capture, 1 of them found otherwise",
+        "BalanceRatio[Red] 1 1.8",
+        "Gamma = 0.8: its codes aren't the converter's",
+        "camera left: it differs",
         "numpy",
     ):
         assert words in page.text, words
@@ -273,15 +287,35 @@ def test_each_capture_that_settled_a_tie_is_told_with_what_stood_before_it(
 ) -> None:
     recordings = small_set()
     fit, validation, diagnosis = made_up()
+    odds = [
+        tuple(RivalOdds(name=name, probability=p) for name, p in stage)
+        for stage in ((("defocus", 0.6), ("coma", 0.4)), (("defocus", 0.9), ("coma", 0.1)), (("defocus", 0.998),))
+    ]
     taken = tuple(
-        Resolution(capture=f"{what} frames", session=f"s-{what}", verdict_before=verdict, effects_before=())
-        for what, verdict in (("dark", "unexplained"), ("flat", "partly_explained"))
+        Resolution(
+            capture=f"{what} frames",
+            session=f"s-{what}",
+            verdict_before=verdict,
+            effects_before=(),
+            rivals=odds[k],
+            rivals_after=odds[k + 1],
+            information_nat=0.25,
+            expected_s=12.0,
+            spent_s=17.0,
+        )
+        for k, (what, verdict) in enumerate((("dark", "unexplained"), ("flat", "partly_explained")))
     )
-    settled = diagnosis.model_copy(update={"resolutions": taken})
+    ended = {"resolutions": taken, "resolve_end": "settled", "resolve_reason": "no rivals are left"}
+    settled = diagnosis.model_copy(update=ended)
     page = Page(render_report(recordings, fit, validation, settled, provenance_of(recordings)))
-    assert "dark frames (session s-dark), then flat frames (session s-flat)." in page.text
-    rows = [page.text.index(f"before {one.capture}") for one in taken]
+    told = " ".join(page.text.split())
+    assert "Settled: no rivals are left." in told
+    rows = [told.index(words) for words in ("dark frames (session s-dark)", "flat frames (session s-flat)")]
     assert rows == sorted(rows)
+    first, second = told[rows[0] : rows[1]], told[rows[1] :]
+    assert "0.25 nat" in first and "17 s" in first
+    assert re.search(r"defocus 0.9, coma 0.1", first, re.IGNORECASE)
+    assert re.search(r"defocus 1\b", second, re.IGNORECASE)
 
 
 def test_the_first_screen_answers_and_all_else_is_folded(

@@ -4,18 +4,50 @@ propagation says."""
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lab.capture.station import Station, read_station
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import FirstEstimates, ModelPosterior
-from lab.twin.budget import budget, parse_uses
+from lab.twin.budget import CaptureGain, budget, parse_uses
+from lab.twin.lab_minutes import LabCapture
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
 from sim.effects.defocus import Defocus
 from tests.lab.twin.test_twin import TRUTH
 
+STATION = """
+name = "bench"
+[monochromator]
+driver = "cornerstone260"
+address = "/dev/null"
+[spectroradiometer]
+driver = "pr655"
+address = "/dev/zero"
+[stage]
+driver = "operator"
+address = "socket://127.0.0.1:1"
+[cameras.left]
+driver = "u3v"
+address = "usbip://127.0.0.1:1/A"
+[cameras.left.datasheet]
+rows = 120
+cols = 160
+cfa = "RGGB"
+bit_depth = 12
+[targets.cap]
+kind = "cap"
+[targets.sphere]
+kind = "sphere"
+[targets.edge]
+kind = "slanted_edge"
+angle_deg = 5.0
+[targets.edge.left]
+regions = [{name = "centre", region = [20, 40, 100, 120], angle_deg = 5.0, field_mm = [0.0, 0.0]}]
+"""
 FIRST = FirstEstimates(
     dark_temperature_c=25.0, read_noise_dn=1.5, black_level_std_dn=0.1, dark_current_std_dn_per_s=0.1,
     level_jitter_dn=0.02, lamp_jitter=1e-3
@@ -44,6 +76,39 @@ def test_the_larger_uncertainty_comes_first() -> None:
         return budget(content, ("MTF50",)).uses[0].contributions[0].name
 
     assert (first(5.0, 0.01), first(1e-7, 1.0)) == ("defocus", "sensitivity G")
+
+
+def _station(tmp_path: Path) -> Station:
+    file = tmp_path / "station.toml"
+    file.write_text(STATION)
+    return read_station(file)
+
+
+def test_the_capture_comes_first_that_tells_what_is_uncertain(tmp_path: Path) -> None:
+    station = _station(tmp_path)
+
+    def ranked(name: str, std: float, use: str) -> list[CaptureGain]:
+        return list(budget(_model((name,), (std,)), (use,), station).uses[0].captures)
+
+    read = ranked("read", 1.0, "variance")
+    assert read[0].sequence.startswith("dark") and not read[0].is_learned
+    assert ranked("curve:G:0", 1.0, "patches")[0].sequence.split(",")[0] in {"flat", "narrowband", "chart"}
+    assert {one.sequence.split(",")[0] for one in read} == {"dark", "flat", "narrowband", "edge"}
+    for one in read:
+        assert one.reduced_percent_per_minute == pytest.approx(one.reduced_percent / one.minutes)
+    # a quick session takes fewer captures, and so leaves more in doubt in less time
+    dark = {one.sequence.endswith("(quick)"): one for one in read if one.sequence.startswith("dark")}
+    assert dark[True].minutes < dark[False].minutes
+
+
+def test_a_capture_leaves_what_information_adds_up_to() -> None:
+    rng = np.random.default_rng(3)
+    half, jacobian, noise = rng.standard_normal((4, 4)), rng.standard_normal((6, 4)), rng.uniform(0.5, 2.0, 6)
+    known = half @ half.T + np.eye(4)
+    one = LabCapture("", 1.0, False, 1, lambda _: np.zeros(6), np.diag(noise))
+    # information adds: V'^-1 = V^-1 + J' S^-1 J
+    wanted = np.linalg.inv(np.linalg.inv(known) + jacobian.T @ np.diag(1.0 / noise) @ jacobian)
+    assert one.known_after(known, jacobian) == pytest.approx(wanted, rel=1e-9, abs=1e-12)
 
 
 def test_an_unknown_use_and_a_model_without_uncertainties_are_refused() -> None:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lab.capture_kinds.dark import DarkCapture
+from lab.capture_kinds.flat import FlatCapture
 from lab.cli import main
+from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.refit import refit
+from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.outcome.doubts import names_in_doubt
 from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import InputError
@@ -20,11 +26,13 @@ from lab.formats.recording_set import Manifest, RecordingSet, write
 from lab.formats.recording_set.files import MemoryFiles
 from lab.twin.changes import Changes, carried, parse_changes
 from lab.twin.predict import predict
-from lab.twin.score import score
+from lab.twin.score import score, together
 from lab.twin.sealed import open_seal, seal
 from lab.twin.session import future_session
 from sim.camera import CameraModel, Lens
+from sim.effects.charge_diffusion import ChargeDiffusion
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
+from sim.effects.defocus import Defocus
 from sim.effects.veiling_glare import VeilingGlare
 from sim.spectrum import Spectrum
 from sim.uniform import electron_rate
@@ -141,6 +149,106 @@ def test_an_effect_that_the_camera_lacks_is_withdrawn() -> None:
     found = score(predict({"left": trained(2, wrong=True)}, PLAN, changes, light_std=0.0), captured(changes, 8))
     verdicts = {effect.name: effect.verdict for effect in found.effects}
     assert verdicts == {"dark_current_temperature": "survives", "veiling_glare": "withdrawn"}
+
+
+def _photons(recordings: RecordingSet, levels: slice) -> RecordingSet:
+    """The darks and some levels of the flats, which state photons in place of a radiance."""
+    flats = recordings.captures(FlatCapture, "left")
+    steps = sorted({c.exposure_s for c in flats})[levels]
+    told = [
+        c.model_copy(update={"radiance": None, "photons_per_pixel": 1e6 * c.exposure_s, "wavelength_nm": 550.0})
+        for c in flats
+        if c.exposure_s in steps
+    ]
+    darks = [c for c in recordings.captures(DarkCapture, "left") if c.temperature_c == 25.0]
+    captures = (*darks, *told)
+    return recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
+
+
+@pytest.fixture(scope="module")
+def of_photons() -> tuple[CameraFile, RecordingSet, RecordingSet]:
+    """A model of the lowest levels of flats that state photons, the recordings of its fit, and those of the others."""
+    drawn = future_session(TRUTH, PLAN, "left", Changes(), 5)
+    low, high = _photons(drawn, slice(0, 4)), _photons(drawn, slice(4, None))
+    fit = fit_recording_set(low, steps=("noise",))
+    model, _ = measurement_model(low, "left", fit)
+    assert model is not None
+    return improved_model(low, "left", fit, None, model, (), ())[0], low, high
+
+
+def test_levels_of_stated_photons_are_predicted_relative_to_the_fitted_ones(
+    of_photons: tuple[CameraFile, RecordingSet, RecordingSet],
+) -> None:
+    content, low, high = of_photons
+    found = score(predict({"left": content}, high, Changes(), fitted=low), high)
+    scores = {q.quantity: q for q in found.quantities}
+    # three levels, of which the brightest channel clips in none: four repeats of three channels, and a variance of each
+    assert scores["photon_transfer"].n == 36 and scores["noise"].n == 9
+    levels = scores["photon_transfer"]
+    # a line through levels up to half of these, whose bend is told to some tenths of a per cent
+    assert levels.largest_of_95_percent < 1.0 and levels.chi2 < 2.0 * levels.n
+    wrong = replace(content, camera=content.camera.model_copy(update={"black_level_dn": 80.0}))
+    missed = score(predict({"left": wrong}, high, Changes(), fitted=low), high)
+    assert missed.chi2 > 10.0 * found.chi2
+
+
+def test_stated_photons_need_the_fitted_recordings(of_photons: tuple[CameraFile, RecordingSet, RecordingSet]) -> None:
+    content, _, high = of_photons
+    with pytest.raises(InputError, match="states photons and no radiance; give the fitted recordings"):
+        predict({"left": content}, high, Changes())
+
+
+def test_a_transfer_tells_which_of_two_rivals_blurs() -> None:
+    """Charge diffusion and defocus lose contrast alike at one aperture; at another only defocus changes."""
+    blurred = replace(TRUTH, effects=(Defocus(defocus_um=14.0),))
+    session = future_session(blurred, PLAN, "left", Changes(), 11)
+    fit = fit_recording_set(session, steps=("noise",))
+    model, _ = measurement_model(session, "left", fit)
+    assert model is not None
+    policy = DecisionPolicy()
+    warm = DarkCurrentTemperature(doublings_per_c=0.1)
+    found = refit(model, (warm, ChargeDiffusion(length_um=0.8)), policy).effects
+    named = Candidate(found[1], {}, 0.6, (), 100.0, members=(("charge_diffusion", 0.6), ("defocus", 0.4)))
+    verdict = Verdict(model, 0.0, 0.0, (), (named, Candidate(found[0], {}, 1.0, (), 100.0)), (), (), ())
+    content = improved_model(session, "left", fit, None, model, found, ())[0]
+    assert content.posterior is not None
+    doubts = names_in_doubt(verdict, policy)
+    content = replace(content, posterior=content.posterior.model_copy(update={"doubts": doubts}))
+
+    changes = Changes(f_number=8.0, radiance_factor=4.0)
+    taken = future_session(carried(blurred, changes), PLAN, "left", changes, 12)
+    tests = score(predict({"left": content}, PLAN, changes, light_std=0.0), taken).effects
+    family = next(one for one in tests if one.effect == "charge_diffusion")
+    assert (family.name, family.verdict, family.becomes) == ("isotropic_contrast_loss", "named", "defocus")
+    assert family.probability > 0.95 and "is defocus" in family.words
+    # told as a name, it falls
+    alone = replace(named, members=(), rivals=(("defocus", 0.4),))
+    doubts = names_in_doubt(replace(verdict, named=(alone, verdict.named[1])), policy)
+    content = replace(content, posterior=content.posterior.model_copy(update={"doubts": doubts}))
+    tests = score(predict({"left": content}, PLAN, changes, light_std=0.0), taken).effects
+    name = next(one for one in tests if one.effect == "charge_diffusion")
+    assert (name.verdict, name.becomes) == ("withdrawn", "defocus")
+    assert together([tests, tests])[0].gain == pytest.approx(2.0 * tests[0].gain)
+
+
+def test_the_surroundings_of_chart_and_edge_are_those_of_the_plans_frames() -> None:
+    drawn = future_session(TRUTH, PLAN, "left", Changes(), 3)
+    bright = {}
+    for capture in drawn.captures(side="left"):
+        frame = drawn.frame(capture).copy()
+        if capture.kind == "chart":
+            frame[:9] = 2000  # a white wall above the chart
+        bright[capture.frame] = frame
+    spectra = {path: drawn.spectrum(path) for path in ("lamp.csv", *drawn.camera("left").quantum_efficiency.values())}
+    plan = RecordingSet(drawn.manifest, files=MemoryFiles(bright, spectra, {}), source="plan")
+    again = future_session(TRUTH, plan, "left", Changes(radiance_factor=0.5), 4)
+    chart = next(c for c in again.captures(side="left") if c.kind == "chart")
+    frame = again.frame(chart).astype(float)
+    # half the light: half the level above black, in the patches and around them
+    assert frame[:9].mean() - 64.0 == pytest.approx(0.5 * (2000.0 - 64.0), rel=0.02)
+    inside = (slice(20, 100), slice(20, 140))
+    before = drawn.frame(chart)[inside].mean() - 64.0
+    assert frame[inside].mean() - 64.0 == pytest.approx(0.5 * before, rel=0.02)
 
 
 def test_the_posterior_goes_through_the_camera_file(content: CameraFile, tmp_path: Path) -> None:

@@ -12,7 +12,15 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.formats.results import DiagnosisResult
 from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import BitWeightsLaw, ColouredLineNoiseLaw, ResponseKneeLaw
+from mocks.former.laws import (
+    BitWeightsLaw,
+    ColouredLineNoiseLaw,
+    LeakyShutterLaw,
+    PhaseDetectionRowsLaw,
+    ResponseKneeLaw,
+    TapGainLaw,
+    TapOffsetLaw,
+)
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -25,6 +33,17 @@ STRONG: tuple[Law, ...] = (
     # three repeats of 192 rows tell 1/f from rows that are correlated over some in three of four draws; else the family
     ColouredLineNoiseLaw(5.0, 0, 11),
     ColouredLineNoiseLaw(5.0, 1, 9),
+    PhaseDetectionRowsLaw(4.0, 0, 9),
+    PhaseDetectionRowsLaw(4.0, 1, 9),
+    PhaseDetectionRowsLaw(4.0, 2, 9),
+    TapGainLaw(1.0, 0, 9),
+    TapGainLaw(1.0, 1, 9),
+    TapGainLaw(1.0, 2, 9),
+    TapOffsetLaw(1.0, 0, 9),
+    TapOffsetLaw(1.0, 1, 9),
+    LeakyShutterLaw(60.0, 0, 9),
+    LeakyShutterLaw(60.0, 1, 9),
+    LeakyShutterLaw(60.0, 2, 9),
 )
 NEW = {str(law.effect) for law in STRONG}
 

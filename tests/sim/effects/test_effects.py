@@ -30,6 +30,7 @@ from sim.optics.imaging import ZernikePupil
 from sim.optics.pupil import pupil_otf, seidel
 from sim.point import TRANSFER, Blur, displaced_um, edge_profile, even_share, halos, optical_transfer
 from sim.scene.scenes import Darkness, EdgeRegion, KnifeEdge, PlanarTarget, PointArray, UniformField
+from sim.sensor.mosaic import PERIOD_PX
 from sim.sensor.mosaic import phases as mosaic_phases
 from sim.spectrum import Spectrum
 from sim.stages import charge_of, signal_of
@@ -187,13 +188,21 @@ def _acting(field: str) -> list[Effect]:
 
 @pytest.mark.parametrize("one", _acting("charge.collected"), ids=lambda e: e.name)
 def test_pixels_of_a_colour_keep_their_mean(one: Effect) -> None:
-    """In even light, by colour: levels don't ask what pixels of one colour do unlike others."""
-    even = np.full((64, 64), 1000.0)
+    """In even light, by colour: levels don't ask what pixels of one colour do unlike others. And in proportion."""
+    even = np.full((PERIOD_PX, PERIOD_PX), 1000.0)
     after = charge_of(CAMERA, (one,)).collect_light(even.copy())
     assert np.any(after != even)
+    np.testing.assert_allclose(charge_of(CAMERA, (one,)).collect_light(2.0 * even), 2.0 * after, rtol=1e-12)
     for colour, phases in mosaic_phases(CAMERA.cfa).items():
         means = [after[row::2, col::2].mean() for row, col in phases]
         assert np.mean(means) == pytest.approx(1000.0, rel=1e-12), colour
+
+
+@pytest.mark.parametrize("one", _acting("signal.gains"), ids=lambda e: e.name)
+def test_gains_by_place_keep_the_mean_of_the_frame(one: Effect) -> None:
+    gains = Uniform(CAMERA, (one,)).gain_map()
+    assert gains is not None and np.ptp(gains) > 0.0
+    assert gains.mean() == pytest.approx(1.0, rel=1e-12)
 
 
 @pytest.mark.parametrize("one", _acting("charge.exchange") + _acting("charge.kernels"), ids=lambda e: e.name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.diagnose.inference.gaussian import BlockCovariance, Gaussian, chi2
+from lab.measure.gaussian import BlockCovariance, Gaussian, chi2
 
 
 def test_gaussians_agree_with_their_formulas() -> None:

@@ -12,7 +12,6 @@ import pytest
 from pydantic import Field
 
 from lab.diagnose.inference.decide import _with_equal_choices, _with_every_mode, decide
-from lab.diagnose.inference.gaussian import BlockCovariance
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.naming import _still_certain, named_members
 from lab.diagnose.inference.score import prototype_changes, signatures_of
@@ -20,6 +19,7 @@ from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.policy import DecisionPolicy
+from lab.measure.gaussian import BlockCovariance
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.families import Family

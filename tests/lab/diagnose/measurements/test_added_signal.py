@@ -14,8 +14,8 @@ from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.dark_lines import fixed_line_block
 from lab.diagnose.measurements.flat_field import shading_block
 from lab.diagnose.measurements.flat_rows import flicker_block
-from lab.diagnose.measurements.study import Study
 from lab.formats.recording_set import RecordingSet
+from lab.measure.study import Study
 from tests.lab.diagnose.on_blocks import measured_model, rendered, sigmas
 from tests.sim.local_effects import ReadOutRamp
 

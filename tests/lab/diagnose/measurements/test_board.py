@@ -14,12 +14,12 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.boards import board_block, calibration_of
 from lab.diagnose.measurements.stereo_gain import scene_gain_block
 from lab.diagnose.measurements.stereo_time import time_block
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.measure.pinhole import distortion_of, matrix_of
-from lab.predict.camera_model import camera_model
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
 from sim.camera import Geometry, Side

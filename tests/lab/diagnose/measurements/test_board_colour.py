@@ -12,10 +12,10 @@ from scipy.special import erf
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.board_colour import board_colour_block
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.importers import read_dot_grids
+from lab.measure.study import Study
 from tests.lab.diagnose import on_blocks
 
 ROWS, COLS, SPACING_PX, RADIUS_PX = 7, 9, 44.0, 9.0

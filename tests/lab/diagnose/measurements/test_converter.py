@@ -17,9 +17,9 @@ from lab.diagnose.measurements.code_density import code_block, widths
 from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.measurements.noise import variance_block
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
-from lab.predict.camera_model import camera_model
+from lab.formats.camera_model import camera_model
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
 from sim.effects.adc_ripple import AdcRipple

@@ -13,7 +13,6 @@ from scipy import stats
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
-from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements import dark_noise, defective_pixels
 from lab.diagnose.measurements.block import Block
@@ -21,11 +20,12 @@ from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import TAIL_EDGES, DarkCondition
 from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.library import measurements
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.predict.camera_model import camera_model
+from lab.measure.gaussian import chi2
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan, laws
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
@@ -280,17 +280,16 @@ def test_what_sim_renders_is_named_with_its_parameters(one: Effect) -> None:
         assert named.effect.corner == "bottom_left"  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize(
-    ("law", "measurement"),
-    [(laws.PeriodicBandingLaw(1.5, 0, 3), "dark_row_noise"), (laws.TapOffsetLaw(1.5, 0, 3), "dark_field")],
-    ids=["banding", "tap"],
-)
-def test_laws_like_listed_effects_are_located_and_get_no_name(law: Law, measurement: str) -> None:
-    """Laws that the library lacks and that resemble its effects: banding of a fixed period, an offset of one read-out
-    tap."""
-    verdict = _verdict(_concealed(92, law))
+def test_banding_of_a_fixed_period_is_located_and_gets_no_name() -> None:
+    """It resembles row noise, and no effect has its law."""
+    verdict = _verdict(_concealed(92, laws.PeriodicBandingLaw(1.5, 0, 3)))
     assert not verdict.named
-    assert measurement in {part.block.measurement.name for part in verdict.after}
+    assert "dark_row_noise" in {part.block.measurement.name for part in verdict.after}
+
+
+def test_an_offset_of_half_of_the_frame_is_a_tap() -> None:
+    (named,) = _verdict(_concealed(92, laws.TapOffsetLaw(1.5, 0, 3))).named
+    assert named.effect.name == "taps"
 
 
 # --- what the recordings don't allow, and faults ----------------------------------------------------------------------

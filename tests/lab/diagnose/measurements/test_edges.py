@@ -8,16 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.challenge.recordings import recordings_of
-from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.edge_estimator import REAL_AT, profile_interpolation, spread_operator
-from lab.diagnose.measurements.slanted_edge import ASIDE, _Edges, edge_block
-from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.edge_profiles import measured_edges
+from lab.diagnose.measurements.slanted_edge import ASIDE, _Edges, edge_block, stopped_edge_block
 from lab.errors import NotDetermined
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.measure.edges import check_phases
-from lab.predict.camera_model import camera_model
+from lab.measure.gaussian import chi2
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
 from sim.effects.base import Effect
@@ -29,6 +31,10 @@ EDGES = Plan(("dark", "slanted_edge"))
 
 def _study(recordings: RecordingSet) -> Study:
     return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+
+
+def _edges(study: Study) -> _Edges:
+    return _Edges(study, measured_edges(study, SlantedEdgeCapture), study.camera)
 
 
 def _recorded(
@@ -76,7 +82,7 @@ def test_a_direct_sum_over_the_samples_agrees() -> None:
     """The estimators' rows on a grid of distances against normal equations with every sample at its own distance:
     within 1e-5 of the contrast."""
     study = _recorded(cfa="MONO", f_number=2.0)
-    edges = _Edges(study)
+    edges = _edges(study)
     geometry = edges.edges[0].measured.geometry
     reach = geometry.reach_px + 1.0
     light = study.recordings.spectrum(str(edges.edges[0].part[0].light_radiance))
@@ -140,7 +146,7 @@ def test_shading_is_no_blur() -> None:
 
 def test_directions_point_to_the_light() -> None:
     study = _recorded(cfa="MONO", f_number=4.0)
-    found = sorted({round(e.direction_deg) for e in _Edges(study).edges})
+    found = sorted({round(e.direction_deg) for e in _edges(study).edges})
     assert found == [-40, 3, 5, 95]
 
 
@@ -181,3 +187,37 @@ def test_an_edge_that_crosses_less_than_a_period_is_left_out(cfa: str, rows: int
     capture = next(c for c in study.recordings.captures("slanted_edge") if c.angle_deg == 2.6)
     with pytest.raises(NotDetermined, match=told):
         check_phases("slanted_edge", study.stated.cfa, study.camera.channels[0], capture.region, 2.6)
+
+
+def _stopped(*laws: Law, f_number: float, stated: float) -> Study:
+    """Edges that the former takes at `f_number`, of a camera whose data sheet says `stated`."""
+    former = ConcealedCamera(7, laws, cfa="MONO", f_number=f_number, rows=112, cols=112)
+    document = recordings_of(former, EDGES)
+    content = document.manifest.model_dump(mode="json", exclude_none=True)
+    content["cameras"]["left"]["f_number"] = stated
+    for capture in content["captures"]:
+        if capture["kind"] == "slanted_edge":
+            capture |= {"kind": "stopped_edge", "f_number": f_number}
+    return _study(document.under(Manifest.model_validate(content)))
+
+
+def test_edges_at_another_f_number_are_predicted_at_it() -> None:
+    """A lens that stands 10 um out of focus, f/2.8 by its data sheet, at f/4: the second former's own pupil. The path
+    error W040 at the rim of f/2.8 is (2.8 / 4)^4 of itself at that of f/4."""
+    block = stopped_edge_block(_stopped(concealed.DefocusLaw(10.0, 1), f_number=4.0, stated=2.8))
+    assert {label.captures for label in block.labels} and block.measurement.name == "stopped_edge"
+    assert _misfit(block) > 2.0
+    assert _misfit(block, effect("defocus")(defocus_um=10.0)) < 1.0
+    w040_um = 0.3
+    at_stop = concealed.SphericalAberrationLaw(w040_um * (2.8 / 4.0) ** 4, 0)
+    block = stopped_edge_block(_stopped(at_stop, f_number=4.0, stated=2.8))
+    assert _misfit(block, effect("spherical_aberration")(w040_um=w040_um)) < 1.0
+    assert _misfit(block, effect("spherical_aberration")(w040_um=w040_um * (2.8 / 4.0) ** 4)) > 1.0
+
+
+def test_edges_at_another_f_number_are_no_slanted_edges_of_the_data_sheets_lens() -> None:
+    study = _stopped(f_number=4.0, stated=2.8)
+    with pytest.raises(NotDetermined, match="no slanted-edge captures"):
+        edge_block(study)
+    with pytest.raises(NotDetermined, match="no slanted-edge captures"):
+        stopped_edge_block(_recorded(cfa="MONO", f_number=4.0))

@@ -7,10 +7,11 @@ import pytest
 
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Block, Effects
+from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.level_repeats import level_repeats_block
 from lab.diagnose.policy import DecisionPolicy
 from mocks.former.laws import ImageLagLaw, LightFlickerLaw, SourceInstabilityLaw
+from sim.effects.base import Effects
 from sim.effects.image_lag import ImageLag
 from sim.effects.light_flicker import LightFlicker
 from sim.effects.source_instability import SourceInstability

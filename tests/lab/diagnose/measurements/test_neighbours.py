@@ -12,16 +12,15 @@ from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
 from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.measurements.noise import variance_block
 from lab.diagnose.measurements.noise_neighbours import correlations, neighbour_block
 from lab.diagnose.measurements.slanted_edge import edge_block
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.measurements.temporal_noise import PAIRS, independent_correlations, repeats_of
 from lab.diagnose.policy import DecisionPolicy
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.predict.camera_model import camera_model
+from lab.measure.study import Study, held_out_flats
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import BrighterFatterLaw, InterPixelCapacitanceLaw, OnChipSharpeningLaw, OnChipSmoothingLaw
 from sim.camera import CameraModel, Lens

@@ -18,10 +18,10 @@ from lab.diagnose.measurements.even_flats import flats
 from lab.diagnose.measurements.flat_lines import line_block
 from lab.diagnose.measurements.green_balance import green_block
 from lab.diagnose.measurements.narrowband import narrowband_block
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
-from lab.predict.camera_model import camera_model
+from lab.formats.camera_model import camera_model
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     ColumnNoiseLaw,
@@ -98,7 +98,7 @@ def test_crosstalk_along_rows_is_no_green_imbalance() -> None:
     assert found["row_excess"] == pytest.approx(0.2, abs=0.06)
 
 
-def test_a_tap_gain_is_a_step_in_the_middle_and_has_no_name() -> None:
+def test_a_tap_gain_is_a_step_in_the_middle_and_is_named() -> None:
     study = _study(771016, (TapGainLaw(1.0),))
     block = line_block(study)
     model = MeasurementModel((block,), study.camera)
@@ -106,9 +106,10 @@ def test_a_tap_gain_is_a_step_in_the_middle_and_has_no_name() -> None:
     steps = {label.condition: v for label, v in zip(block.labels, block.value, strict=True) if not label.held_out}
     # 1 % within 3 sigma of 0.8 % PRNU over 8 columns of 96 pixels a side, with a slope fitted: 0.2 %
     assert steps["column 64"] == pytest.approx(0.01, abs=0.003)
-    verdict = decide(model, np.random.default_rng(0), DecisionPolicy())
-    assert not verdict.named
-    assert verdict.discrepancies
+    (named,) = decide(model, np.random.default_rng(0), DecisionPolicy()).named
+    assert named.effect.name == "taps"
+    assert named.std["gain_percent"] is not None
+    assert named.effect.gain_percent == pytest.approx(1.0, abs=4.0 * named.std["gain_percent"])  # type: ignore[attr-defined]
 
 
 def test_white_columns_are_no_steps() -> None:

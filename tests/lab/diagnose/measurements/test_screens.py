@@ -24,11 +24,11 @@ from lab.diagnose.measurements.library import measurements
 from lab.diagnose.measurements.pattern_contrast import contrast_block
 from lab.diagnose.measurements.pattern_fit import patterns
 from lab.diagnose.measurements.screen_grid import grid_block
-from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
+from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.predict.camera_model import camera_model
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
 from sim.effects.charge_diffusion import ChargeDiffusion

@@ -14,7 +14,6 @@ from lab.diagnose.measurements.flat_field import (
     shading_block,
 )
 from lab.diagnose.measurements.linearity import linearity_block
-from mocks.former import Law
 from mocks.former.laws import DustShadowLaw, NonUniformIlluminationLaw, TapGainLaw, VignettingDecentreLaw, VignettingLaw
 from tests.lab.diagnose.on_blocks import former, measured_model, names, sigmas, study, verdict
 
@@ -58,13 +57,14 @@ def test_a_slope_is_uneven_light_with_or_without_a_bow(variant: int) -> None:
         assert abs(found.named[0].effect.model_dump()[name] - value) < 3.0 * std
 
 
-@pytest.mark.parametrize(
-    "law", [TapGainLaw(1.0), pytest.param(DustShadowLaw(2.0, 0, 4), marks=pytest.mark.slow)], ids=lambda law: law.name
-)
-def test_what_no_law_fits_is_seen_and_gets_no_name(law: Law) -> None:
-    found = verdict(former(24, law), *LOOKED_AT)
+def test_what_no_law_fits_is_seen_and_gets_no_name() -> None:
+    found = verdict(former(24, DustShadowLaw(2.0, 0, 4)), *LOOKED_AT)
     assert not found.named
     assert {s.block.measurement.name for s in found.before} == {"flat_field"}
+
+
+def test_a_brighter_half_is_a_tap() -> None:
+    assert names(verdict(former(24, TapGainLaw(1.0)), *LOOKED_AT)) == ["taps"]
 
 
 def test_a_pattern_that_neighbours_share_counts_more() -> None:

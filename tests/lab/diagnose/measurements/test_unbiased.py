@@ -19,9 +19,9 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.library import measurements
 from lab.diagnose.measurements.line_spectra import Bands, log_mean_bias, log_mean_variance, periodogram
-from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.predict.camera_model import camera_model
+from lab.formats.camera_model import camera_model
+from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Plan
 
 #: Probability that a healthy measurement fails a whole test, over all its comparisons (Bonferroni).

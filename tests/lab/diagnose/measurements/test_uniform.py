@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from lab.challenge.recordings import recordings_of
-from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import cell_means
 from lab.diagnose.measurements.dark_level import added_dark_dn, dark_current_map
@@ -22,13 +21,14 @@ from lab.diagnose.measurements.narrowband import (
     _sample_std,
     narrowband_block,
 )
-from lab.diagnose.measurements.noise_guess import (
+from lab.measure.gaussian import chi2
+from lab.measure.noise_figures import (
     NARROW_WINDOW_PX,
     WIDE_PLANE_PX,
     WIDE_WINDOW_PX,
     variance_between_pixels,
 )
-from lab.diagnose.measurements.repeatability import level_repeatability, repeated_levels
+from lab.measure.repeatability import level_repeatability, repeated_levels
 from lab.measure.rounding import rounding_std_dn
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (

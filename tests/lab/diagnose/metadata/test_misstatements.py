@@ -13,7 +13,7 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import InstrumentSnapshot, RecordingSet
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     AdcNonlinearityLaw,
@@ -144,6 +144,17 @@ def test_metadata_that_no_recording_can_check_are_listed() -> None:
     assert (one.step, one.side) == ("bit_depth", "left")
     assert "no pixel is above 1000 DN" in one.reason
     assert "bit_depth = 12" in one.reason
+
+
+def test_what_an_instrument_said_could_not_be_set_is_listed() -> None:
+    recordings = _recorded(13, "MONO", ("dark", "flat"))
+    there = {
+        "camera left": InstrumentSnapshot(departures=("BalanceRatio[Red] = 1.8: its codes aren't the converter's",)),
+        "monochromator": InstrumentSnapshot(departures=("the bandwidth of its light isn't known",)),
+    }
+    told = [*unchecked(recordings.under(recordings.manifest.model_copy(update={"instruments": there})), "left")]
+    assert [(one.step, one.side) for one in told] == [("instrument_settings", "left"), ("instrument_settings", None)]
+    assert "BalanceRatio[Red] = 1.8" in told[0].reason and "bandwidth" in told[1].reason
 
 
 @pytest.mark.parametrize(

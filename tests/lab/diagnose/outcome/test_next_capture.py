@@ -14,7 +14,7 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
-from lab.diagnose.outcome.next_capture import next_sentence, proposals
+from lab.diagnose.outcome.next_capture import doubt_of, next_sentence
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import visibility
@@ -106,9 +106,13 @@ def test_the_stated_probability_of_deciding_rightly_holds() -> None:
     assert float(np.mean(nearer)) == pytest.approx(float(norm.cdf(np.sqrt(0.5 * d))), abs=0.024)
 
 
-def test_proposals_are_sorted_and_name_their_nearest_rivals() -> None:
+def test_captures_are_listed_in_order_and_name_their_nearest_rivals() -> None:
     verdict = _undecided(effect("optical_low_pass_filter")(displacement_x_um=1.0), ("defocus", 0.3), ("unknown", 0.1))
-    found = [p.capture for p in proposals(SET, "left", verdict, DecisionPolicy())]
+    doubt = doubt_of(SET, "left", verdict, DecisionPolicy())
+    assert doubt is not None
+    assert doubt.rivals == ("optical_low_pass_filter", "defocus")
+    assert doubt.odds == pytest.approx((0.6 / 0.9, 0.3 / 0.9))  # what is unknown counts for neither
+    found = doubt.listed(DecisionPolicy())
     assert {c.rivals for c in found} == {("optical_low_pass_filter", "defocus")}
     assert "edges" in found[0].capture  # one spreads along two axes, the other all around
     assert found[0].distance > 2.0
@@ -117,7 +121,7 @@ def test_proposals_are_sorted_and_name_their_nearest_rivals() -> None:
 
 
 def test_without_rivals_no_capture_is_proposed() -> None:
-    assert proposals(SET, "left", _undecided(Nonlinearity(), ("unknown", 0.02)), DecisionPolicy()) == ()
+    assert doubt_of(SET, "left", _undecided(Nonlinearity(), ("unknown", 0.02)), DecisionPolicy()) is None
     assert next_sentence((), None, DecisionPolicy()) is None
 
 
@@ -166,10 +170,12 @@ def test_captures_that_neither_rival_changes_are_not_listed() -> None:
     """A filter against defocus: dark frames, flats and narrowband levels see neither."""
     verdict = _undecided(effect("optical_low_pass_filter")(displacement_x_um=1.0), ("defocus", 0.3))
     every = DecisionPolicy(next_captures_listed=1000)
-    found = [p.capture for p in proposals(SET, "left", verdict, every)]
+    doubt = doubt_of(SET, "left", verdict, every)
+    assert doubt is not None
+    found = doubt.listed(every)
     assert len(found) > 2
     assert all(c.distance >= 0.02 for c in found)
-    assert all("edges" in c.capture or "slanted_edge" in c.capture for c in found)
+    assert all("slanted" in c.capture for c in found)
 
 
 def _dark_set(repeats: int) -> RecordingSet:

@@ -8,7 +8,7 @@ import pytest
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.formats.camera_file import CameraFile
-from lab.predict.camera_model import camera_model
+from lab.formats.camera_model import camera_model
 from mocks.former import ConcealedCamera, Plan
 from mocks.former import laws as concealed_laws
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter

@@ -12,7 +12,7 @@ from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.outcome.merge_sides import merged
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
-from lab.formats.results import DiagnosisResult
+from lab.formats.results import DiagnosisLists, DiagnosisResult
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.hot_pixels import HotPixels
@@ -41,7 +41,10 @@ BLINKING = replace(
 def _told(*sides: tuple[Side, Candidate]) -> DiagnosisResult:
     found = [
         SideFindings(
-            side, (), is_judged=True, named=(NamedCandidate(c, ("defective_pixels",), ("a factor on the noise",)),)
+            side,
+            DiagnosisLists(),
+            is_judged=True,
+            named=(NamedCandidate(c, ("defective_pixels",), ("a factor on the noise",)),),
         )
         for side, c in sides
     ]

@@ -167,6 +167,7 @@ def test_means_near_the_highest_code_are_left_out(tmp_path: Path) -> None:
         (("narrowband,R,400", "flat,R,400"), "kind 'flat'; write dark or narrowband"),
         (("narrowband,R,400", "narrowband,Y,400"), "channel 'Y' of a RGGB sensor"),
         (("narrowband,R,400,10", "narrowband,R,400,wide"), "bandwidth_nm = 'wide' isn't a number"),
+        (("narrowband,R,400,10,0.1,", "narrowband,R,400,10,0.1,-"), "more than 6 standard deviations below the dark"),
     ],
 )
 def test_what_cannot_be_used_is_one_line(tmp_path: Path, change: tuple[str, str], words: str) -> None:

@@ -152,6 +152,7 @@ def test_light_that_is_narrower_than_stated_is_told_and_taken_as_it_is(tmp_path:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_the_bandwidth_stated_rightly_is_kept_and_scatter_is_found_as_large_as_it_is(tmp_path: Path) -> None:
     """20 sweeps of 2 % of scatter: bands of two standard deviations hold 93 to 97 %. Each sweep has some 30 independent
     values; of 600 the share has a standard deviation of 0.9 %, which is allowed for thrice.

@@ -227,3 +227,24 @@ def test_a_picture_is_held_against_its_exif(tmp_path: Path) -> None:
     assert any(line.endswith(told) for line in read.warnings)
     written = recording.read(recording.write(read, tmp_path / "out"))
     assert told in written.manifest.notes.splitlines()  # kept, without the folder it came from
+
+
+def _named(file: Path, serial: str, balance: int = 1) -> None:
+    tags = [(271, 2, 0, "NIKON CORPORATION", True), (272, 2, 0, "NIKON D810", True), (42033, 2, 0, serial, True)]
+    tags.append((41987, 3, 1, balance, True))
+    frame = np.full((16, 24), 90, np.uint8)
+    tifffile.imwrite(file, frame, photometric="minisblack", metadata=None, software=False, extratags=tags)
+
+
+def test_the_cameras_that_the_frames_name_go_into_the_set(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "d", ["a.tif,dark,0.1", "b.tif,dark,0.1"])
+    for name in "ab":
+        _named(folder / f"{name}.tif", "6001234")
+    recordings = read_foreign("raw-folder", folder)
+    camera = recordings.manifest.instruments["camera left"]
+    assert (camera.maker, camera.model, camera.serial_number) == ("NIKON CORPORATION", "NIKON D810", "6001234")
+    assert camera.settings == {"WhiteBalance": "manual"}
+    assert recording.read(recording.write(recordings, tmp_path / "set")).manifest.instruments == {"camera left": camera}
+    _named(folder / "b.tif", "6009999")
+    (line,) = [line for line in read_foreign("raw-folder", folder).warnings if "serial" in line]
+    assert "b.tif: camera left: serial number was 6001234, is 6009999, as in a.tif: give each camera" in line

@@ -18,7 +18,7 @@ from lab.capture_kinds.base import Capture
 from sim.spectrum import FloatArray
 
 if TYPE_CHECKING:
-    from lab.diagnose.measurements.study import Study
+    from lab.measure.study import Study
 
 LAMP_FLOOR = 1.0e-4  # least relative standard deviation of a level, common to the channels of a capture
 #: False-alarm probability, over all settings, of calling one out of line; and the largest share of settings out of

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 
-from lab.formats.recording_set import RecordingSet, manifest_json
+from lab.formats.recording_set import InstrumentSnapshot, RecordingSet, manifest_json
 from sim.parameters import Frozen
 
 #: The distributions whose version can change a number.
@@ -19,7 +18,7 @@ class Provenance(Frozen):
     """The origin of a calibration: instruments, software, and digests of the recordings."""
 
     made: datetime
-    instruments: dict[str, dict[str, str]] = {}  # role -> identification by the instrument (maker, model, serial, ...)
+    instruments: dict[str, InstrumentSnapshot] = {}  # by name, what each said of itself before the first capture
     versions: dict[str, str] = {}
     manifest_sha256: str
     frame_sha256: dict[str, str]  # capture id -> SHA-256 of the frame's values (little-endian uint16, row by row)
@@ -36,9 +35,7 @@ def installed_versions() -> dict[str, str]:
     return found
 
 
-def provenance_of(
-    recordings: RecordingSet, instruments: Mapping[str, Mapping[str, str]] | None = None, made: datetime | None = None
-) -> Provenance:
+def provenance_of(recordings: RecordingSet, made: datetime | None = None) -> Provenance:
     """Provenance of an evaluation of `recordings`: reads every frame once. `made`: now, where not given."""
     digests = {
         capture.id: hashlib.sha256(recordings.frame(capture).astype("<u2").tobytes()).hexdigest()
@@ -46,7 +43,7 @@ def provenance_of(
     }
     return Provenance(
         made=made or datetime.now(UTC),
-        instruments={role: dict(said) for role, said in (instruments or {}).items()},
+        instruments=recordings.manifest.instruments,
         versions=installed_versions(),
         manifest_sha256=hashlib.sha256(manifest_json(recordings.manifest).encode()).hexdigest(),
         frame_sha256=digests,

@@ -12,16 +12,16 @@ import numpy as np
 
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.flat import FlatCapture
-from lab.diagnose.measurements.block import Effects
-from lab.diagnose.measurements.noise_guess import NoiseGuess, noise_guess
-from lab.diagnose.measurements.reads import LAG, acting
-from lab.diagnose.measurements.saturation import CLIPPED_SHARE, clipping_level_dn
 from lab.errors import NotDetermined
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
 from lab.measure.mishaps import CopiedFrames, copied_frames
-from lab.measure.stated_light import most_frequent_gain_db
+from lab.measure.noise_figures import NoiseFigures, noise_figures
+from lab.measure.plane_means import plane_means
+from lab.measure.reads import LAG, acting
+from lab.measure.stated_light import lamps_of, most_frequent_gain_db
 from sim.camera import CameraModel, Side
+from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import FieldPoints, Uniform
@@ -29,6 +29,7 @@ from sim.uniform import FieldPoints, Uniform
 T = TypeVar("T")
 C = TypeVar("C", bound=Capture)
 TAIL_STD = 0.1  # relative standard deviation of the light that the baseline's point spread function sends far
+CLIPPED_SHARE = 2e-4  # of a plane's pixels: with fewer clipped ones its mean is used
 WARMTH_STD = 0.1  # prior relative change of the dark current per degree C: it doubles within 5 to 10 degrees
 
 
@@ -45,7 +46,7 @@ class Study:
     """One side of a recording set, from which measurements are made. What they share is computed once.
 
     `camera`: the baseline; its gain, black level, dark current, read noise and full well are those of the noise fit, or
-    first estimates where there is none (`noise_guess`). `saturation_dn`: code from which on pixels clip (None:
+    first estimates where there is none (`noise_figures`). `saturation_dn`: code from which on pixels clip (None:
     estimated). `misstated`: ids of flats whose stated number of photons contradicts the others. `fitted`: the side's
     noise fit, None where its recordings don't determine one. `noise`: known figures in the place of all estimates; the
     baseline then is `camera` as it is.
@@ -59,7 +60,7 @@ class Study:
         saturation_dn: float | None = None,
         misstated: frozenset[str] = frozenset(),
         fitted: NoiseFit | None = None,
-        noise: NoiseGuess | None = None,
+        noise: NoiseFigures | None = None,
     ) -> None:
         self.misstated, self.fitted = misstated, fitted
         #: Captures that are left out, as their frames weren't taken anew.
@@ -83,7 +84,7 @@ class Study:
             self.saturation_dn = clipping_level_dn(self)
         #: Amplification, dB, of most of the flats: that of `noise.gain`.
         self.usual_gain_db = most_frequent_gain_db(self.recordings.captures(FlatCapture, side))
-        self.noise: NoiseGuess = noise_guess(self) if noise is None else noise
+        self.noise: NoiseFigures = noise_figures(self) if noise is None else noise
         if noise is not None:
             return
         self.camera = camera.model_copy(
@@ -117,25 +118,15 @@ class Study:
             mask[row::step, col::step] = True
         return mask
 
-    def pixels_of(self, frame: Any, channel: str) -> FloatArray:
-        """Values (pixels,) of a channel's pixels in a frame."""
-        step = mosaic.step(self.camera.cfa)
-        parts = [frame[row::step, col::step] for row, col in mosaic.phases(self.camera.cfa)[channel]]
-        return np.concatenate([np.asarray(p, float).ravel() for p in parts])
-
     def levels(self, capture: Capture) -> Levels:
         """The means of a capture by channel, computed once. A channel clips where `CLIPPED_SHARE` of its pixels do."""
         if capture.id not in self._levels:
-            frame = self.recordings.frame(capture)
-            mean: dict[str, float | None] = {}
-            pixels, whole = {}, {}
-            for channel in self.channels:
-                values = self.pixels_of(frame, channel)
-                clipped = float(np.mean(values >= self.saturation_dn))
-                whole[channel] = float(values.mean())
-                mean[channel] = whole[channel] if clipped < CLIPPED_SHARE else None
-                pixels[channel] = values.size
-            self._levels[capture.id] = Levels(mean, pixels, whole)
+            found = plane_means(self.recordings.frame(capture), self.camera.cfa, self.saturation_dn)
+            self._levels[capture.id] = Levels(
+                {c: one.mean_dn if one.clipped_share < CLIPPED_SHARE else None for c, one in found.items()},
+                {c: one.pixels for c, one in found.items()},
+                {c: one.mean_dn for c, one in found.items()},
+            )
         return self._levels[capture.id]
 
     @property
@@ -156,27 +147,8 @@ class Study:
 
     @cached_property
     def lamps(self) -> dict[str, int]:
-        """Radiance file of flats -> number of its lamp.
-
-        Files that differ by less than 1 % in spectral shape and 5 % in level are readings of one lamp, taken anew
-        before every pass."""
-        found: list[tuple[FloatArray, FloatArray]] = []
-        lamps: dict[str, int] = {}
-        for capture in self.recordings.captures(FlatCapture, self.side):
-            if capture.radiance is None or capture.radiance in lamps:
-                continue
-            wavelength, value = self.spectrum(capture.radiance).arrays
-            for k, (where, level) in enumerate(found):
-                if len(where) != len(wavelength) or np.any(where != wavelength):
-                    continue
-                ratio = float(value.sum() / level.sum())
-                if abs(ratio - 1.0) < 0.05 and np.abs(value / ratio - level).sum() < 0.01 * np.abs(level).sum():
-                    lamps[capture.radiance] = k
-                    break
-            else:
-                lamps[capture.radiance] = len(found)
-                found.append((wavelength, value))
-        return lamps
+        """Number of the lamp of each radiance file of flats."""
+        return lamps_of(self.recordings, self.recordings.captures(FlatCapture, self.side))
 
     def flat_levels(self) -> list[list[Any]]:
         """Flat captures by what sets their level: exposure, lamp, gain, number of photons."""
@@ -271,3 +243,63 @@ def mean_frame(recordings: RecordingSet, captures: Sequence[Capture]) -> FloatAr
     for capture in captures[1:]:
         total += recordings.frame(capture)
     return total / len(captures)
+
+
+def clipping_level_dn(study: Study) -> float:
+    """Code (DN) from which on a pixel counts as clipped: the converter's highest, or less where the full well is
+    reached before it.
+
+    Pixels at full well have no shot noise. A plane is taken to be there where its 97, 99 and 99.9 % quantiles lie
+    closer together than a third of their distance by shot noise.
+    """
+    white = study.camera.white_level_dn
+    gain = study.stated.conversion_gain_dn_per_e
+    black = study.stated.black_level_dn or 0.0
+    piles = []
+    for kind in ("flat", "narrowband", "white"):
+        for capture in study.recordings.captures(kind, study.side):
+            frame = study.recordings.frame(capture)
+            for channel in study.channels:
+                row, col = mosaic.phases(study.camera.cfa)[channel][0]
+                step = mosaic.step(study.camera.cfa)
+                values = np.asarray(frame[row::step, col::step])
+                if values.max() < 0.25 * white:
+                    continue
+                middle, high, top = np.quantile(values, [0.97, 0.99, 0.999])
+                if gain is None:
+                    # a tenth of the shot noise for a full well of 1e5 e: less than any unclipped plane has
+                    least = 0.1 * np.sqrt(max(top - black, 1.0) * white / 1e5)
+                else:
+                    least = np.sqrt(gain * max(top - black, 1.0)) / 3.0
+                if (
+                    top - high < 0.76 * least and high - middle < 0.45 * least
+                ):  # quantiles of a normal distribution, in standard deviations
+                    piles.append((float(top), float(top - middle)))
+    below = [(top, width) for top, width in piles if top < white - 1.0]
+    if not below:
+        return white
+    top = float(np.median([t for t, _ in below]))
+    # a margin below the full well for the noise of its pixels
+    return min(white, top - 3.0 * max(float(np.median([w for _, w in below])), 2.0))
+
+
+def held_out_of(group: Sequence[Capture], index: int, groups: int) -> set[str]:
+    """Ids of the held-out captures of a group of repeats: the last third, at least one. Of groups without repeats,
+    every third is held out, where there are three or more (`groups`: their number, `index`: this one's)."""
+    if len(group) > 1:
+        return {c.id for c in group[len(group) - max(len(group) // 3, 1) :]}
+    return {group[0].id} if groups >= 3 and index % 3 == 1 else set()
+
+
+def held_out_flats(study: Study) -> frozenset[str]:
+    """Ids of held-out flats: the last third of a level's repeats where it has six or more, as temporal noise needs
+    pairs. Of other levels, every third from the darkest on, never the brightest."""
+    groups = study.flat_levels()
+    size = {id(g): float(np.mean(list(study.levels(g[0]).whole.values()))) for g in groups}
+    out: set[str] = set()
+    for rank, group in enumerate(sorted(groups, key=lambda g: size[id(g)])):
+        if len(group) >= 6:
+            out |= {c.id for c in group[len(group) - len(group) // 3 :]}
+        elif rank % 3 == 1 and rank < len(groups) - 1:
+            out |= {c.id for c in group}
+    return frozenset(out)

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lab.diagnose.measurements.line_spectra import Image
 from sim.sensor.lines import Lines
 
+Image = NDArray[np.float32]
+
 if TYPE_CHECKING:
-    from lab.diagnose.measurements.study import Study
+    from lab.measure.study import Study
 
 CLIP = 4.5  # standard deviations at which pixels are clipped in robust statistics
 MEDIAN_OF = 5  # most frames whose median shows defective pixels

@@ -3,15 +3,20 @@ quantities."""
 
 from __future__ import annotations
 
-from lab.diagnose.measurements.block import Effects
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 from sim.effects.library import list_changes
 
 #: Image lag.
 LAG = frozenset({"charge.lag"})
 DARK_CURRENT = frozenset({"charge.dark_current"})
+#: Light that pixels of a colour collect unlike others.
+COLLECTED = frozenset({"charge.collected"})
 #: What read-out adds to the pixels, lit or dark.
 ADDED = frozenset({"signal.disturbances"})
+#: Light that is collected beside the exposure.
+LEAK = frozenset({"charge.leak_s"})
+#: Factors on what is read, by place.
+GAINS = frozenset({"signal.gains"})
 #: Row and column noise.
 LINES = frozenset({"signal.lines"})
 #: The light of a screen for the picture that it is given.

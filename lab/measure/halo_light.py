@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lab.diagnose.measurements.block import Effects
 from sim.camera import CameraModel
+from sim.effects.base import Effects
 from sim.point import halos
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray

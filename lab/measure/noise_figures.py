@@ -12,22 +12,23 @@ from scipy import ndimage
 
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.flat import FlatCapture
-from lab.diagnose.measurements.pixel_outliers import sound_pixels
-from lab.diagnose.measurements.repeatability import (
+from lab.formats.results import NoiseFit
+from lab.measure.pixel_outliers import sound_pixels
+from lab.measure.plane_means import channel_pixels
+from lab.measure.repeatability import (
     LAMP_FLOOR,
     RepeatedMeans,
     level_repeatability,
     repeated_levels,
     steady,
 )
-from lab.formats.results import NoiseFit
 from lab.measure.rounding import variance_before_rounding
 from lab.measure.stated_light import most_frequent_gain_db
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 if TYPE_CHECKING:
-    from lab.diagnose.measurements.study import Study
+    from lab.measure.study import Study
 
 STATED_BLACK_SHARE, STATED_BLACK_DN = 0.03, 2.0  # standard deviation of a stated black level, relative and absolute
 BLACK_FLOOR_DN = 0.01  # standard deviation of a frame's mean beside noise
@@ -44,7 +45,7 @@ ALIKE_C = 2.0  # dark captures whose temperatures differ by less than this from 
 
 
 @dataclass(frozen=True)
-class NoiseGuess:
+class NoiseFigures:
     """First estimates, good to a few per cent. Predictions are linear in the nuisance parameters about these."""
 
     black: float  # DN
@@ -68,7 +69,7 @@ class NoiseGuess:
         )
 
 
-def noise_guess(study: Study) -> NoiseGuess:
+def noise_figures(study: Study) -> NoiseFigures:
     """Return the noise fit's gain, black level, dark current and PRNU where there is a fit; else first estimates from
     dark and flat captures. The read noise is that of the dark frames as recorded, rounding included. What these don't
     determine is taken from the data sheet, else a usual value.
@@ -94,7 +95,7 @@ def noise_guess(study: Study) -> NoiseGuess:
     return replace(first, gain=gain, gain_is_known=True, prnu=prnu, jitter_lamp=max(lamp, LAMP_FLOOR))
 
 
-def _as_fitted(study: Study, first: NoiseGuess, fitted: NoiseFit, gain_at_0_db: float) -> NoiseGuess:
+def _as_fitted(study: Study, first: NoiseFigures, fitted: NoiseFit, gain_at_0_db: float) -> NoiseFigures:
     """Return the noise fit's figures in the place of first estimates. The fit states its gain for 0 dB, and its read
     noise without
     rounding: that of the dark frames stays."""
@@ -115,7 +116,7 @@ def _as_fitted(study: Study, first: NoiseGuess, fitted: NoiseFit, gain_at_0_db: 
     )
 
 
-def _as_stated(study: Study) -> NoiseGuess:
+def _as_stated(study: Study) -> NoiseFigures:
     """Return what the data sheet states, with usual values in the place of what it doesn't."""
     stated = study.stated
     black, black_std = 0.0, 0.05 * study.camera.white_level_dn
@@ -124,7 +125,7 @@ def _as_stated(study: Study) -> NoiseGuess:
         black_std = max(STATED_BLACK_DN, STATED_BLACK_SHARE * black)
     # without dark frames: a dark current as stated, or of some tens of electrons
     expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
-    return NoiseGuess(
+    return NoiseFigures(
         black=black, dark_dn_per_s=0.0, dark_c=study.temperature_c, gain=1.0, gain_is_known=False, read_dn=1.0,
         prnu=USUAL_PRNU,
         jitter_dn=BLACK_FLOOR_DN, jitter_freedom=0.0, jitter_lamp=USUAL_LAMP, black_std=black_std,
@@ -132,7 +133,7 @@ def _as_stated(study: Study) -> NoiseGuess:
     )  # fmt: skip
 
 
-def _from_darks(study: Study, stated: NoiseGuess) -> NoiseGuess:
+def _from_darks(study: Study, stated: NoiseFigures) -> NoiseFigures:
     """Return black level, dark current, read noise and repeatability by the dark captures; as stated where there are
     none.
 
@@ -201,7 +202,7 @@ def _transfer_points(study: Study, black: float) -> tuple[list[float], list[floa
             total += frame
             even = _even_rows(frame, step)  # without flicker of the light
             for channel, repeats in evened.items():
-                repeats.add(study.pixels_of(even, channel))
+                repeats.add(channel_pixels(even, study.camera.cfa, channel))
         for channel, repeats in evened.items():
             signal.append(float(np.mean([study.levels(c).whole[channel] for c in group])) - black)
             variance.append(repeats.variance_dn2 / (1.0 - step / study.camera.cols))

@@ -1,0 +1,171 @@
+// The drift board: figures by calibrations, coloured by limits and drift; a row's name opens its history.
+
+import { number, svg, ticks } from "./charts.js";
+import { isLike, measured, unitText } from "./figures.js";
+import { $, addView, ask, element, options, query, show, time, told } from "./page.js";
+
+const HEIGHT = 240;
+const LEFT = 76;
+const RIGHT = 14;
+const TOP = 12;
+const BOTTOM = 34;
+const form = $("drift-form").elements;
+
+let board = null;
+let asked = ""; // camera and reference temperature of the board
+let figure = ""; // key of the row whose history stands there
+
+const keyOf = (one) => JSON.stringify([one.figure, one.place]);
+const titleOf = (one) => one.title || [one.figure, one.place].filter(Boolean).join(" ");
+const cameraName = (name) => (name.startsWith("{") ? "the pair" : name);
+const needsLook = (row) => row.cells.some((cell) => cell && (cell.drifted || ["warn", "bad"].includes(cell.mark)));
+
+// --- the board ------------------------------------------------------------------------------------------------------
+
+function cell(one, column, row) {
+  if (!one) return element("td", { className: "cell none", textContent: "–" });
+  const state = [one.mark ?? "", one.drifted ? "drifted" : ""].join(" ");
+  const made = element("td", { className: `cell ${state}`, textContent: `${one.drifted ? "◆ " : ""}${number(one.value, 4)}` });
+  const words = [one.mark, one.drifted ? `drifted, ${number(one.significance_sigma, 3)} σ` : "", one.corrected ? `at ${number(row.reference_c, 3)} °C` : ""];
+  made.title = `${column.name}, ${time(column.created)}: ${measured(one.value, one.std)}${unitText(row.unit)}${words.filter(Boolean).map((word) => `, ${word}`).join("")}`;
+  return made;
+}
+
+function rowOf(row) {
+  const link = element("button", { className: "quiet", textContent: titleOf(row), title: `${row.figure} ${row.place}`.trim() });
+  link.addEventListener("click", told("drift-problem", () => openHistory(row)));
+  const name = element("th", { scope: "row" }, link);
+  name.append(element("span", { className: "hint", textContent: `${row.unit === "1" ? "" : ` ${row.unit}`}${row.reference_c == null ? "" : ` at ${number(row.reference_c, 3)} °C`}` }));
+  return element("tr", {}, name, ...row.cells.map((one, at) => cell(one, board.columns[at], row)));
+}
+
+function draw() {
+  const found = board.rows.filter((row) => isLike(row, form.search.value) && (!form.attention.checked || needsLook(row)));
+  const days = board.columns.map((one) => one.created.slice(0, 10));
+  const head = board.columns.map((one) => {
+    const day = one.created.slice(0, 10);
+    const alone = days.indexOf(day) === days.lastIndexOf(day);
+    const link = element("a", { href: `#/calibrations/${one.calibration_id}`, textContent: alone ? day.slice(2) : `${day.slice(5)} ${one.created.slice(11, 16)}`, title: `${one.name}, ${time(one.created)}, ${one.state}` });
+    link.setAttribute("aria-label", `${one.name}, ${time(one.created)}, ${one.state}`);
+    const column = element("th", { scope: "col", className: one.state }, link);
+    if (one.state === "certified") column.append(" ✓");
+    return column;
+  });
+  $("drift-head").replaceChildren(element("tr", {}, element("th", { scope: "col", textContent: "Figure" }), ...head));
+  delete $("drift-rows").dataset.shown;
+  show("drift-rows", found, rowOf);
+  const look = board.rows.filter(needsLook).length;
+  const law = board.rows.find((row) => row.law);
+  const words = [`${found.length} of ${board.rows.length} figures, ${board.columns.length} calibrations, the oldest first`, `${look || "none"} out of limits or drifted`];
+  if (law) words.push(`dark currents at ${number(law.reference_c, 3)} °C: ${law.law}`);
+  $("drift-told").textContent = words.join("; ");
+}
+
+async function showBoard(anew) {
+  const camera = form.camera.value;
+  const wanted = new URLSearchParams({ camera });
+  if (form.reference_c.value !== "") wanted.set("reference_c", form.reference_c.value);
+  if (!anew && asked === wanted.toString()) return;
+  const found = await ask(`/drift?${wanted}`);
+  if (camera !== form.camera.value) return;
+  board = found;
+  asked = wanted.toString();
+  draw();
+}
+
+// --- a figure's history ---------------------------------------------------------------------------------------------
+
+async function openHistory(row) {
+  figure = keyOf(row);
+  const parts = { camera: form.camera.value, figure: row.figure, place: row.place };
+  const history = await ask(`/history?${new URLSearchParams(parts)}`);
+  $("history-part").hidden = false; // it is as wide as the view then
+  drawHistory(history);
+  $("history-title").focus();
+  $("history-part").scrollIntoView({ block: "nearest" });
+}
+
+const rangeOf = (from, to) => (to > from ? [from, to] : [from - 1, to + 1]);
+
+function drawHistory(history) {
+  const width = Math.min(Math.max($("history").clientWidth || 720, 320), 720); // a phone's letters are as large as a desktop's
+  const points = history.points;
+  const ends = points.flatMap((p) => [p.value - 2 * p.std, p.value + 2 * p.std]);
+  const bands = history.limit ? [history.limit.good, history.limit.warn ?? history.limit.good] : [];
+  const [least, most] = rangeOf(Math.min(...ends), Math.max(...ends));
+  const spread = most - least;
+  // The ends of the bands are shown where that leaves the points half of the height.
+  const near = bands.flat().filter((end) => end != null && end > least - spread && end < most + spread);
+  const [bottom, top] = rangeOf(Math.min(least, ...near) - 0.08 * spread, Math.max(most, ...near) + 0.08 * spread);
+  const x = (at) => LEFT + ((width - LEFT - RIGHT) * (at + 0.5)) / points.length;
+  const y = (value) => TOP + ((HEIGHT - TOP - BOTTOM) * (top - Math.min(Math.max(value, bottom), top))) / (top - bottom);
+  const band = ([low, high], name) =>
+    svg("rect", { class: `band ${name}`, x: LEFT, width: width - LEFT - RIGHT, y: y(high ?? top), height: y(low ?? bottom) - y(high ?? top) });
+  const newest = points.at(-1);
+  const drifted = points.filter((p) => p.drifted).length;
+  const title = titleOf(history);
+  const valueText = (p) => `${measured(p.value, p.std)}${unitText(history.unit)}${p.temperature_c == null ? "" : ` at ${number(p.temperature_c, 3)} °C`}`;
+  const summary = `${title} of ${cameraName(history.camera)}: ${points.length} calibrations, the newest ${valueText(newest)}${newest.mark ? `, ${newest.mark}` : ""}, ${drifted || "none"} drifted`;
+  const picture = svg("svg", { viewBox: `0 0 ${width} ${HEIGHT}`, role: "img", "aria-label": summary });
+  if (bands.length) picture.append(band(bands[1], "warn"), band(bands[0], "good"));
+  for (const value of ticks(bottom, top)) {
+    picture.append(svg("line", { class: "grid", x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value) }));
+    picture.append(svg("text", { x: LEFT - 8, y: y(value) + 4, "text-anchor": "end" }, number(value)));
+  }
+  const every = Math.ceil(points.length / Math.max(2, Math.floor((width - LEFT - RIGHT) / 84)));
+  points.forEach((p, at) => {
+    const mark = svg("g", { class: `point ${p.mark ?? ""} ${p.state}` }, svg("title", {}, `${time(p.created)}: ${valueText(p)}`));
+    mark.append(svg("line", { x1: x(at), x2: x(at), y1: y(p.value - 2 * p.std), y2: y(p.value + 2 * p.std) }));
+    // A drift has another shape, not only another colour.
+    const [cx, cy] = [x(at), y(p.value)];
+    mark.append(p.drifted ? svg("path", { d: `M${cx - 7} ${cy}L${cx} ${cy - 7}L${cx + 7} ${cy}L${cx} ${cy + 7}Z` }) : svg("circle", { cx, cy, r: 4.5 }));
+    if (p.state === "certified") mark.append(svg("circle", { class: "ring", cx, cy, r: 9 }));
+    picture.append(mark);
+    if (at % every === 0) picture.append(svg("text", { x: cx, y: HEIGHT - 12, "text-anchor": "middle" }, p.created.slice(0, 10)));
+  });
+  $("history-title").textContent = `History of ${title}`;
+  $("history").replaceChildren(picture);
+  $("history-words").textContent = summary;
+  $("history-rows").replaceChildren(
+    ...points.toReversed().map((p) =>
+      element(
+        "tr",
+        {},
+        element("td", { textContent: time(p.created) }),
+        element("td", {}, element("a", { href: `#/calibrations/${p.calibration_id}`, textContent: p.state })),
+        element("td", { textContent: valueText(p) }),
+        element("td", { textContent: p.mark ?? "" }),
+        element("td", { textContent: p.drifted ? `drifted, ${number(p.significance_sigma, 3)} sigma` : "" }),
+      ),
+    ),
+  );
+}
+
+// --- the view -------------------------------------------------------------------------------------------------------
+
+for (const name of ["search", "attention"]) form[name].addEventListener("input", () => board && draw());
+for (const name of ["camera", "reference_c"]) {
+  form[name].addEventListener("change", told("drift-problem", async () => {
+    $("history-part").hidden = true;
+    figure = "";
+    await showBoard(true);
+  }));
+}
+$("drift-form").addEventListener("submit", (event) => event.preventDefault());
+
+addView({
+  pattern: /^\/drift$/,
+  section: "view-drift",
+  title: () => "Drift",
+  async show(first) {
+    if (!first) return; // a board changes with a fit, not by itself
+    const named = [...new Set((await ask("/figures")).map((one) => one.camera))];
+    options(form.camera, named, cameraName);
+    if (query().has("camera")) form.camera.value = query().get("camera");
+    const none = named.length === 0;
+    $("no-drift").hidden = !none;
+    for (const id of ["drift-form", "drift-scroll"]) $(id).hidden = none;
+    if (!none) await showBoard(true);
+    if (figure) $("history-part").hidden = false;
+  },
+});

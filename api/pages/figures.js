@@ -1,0 +1,39 @@
+// Figures as rows of a table: plain name, camera, value with its uncertainty and unit, the good band, the mark.
+
+import { $, element } from "./page.js";
+import { number } from "./charts.js";
+
+export const unitText = (unit) => (unit === "1" ? "" : ` ${unit}`);
+export const measured = (value, std) => (value == null ? "" : std ? `${number(value, 6)} ± ${number(std, 2)}` : number(value, 6));
+
+export function bandText([low, high]) {
+  if (low == null) return `≤ ${number(high)}`;
+  return high == null ? `≥ ${number(low)}` : `${number(low)} … ${number(high)}`;
+}
+
+export const mark = (name) => element("span", { className: `mark ${name}`, textContent: name });
+
+export const figureRow = (one) =>
+  element(
+    "tr",
+    {},
+    element("td", { textContent: one.title || one.figure, title: `${one.figure} ${one.place}`.trim() }),
+    element("td", { textContent: one.side ?? "the pair" }),
+    element("td", { className: "value", textContent: `${measured(one.value, one.std)}${unitText(one.unit)}` }),
+    element("td", { textContent: one.good ? bandText(one.good) : "" }),
+    element("td", {}, one.mark ? mark(one.mark) : ""),
+  );
+
+// Whether a figure has every word of a search in its names.
+export function isLike(one, text) {
+  const names = [one.title, one.figure, one.place, one.side, one.unit].join(" ").toLowerCase();
+  return text.toLowerCase().split(/\s+/).every((word) => names.includes(word));
+}
+
+// Draws those of `items()` that the search field of the form `id` asks for, now and whenever it is changed.
+export function searchIn(id, items, draw) {
+  const again = () => draw(items().filter((one) => isLike(one, $(id).elements.search.value)));
+  $(id).addEventListener("input", again);
+  $(id).addEventListener("submit", (event) => event.preventDefault());
+  return again;
+}

@@ -1,0 +1,166 @@
+"""What `calibench import` and `export` do with the formats that other programs exchange (`lab.formats`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.markup import escape
+
+from lab.capture_kinds.base import Names, names_in
+from lab.cli.console import out, warn
+from lab.cli.progress import progress_bar
+from lab.cli.sources import recordings_of, store_to_read
+from lab.errors import InputError
+from lab.pipeline import session_recordings
+
+if TYPE_CHECKING:
+    from lab.formats.cgats import CgatsSpectra
+    from lab.formats.importers.import_options import ImportOptions
+
+#: `import --from` these, and `export --as` these; the last of a camera file.
+SPECTRA, LENSFUN, TILED = "spectra", "lensfun", "tiled"
+OF_A_CAMERA = (LENSFUN, "rawtoaces", "dcp", "icc", "pyxel")
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What is stated of an export for Pyxel: exposure and light (`photons` a pixel in it, None: to half of the full
+    well), and the channel whose quantum efficiency it gets."""
+
+    exposure_s: float = 0.01
+    photons: float | None = None
+    wavelength_nm: float = 550.0
+    channel: str = ""
+
+
+def import_spectra(path: Path, to: Path) -> None:
+    """The spectra of a CGATS file as CSV: one as the file `to`, several as NAME.csv in the folder `to`."""
+    from lab.formats.cgats import read_cgats
+    from lab.formats.raw_file import replacing
+    from lab.formats.spectrum_csv import format_spectrum
+
+    found = read_cgats(path)
+    warn(tuple(f"{path}: {remark}" for remark in found.remarks))
+    files = {to if to.suffix.lower() == ".csv" else to / "1.csv": one for one in found.spectra.values()}
+    if len(found.spectra) > 1:
+        names = {name: "".join(c if c.isalnum() or c in "-_." else "_" for c in name) for name in found.spectra}
+        if len(set(names.values())) < len(names) or to.suffix.lower() == ".csv":
+            raise InputError(f"{to}: {path} holds {len(names)} spectra; give a folder by --out, and other names")
+        files = {to / f"{names[name]}.csv": one for name, one in found.spectra.items()}
+    for file, one in files.items():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as partial:
+            partial.write_text(format_spectrum(one), encoding="utf-8")
+    out.print(escape(f"{to}: {len(files)} spectra, {found.quantity or 'their quantity not stated'}"))
+
+
+def import_lens(path: Path, options: ImportOptions, lens: str, to: Path) -> None:
+    """A lens of lensfun's before the camera of a camera file, as another camera file."""
+    from lab.formats.camera_file import read_camera, write_camera
+    from lab.formats.lensfun import read_lensfun, with_lens
+
+    if [name for name in options.stated() if name != "--camera"] or options.camera is None:
+        raise InputError(f"--from {LENSFUN} takes --camera FILE, the camera to put the lens before, and --lens alone")
+    content = read_camera(options.camera)
+    found = read_lensfun(path, content.camera.lens.focal_length_mm, content.camera.lens.f_number, lens)
+    try:
+        made, remarks = with_lens(content, found)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    warn(tuple(f"{path}: {remark}" for remark in remarks))
+    write_camera(to, made)
+    had = [name for name in ("distortion", "vignetting", "tca") if getattr(found, name) is not None]
+    out.print(escape(f"{to}: {found.model} at {found.focal_length_mm:g} mm: {', '.join(had)}"))
+
+
+def export_spectra(source: str, to: Path, quantity: str, data: Path | None) -> None:
+    """A spectrum's CSV, or all radiances of a recording set or session, as .sp or .ti3."""
+    from lab.formats.cgats import write_cgats
+
+    if to.suffix.lower() not in (".sp", ".ti3"):
+        raise InputError(f"--to {to}: name a file that ends in .sp or .ti3")
+    warn(tuple(f"{to}: {remark}" for remark in write_cgats(to, _spectra(source, quantity, data))))
+    out.print(escape(str(to)))
+
+
+def _spectra(source: str, quantity: str, data: Path | None) -> CgatsSpectra:
+    from lab.formats.cgats import CgatsSpectra, Quantity, get_quantity
+    from lab.formats.spectrum_csv import parse_spectrum
+
+    stated: Quantity = get_quantity(quantity)
+    if not Path(source).is_file():
+        recordings = recordings_of(source, data)
+        paths = [
+            path for capture in recordings.captures() for _, what, path in names_in(capture) if what is Names.SPECTRUM
+        ]
+        if not paths:
+            raise InputError(f"{source}: has no radiance that was measured; give a set that has")
+        return CgatsSpectra({Path(p).stem: recordings.spectrum(p) for p in dict.fromkeys(paths)}, "radiance")
+    try:
+        return CgatsSpectra({Path(source).stem: parse_spectrum(Path(source).read_text(encoding="utf-8"))}, stated)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{source}: can't be read as text; give a CSV in UTF-8") from error
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
+
+
+def export_camera(kind: str, source: str, to: Path, options: ExportOptions) -> None:
+    """A camera file as one of `OF_A_CAMERA`."""
+    from lab.formats.camera_file import read_camera
+    from lab.formats.colour_profile import write_dcp, write_icc, write_rawtoaces
+    from lab.formats.lensfun import write_lensfun
+    from lab.formats.pyxel_file import write_pyxel
+
+    if not source.endswith(".toml"):
+        raise InputError(f"{source}: --as {kind} is of a camera file; `calibench fit --write-cameras` writes one")
+    content = read_camera(Path(source))
+    if kind == "pyxel":
+        at = content.camera.quantum_efficiency
+        efficiency = max((float(curve.at(options.wavelength_nm)) for curve in at.values()), default=0.0)
+        if options.photons is None and not efficiency > 0:
+            raise InputError(f"--wavelength-nm {options.wavelength_nm:g}: no light is seen there; state --photons")
+        photons = options.photons or 0.5 * content.camera.full_well_e / efficiency
+        remarks = write_pyxel(
+            to,
+            content,
+            exposure_s=options.exposure_s,
+            photons_per_pixel=photons,
+            wavelength_nm=options.wavelength_nm,
+            channel=options.channel,
+        )
+    else:
+        writer = {LENSFUN: write_lensfun, "rawtoaces": write_rawtoaces, "dcp": write_dcp, "icc": write_icc}[kind]
+        remarks = writer(to, content)
+    warn(tuple(f"{to}: {remark}" for remark in remarks))
+    out.print(escape(str(to)))
+
+
+def export_tiled(session: str, to: str, data: Path | None) -> None:
+    """A stored session into a Tiled catalogue: a server's address, or a folder."""
+    from lab.capture.tiled_catalogue import open_catalogue, write_session
+
+    store = store_to_read(data)
+    recordings = session_recordings(store, session)
+    warn(recordings.warnings)
+    catalogue = open_catalogue(to)
+    with progress_bar("export") as advance:
+        key = write_session(catalogue, recordings, store.folder(session) / "documents.jsonl", advance)
+    out.print(escape(f"{to}: {key}, {len(recordings.manifest.captures)} captures"))
+
+
+def import_tiled(path: Path, to: Path) -> None:
+    """A session of a Tiled catalogue, CATALOGUE/SESSION, as a recording set."""
+    from lab.capture.tiled_catalogue import open_catalogue, read_session
+    from lab.formats import recording_set
+
+    where = str(path.parent)
+    server = where.startswith(("http:", "https:"))  # of whose address a path keeps one slash
+    if not server and not path.parent.is_dir():
+        raise InputError(f"{path}: no such catalogue; give FOLDER/SESSION, or the server's address with /SESSION")
+    recordings = read_session(open_catalogue(where.replace(":/", "://", 1) if server else where), path.name)
+    warn(recordings.warnings)
+    with progress_bar("import") as advance:
+        folder = recording_set.write(recordings, to, progress=advance)
+    out.print(escape(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}"))

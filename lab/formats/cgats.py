@@ -1,0 +1,238 @@
+"""Spectra in CGATS text, as ArgyllCMS and makers' programs exchange them: `.sp` (one or several spectra) and `.ti3`.
+
+CGATS.17 is a header of keywords, a list of fields, and rows of data. Argyll's keywords `SPECTRAL_START_NM`,
+`SPECTRAL_END_NM` and `SPECTRAL_BANDS` give evenly spaced wavelengths, `SPECTRAL_NORM` the value that stands for 1, and
+`MEAS_TYPE` the quantity. Radiances are in mW sr^-1 m^-2 nm^-1 there, in W sr^-1 m^-2 nm^-1 here.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from lab.errors import InputError, one_line
+from lab.formats.foreign_text import read_foreign_text
+from lab.formats.raw_file import replacing
+from sim.spectrum import Spectrum
+
+Quantity = Literal["radiance", "reflectance", "transmittance", "sensitivity"]
+
+#: Quantity -> Argyll's MEAS_TYPE, the norm that is written, and the factor from a value here to one of that norm 1.
+_WRITTEN: dict[Quantity, tuple[str, float, float]] = {
+    "radiance": ("EMISSION", 1.0, 1e3),
+    "reflectance": ("REFLECTIVE", 100.0, 1.0),
+    "transmittance": ("TRANSMISSIVE", 100.0, 1.0),
+    "sensitivity": ("SENSITIVITY", 1.0, 1.0),
+}
+#: Names of a field that holds a wavelength: Argyll's, and those of makers' programs.
+_FIELD = re.compile(r"(?:SPEC(?:TRAL)?_(?:NM_?)?|NM_?)(\d+(?:\.\d+)?)", re.I)
+#: Most bands that Argyll reads.
+MOST_BANDS = 601
+#: A step between wavelengths may differ from the mean by this share and count as even.
+EVEN = 1e-6
+
+
+@dataclass(frozen=True)
+class CgatsSpectra:
+    """Spectra by their names. `quantity` None: the file doesn't state it; the values are then the file's over its norm.
+
+    Radiances are in W sr^-1 m^-2 nm^-1; reflectances, transmittances and sensitivities have no unit.
+    """
+
+    spectra: Mapping[str, Spectrum]
+    quantity: Quantity | None
+    remarks: tuple[str, ...] = ()
+
+
+def get_quantity(name: str) -> Quantity:
+    """The quantity of that name. Raises InputError for another."""
+    for known in _WRITTEN:
+        if name == known:
+            return known
+    raise InputError(f"--quantity {name}: isn't known; give one of {', '.join(_WRITTEN)}")
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_cgats(file: Path) -> CgatsSpectra:
+    """Read the spectra of a CGATS file's first table.
+
+    Raises InputError, one line that begins with the file, where it isn't CGATS or holds no spectra.
+    """
+    try:
+        text = read_foreign_text(file)
+        found = parse_cgats(text.text)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    return CgatsSpectra(found.spectra, found.quantity, (*text.remarks, *found.remarks))
+
+
+def parse_cgats(text: str) -> CgatsSpectra:
+    """The spectra in CGATS text. Its InputError leaves the path to the caller."""
+    keywords, fields, rows = _table(text)
+    columns = {at: float(match[1]) for at, field in enumerate(fields) if (match := _FIELD.fullmatch(field))}
+    if len(columns) < 2:
+        raise InputError("has no fields SPEC_nnn of two wavelengths or more; give a file with spectral data")
+    wavelength_nm = _wavelengths(keywords, list(columns.values()))
+    norm = _number(keywords.get("SPECTRAL_NORM", "1"), "SPECTRAL_NORM")
+    if not norm > 0:
+        raise InputError(f"SPECTRAL_NORM is {norm:g}, not above the limit of 0; correct it")
+    stated = keywords.get("MEAS_TYPE", "").upper()
+    quantity = next((name for name, (said, _, _) in _WRITTEN.items() if said == stated), None)
+    factor = 1.0 / norm / (_WRITTEN[quantity][2] if quantity else 1.0)
+    remarks = () if quantity else ("MEAS_TYPE isn't stated: values over the norm, their unit unknown",)
+    name_at = next((fields.index(key) for key in ("SAMPLE_ID", "SAMPLE_NAME", "SampleID") if key in fields), None)
+    spectra: dict[str, Spectrum] = {}
+    for number, row in enumerate(rows, start=1):
+        name = str(number) if name_at is None else row[name_at]
+        if name in spectra:
+            raise InputError(f"SAMPLE_ID {name} stands twice; number the samples")
+        values = [_number(row[at], f"row {number}, {fields[at]}") * factor for at in columns]
+        spectra[name] = Spectrum.of(wavelength_nm, values)
+    return CgatsSpectra(spectra, quantity, remarks)
+
+
+def _table(text: str) -> tuple[dict[str, str], list[str], list[list[str]]]:
+    """Keywords, names of the fields, and rows of the first table."""
+    keywords: dict[str, str] = {}
+    fields: list[str] = []
+    data: list[str] = []
+    part = "head"
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = _words(line, number)
+        if not words:
+            continue
+        first = words[0].upper()
+        if first in ("BEGIN_DATA_FORMAT", "BEGIN_DATA"):
+            part, words = first, words[1:]
+        if part == "head" and len(words) > 1:
+            keywords.setdefault(first, words[1])
+        elif first == "END_DATA_FORMAT":
+            part = "head"
+        elif first == "END_DATA":
+            break
+        elif part == "BEGIN_DATA_FORMAT":
+            fields += words
+        elif part == "BEGIN_DATA":
+            data += words
+    else:
+        raise InputError("isn't a whole CGATS file: it has no END_DATA; give one, or copy it again")
+    if not fields or not data or len(data) % len(fields):
+        raise InputError(f"has {len(data)} values for {len(fields)} fields, not whole rows; copy it again")
+    return keywords, fields, [data[at : at + len(fields)] for at in range(0, len(data), len(fields))]
+
+
+def _words(line: str, number: int) -> list[str]:
+    lexer = shlex.shlex(line, posix=True)
+    lexer.whitespace_split, lexer.commenters, lexer.quotes, lexer.escape = True, "#", '"', ""
+    try:
+        return list(lexer)
+    except ValueError as error:
+        raise InputError(f"line {number} isn't CGATS ({one_line(error)}); close its quotes") from error
+
+
+def _wavelengths(keywords: Mapping[str, str], named_nm: list[float]) -> list[float]:
+    """The wavelengths (nm) of the fields: those that Argyll's keywords give, else those in the fields' names."""
+    keys = ("SPECTRAL_START_NM", "SPECTRAL_END_NM", "SPECTRAL_BANDS")
+    if any(key not in keywords for key in keys):
+        exact = named_nm
+    else:
+        start, end, bands = (_number(keywords[key], key) for key in keys)
+        if bands != len(named_nm):
+            raise InputError(f"SPECTRAL_BANDS is {bands:g}, and {len(named_nm)} fields SPEC_nnn are there; correct one")
+        exact = np.linspace(start, end, len(named_nm)).tolist()
+        for name, at in zip(named_nm, exact, strict=True):
+            if abs(name - at) > 1.0:  # the names are rounded to whole nanometres
+                raise InputError(f"the field of {name:g} nm is at {at:g} nm by SPECTRAL_START_NM; correct one")
+    for one, other in pairwise(exact):
+        if not one < other:
+            raise InputError(f"{other:g} nm follows {one:g} nm; let the wavelengths ascend")
+    return exact
+
+
+def _number(text: str, what: str) -> float:
+    try:
+        found = float(text)
+    except ValueError:
+        found = math.nan
+    if not math.isfinite(found):
+        raise InputError(f"{what} is '{text[:40]}', not a number; correct it")
+    return found
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def write_cgats(file: Path, content: CgatsSpectra) -> tuple[str, ...]:
+    """Write spectra as `.ti3` where the name ends so, else as `.sp`. Returns what was changed for the format.
+
+    All spectra get one grid of even steps, the finest of them, as the format has no other. Raises InputError where that
+    has more bands than Argyll reads, or the quantity isn't stated.
+    """
+    if content.quantity is None:
+        raise InputError(f"{file}: the quantity isn't stated; give one of {', '.join(_WRITTEN)}")
+    try:
+        grid_nm, remarks = _grid(content.spectra)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    text = "\n".join(_lines(content.spectra, content.quantity, grid_nm, ti3=file.suffix.lower() == ".ti3")) + "\n"
+    with replacing(file) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return remarks
+
+
+def _grid(spectra: Mapping[str, Spectrum]) -> tuple[list[float], tuple[str, ...]]:
+    """Evenly spaced wavelengths (nm) for all spectra, and what was changed for that."""
+    if not spectra:
+        raise InputError("there is no spectrum to write; give one at least")
+    grids = {one.wavelength_nm for one in spectra.values()}
+    if len(min(grids, key=len)) < 2:
+        raise InputError("a spectrum of one sample has no step; give two or more")
+    step_nm = min(float(np.diff(grid).min()) for grid in grids)
+    first, last = min(grid[0] for grid in grids), max(grid[-1] for grid in grids)
+    steps = max(round((last - first) / step_nm), 1)
+    if steps + 1 > MOST_BANDS:
+        raise InputError(
+            f"{first:g} to {last:g} nm by {step_nm:g} nm are {steps + 1} bands, over the limit of {MOST_BANDS}"
+        )
+    even = [first + k * (last - first) / steps for k in range(steps + 1)]
+    same = len(grids) == 1 and len(even) == len(next(iter(grids)))
+    if same and all(abs(a - b) <= EVEN * step_nm for a, b in zip(even, next(iter(grids)), strict=True)):
+        return list(next(iter(grids))), ()
+    return even, (f"resampled to {steps + 1} even steps of {(last - first) / steps:g} nm, 0 beyond a spectrum's ends",)
+
+
+def _lines(spectra: Mapping[str, Spectrum], quantity: Quantity, grid_nm: list[float], ti3: bool) -> Iterator[str]:
+    said, norm, factor = _WRITTEN[quantity]
+    yield from ("CTI3   " if ti3 else "SPECT  ", "")
+    yield from ('DESCRIPTOR "spectra of calibench"', 'ORIGINATOR "calibench"')
+    if ti3:
+        yield from ('KEYWORD "DEVICE_CLASS"', f'DEVICE_CLASS "{"DISPLAY" if quantity == "radiance" else "OUTPUT"}"')
+        yield from ('KEYWORD "COLOR_REP"', 'COLOR_REP "XYZ"')
+    yield from ('KEYWORD "MEAS_TYPE"', f'MEAS_TYPE "{said}"')
+    for key, value in (
+        ("SPECTRAL_BANDS", str(len(grid_nm))),
+        ("SPECTRAL_START_NM", repr(grid_nm[0])),
+        ("SPECTRAL_END_NM", repr(grid_nm[-1])),
+        ("SPECTRAL_NORM", f"{norm:.6f}"),
+    ):
+        yield from (f'KEYWORD "{key}"', f'{key} "{value}"')
+    fields = [f"SPEC_{int(nm + 0.5):03d}" for nm in grid_nm]
+    named = ti3 or len(spectra) > 1
+    yield from ("", *(f'KEYWORD "{field}"' for field in fields))
+    yield f"NUMBER_OF_FIELDS {len(fields) + named}"
+    yield from ("BEGIN_DATA_FORMAT", " ".join([*(["SAMPLE_ID"] if named else []), *fields]), "END_DATA_FORMAT", "")
+    yield from (f"NUMBER_OF_SETS {len(spectra)}", "BEGIN_DATA")
+    for name, one in spectra.items():
+        quoted = [f'"{" ".join(name.split())}"'.replace("\\", "/")] if named else []
+        yield " ".join([*quoted, *(repr(float(value)) for value in np.asarray(one.at(grid_nm)) * factor * norm)])
+    yield "END_DATA"

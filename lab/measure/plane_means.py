@@ -1,0 +1,50 @@
+"""Means of one frame by channel: what fits and diagnosis take of narrowband light, flats and darks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.camera import Cfa
+from sim.sensor.mosaic import phases, step
+from sim.spectrum import FloatArray
+
+ROUNDING_STD_DN = 0.3  # standard deviation that rounding to whole codes adds to a pixel: 1 / sqrt(12)
+
+
+@dataclass(frozen=True)
+class PlaneMean:
+    """The pixels of one channel in a frame, or in a part of it."""
+
+    mean_dn: float
+    std_dn: float  # between the pixels
+    pixels: int
+    clipped_share: float
+
+    @property
+    def mean_std_dn(self) -> float:
+        """Standard deviation of the mean, with the pixels' own scatter and rounding."""
+        return float(np.hypot(self.std_dn, ROUNDING_STD_DN) / np.sqrt(self.pixels))
+
+
+def channel_pixels(frame: NDArray[Any], cfa: Cfa, channel: str) -> FloatArray:
+    """Return the values (pixels,), DN, of a channel's pixels. `frame` (rows, cols) begins on a whole period of the
+    mosaic."""
+    period = step(cfa)
+    return np.concatenate([np.asarray(frame[r::period, c::period], float).ravel() for r, c in phases(cfa)[channel]])
+
+
+def plane_means(frame: NDArray[Any], cfa: Cfa, saturation_dn: float) -> dict[str, PlaneMean]:
+    """Return the mean of each channel.
+
+    `frame` (rows, cols), DN, begins on a whole period of the mosaic; a pixel of `saturation_dn` or more is clipped.
+    """
+    found = {}
+    for channel in phases(cfa):
+        values = channel_pixels(frame, cfa, channel)
+        clipped = float(np.mean(values >= saturation_dn))
+        found[channel] = PlaneMean(float(values.mean()), float(values.std()), values.size, clipped)
+    return found
