@@ -68,7 +68,7 @@ def draft(
     ],
     law: Annotated[int, typer.Option("--law", metavar="N", help="which of the discovered laws, from 1 on")],
     out_file: Annotated[
-        Path, typer.Option("--out", metavar="FILE.py", help="the effect's file; its name is the effect's")
+        Path, typer.Option("--out", metavar="FILE", help="the effect's file; its name is the effect's")
     ],
     data: StoreFolder = None,
 ) -> None:

@@ -80,6 +80,7 @@ def _law_chart(law: DiscoveredLaw) -> Figure:
         }
     elif law.form == "by index":
         known = half < half.max() * DETERMINED
+        known = known if known.any() else ~known  # all of them are as well known
         x, departure, half = law.first + x[known], departure[known], half[known]
         ends, none = [float(x[0]), float(x[-1])], np.zeros(2)
         data.append(band(ends, none, np.full(2, float(np.median(half))), AFTER))

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.stats import norm
 
 from lab.capture_kinds.base import Capture
-from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.block import Label
 from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER

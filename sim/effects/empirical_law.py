@@ -205,9 +205,6 @@ class EmpiricalLaw(Effect):
         return light.add_laws(level=lambda elapsed_s: 1.0 + float(self._at(np.asarray(elapsed_s))))
 
     def on_image(self, image: Image) -> Image:
-        if self._acts("charge") and self.at and self.along in {"row", "column"}:
-            # what isn't periodic acts by place: small tiles don't tell where in the frame they are
-            return image.add_laws(shading=lambda x_um, y_um: 1.0 + self._at(self._share(x_um, y_um, image.camera)))
         if not self._acts("image"):
             return image
         if self.along == "radius":
@@ -215,11 +212,6 @@ class EmpiricalLaw(Effect):
         if self.along == "wavelength":
             return image.add_laws(transmittance=lambda wavelength_nm, sine: 1.0 + self._at(wavelength_nm))
         return image.add_laws(transfer=lambda fx, fy, wavelength_nm: 1.0 + self._at(np.hypot(fx, fy)))
-
-    def _share(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
-        """Return the share of the rows or columns at places on the sensor."""
-        place, count = (y_um, camera.rows) if self.along == "row" else (x_um, camera.cols)
-        return np.asarray(0.5 + place / (camera.pixel_pitch_um * count))
 
     def on_charge(self, charge: Charge) -> Charge:
         if not self._acts("charge"):
@@ -233,6 +225,16 @@ class EmpiricalLaw(Effect):
         return charge.add_laws(collected=lambda electrons: electrons * self._even(electrons.shape, charge.camera))
 
     def on_signal(self, signal: Signal) -> Signal:
+        if self._acts("charge") and self.at and self.along in {"row", "column"}:
+            # what isn't periodic acts by place: small tiles don't tell where in the frame they are
+            by_row, camera = self.along == "row", signal.camera
+            count = camera.rows if by_row else camera.cols
+            mean = float(np.mean(1.0 + self._by_line(count)))  # of the frame's gain: the camera's own
+
+            def gains(row: FloatArray, col: FloatArray) -> FloatArray:
+                return (1.0 + self._at(((row if by_row else col) + 0.5) / count)) / mean
+
+            return signal.add_laws(gains=gains)
         if not self._acts("signal"):
             return signal
         if self.along == "level":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,13 +16,17 @@ from lab.diagnose.measurements.dark_frames import dark_frames
 from lab.diagnose.measurements.dark_readout import dark_readout
 from lab.diagnose.measurements.even_flats import flats
 from lab.diagnose.measurements.flat_lines import differing_light, without_dark
+from lab.diagnose.measurements.even_flats import FlatLevel, flats
+from lab.diagnose.measurements.flat_lines import without_dark
 from lab.errors import NotDetermined
+from lab.measure.reads import COLLECTED, GAINS, acting
 from lab.measure.study import Study
 from sim.effects.base import Effects
 from sim.effects.empirical_law import Along, Of, Stage
+from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.uniform import Uniform
+from sim.uniform import SHADING, FieldPoints, Uniform
 
 #: Lines on either side of the running polynomial, in lines of a plane of the mosaic, and its degree.
 REACH, DEGREE = 24, 2
@@ -78,20 +82,36 @@ def _code_profile(codes: CodeCounts, effects: Effects, study: Study) -> Profile:
 
 
 def _lit_images(study: Study, effects: Effects) -> dict[bool, FloatArray]:
-    """The mean flat, each plane over its mean, less the dark offsets, over what the effects leave of even light: of
-    seen (False) and of held-out captures.
+    """The mean flat, each plane over its mean, less the dark offsets and over the pattern that effects give even light:
+    of seen (False) and of held-out captures.
     """
     try:
         levels, images = study.once(flats)
     except NotDetermined:
         return {}
-    dark, known = study.once(dark_readout), differing_light(study.camera, effects)
+    dark, pattern = study.once(dark_readout), _pattern(study, levels, effects)
     found = {}
     for held_out, (image, _) in images.items():
         part = [u for u in levels if u.held_out == held_out]
         level = image if dark is None else without_dark(study, dark, part, image)[0]
-        found[held_out] = np.asarray(level if known is None else level / known, float)
+        found[held_out] = np.asarray(level / pattern, float)
     return found
+
+
+def _pattern(study: Study, levels: Sequence[FlatLevel], effects: Effects) -> FloatArray | float:
+    """Return what effects make of even light (rows, cols): collected, shaded, amplified by place; 1 where none do."""
+    here = acting(effects, COLLECTED | GAINS | SHADING)
+    if not here:
+        return 1.0
+    camera, model = study.camera, Uniform(study.camera, here)
+    level_e = float(np.mean([np.mean(list(u.mean.values())) for u in levels])) / study.noise.gain
+    even = np.full((camera.rows, camera.cols), level_e)
+    row, col = np.indices(even.shape)
+    points = FieldPoints.at(camera, row.ravel(), col.ravel())
+    pattern = collected_mosaic(camera, even, acting(here, COLLECTED), exposure_s=1.0, elapsed_s=0.0) / level_e
+    pattern = pattern * model.shade_light(np.ones(even.size), points.x_um, points.y_um).reshape(even.shape)
+    gains = model.gain_map()
+    return pattern if gains is None else pattern * gains
 
 
 def _dark_images(study: Study, effects: Effects) -> dict[bool, FloatArray]:

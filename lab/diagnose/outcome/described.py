@@ -31,8 +31,9 @@ DESCRIBED_SHARE = 0.5
 def described(verdict: Verdict, found: Sequence[PredictiveTable], laws: Sequence[EmpiricalLaw]) -> dict[int, str]:
     """Return the indices of the blocks that laws describe, and which do, in words.
 
-    A law describes a mismatch where it takes `DESCRIBED_SHARE` of the excess off its chi2. Steps between the lines of
-    flats are predicted by no effect: there the index tells.
+    A law describes a mismatch where it takes `DESCRIBED_SHARE` of the excess off its chi2, and where a smooth
+    discrepancy doesn't predict the captures held out better. Steps between the lines of flats are predicted by no
+    effect: there the index tells.
     """
     model, words = verdict.model, {}
     if not found:
@@ -44,9 +45,20 @@ def described(verdict: Verdict, found: Sequence[PredictiveTable], laws: Sequence
         told = ", ".join(dict.fromkeys(f"the law of the {place_in_words(one.look)}" for one in mine))
         before, after = (_chi2(one, model.value, at) for one in (without, beside))
         is_felt = any(block.reads & list_changes(law) for law in laws)
-        if mine and (not is_felt or before - after >= DESCRIBED_SHARE * (before - len(block.value))):
+        takes_off = before - after >= DESCRIBED_SHARE * (before - len(block.value))
+        if mine and (not is_felt or (takes_off and not _is_smoother(verdict, laws, index))):
             words[index] = told
     return words
+
+
+def _is_smoother(verdict: Verdict, laws: Sequence[EmpiricalLaw], index: int) -> bool:
+    """Whether a block's smooth discrepancy predicts its held-out numbers, beyond their noise, better than laws do."""
+    if index not in verdict.kernels:
+        return False
+    model, where = verdict.model, verdict.model.mask(index)
+    smooth, n = model.held_out(verdict.effects, where, verdict.kernels)
+    others = {k: kernel for k, kernel in verdict.kernels.items() if k != index}
+    return n > 0 and model.held_out((*verdict.effects, *laws), where, others)[0] > max(smooth, 2.0 * n)
 
 
 def _chi2(gaussian: Gaussian, value: FloatArray, at: slice) -> float:

@@ -236,6 +236,50 @@ def test_a_law_without_a_name_is_told_and_drawn(small_set: Callable[..., Recordi
     assert figure["layout"]["xaxis"]["title"]["text"] == "code mod 2"
 
 
+def _law(departure: list[float], **fields: Any) -> DiscoveredLaw:
+    return DiscoveredLaw(
+        side="left", period=fields.pop("period", 0), table=tuple(1.0 + d for d in departure),
+        shown_period=fields.pop("shown_period", 0), shown_departure=tuple(departure),
+        shown_std=(0.01,) * len(departure), chi2_before=900.0, chi2_after=120.0, n=100, suspects="a lamp",
+        statement="It steps.", **fields,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("law", "x", "y", "title"),
+    [
+        (
+            _law([0.0, 0.02, 0.02], stage="light", along="time", form="step", at=(10.0, 40.0, 90.0)),
+            [10.0, 40.0, 90.0], [0.0, 2.0, 2.0], "time, s after the first capture",
+        ),
+        (
+            _law([-0.01, -0.01, 0.01, 0.01], stage="charge", along="column", form="step", at=(0.375, 0.625)),
+            [0.0, 1.0, 2.0, 3.0], [-1.0, -1.0, 1.0, 1.0], "column",
+        ),
+        (
+            _law([0.1, -0.1], stage="codes", along="code", form="by index", first=500),
+            [500.0, 501.0], [10.0, -10.0], "code",
+        ),
+    ],
+)  # fmt: skip
+def test_curves_steps_and_codes_are_drawn_along_their_index(
+    law: DiscoveredLaw, x: list[float], y: list[float], title: str, made_up: MadeUp
+) -> None:
+    changed = made_up()[2].model_copy(update={"discovered": (law,)})
+    ((_, figure),) = context(changed, ("left",))["discovered"]
+    points = figure["data"][-1]
+    assert (points["x"], points["y"]) == (pytest.approx(x), pytest.approx(y))
+    assert figure["layout"]["xaxis"]["title"]["text"] == title
+
+
+def test_a_table_by_row_and_column_is_a_map(made_up: MadeUp) -> None:
+    law = _law([0.01, -0.01, 0.02, -0.02], stage="charge", along="row and column", period=2, columns=2, shown_period=4)
+    changed = made_up()[2].model_copy(update={"discovered": (law,)})
+    ((_, figure),) = context(changed, ("left",))["discovered"]
+    (cells,) = figure["data"]
+    assert np.array(cells["z"]) == pytest.approx(np.array([[1.0, -1.0], [2.0, -2.0]]))
+
+
 def test_each_capture_that_settled_a_tie_is_told_with_what_stood_before_it(
     small_set: Callable[..., RecordingSet], made_up: MadeUp
 ) -> None:

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from sim.camera import CameraModel, Geometry, Lens
 from sim.effects.base import STAGES, Effect
-from sim.effects.library import effect, effects, may_change
+from sim.effects.library import effect, effects, list_changes, may_change
 from sim.frame import (
     Exposure,
     collected_mosaic,
@@ -183,7 +183,9 @@ def test_a_blur_conserves_light(one: Effect) -> None:
 
 
 def _acting(field: str) -> list[Effect]:
-    return [group[0] for kind in ALL if field in may_change(kind) for group in kind.prototypes(CAMERA)[:1]]
+    """Of every effect that may change a field, the first prototype that does."""
+    every = ([one for group in kind.prototypes(CAMERA) for one in group] for kind in ALL if field in may_change(kind))
+    return [next(one for one in prototypes if field in list_changes(one)) for prototypes in every]
 
 
 @pytest.mark.parametrize("one", _acting("charge.collected"), ids=lambda e: e.name)
