@@ -99,11 +99,11 @@ class DeviceChecks:
                     self._latest[name, device] = self._kept(name, device)
                     continue
                 checked = Checked(self._test(name, station, device, keep_transcript), now())
-                self._latest[name, device] = checked
                 try:
                     write_durably(self._folder / name / f"{device}.json", _CHECKED.dump_json(checked))
                 except (OSError, InputError) as error:
                     log.warning("check of %s, %s: isn't kept: %s", name, device, error)
+                self._latest[name, device] = checked
         finally:
             let_go()
 

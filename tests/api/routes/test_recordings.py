@@ -529,3 +529,31 @@ def test_an_upload_is_carried_out_once(running: Running, folder: Path) -> None:
         assert send(client, b"no archive", ZIP | {"Idempotency-Key": "twice"}).status_code == 422
         assert send(client, packed(folder), ZIP | {"Idempotency-Key": "twice"}).status_code == 201
     assert len(kept(running)) == 2
+
+
+def test_the_captures_of_a_set_are_looked_at(running: Running, folder: Path, little_set: RecordingSet) -> None:
+    """Numbered from 1 in the manifest's order; each frame is the one that was sent."""
+    with running.client("calibrate") as client:
+        here = send(client, packed(folder)).headers["location"]
+        detail = client.get(here).json()
+        assert detail["counts"] == [{"kind": "dark", "side": "left", "captures": 2}] and detail["results"] == {}
+        captures = client.get(f"{here}/captures").json()
+        assert [(one["id"], one["name"], one["exposure_s"]) for one in captures] == [(1, "d0", 0.1), (2, "d1", 0.1)]
+        newest = client.get(f"{here}/captures", params={"order": "newest", "limit": 1})
+        assert [one["id"] for one in newest.json()] == [2] and newest.headers["x-total-count"] == "2"
+        assert [one["id"] for one in client.get(f"{here}/captures?order=newest&after=2").json()] == [1]
+        assert client.get(f"{here}/captures?side=right").json() == []
+        for number, capture in enumerate(little_set.captures(), start=1):
+            sent = np.load(io.BytesIO(client.get(f"{here}/captures/{number}/frame.npy").content))
+            assert np.array_equal(sent, little_set.frame(capture))
+        (channel,) = client.get(f"{here}/captures/2/figures").json()["channels"]
+        assert channel["mean_dn"] == pytest.approx(little_set.frame(little_set.captures()[1]).mean())
+        assert client.get(f"{here}/captures/1/preview.webp").content[8:12] == b"WEBP"
+        assert client.get(f"{here}/captures/3").status_code == 404
+        job = client.post(f"{here}/jobs", json={"kind": "fit"}).json()
+        id = here.rpartition("/")[2]
+        assert [one["id"] for one in client.get("/api/v1/jobs", params={"recordings_id": id}).json()] == [job["id"]]
+        assert client.get("/api/v1/jobs", params={"session_id": "nothing"}).json() == []
+        assert client.get("/api/v1/jobs", params={"session_id": "x", "recordings_id": id}).status_code == 422
+        assert client.get(f"{here}/figures").status_code == 409
+        until(client, f"/api/v1/jobs/{job['id']}", lambda one: one["state"] in ("done", "failed"), 60.0)

@@ -17,6 +17,7 @@ from api.client import ServiceClient
 from drivers.errors import Disconnected
 from lab.capture.tables import IdempotentRow
 from tests.api.conftest import Running, events, serving, until, until_state
+from tests.lab.calibration.test_life import fitted
 from tests.lab.fake_bench import BLACK, COLS, ROWS
 
 DARKS = {"station": "fakes", "name": "darks", "quick": True, "sequences": ["dark"]}
@@ -341,3 +342,38 @@ def test_figures_and_curves_of_what_was_captured(shared: Running) -> None:
         with ServiceClient(shared.url, shared.keys["read"]) as typed:
             assert typed.curves(only_session(shared)).looked_at == looked["looked_at"]
         assert client.get("/api/v1/sessions/none/curves").status_code == 404
+
+
+def test_sessions_are_searched_and_described(running: Running) -> None:
+    """A list tells what was calibrated; a search finds notes, tags, and what the instruments reported."""
+    with running.client("operate") as client:
+        asked = {"station": "fakes", "quick": True, "sequences": ["dark"], "notes": "before #lens-a"}
+        one, other = (
+            client.post("/api/v1/sessions", json=asked | {"name": name, "queue": name == "b"}) for name in "ab"
+        )
+        ids = [one.json()["id"], other.json()["id"]]
+        for id in ids:
+            until_state(client, id, "finished")
+        fit = running.store.add_result("fit", ids[0], fitted(2.0).model_dump(mode="json"))
+        running.store.add_result("diagnose", ids[0], {"verdict": "unexplained"})
+        changed = client.patch(f"/api/v1/sessions/{ids[1]}", json={"notes": "after #lens-b"})
+        assert (
+            changed.status_code == 200 and changed.json()["notes"] == "after #lens-b" and changed.json()["name"] == "b"
+        )
+
+        def found(**query: str) -> list[str]:
+            answer = client.get("/api/v1/sessions", params=query)
+            assert int(answer.headers["x-total-count"]) == len(answer.json())
+            return [session["id"] for session in answer.json()]
+
+        assert found() == found(search="SN-1 bench") == ids[::-1]
+        assert found(search="#lens-b") == [ids[1]] and found(verdict="unexplained") == [ids[0]]
+        assert found(search="#lens-b", verdict="unexplained") == []
+        listed = {session["id"]: session for session in client.get("/api/v1/sessions").json()}
+        assert listed[ids[0]]["calibration_id"] == fit and listed[ids[0]]["mtf50_cy_per_px"] == {"left": 0.25}
+        assert listed[ids[1]]["tags"] == ["lens-b"] and listed[ids[1]]["cameras"]["left"] == "fake camera left SN-1"
+        assert client.get("/api/v1/sessions", params={"verdict": "wrong"}).status_code == 422
+        assert client.patch(f"/api/v1/sessions/{ids[0]}", json={"name": "x" * 121}).status_code == 422
+        assert client.patch("/api/v1/sessions/nothing", json={}).status_code == 404
+    with running.client("read") as reader:
+        assert reader.patch(f"/api/v1/sessions/{ids[0]}", json={"name": "x"}).status_code == 403

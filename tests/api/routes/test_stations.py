@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from api.checks import DeviceChecks
 from api.client import ServiceClient, ServiceProblem
 from api.schemas import PlanAsked
 from drivers import discovery
@@ -16,7 +17,7 @@ from drivers.contract.scripted import ScriptedPeer
 from drivers.discovery import Found
 from drivers.errors import Disconnected
 from lab.capture_kinds.base import SEQUENCES
-from tests.api.conftest import Running, until_state
+from tests.api.conftest import Running, until, until_state
 from tests.lab.fake_bench import Bench, FakeMonochromator
 
 GOLDEN = Path(__file__).parents[2] / "wire"
@@ -74,6 +75,25 @@ def test_a_check_says_who_it_is_and_leaves_it_safe(running: Running) -> None:
         assert broken.state == "fails"
         assert broken.words == "camera left at here: the line is gone; plug it in again"
         assert [one.state for one in client.devices("fakes")] == ["works", "unknown", "unknown", "fails", "unknown"]
+
+
+def test_every_device_of_a_station_is_checked_and_that_is_kept(running: Running) -> None:
+    """One after the other; the next service knows how it went."""
+    with client_of(running) as client:
+        assert {one.state for one in client.start_checks("fakes")} <= {"checking", "works", "fails"}
+        with running.client() as looking:
+            until(looking, "/api/v1/stations/fakes/devices", lambda of: all(one["checked"] for one in of), 60.0)  # type: ignore[attr-defined]
+        checked = client.devices("fakes")
+        assert {one.name: one.state for one in checked} == {
+            "monochromator": "works", "spectroradiometer": "fails", "stage": "works",
+            "cameras.left": "works", "cameras.right": "works",
+        }  # fmt: skip
+        later = DeviceChecks(running.app.state.service.live, running.bench.drivers, running.store.root / "transcripts")
+        kept = {one.name: later.latest("fakes", one.name) for one in checked}
+        assert {name: (of.state, of.ended) for name, of in kept.items() if of} == {
+            one.name: (one.state, one.checked) for one in checked
+        }
+        assert later.latest("elsewhere", "stage") is None
 
 
 def test_nothing_else_uses_the_instruments_during_a_check(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,8 @@ from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
 import lab.jobs
+from lab.calibration.life import drift_board
+from lab.calibration.overview import overviews
 from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession
 from lab.capture.store import Store
@@ -22,6 +24,7 @@ from lab.errors import InputError
 from lab.jobs import JobRunner
 from lab.pipeline import PipelineRequest, Tell
 from tests.lab import fake_bench
+from tests.lab.calibration.test_life import calibrated
 from tests.postgresql import database, postgresql
 
 DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
@@ -110,3 +113,18 @@ def test_both_names_of_the_protocol_use_the_driver_that_is_installed() -> None:
         engine = open_engine(f"{name}://db/x")
         assert isinstance(engine, sa.Engine) and engine.driver == "psycopg"
         engine.dispose()
+
+
+def test_sessions_are_searched_and_looked_over(url: str, tmp_path: Path) -> None:
+    store = Store(tmp_path, url)
+    calibration = calibrated(store, 2.0)
+    session = store.result(calibration).source
+    store.describe_session(session, notes="50% #night")
+    store.add_result("diagnose", session, {"verdict": "explained"})
+    assert [one.id for one in store.sessions(search="#night m c 50%")] == [session]
+    assert store.count_sessions(search="L1") == 1 and store.sessions(search="elsewhere") == []
+    found = overviews(store, [session])[session]
+    assert found.calibration_id == calibration and found.verdict == "explained"
+    assert found.mtf50_cy_per_px == {"left": 0.25} and found.read_noise_e == {"left": 2.0, "right": 2.0}
+    assert len(drift_board(store, "m c L1").columns) == 1
+    store.close()
