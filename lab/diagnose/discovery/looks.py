@@ -14,8 +14,6 @@ from lab.diagnose.discovery.profile import Look, Profile
 from lab.diagnose.measurements.code_density import CodeCounts, counted, prepared, widths
 from lab.diagnose.measurements.dark_frames import dark_frames
 from lab.diagnose.measurements.dark_readout import dark_readout
-from lab.diagnose.measurements.even_flats import flats
-from lab.diagnose.measurements.flat_lines import differing_light, without_dark
 from lab.diagnose.measurements.even_flats import FlatLevel, flats
 from lab.diagnose.measurements.flat_lines import without_dark
 from lab.errors import NotDetermined
