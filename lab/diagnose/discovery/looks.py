@@ -105,7 +105,7 @@ def _pattern(study: Study, levels: Sequence[FlatLevel], effects: Effects) -> Flo
     level_e = float(np.mean([np.mean(list(u.mean.values())) for u in levels])) / study.noise.gain
     even = np.full((camera.rows, camera.cols), level_e)
     row, col = np.indices(even.shape)
-    points = FieldPoints.at(camera, row.ravel(), col.ravel())
+    points = FieldPoints.at(camera, row.ravel().astype(float), col.ravel().astype(float))
     pattern = collected_mosaic(camera, even, acting(here, COLLECTED), exposure_s=1.0, elapsed_s=0.0) / level_e
     pattern = pattern * model.shade_light(np.ones(even.size), points.x_um, points.y_um).reshape(even.shape)
     gains = model.gain_map()
