@@ -12,7 +12,7 @@ const bySide = (of) => {
 export const verdictWords = (verdict) => (verdict ?? "").replaceAll("_", " ");
 
 // A session that ended early goes on where its station is now: the file of that name may have other addresses.
-export async function goOn(session) {
+async function goOn(session) {
   const [detail, stations] = await Promise.all([ask(`/sessions/${session.id}`), ask("/stations")]);
   const same = stations.filter((s) => !s.problem && s.title === detail.station);
   await post(`/sessions/${session.id}/resume`, { station: same.length === 1 ? same[0].name : null });
