@@ -53,10 +53,11 @@ def self_test(station: Station, name: str, connect: Callable[[Station], Drivers]
     got it."""
     _entry(station, name)
     side = _said(name).partition(" ")[2]
-    return _self_test(_said(name), connect(station).all[_said(name)], _sheets(station).get(side))
+    return _self_test(_said(name), connect(station).all[_said(name)], data_sheets(station).get(side))
 
 
-def _sheets(station: Station) -> dict[str, DataSheet]:
+def data_sheets(station: Station) -> dict[str, DataSheet]:
+    """Return the cameras' data sheets by side."""
     return {side: camera.datasheet for side, camera in station.cameras.items()}
 
 
@@ -131,7 +132,7 @@ def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
 
 def check_station(station: Station) -> list[SelfTest]:
     """The self-tests of a whole station."""
-    return list(self_tests(drivers_of(station), _sheets(station)))
+    return list(self_tests(drivers_of(station), data_sheets(station)))
 
 
 def station_text(found: Iterable[Found]) -> str:

@@ -78,11 +78,11 @@ def listed(
 @devices.command()
 def check(station_file: StationFile) -> None:
     """Connect to each instrument of a station, use it once, and report whether it works. Exit code 3 if one doesn't."""
-    from lab.capture.self_test import self_tests
+    from lab.capture.self_test import data_sheets, self_tests
     from lab.capture.station import drivers_of, read_station
 
-    failed = 0
-    for test in self_tests(drivers_of(read_station(station_file))):
+    failed, station = 0, read_station(station_file)
+    for test in self_tests(drivers_of(station), data_sheets(station)):
         out.print(
             f"{'[green]works[/]' if test.works else '[red]fails[/]'}  {test.name}  {escape(test.identity or '-')}"
         )
