@@ -185,7 +185,7 @@ def create_app(
     jobs_runner: JobRunner | None = None,
     recovery: Recovery | None = None,
 ) -> FastAPI:
-    """The application on a store.
+    """Return the application on a store.
 
     `stations`: the folder of the station files, by default `stations` in the data folder. `hosts`: names under which
     the service is reached, beside this computer's own. `webhook_hosts`: those that may be told of sessions' ends.
@@ -277,7 +277,7 @@ def create_app(
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI schema, with the models of errors and events, which no route's return type names."""
+    """Return the OpenAPI schema, with the models of errors and events, which no route's return type names."""
     if app.openapi_schema is None:
         made = get_openapi(
             title=app.title,

@@ -26,8 +26,8 @@ ARCHIVE: dict[int | str, dict[str, Any]] = {
 
 
 def sent(pieces: Iterator[bytes], name: str, form: ArchiveForm) -> Response:
-    """The pieces of an archive as an answer. The first is made before the answer begins, so that what has no files is
-    refused; where a later one is damaged, the answer breaks off."""
+    """Return the pieces of an archive as an answer. The first is made before the answer begins, so that what has no
+    files is refused; where a later one is damaged, the answer breaks off."""
     first = next(pieces)
 
     def every() -> Iterator[bytes]:

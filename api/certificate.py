@@ -41,14 +41,15 @@ def _sha256(document: Any) -> str:
 
 
 def certificate(store: Store, one: CalibrationRecord) -> Certificate:
-    """The certificate of a calibration that was certified."""
+    """Return the certificate of a calibration that was certified."""
     stated = one.model_dump(mode="json", include=_STATED)
     fit = _sha256(store.result(one.id).document)
     return Certificate(stated=stated, fit_sha256=fit, sha256=_sha256({"stated": stated, "fit_sha256": fit}))
 
 
 def rejections(store: Store, found: CalibrationRecord) -> tuple[str, ...]:
-    """What speaks against a calibration's model: its session's newest diagnosis where that rejects it, or its lack."""
+    """Return what speaks against a calibration's model: its session's newest diagnosis where that rejects it, or its
+    lack."""
     newest = store.newest_results(found.session_id)
     if "diagnose" not in newest:
         return ("The session isn't diagnosed: nobody looked whether the model leaves something out.",)
@@ -60,8 +61,8 @@ def rejections(store: Store, found: CalibrationRecord) -> tuple[str, ...]:
 
 
 def certificate_page(store: Store, one: CalibrationRecord, runs: tuple[RunRecord, ...]) -> str:
-    """The page of a calibration that was certified, which needs nothing else and prints on A4. `runs`: how its session
-    was captured."""
+    """Return the page of a calibration that was certified, which needs nothing else and prints on A4. `runs`: how its
+    session was captured."""
     found = certificate(store, one)
     judged = {(of.figure, of.side, of.place) for of in one.judgements}
     newest = store.newest_results(one.session_id)

@@ -58,13 +58,13 @@ class DeviceChecks:
         self._closed = False
 
     def latest(self, station: str, device: str) -> Checked | None:
-        """How the latest check of a device went, also before the service's start; None if there was none."""
+        """Return how the latest check of a device went, also before the service's start; None if there was none."""
         if (station, device) not in self._latest:
             self._latest[station, device] = self._kept(station, device)
         return self._latest[station, device]
 
     def transcript(self, station: str, device: str) -> Path:
-        """Where the transcript of a device's latest check is, if one was kept."""
+        """Return where the transcript of a device's latest check is, if one was kept."""
         return self._folder / station / f"{device}.txt"
 
     def _kept(self, station: str, device: str) -> Checked | None:

@@ -196,8 +196,8 @@ class ServiceClient:
             response = self.request("GET", f"{self.url}{following}")
 
     def _ended(self, what: str, look: Callable[[], W], ends: tuple[str, ...], patience_s: float) -> W:
-        """What `look` finds once its state is one of `ends`. Raises ServiceProblem unless that is the first of them,
-        the good one."""
+        """Return what `look` finds once its state is one of `ends`. Raises ServiceProblem unless that is the first of
+        them, the good one."""
         until = time.monotonic() + patience_s
         while (found := look()).state not in ends:
             if time.monotonic() > until:
@@ -208,11 +208,11 @@ class ServiceClient:
         return found
 
     def health(self) -> Health:
-        """Whether the service is up, and its version."""
+        """Return whether the service is up, and its version."""
         return Health.model_validate_json(self.http.get(f"{self.url}/health").raise_for_status().content)
 
     def ready(self) -> Health:
-        """Whether the service can work: its registry answers, its data folder takes files."""
+        """Return whether the service can work: its registry answers, its data folder takes files."""
         response = self.http.get(f"{self.url}/healthz")
         if response.is_error:
             raise _problem(response)
@@ -229,7 +229,7 @@ class ServiceClient:
     # --- stations and sessions ----------------------------------------------------------------------------------------
 
     def stations(self) -> list[StationState]:
-        """The stations that the service knows."""
+        """Return the stations that the service knows."""
         return list(self._pages(StationState, "/stations"))
 
     def station(self, name: str) -> StationState:
@@ -237,11 +237,11 @@ class ServiceClient:
         return self._get(StationState, f"/stations/{name}")
 
     def connected(self) -> list[ConnectedDevice]:
-        """What is connected to the service's computer, and what drives it."""
+        """Return what is connected to the service's computer, and what drives it."""
         return list(self._pages(ConnectedDevice, "/devices"))
 
     def devices(self, station: str) -> list[DeviceState]:
-        """A station's instruments, and how their latest self-tests went."""
+        """Return a station's instruments, and how their latest self-tests went."""
         return list(self._pages(DeviceState, f"/stations/{station}/devices"))
 
     def device(self, station: str, device: str) -> DeviceState:
@@ -274,11 +274,11 @@ class ServiceClient:
         return TypeAdapter(list[DeviceState]).validate_json(response.content)
 
     def transcript(self, station: str, device: str) -> str:
-        """What went over an instrument's wire in the latest check that kept it."""
+        """Return what went over an instrument's wire in the latest check that kept it."""
         return self.request("GET", f"/stations/{station}/devices/{device}/transcript").text
 
     def sequences(self) -> list[SequenceDescription]:
-        """The catalogue of sequences."""
+        """Return the catalogue of sequences."""
         return list(self._pages(SequenceDescription, "/sequences"))
 
     def sequence(self, name: str) -> SequenceDescription:
@@ -286,7 +286,7 @@ class ServiceClient:
         return self._get(SequenceDescription, f"/sequences/{name}")
 
     def estimate(self, station: str, asked: PlanAsked | None = None) -> PlanEstimate:
-        """What a session would take on a station: captures and time."""
+        """Return what a session would take on a station: captures and time."""
         return self._post(PlanEstimate, f"/stations/{station}/estimate", asked or PlanAsked())
 
     def sessions(self, **only: str) -> Iterator[ListedSession]:
@@ -308,7 +308,7 @@ class ServiceClient:
         return StoredSession.model_validate_json(response.content)
 
     def session_request(self, session_id: str) -> SessionStart:
-        """What a session was asked to start with."""
+        """Return what a session was asked to start with."""
         return self._get(SessionStart, f"/sessions/{session_id}/request")
 
     def change_request(self, session_id: str, start: SessionStart) -> StoredSession:
@@ -317,7 +317,7 @@ class ServiceClient:
         return StoredSession.model_validate_json(response.content)
 
     def queue(self) -> list[QueueEntry]:
-        """The sessions that wait for their instruments, in their order."""
+        """Return the sessions that wait for their instruments, in their order."""
         return list(self._pages(QueueEntry, "/queue"))
 
     def queue_session(self, session_id: str, asked: QueuePlace | None = None) -> list[QueueEntry]:
@@ -378,11 +378,11 @@ class ServiceClient:
         return self.wait_session(self.start_session(start).id, patience_s)
 
     def captures(self, session_id: str, **only: str) -> Iterator[StoredCapture]:
-        """The captures of a session; `only`: of a `kind`, a `side`."""
+        """Yield the captures of a session; `only`: of a `kind`, a `side`."""
         return self._pages(StoredCapture, f"/sessions/{session_id}/captures", **only)
 
     def follow_session(self, session_id: str) -> Iterator[StoredSession | Progress]:
-        """A session's state and progress as they change, until its run is over."""
+        """Yield a session's state and progress as they change, until its run is over."""
         for name, data in self._events(f"/sessions/{session_id}/events"):
             yield (Progress if name == "progress" else StoredSession).model_validate_json(data)
 
@@ -399,7 +399,7 @@ class ServiceClient:
         stretch: bool = False,
         picture: Literal["png", "webp"] = "png",
     ) -> bytes:
-        """A capture's small picture. `stretch`: white is the frame's own brightest; `picture`: its format."""
+        """Return a capture's small picture. `stretch`: white is the frame's own brightest; `picture`: its format."""
         asked = {"width": width_px, "stretch": stretch}
         return self.request(
             "GET", f"/sessions/{session_id}/captures/{capture_id}/preview.{picture}", params=asked
@@ -414,13 +414,13 @@ class ServiceClient:
         return self._get(Curves, f"/sessions/{session_id}/curves")
 
     def frame(self, capture: StoredCapture) -> NDArray[np.uint16]:
-        """The raw frame of a capture: uint16 (rows, cols)."""
+        """Return the raw frame of a capture: uint16 (rows, cols)."""
         content = self.request("GET", f"/sessions/{capture.session_id}/captures/{capture.id}/frame.npy").content
         frame: NDArray[np.uint16] = np.load(io.BytesIO(content), allow_pickle=False)
         return frame
 
     def session_figures(self, session_id: str) -> list[FigureOfFit]:
-        """The figures of a session's newest fit."""
+        """Return the figures of a session's newest fit."""
         return list(self._pages(FigureOfFit, f"/sessions/{session_id}/figures"))
 
     # --- recordings and jobs ------------------------------------------------------------------------------------------
@@ -440,7 +440,7 @@ class ServiceClient:
         return self._get(RecordingsDetail, f"/recordings/{recordings_id}")
 
     def recorded_captures(self, recordings_id: str, **only: str) -> Iterator[RecordedCapture]:
-        """The captures of a recording set; `only`: of a `kind`, a `side`."""
+        """Yield the captures of a recording set; `only`: of a `kind`, a `side`."""
         return self._pages(RecordedCapture, f"/recordings/{recordings_id}/captures", **only)
 
     def recorded_capture(self, recordings_id: str, number: int) -> RecordedCapture:
@@ -448,11 +448,11 @@ class ServiceClient:
         return self._get(RecordedCapture, f"/recordings/{recordings_id}/captures/{number}")
 
     def recorded_preview(self, recordings_id: str, number: int, *, picture: Literal["png", "webp"] = "png") -> bytes:
-        """The small picture of a recording set's capture."""
+        """Return the small picture of a recording set's capture."""
         return self.request("GET", f"/recordings/{recordings_id}/captures/{number}/preview.{picture}").content
 
     def recorded_frame(self, recordings_id: str, number: int) -> NDArray[np.uint16]:
-        """The raw frame of a recording set's capture: uint16 (rows, cols)."""
+        """Return the raw frame of a recording set's capture: uint16 (rows, cols)."""
         content = self.request("GET", f"/recordings/{recordings_id}/captures/{number}/frame.npy").content
         frame: NDArray[np.uint16] = np.load(io.BytesIO(content), allow_pickle=False)
         return frame
@@ -462,7 +462,7 @@ class ServiceClient:
         return self._get(FrameFigures, f"/recordings/{recordings_id}/captures/{number}/figures")
 
     def recordings_figures(self, recordings_id: str) -> list[FigureOfFit]:
-        """The figures of the newest fit of recordings."""
+        """Return the figures of the newest fit of recordings."""
         return list(self._pages(FigureOfFit, f"/recordings/{recordings_id}/figures"))
 
     def fetch_recordings(self, recordings_id: str, file: Path) -> Path:
@@ -490,7 +490,7 @@ class ServiceClient:
         return self._post(Job, f"/recordings/{recordings_id}/jobs", JobStart(kind=kind, camera_model=camera_model))
 
     def follow_job(self, job_id: str) -> Iterator[Job]:
-        """A job as it changes, until it is over."""
+        """Yield a job as it changes, until it is over."""
         for _, data in self._events(f"/jobs/{job_id}/events"):
             yield Job.model_validate_json(data)
 
@@ -531,19 +531,19 @@ class ServiceClient:
         return self._made(DiagnosisResult, "diagnose", session_id, patience_s)
 
     def findings(self, session_id: str) -> DiagnosisFindings:
-        """What a session's newest diagnosis found, in words."""
+        """Return what a session's newest diagnosis found, in words."""
         return self._get(DiagnosisFindings, f"/sessions/{session_id}/findings")
 
     def recordings_findings(self, recordings_id: str) -> DiagnosisFindings:
-        """What the newest diagnosis of recordings found, in words."""
+        """Return what the newest diagnosis of recordings found, in words."""
         return self._get(DiagnosisFindings, f"/recordings/{recordings_id}/findings")
 
     def pipeline_results(self, job_id: str) -> PipelineResults:
-        """What a pipeline found."""
+        """Return what a pipeline found."""
         return self._get(PipelineResults, f"/jobs/{job_id}/result")
 
     def report(self, job_id: str) -> str:
-        """The page of a job of the kind `report` or `pipeline`."""
+        """Return the page of a job of the kind `report` or `pipeline`."""
         return self.request("GET", f"/jobs/{job_id}/report").text
 
     # --- challenges ---------------------------------------------------------------------------------------------------
@@ -569,11 +569,11 @@ class ServiceClient:
         return self._fetched(f"/challenges/{challenge_id}/cases/{case}/archive", file)
 
     def challenge_score(self, challenge_id: str) -> ChallengeScore:
-        """The score of a challenge that is scored."""
+        """Return the score of a challenge that is scored."""
         return self._get(ChallengeScore, f"/challenges/{challenge_id}/score")
 
     def challenge_truths(self, challenge_id: str) -> Truths:
-        """The truths of a challenge that is scored."""
+        """Return the truths of a challenge that is scored."""
         return self._get(Truths, f"/challenges/{challenge_id}/truths")
 
     def delete_challenge(self, challenge_id: str) -> None:
@@ -599,11 +599,11 @@ class ServiceClient:
         return self._get(DraftedLimits, f"/calibrations/{calibration_id}/drafted-limits")
 
     def certificate(self, calibration_id: str) -> Certificate:
-        """What a certificate states, and its hashes."""
+        """Return what a certificate states, and its hashes."""
         return self._get(Certificate, f"/calibrations/{calibration_id}/certificate.json")
 
     def certificate_page(self, calibration_id: str) -> str:
-        """A certificate as a page to print."""
+        """Return a certificate as a page to print."""
         return self.request("GET", f"/calibrations/{calibration_id}/certificate").text
 
     def revoke(self, calibration_id: str, why: str) -> CalibrationRecord:
@@ -618,7 +618,7 @@ class ServiceClient:
         return self._post(CalibrationRecord, f"/calibrations/{calibration_id}/certify", asked)
 
     def camera_models(self) -> Iterator[CameraModels]:
-        """The camera models of fits and diagnoses, the newest first."""
+        """Yield the camera models of fits and diagnoses, the newest first."""
         return self._pages(CameraModels, "/camera-models")
 
     def camera_model(self, model_id: str) -> CameraModels:
@@ -642,7 +642,7 @@ class ServiceClient:
         return self._post(StoredPrediction, "/predictions", asked)
 
     def predictions(self) -> Iterator[StoredPrediction]:
-        """The sealed predictions, the newest first."""
+        """Yield the sealed predictions, the newest first."""
         return self._pages(StoredPrediction, "/predictions")
 
     def prediction(self, prediction_id: str) -> StoredPrediction:
@@ -650,7 +650,7 @@ class ServiceClient:
         return self._get(StoredPrediction, f"/predictions/{prediction_id}")
 
     def sealed_prediction(self, prediction_id: str) -> bytes:
-        """The sealed file, whose SHA-256 is that of the prediction."""
+        """Return the sealed file, whose SHA-256 is that of the prediction."""
         return self.request("GET", f"/predictions/{prediction_id}/sealed.json").content
 
     def delete_prediction(self, prediction_id: str) -> None:
@@ -662,7 +662,8 @@ class ServiceClient:
         return self._post(TwinScore, f"/predictions/{prediction_id}/score", asked)
 
     def budget(self, model_id: str, use: str, station: str | None = None) -> dict[Side, BudgetResult]:
-        """What matters for a use of each camera of a model; with a station, which of its sequences to take next."""
+        """Return what matters for a use of each camera of a model; with a station, which of its sequences to take
+        next."""
         params = {"use": use} | ({} if station is None else {"station": station})
         found = self.request("GET", f"/camera-models/{model_id}/budget", params=params).json()
         return {side: BudgetResult.model_validate(one) for side, one in found.items()}
@@ -672,15 +673,15 @@ class ServiceClient:
         return self._get(Comparison, "/comparisons", a=a, b=b, fail_on=list(fail_on))
 
     def comparison_page(self, a: str, b: str) -> str:
-        """The comparison with its pictures, one page."""
+        """Return the comparison with its pictures, one page."""
         return self.request("GET", "/comparisons/page", params={"a": a, "b": b}).text
 
     def figures(self) -> list[FigureName]:
-        """What there is a history of."""
+        """Return what there is a history of."""
         return list(self._pages(FigureName, "/figures"))
 
     def history(self, camera: str, figure: str, place: str = "") -> History:
-        """A figure of a camera over its calibrations."""
+        """Return a figure of a camera over its calibrations."""
         return self._get(History, "/history", camera=camera, figure=figure, place=place)
 
     def drift(self, camera: str, *, reference_c: float | None = None, newest: int = BOARD_COLUMNS) -> DriftBoard:
@@ -691,11 +692,11 @@ class ServiceClient:
     # --- what the models know -----------------------------------------------------------------------------------------
 
     def parameters(self) -> list[ParameterDescription]:
-        """The parameters of the camera model, with unit, bounds and prior."""
+        """Return the parameters of the camera model, with unit, bounds and prior."""
         return list(self._pages(ParameterDescription, "/parameters"))
 
     def effects(self) -> list[EffectDescription]:
-        """The library that a diagnosis chooses from."""
+        """Return the library that a diagnosis chooses from."""
         return list(self._pages(EffectDescription, "/effects"))
 
     def effect(self, name: str) -> EffectDescription:

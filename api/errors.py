@@ -50,7 +50,7 @@ MEDIA_TYPE = "application/problem+json"
 
 
 def problem(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
-    """An error response."""
+    """Return an error response."""
     body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail)
     return Response(body.model_dump_json(), status, headers, MEDIA_TYPE)
 
@@ -78,7 +78,7 @@ def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 def known(what: str, look: Callable[[], T]) -> T:
-    """The result of `look`. Raises 404 with `what` as its one line where `look` raises InputError."""
+    """Return the result of `look`. Raises 404 with `what` as its one line where `look` raises InputError."""
     try:
         return look()
     except InputError:
@@ -97,7 +97,7 @@ def _answer(status: int) -> Callable[[Request, Exception], Response]:
 
 
 def _paths_of(request: Request) -> list[str]:
-    """The described paths that a request's path is one of."""
+    """Return the described paths that a request's path is one of."""
     return [path for path in request.app.openapi()["paths"] if compile_path(path)[0].match(request.url.path)]
 
 
@@ -136,7 +136,8 @@ def _invalid(request: Request, error: Exception) -> Response:
 
 
 def _refused(request: Request, error: Exception) -> Response:
-    """What a route or the router refuses; of a wrong method, `Allow` names the methods of all routes of the path."""
+    """Return what a route or the router refuses; of a wrong method, `Allow` names the methods of all routes of the
+    path."""
     assert isinstance(error, RouterException)
     headers = dict(error.headers or {})
     if error.status_code == 405:

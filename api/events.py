@@ -20,8 +20,8 @@ def event(name: str, content: BaseModel) -> ServerSentEvent:
 
 
 def stream(events: Callable[[anyio.Event], AsyncIterator[ServerSentEvent]]) -> EventSourceResponse:
-    """The streaming response. A comment every 15 s keeps proxies from closing the connection. `events` is given an
-    event that is set when the service stops, and ends then."""
+    """Return the streaming response. A comment every 15 s keeps proxies from closing the connection. `events` is given
+    an event that is set when the service stops, and ends then."""
     stopping = anyio.Event()
     return EventSourceResponse(
         events(stopping), ping=KEEP_ALIVE_S, send_timeout=30.0, shutdown_event=stopping, shutdown_grace_period=2.0
@@ -36,8 +36,9 @@ async def watched(
     changed: Callable[[], None],
     every_s: float = 0.5,
 ) -> AsyncIterator[ServerSentEvent]:
-    """The state now and after each change; the last event is called `end`. `look` reads the registry every `every_s`
-    seconds, because other processes write to it, too; `changed` is called before a change of its `state` is told."""
+    """Yield the state now and after each change; the last event is called `end`. `look` reads the registry every
+    `every_s` seconds, because other processes write to it, too; `changed` is called before a change of its `state` is
+    told."""
     seen: Any = None
     while True:
         found: Any = await asyncio.to_thread(look)

@@ -21,8 +21,8 @@ ADDRESSES = 10_000
 
 
 def network_of(address: str) -> str:
-    """What is counted as one address: an IPv4 address, or the 64 bits of an IPv6 network, of which a client has all
-    addresses."""
+    """Return what is counted as one address: an IPv4 address, or the 64 bits of an IPv6 network, of which a client has
+    all addresses."""
     try:
         parsed = ipaddress.ip_address(address)
     except ValueError:

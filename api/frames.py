@@ -27,7 +27,7 @@ class Npy(Response):
 def picture_of(
     service: Service, request: Request, source: str, capture_id: int, form: Form, width_px: int, stretch: bool
 ) -> Response:
-    """A capture's picture; 304 where the client has it."""
+    """Return a capture's picture; 304 where the client has it."""
     tag = f'"{source}-{capture_id}-{width_px}-{int(stretch)}-{form}"'
     headers = FOR_EVER | {"ETag": tag}
     if request.headers.get("if-none-match") == tag:
@@ -37,6 +37,6 @@ def picture_of(
 
 
 def npy_of(service: Service, source: str, capture_id: int) -> Response:
-    """A capture's raw frame as .npy."""
+    """Return a capture's raw frame as .npy."""
     headers = FOR_EVER | {"Content-Disposition": f'attachment; filename="capture-{capture_id}.npy"'}
     return Npy(npy_bytes(service.pictures.frame(source, capture_id)), headers=headers)

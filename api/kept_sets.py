@@ -27,7 +27,7 @@ class KeptSet:
     remove: Callable[[], None]
 
     def archive(self, form: ArchiveForm) -> Response:
-        """The set as an archive. Raises Conflict where it can't be handed out now."""
+        """Return the set as an archive. Raises Conflict where it can't be handed out now."""
         try:
             recordings = self.read()
         except InputError as error:
@@ -45,7 +45,7 @@ class KeptSet:
 
 
 def session_set(service: Service, session_id: str) -> KeptSet:
-    """A session; 404 where there is none, Conflict where it is under way: what it has is still changing."""
+    """Return a session; 404 where there is none, Conflict where it is under way: what it has is still changing."""
     state = service.state(service.session(session_id))
     if state not in OVER:
         raise Conflict(f"session {session_id} is {state}; wait for its end or abort it")
@@ -76,7 +76,7 @@ def sent_set(service: Service, recordings_id: str) -> KeptSet:
 
 
 def challenge_folder(service: Service, challenge_id: str, case: str = "") -> KeptSet:
-    """A challenge, or with `case` one of its recording sets; 404 where there is none."""
+    """Return a challenge, or with `case` one of its recording sets; 404 where there is none."""
     kept = service.challenges
     folder = known(
         f"no challenge {challenge_id!r}; GET /api/v1/challenges lists them", lambda: kept.folder(challenge_id)

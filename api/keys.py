@@ -40,17 +40,17 @@ class Permission(StrEnum):
     ADMIN = "admin"
 
     def allows(self, wanted: Permission) -> bool:
-        """Whether a key of this scope may do what needs `wanted`."""
+        """Return whether a key of this scope may do what needs `wanted`."""
         return self is wanted or self is Permission.ADMIN or wanted is Permission.READ
 
 
 def new_key() -> str:
-    """A fresh key: 256 random bits behind a prefix that secret scanners can find."""
+    """Return a fresh key: 256 random bits behind a prefix that secret scanners can find."""
     return KEY_PREFIX + secrets.token_urlsafe(32)
 
 
 def digest(key: str) -> str:
-    """What is stored of a key."""
+    """Return what is stored of a key."""
     return hashlib.sha256(key.encode()).hexdigest()
 
 
@@ -62,7 +62,7 @@ class StoredKey:
 
 
 def stored_keys(store: Store, anew: bool = True) -> list[StoredKey]:
-    """The keys that a store holds; unless `anew`, as it knows them."""
+    """Return the keys that a store holds; unless `anew`, as it knows them."""
     return [StoredKey(name, Permission(scope), sha256) for name, scope, sha256 in store.keys(anew)]
 
 
@@ -76,7 +76,7 @@ def create_key(store: Store, name: str, scope: Permission) -> str:
 
 
 def holder(key: str, stored: Iterable[StoredKey]) -> StoredKey | None:
-    """The stored key that `key` is, or None; every stored key is compared, each in constant time."""
+    """Return the stored key that `key` is, or None; every stored key is compared, each in constant time."""
     mine = digest(key)
     found = None
     for candidate in stored:
@@ -107,7 +107,7 @@ class HideKeys(logging.Filter):
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is this computer's own."""
+    """Return whether an address is this computer's own."""
     if host == "localhost":
         return True
     try:

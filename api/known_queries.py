@@ -17,7 +17,7 @@ def _names(field: Any) -> list[str]:
 
 
 def _query(dependant: Dependant) -> list[Any]:
-    """The query parameters of a route and of all that it depends on."""
+    """Return the query parameters of a route and of all that it depends on."""
     return [*dependant.query_params, *(field for one in dependant.dependencies for field in _query(one))]
 
 

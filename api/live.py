@@ -115,7 +115,7 @@ class LiveSession:
                 loop.call_soon_threadsafe(_wake, mine)
 
     def once(self, progress: Progress, make: Callable[[Progress], str]) -> str:
-        """What `make` makes of a progress, made once for all who follow. For one thread: that of the followers'
+        """Return what `make` makes of a progress, made once for all who follow. For one thread: that of the followers'
         loop."""
         if self._made is None or self._made[0] is not progress:
             self._made = (progress, make(progress))
@@ -126,8 +126,8 @@ class LiveSession:
         self._changed()
 
     async def follow(self, stopping: anyio.Event) -> AsyncIterator[Progress]:
-        """The latest progress, then later ones, until the run ends or the service stops. A slow follower misses some,
-        never the last."""
+        """Yield the latest progress, then later ones, until the run ends or the service stops. A slow follower misses
+        some, never the last."""
         wake = asyncio.Event()
         me = (asyncio.get_running_loop(), wake)
         with self._lock:
@@ -186,11 +186,11 @@ class LiveSessions:
         return bool(self.running())
 
     def running(self) -> list[LiveSession]:
-        """The sessions that this process runs now."""
+        """Return the sessions that this process runs now."""
         return [session for session in list(self._live.values()) if not session.ended]
 
     def find(self, session_id: str) -> LiveSession | None:
-        """The session if this process runs it now, else None."""
+        """Return the session if this process runs it now, else None."""
         live = self._live.get(session_id)
         return live if live is not None and not live.ended else None
 
@@ -246,8 +246,8 @@ class LiveSessions:
             live.begin(capture)
 
     def capturer(self, station: Station) -> Capturer:
-        """How a pipeline captures on `station`: as a session of this service, which can be followed, paused and aborted
-        like any other. Joins a session that is under way."""
+        """Return how a pipeline captures on `station`: as a session of this service, which can be followed, paused and
+        aborted like any other. Joins a session that is under way."""
 
         def captured(request: CaptureRequest, tell: Callable[[Progress], None]) -> str:
             session_id = request.session

@@ -23,7 +23,7 @@ class _ByState(Collector):
         self._counts = counts
 
     def collect(self) -> Iterable[Metric]:
-        """A gauge for each kind of thing, by state."""
+        """Return a gauge for each kind of thing, by state."""
         for what, states in self._counts.items():
             gauge = GaugeMetricFamily(f"calibench_{what}", f"{what.capitalize()} by state.", labels=["state"])
             for state, number in states().items():

@@ -35,7 +35,7 @@ class Pictures:
         return self._sent(recordings_id)
 
     def frame(self, source: str, capture_id: int) -> NDArray[np.uint16]:
-        """The raw frame of a capture, as `picture` finds it."""
+        """Return the raw frame of a capture, as `picture` finds it."""
         with self._making:
             return self._frame(source, capture_id)[0]
 
@@ -45,12 +45,12 @@ class Pictures:
         return found
 
     def picture(self, source: str, capture_id: int, width_px: int, stretch: bool, form: Form) -> bytes:
-        """A capture as `preview` shows it. Raises InputError where its frame is missing or damaged."""
+        """Return a capture as `preview` shows it. Raises InputError where its frame is missing or damaged."""
         with self._making:
             return self._picture(source, capture_id, width_px, stretch, form)
 
     def figures(self, source: str, capture_id: int) -> FrameFigures:
-        """The figures of a capture's frame. Raises InputError as `picture`."""
+        """Return the figures of a capture's frame. Raises InputError as `picture`."""
         with self._making:
             return self._figures(source, capture_id)
 

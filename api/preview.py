@@ -23,9 +23,9 @@ WEBP_QUALITY = 80
 def preview(
     frame: NDArray[np.uint16], camera: DataSheet, width_px: int, stretch: bool = False, form: Form = "png"
 ) -> bytes:
-    """A picture of `frame` (rows, cols), at most `width_px` wide, lossless as PNG or small as WebP. Black is the data
-    sheet's black level, white its white level, or with `stretch` the frame's own 99.9th percentile, so that dark frames
-    show what is in them. No white balance."""
+    """Return a picture of `frame` (rows, cols), at most `width_px` wide, lossless as PNG or small as WebP. Black is the
+    data sheet's black level, white its white level, or with `stretch` the frame's own 99.9th percentile, so that dark
+    frames show what is in them. No white balance."""
     black = camera.black_level_dn or 0.0
     mosaic = {name: plane.astype(np.float32) for name, plane in planes(frame, camera.cfa).items()}
     if camera.cfa == "MONO":

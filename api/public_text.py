@@ -25,13 +25,13 @@ class PublicText:
     root: Path
 
     def within(self, text: str) -> str:
-        """The text with files of the data folder named relative to it; for whole documents, JSON or HTML."""
+        """Return the text with files of the data folder named relative to it; for whole documents, JSON or HTML."""
         for root in dict.fromkeys((json.dumps(str(self.root))[1:-1], str(self.root))):
             text = text.replace(f"{root}/", "").replace(root, "the data folder")
         return text
 
     def __call__(self, text: str) -> str:
-        """A sentence without any path of the server."""
+        """Return a sentence without any path of the server."""
         return _PATH.sub(lambda found: found["last"] or "a folder", self.within(text))
 
     def or_none(self, text: str | None) -> str | None:

@@ -57,8 +57,8 @@ class KnownSafety:
                 )
 
     def find(self, station: Station) -> StationSafety | None:
-        """What is known of a station; None where its instruments haven't answered since the service's start, or a run
-        uses them now."""
+        """Return what is known of a station; None where its instruments haven't answered since the service's start, or
+        a run uses them now."""
         return self._known.get(key_of(station))
 
     def note(self, station: Station, safety: StationSafety | None) -> None:
@@ -85,6 +85,6 @@ class KnownSafety:
 
 
 def key_of(station: Station) -> str:
-    """What tells stations apart that have shutters of their own."""
+    """Return what tells stations apart that have shutters of their own."""
     one = station.monochromator
     return one.address if one is not None and one.address else " ".join(sorted(station.addresses))

@@ -142,7 +142,7 @@ class PlanAsked(Asked):
     )
 
     def plan(self, station: Station) -> CapturePlan:
-        """The plan on a station. Raises InputError."""
+        """Return the plan on a station. Raises InputError."""
         return full_plan(station, self.quick, self.sequences, self.parameters)
 
 

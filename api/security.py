@@ -40,7 +40,7 @@ class Logins:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def open(self, key: StoredKey) -> str:
-        """A token for `key`, valid for twelve hours."""
+        """Return a token for `key`, valid for twelve hours."""
         token, at = secrets.token_urlsafe(32), self.clock()
         with self._lock:
             self._tokens = {known: entry for known, entry in self._tokens.items() if at < entry[1]}
@@ -48,7 +48,7 @@ class Logins:
         return token
 
     def holder(self, token: str) -> StoredKey | None:
-        """The key that `token` was made for; None for an unknown or expired token."""
+        """Return the key that `token` was made for; None for an unknown or expired token."""
         with self._lock:
             key, until = self._tokens.get(digest(token), (None, 0.0))
         return key if key is not None and self.clock() < until else None
@@ -81,8 +81,8 @@ class Gate:
     _proven: set[str] = field(default_factory=set)
 
     def check(self, key: str, address: str) -> StoredKey | None:
-        """The stored key that `key` is, or None. Raises TooManyFailures without comparing where the address has none
-        left."""
+        """Return the stored key that `key` is, or None. Raises TooManyFailures without comparing where the address has
+        none left."""
         mine = digest(key)
         if mine not in self._proven and (wait_s := self.failures.wait_s(address)):
             raise TooManyFailures(wait_s)
@@ -95,8 +95,8 @@ class Gate:
         return found
 
     def identify(self, request: Request) -> StoredKey | None:
-        """The key of a request, from the Authorization header, else from the page's cookie; None without a valid one.
-        Raises TooManyFailures. A request is identified once, however often it is asked."""
+        """Return the key of a request, from the Authorization header, else from the page's cookie; None without a valid
+        one. Raises TooManyFailures. A request is identified once, however often it is asked."""
         if not hasattr(request.state, "key"):
             request.state.key = self._identify(request)
         key: StoredKey | None = request.state.key
@@ -115,7 +115,7 @@ class Gate:
 
 
 def address_of(request: Request) -> str:
-    """The address that a request came from; a proxy's where there is one."""
+    """Return the address that a request came from; a proxy's where there is one."""
     return request.client.host if request.client is not None else "unknown"
 
 
@@ -142,7 +142,8 @@ class Demand:
         bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_BEARER)],
         cookie: Annotated[str | None, Security(_COOKIE)],
     ) -> StoredKey:
-        """The key of the request. `bearer` and `cookie` are parameters only so that OpenAPI lists the two schemes."""
+        """Return the key of the request. `bearer` and `cookie` are parameters only so that OpenAPI lists the two
+        schemes."""
         gate: Gate = request.app.state.gate
         key = gate.identify(request)
         if key is None:

@@ -36,7 +36,7 @@ class Arrived:
     archive: Path
 
     def told(self, text: str) -> str:
-        """A sentence about its files, which names them as in the archive."""
+        """Return a sentence about its files, which names them as in the archive."""
         return self.service.public(as_in_archive(text, self.place))
 
 

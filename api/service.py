@@ -73,18 +73,19 @@ class Service:
     changed: Callable[[], None]
 
     def station_files(self) -> dict[str, Path]:
-        """The station files by name."""
+        """Return the station files by name."""
         return {file.stem: file for file in sorted(self.stations.glob("*.toml")) if file.is_file()}
 
     def station_file(self, name: str) -> Path:
-        """A station's file; 404 where there is none."""
+        """Return a station's file; 404 where there is none."""
         file = self.station_files().get(name)  # looked up, never joined: a name can't leave the folder
         if file is None:
             raise HTTPException(404, f"no station {name[:100]!r}; GET /api/v1/stations lists them")
         return file
 
     def station(self, name: str) -> Station:
-        """A station by its file's name; 404 where there is none. Raises InputError where the file can't be used."""
+        """Return a station by its file's name; 404 where there is none. Raises InputError where the file can't be
+        used."""
         file = self.station_file(name)
         with os.scandir(self.stations) as entries:  # a station's curves are files beside it
             there = frozenset(
@@ -93,16 +94,16 @@ class Service:
         return _read_station(file, there)
 
     def safety(self, station: Station) -> StationSafety | None:
-        """What is known of a station's safe state, as an answer may have it."""
+        """Return what is known of a station's safe state, as an answer may have it."""
         found = self.live.safety.find(station)
         return found and found.model_copy(update={"words": self.public(found.words)})
 
     def session(self, session_id: str) -> SessionInfo:
-        """A session; 404 where there is none."""
+        """Return a session; 404 where there is none."""
         return known(missing_session(session_id), lambda: self.store.session(session_id))
 
     def state(self, info: SessionInfo) -> Any:
-        """What state a session is in: as this service runs it, else as the registry has it."""
+        """Return what state a session is in: as this service runs it, else as the registry has it."""
         live = self.live.find(info.id)
         if live is None:
             return info.state
@@ -111,7 +112,7 @@ class Service:
         return "pausing" if live.pausing and live.latest.state == "running" else live.latest.state
 
     def job(self, job_id: str) -> JobInfo:
-        """A job; 404 where there is none."""
+        """Return a job; 404 where there is none."""
         return known(f"no job {job_id[:60]!r}; GET /api/v1/jobs lists them", lambda: self.jobs.job(job_id))
 
     def check_no_job(self, source: str, what: str) -> None:
@@ -120,14 +121,14 @@ class Service:
             raise Conflict(f"{what}: job {job.id} ({job.kind}) is {job.state}; wait for its end or cancel it")
 
     def recordings(self, recordings_id: str) -> Path:
-        """The folder of recordings that were sent in; 404 where there are none of that id."""
+        """Return the folder of recordings that were sent in; 404 where there are none of that id."""
         return known(
             f"no recordings {recordings_id[:60]!r}; GET /api/v1/recordings lists them",
             lambda: self.inbox.folder(recordings_id),
         )
 
     def report(self, job_id: str) -> str:
-        """The page that a job of the kind `report` or `pipeline` wrote. Raises InputError where it is gone."""
+        """Return the page that a job of the kind `report` or `pipeline` wrote. Raises InputError where it is gone."""
         written = ReportFile.model_validate(self.store.result(job_id).document)
         try:
             return (self.store.root / written.path).read_text(encoding="utf-8")
@@ -135,17 +136,17 @@ class Service:
             raise InputError(f"{written.path}: can't be read ({error.strerror}); make the report again") from error
 
     def progress(self, session_id: str) -> Progress | None:
-        """The latest progress of a session that this process runs, else None."""
+        """Return the latest progress of a session that this process runs, else None."""
         live = self.live.find(session_id)
         return self.told(live.latest) if live is not None and live.latest is not None else None
 
     def told(self, progress: Progress) -> Progress:
-        """A session's progress as an answer may have it."""
+        """Return a session's progress as an answer may have it."""
         texts = {"what": self.public(progress.what), "remark": self.public.or_none(progress.remark)}
         return progress.model_copy(update=texts)
 
     def public_runs(self, runs: Iterable[RunRecord]) -> tuple[RunRecord, ...]:
-        """The provenance of a session. An address that is a folder of the server is only its name."""
+        """Return the provenance of a session. An address that is a folder of the server is only its name."""
         return tuple(
             run.model_copy(
                 update={
@@ -163,19 +164,19 @@ class Service:
 
 
 def missing_session(session_id: str) -> str:
-    """What is said of a session that isn't there."""
+    """Return what is said of a session that isn't there."""
     return f"no session {session_id[:60]!r}; GET /api/v1/sessions lists them"
 
 
 def camera_model(service: Service, model_id: str) -> CameraModelRecord:
-    """A camera model; 404 where there is none."""
+    """Return a camera model; 404 where there is none."""
     missing = f"no camera model {model_id!r}; GET /api/v1/camera-models lists them"
     return known(missing, lambda: camera_models.record(service.store, model_id))
 
 
 @functools.lru_cache(maxsize=64)
 def _read_station(file: Path, there: frozenset[tuple[str, int, int]]) -> Station:
-    """A station's file, parsed once as long as the files `there` beside it are the same. Raises InputError."""
+    """Return a station's file, parsed once as long as the files `there` beside it are the same. Raises InputError."""
     return read_station(file)
 
 

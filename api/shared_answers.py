@@ -50,12 +50,12 @@ class Shared:
         self._answers = {}
 
     def find(self, asked: str) -> _Answer | None:
-        """The answer that others got, or wait for; None where there is none."""
+        """Return the answer that others got, or wait for; None where there is none."""
         found = self._answers.get(asked)
         return found if found is not None and time.monotonic() < found.until_s else None
 
     def begin(self, asked: str) -> _Answer:
-        """An answer that is going to be made."""
+        """Return an answer that is going to be made."""
         if len(self._answers) >= MOST:
             self.forget()
         made = self._answers[asked] = _Answer(time.monotonic() + FRESH_S)
@@ -85,7 +85,7 @@ class SharedAnswers:
         return not conditional and _SHARED.match(scope["path"], len(self.prefix)) is not None
 
     async def _known(self, scope: Scope) -> bool:
-        """Whether the request has a key that may read; where it hasn't, the route says so."""
+        """Return whether the request has a key that may read; where it hasn't, the route says so."""
         gate, request = self.gate, Request(scope)
         try:
             key = gate.identify(request) if gate.is_quick() else await asyncio.to_thread(gate.identify, request)

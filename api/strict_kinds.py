@@ -7,8 +7,8 @@ from typing import Any, Literal, get_args, get_origin
 
 
 def _kinds(annotation: Any) -> set[Any]:
-    """The plain kinds that an annotation allows for a value, those of a sequence's items and a mapping's values among
-    them."""
+    """Return the plain kinds that an annotation allows for a value, those of a sequence's items and a mapping's values
+    among them."""
     if get_origin(annotation) is Literal:
         return {type(value) for value in get_args(annotation)}
     arguments = get_args(annotation)

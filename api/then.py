@@ -45,8 +45,8 @@ def keep_request(store: Store, session_id: str, asked: SessionStart) -> None:
 
 
 def kept_request(store: Store, session_id: str) -> SessionStart | None:
-    """What a session was asked to start with, with the name, the notes and the time that it has now; None where it
-    wasn't started by a service."""
+    """Return what a session was asked to start with, with the name, the notes and the time that it has now; None where
+    it wasn't started by a service."""
     with store.reading() as db:
         row = db.get_one(SessionRow, session_id)
         kept, at, words = row.request, row.not_before, {"name": row.name, "notes": row.notes}
@@ -58,7 +58,7 @@ def kept_request(store: Store, session_id: str) -> SessionStart | None:
 
 
 def then_of(store: Store, session_id: str) -> ThenState | None:
-    """How far that is which follows a session's end; None where nothing was asked for."""
+    """Return how far that is which follows a session's end; None where nothing was asked for."""
     with store.reading() as db:
         row = db.get_one(SessionRow, session_id)
         state, kept, asked = row.then_state, row.then or {}, row.request
@@ -192,7 +192,7 @@ class ThenRunner:
         self._end(one, "done", one.then | ({"comparison": comparison} if comparison else {}), words)
 
     def _compared(self, one: _Following) -> tuple[str, str | None]:
-        """How the newest fit of a session compares with the certified calibration of its cameras."""
+        """Return how the newest fit of a session compares with the certified calibration of its cameras."""
         newest = calibration(self._store, one.id)
         of_rig = (CalibrationRow.rig == rig_of(newest.cameras), CalibrationRow.certified.is_not(None))
         asked = sa.select(CalibrationRow.id).where(*of_rig).order_by(CalibrationRow.certified.desc())

@@ -55,7 +55,7 @@ def check_room(folder: Path, wanted_bytes: int) -> None:
 
 
 def inside(name: str) -> PurePosixPath:
-    """A member's name as a path in the folder. Raises InputError for a path that leads out of it."""
+    """Return a member's name as a path in the folder. Raises InputError for a path that leads out of it."""
     path = PurePosixPath(name)
     parts = path.parts
     if (
@@ -91,11 +91,11 @@ class _Archive(ABC):
 
     @abstractmethod
     def members(self) -> Iterator[_Member]:
-        """What it states to hold."""
+        """Yield what it states to hold."""
 
     @abstractmethod
     def open(self, member: _Member) -> IO[bytes]:
-        """A file's content."""
+        """Return a file's content."""
 
 
 class _Zip(_Archive):
@@ -158,7 +158,7 @@ class _Bounded(io.RawIOBase):
         return self._file.tell()
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """The next bytes. Raises TooMuch where more are asked for than the limit."""
+        """Return the next bytes. Raises TooMuch where more are asked for than the limit."""
         if size is None or size < 0:
             at = self.tell()
             size = self.seek(0, io.SEEK_END) - at
@@ -234,7 +234,7 @@ def check_ratio(archive: Path, stated_bytes: int) -> None:
 
 
 def _said(error: Exception, folder: Path) -> str:
-    """What is wrong with an archive, in one line without the words of Python's readers."""
+    """Return what is wrong with an archive, in one line without the words of Python's readers."""
     if isinstance(error, FileExistsError | NotADirectoryError | IsADirectoryError):
         name = Path(str(error.filename)).relative_to(folder) if error.filename else ""
         return f"{name} is there twice, or as a file and as a folder"[-120:]
@@ -243,7 +243,7 @@ def _said(error: Exception, folder: Path) -> str:
 
 
 def _checked(opened: _Archive, room: Path, limit_bytes: int, limit_files: int) -> list[tuple[_Member, PurePosixPath]]:
-    """The archive's members and their paths, all checked by what the archive states of them."""
+    """Return the archive's members and their paths, all checked by what the archive states of them."""
     checked: list[tuple[_Member, PurePosixPath]] = []
     for member in opened.members():
         if len(checked) == limit_files:

@@ -37,7 +37,7 @@ _MODEL_FILES = 64
 
 
 def is_recordings(source: str) -> bool:
-    """Whether an id is one of recordings that were sent in, not of a session."""
+    """Return whether an id is one of recordings that were sent in, not of a session."""
     return _ID.fullmatch(source) is not None
 
 
@@ -70,7 +70,7 @@ class Foreign:
     statements: ImportOptions
 
     def read(self, folder: Path) -> RecordingSet:
-        """The recordings below `folder`. Raises InputError."""
+        """Return the recordings below `folder`. Raises InputError."""
         from lab.formats.importers import KINDS, read_foreign
 
         of_a_file = self.format in KINDS and KINDS[self.format].of_a_file
@@ -88,7 +88,7 @@ class Foreign:
 
     @staticmethod
     def _located(folder: Path, name: str, path: str, a_file: bool = True) -> Path:
-        """A file or folder of the archive. Raises InputError where it isn't in it."""
+        """Return a file or folder of the archive. Raises InputError where it isn't in it."""
         found = folder / inside(path)
         if not (found.is_file() or (found.is_dir() and not a_file)):
             raise InputError(f"{name} {path[:80]!r}: isn't in the archive; name it as in the archive")
@@ -107,13 +107,13 @@ class Inbox:
         return [entry.name for entry in sorted(entries, key=lambda one: (-one.stat().st_mtime_ns, one.name))]
 
     def folder(self, id: str) -> Path:
-        """The recording set's folder. Raises InputError where there is none of that id."""
+        """Return the recording set's folder. Raises InputError where there is none of that id."""
         if not _ID.fullmatch(id) or not (self.root / id).is_dir():
             raise InputError(f"no recordings {id[:60]!r}; list those that were sent in")
         return _top(self.root / id)
 
     def id_of(self, folder: str) -> str | None:
-        """The id of the recordings whose folder this is, or None."""
+        """Return the id of the recordings whose folder this is, or None."""
         with contextlib.suppress(ValueError):
             return Path(folder).relative_to(self.root).parts[0]
         return None
@@ -165,7 +165,7 @@ class Inbox:
         shutil.rmtree(away)
 
     def manifest(self, id: str) -> dict[str, Any]:
-        """The manifest of kept recordings as it is written: it was checked when they were sent in."""
+        """Return the manifest of kept recordings as it is written: it was checked when they were sent in."""
         found: dict[str, Any] = json.loads((self.folder(id) / _MANIFEST).read_text(encoding="utf-8-sig"))
         return found
 
@@ -177,7 +177,7 @@ class Inbox:
 
 
 def take_cameras(place: Path, archive: Path, limit_bytes: int) -> dict[Side, CameraFile]:
-    """The camera files of an archive: SIDE.toml, with the curves and arrays that they name beside them. Raises
+    """Return the camera files of an archive: SIDE.toml, with the curves and arrays that they name beside them. Raises
     InputError."""
     sent = place / "sent"
     unpack(archive, sent, limit_bytes, _MODEL_FILES)
@@ -201,8 +201,8 @@ def take_cameras(place: Path, archive: Path, limit_bytes: int) -> dict[Side, Cam
 
 
 def _top(folder: Path, holds: str | None = _MANIFEST) -> Path:
-    """The folder that holds the file `holds`: `folder`, or the only folder in it. None: the only folder where no file
-    is beside it."""
+    """Return the folder that holds the file `holds`: `folder`, or the only folder in it. None: the only folder where no
+    file is beside it."""
     entries = [entry for entry in folder.iterdir() if entry.name != "__MACOSX"]
     inner = [entry for entry in entries if entry.is_dir()]
     here = (folder / holds).exists() if holds is not None else len(entries) > 1
@@ -210,7 +210,7 @@ def _top(folder: Path, holds: str | None = _MANIFEST) -> Path:
 
 
 def as_in_archive(text: str, place: Path) -> str:
-    """A message with the archive's files named as in the archive."""
+    """Return a message with the archive's files named as in the archive."""
     for part in ("set", "sent"):
         for top in place.glob(f"{part}/*"):
             if top.is_dir() and len(list((place / part).iterdir())) == 1:

@@ -50,7 +50,8 @@ class AlpacaDevice:
         self._asked = 0
 
     def get(self, name: str) -> Any:
-        """The value of a property. Raises `Refused` with ASCOM's number, `NoAnswer`, `Disconnected`, `Garbled`."""
+        """Return the value of a property. Raises `Refused` with ASCOM's number, `NoAnswer`, `Disconnected`,
+        `Garbled`."""
         return self._value(name, *self._request("GET", name, {}))
 
     def put(self, name: str, **arguments: Any) -> None:
@@ -58,7 +59,7 @@ class AlpacaDevice:
         self._value(name, *self._request("PUT", name, arguments))
 
     def has(self, name: str) -> bool:
-        """Whether a property is implemented."""
+        """Return whether a property is implemented."""
         try:
             self.get(name)
         except Refused:
@@ -66,19 +67,20 @@ class AlpacaDevice:
         return True
 
     def get_if_there(self, name: str) -> Any:
-        """The value of a property; None where it isn't implemented."""
+        """Return the value of a property; None where it isn't implemented."""
         try:
             return self.get(name)
         except Refused:
             return None
 
     def identity(self) -> Identity:
-        """The device's name and its driver's. Raises `InstrumentError`."""
+        """Return the device's name and its driver's. Raises `InstrumentError`."""
         told = [str(self.get_if_there(name) or "") for name in ("driverinfo", "name", "driverversion")]
         return Identity(told[0], told[1], self._unique_id(), told[2])
 
     def _unique_id(self) -> str:
-        """The device's own identifier, which stays when its address changes; empty where the server doesn't list it."""
+        """Return the device's own identifier, which stays when its address changes; empty where the server doesn't
+        list it."""
         _, _, kind, number, _ = self._path.removeprefix("/").split("/", 4)
         try:
             listed = self._value("configureddevices", *self._request("GET", "/management/v1/configureddevices", {}))
@@ -91,7 +93,7 @@ class AlpacaDevice:
             return ""
 
     def image(self) -> NDArray[Any]:
-        """The picture, (rows, cols)."""
+        """Return the picture, (rows, cols)."""
         kind, body = self._request("GET", "imagearray", {}, accept=f"{_IMAGE_BYTES}, application/json")
         if kind.startswith(_IMAGE_BYTES):
             return self._unpacked(body)
@@ -101,7 +103,7 @@ class AlpacaDevice:
         return value.T
 
     def _unpacked(self, body: bytes) -> NDArray[Any]:
-        """A picture sent as ImageBytes: eleven numbers, then columns."""
+        """Return a picture sent as ImageBytes: eleven numbers, then columns."""
         if len(body) < 44:
             raise Garbled(f"{self._who}: a picture of {len(body)} bytes; let no proxy stand between")
         _, error, _, _, start, _, sent_as, rank, cols, rows, _ = struct.unpack("<11i", body[:44])
@@ -115,7 +117,7 @@ class AlpacaDevice:
         return numbers.reshape(cols, rows).T
 
     def _request(self, method: str, name: str, given: dict[str, Any], accept: str = "*/*") -> tuple[str, bytes]:
-        """The answer's content type and body, within the time that is left."""
+        """Return the answer's content type and body, within the time that is left."""
         self._asked += 1
         fields = urlencode(given | {"ClientID": _CLIENT, "ClientTransactionID": self._asked})
         path = name if name.startswith("/") else self._path + name

@@ -68,7 +68,7 @@ class Apart:
             raise
 
     def call(self, method: str, *arguments: Any, timeout_s: float) -> Any:
-        """What a method of the object returns. Raises what it raises.
+        """Return what a method of the object returns. Raises what it raises.
 
         Raises `NoAnswer` where it doesn't end in time and `Disconnected` where the process died: it is gone then.
         """

@@ -12,7 +12,7 @@ from sim.spectrum import Spectrum
 
 
 def read_calibration(path: str, columns: list[str], who: str) -> Spectrum:
-    """The curve of a file whose first line names `columns`. Raises `InstrumentError`, one line that begins with
+    """Return the curve of a file whose first line names `columns`. Raises `InstrumentError`, one line that begins with
     `who`."""
     file = Path(path)
     try:

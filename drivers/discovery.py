@@ -58,7 +58,7 @@ def find_all(usbip: str = "") -> Iterator[Found]:
 
 
 def usb_devices() -> Iterator[Found]:
-    """The instruments among this computer's USB devices."""
+    """Yield the instruments among this computer's USB devices."""
     with suppress(usb.core.USBError, usb.core.NoBackendError):
         for device in usb.core.find(find_all=True):
             if (found := _usb_device(device, "usb://")) is not None:
@@ -66,7 +66,7 @@ def usb_devices() -> Iterator[Found]:
 
 
 def usbip_devices(server: str) -> Iterator[Found]:
-    """The instruments that a USB/IP server exports. Raises `Disconnected`."""
+    """Yield the instruments that a USB/IP server exports. Raises `Disconnected`."""
     host, _, port = server.partition(":")
     where = f"usbip://{host}:{port or DEFAULT_PORT}/"
     try:
@@ -110,7 +110,7 @@ def _usb_driver(device: usb.core.Device) -> tuple[str, str, tuple[str, ...]]:
 
 
 def _enumerated(family: str, name: str) -> Iterator[Found]:
-    """What a driver's own library lists, where the driver's class has a static method `enumerate_cameras`."""
+    """Yield what a driver's own library lists, where the driver's class has a static method `enumerate_cameras`."""
     try:
         listing = getattr(driver(family, name), "enumerate_cameras", None)
         if listing is not None:
@@ -150,7 +150,7 @@ def probe(address: str) -> Iterator[tuple[str, Identity | InstrumentError]]:
 
 
 def _is_serial(made: Any) -> bool:
-    """Whether a driver speaks on a serial port and needs nothing but its address."""
+    """Return whether a driver speaks on a serial port and needs nothing but its address."""
     from drivers.stage.base import Stage
     from drivers.transport import WireInstrument
 

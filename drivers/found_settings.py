@@ -96,7 +96,7 @@ class FoundSettings:
         return dict(self._values)
 
     def get(self, name: str, otherwise: Setting) -> Setting:
-        """What was found, or `otherwise` where it wasn't changed."""
+        """Return what was found, or `otherwise` where it wasn't changed."""
         return self._values.get(name, otherwise)
 
     def note(self, name: str, value: Setting) -> None:

@@ -183,7 +183,7 @@ class IndiDevice:
     # --- its properties -----------------------------------------------------------------------------------------------
 
     def has(self, name: str) -> bool:
-        """Whether it has a property now."""
+        """Return whether it has a property now."""
         return name.partition(".")[0] in self._vectors
 
     def _vector(self, name: str) -> _Vector:
@@ -206,14 +206,14 @@ class IndiDevice:
         self._await(name, lambda: self._vector(name).updates > before)
 
     def get(self, name: str) -> Setting:
-        """A property's value as it was told last."""
+        """Return a property's value as it was told last."""
         vector = self._vector(name)
         if vector.kind == "Switch":
             return next((one for one, value in vector.values.items() if value == "On"), "")
         return ";".join(f"{one}={value}" for one, value in vector.values.items())
 
     def number(self, name: str, element: str) -> float:
-        """A number of a property. Raises `Garbled` where it is none."""
+        """Return a number of a property. Raises `Garbled` where it is none."""
         told = self._vector(name).values.get(element, "")
         try:
             return float(told)
@@ -223,7 +223,7 @@ class IndiDevice:
             ) from None
 
     def text(self, name: str, element: str) -> str:
-        """A text of a property; empty where it has none."""
+        """Return a text of a property; empty where it has none."""
         return self._vectors[name].values.get(element, "") if name in self._vectors else ""
 
     def state(self, name: str) -> str:
@@ -282,13 +282,13 @@ class IndiDevice:
         self._vector(name).blob = None
 
     def blob(self, name: str, wait_s: float) -> bytes | None:
-        """A picture, if there is one by now; None otherwise, at the latest after `wait_s`."""
+        """Return a picture, if there is one by now; None otherwise, at the latest after `wait_s`."""
         if self._vector(name).blob is None:
             self._pump(wait_s)
         return self._vector(name).blob
 
     def identity(self) -> Identity:
-        """The driver's program, the device's name, and the driver's version."""
+        """Return the driver's program, the device's name, and the driver's version."""
         info = "DRIVER_INFO"
         return Identity(self.text(info, "DRIVER_EXEC"), self.name, "", self.text(info, "DRIVER_VERSION"))
 

@@ -46,11 +46,12 @@ class Instrument(ABC):
         return {}
 
     def found(self) -> Mapping[str, Setting]:
-        """What a setting was before this driver changed it, by its name, while that isn't restored."""
+        """Return what a setting was before this driver changed it, by its name, while that isn't restored."""
         return {}
 
     def departures(self) -> tuple[str, ...]:
-        """What of it can't be set as a measurement wants it, in words: it belongs to all that is recorded with it."""
+        """Return what of it can't be set as a measurement wants it, in words: it belongs to all that is recorded
+        with it."""
         return ()
 
     @abstractmethod

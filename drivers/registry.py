@@ -27,7 +27,8 @@ def drivers() -> tuple[tuple[str, str], ...]:
 
 
 def driver(family: str, name: str) -> Callable[..., Any]:
-    """What makes the instrument: call it with an address. Raises `InstrumentError` if there is no such driver."""
+    """Return what makes the instrument: call it with an address. Raises `InstrumentError` if there is no such
+    driver."""
     point = _all().get(f"{family}.{name}")
     if point is None:
         known = ", ".join(names(family)) or "none"

@@ -29,7 +29,7 @@ class Piece:
     data: bytes
 
     def line(self) -> str:
-        """The piece as a line of a transcript, without its end."""
+        """Return the piece as a line of a transcript, without its end."""
         mark = next(mark for mark, direction in _MARKS.items() if direction == self.direction)
         return f"{mark} {self.data.decode('latin-1').encode('unicode_escape').decode('ascii')}"
 

@@ -213,7 +213,7 @@ class Transport:
 
 
 def _number_of(error: BaseException) -> int | None:
-    """The system's number of an error; pyserial keeps that of a refused lock in its text alone."""
+    """Return the system's number of an error; pyserial keeps that of a refused lock in its text alone."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno
     found = re.search(r"\[Errno (\d+)\]", str(error))
@@ -275,7 +275,8 @@ class WireInstrument(Instrument):
             raise unsafe
 
     def _make_safe_for_good(self) -> InstrumentError | None:
-        """The safe state before the connection ends. Returns what is to be raised afterwards: light may get out."""
+        """Return the safe state before the connection ends. Returns what is to be raised afterwards: light may get
+        out."""
         with suppress(InstrumentError):
             self.stop()
         return None

@@ -176,12 +176,12 @@ class Pipe:
 
 
 def timed_out() -> usb.core.USBTimeoutError:
-    """The exception that pyusb's own backends raise on a time-out."""
+    """Return the exception that pyusb's own backends raise on a time-out."""
     return usb.core.USBTimeoutError("Operation timed out", error_code=-7, errno=errno.ETIMEDOUT)
 
 
 def failed(status: int, what: str) -> usb.core.USBError:
-    """A USB error of an errno (positive)."""
+    """Return a USB error of an errno (positive)."""
     return usb.core.USBError(f"{what}: {errno.errorcode.get(status, status)}", errno=status)
 
 
@@ -531,7 +531,8 @@ class UsbIpBackend(PipeBackend):
 
 
 def find(backend: IBackend | None, serial_number: str) -> usb.core.Device:
-    """The device with this serial number (or bus id, over USB/IP) on a backend; None: the computer's own USB ports.
+    """Return the device with this serial number (or bus id, over USB/IP) on a backend; None: the computer's own USB
+    ports.
 
     Raises `Disconnected` if it isn't there, naming those that are.
     """
@@ -565,7 +566,7 @@ def find(backend: IBackend | None, serial_number: str) -> usb.core.Device:
 
 
 def open_device(address: str) -> usb.core.Device:
-    """A device by address: `usbip://HOST[:PORT]/SERIAL`, or `usb://SERIAL` in a local port.
+    """Return a device by address: `usbip://HOST[:PORT]/SERIAL`, or `usb://SERIAL` in a local port.
 
     Raises `InstrumentError` for an address of another form, `Disconnected` where nothing answers.
     """
@@ -579,12 +580,12 @@ def open_device(address: str) -> usb.core.Device:
 
 
 def in_words(error: usb.core.USBError) -> str:
-    """What an error says, without its number before and its name behind."""
+    """Return what an error says, without its number before and its name behind."""
     return re.sub(r"^\[Errno -?\d+\] |: E[A-Z]+$", "", str(error))
 
 
 def translate(error: usb.core.USBError, who: str, doing: str) -> InstrumentError:
-    """The driver's error for one of pyusb's, in one line."""
+    """Return the driver's error for one of pyusb's, in one line."""
     if isinstance(error, usb.core.USBTimeoutError):
         return NoAnswer(f"{who}: no answer while {doing}; check the cable and the power")
     if error.errno in GONE:

@@ -7,7 +7,7 @@ from sim.effects.library import effects as library
 
 
 def effect_title(name: str) -> str:
-    """An effect's or a family's identifier as words, as they stand within a sentence."""
+    """Return an effect's or a family's identifier as words, as they stand within a sentence."""
     if name in set(Family):
         return Family(name).words
     kind = library().get(name)

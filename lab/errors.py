@@ -8,7 +8,7 @@ import socket
 
 
 def one_line(error: Exception) -> str:
-    """An exception's text on one line; its class where it has no text."""
+    """Return an exception's text on one line; its class where it has no text."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
@@ -51,8 +51,8 @@ _OF_DATABASES = {
 
 
 def failure_of_environment(error: BaseException) -> str | None:
-    """A failure of the disk, of permissions, of the database or of the network as one line: where, what, remedy; None
-    for anything else, which is a defect."""
+    """Return a failure of the disk, of permissions, of the database or of the network as one line: where, what, remedy;
+    None for anything else, which is a defect."""
     if isinstance(error, socket.gaierror):
         return f"{one_line(error)}: a host's name isn't known; look after the network, or correct the address"
     if isinstance(error, OSError) and error.errno in _REMEDIES:

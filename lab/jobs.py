@@ -148,8 +148,8 @@ def run_job(
 
 
 def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: ResolveLimits | None) -> PipelineRequest:
-    """What a job asks of the pipeline. A pipeline on a session captures what is left of it, and computes every step
-    anew."""
+    """Return what a job asks of the pipeline. A pipeline on a session captures what is left of it, and computes every
+    step anew."""
     page = store.root / "reports" / f"{job_id}.html"
     if kind in ("capture", "pipeline") and store.has_session(source):
         capture = CaptureRequest(session=source)
@@ -165,7 +165,7 @@ def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: Resolv
 
 
 def _models(store: Store, request: PipelineRequest, camera_model: str) -> dict[Side, CameraFile]:
-    """The cameras that stand in for the fitted ones. Raises InputError where the model lacks one."""
+    """Return the cameras that stand in for the fitted ones. Raises InputError where the model lacks one."""
     from lab.calibration import camera_models
 
     assert request.recordings is not None
@@ -249,7 +249,7 @@ class JobRunner:
         return len(orphans)
 
     def _dask(self) -> Any:
-        """The Dask client, started at the first job."""
+        """Return the Dask client, started at the first job."""
         import dask
         from distributed import Client
 
@@ -364,7 +364,7 @@ class JobRunner:
             return [JobInfo.model_validate(row) for row in db.scalars(asked)]
 
     def count_jobs(self, source: str | None = None) -> int:
-        """How many jobs there are, or on one source."""
+        """Return how many jobs there are, or on one source."""
         asked = sa.select(sa.func.count()).select_from(JobRow)
         with self.store.reading() as db:
             return db.scalars(asked if source is None else asked.where(JobRow.source == source)).one()

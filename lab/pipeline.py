@@ -186,7 +186,8 @@ class PipelineResult:
 
 
 def session_recordings(store: Store, session_id: str) -> RecordingSet:
-    """A stored session as a recording set, inspected as a folder would be. Raises InputError where it can't be used."""
+    """Return a stored session as a recording set, inspected as a folder would be. Raises InputError where it can't
+    be used."""
     from lab.formats.recording_set import RecordingError, inspect
 
     recordings = store.recording_set(session_id)
@@ -200,7 +201,7 @@ def session_recordings(store: Store, session_id: str) -> RecordingSet:
 
 
 def source_recordings(source: str, open_store: Callable[[], Store | None]) -> RecordingSet:
-    """The recordings of `source`, a recording set's folder or a stored session's id. Raises InputError if it is
+    """Return the recordings of `source`, a recording set's folder or a stored session's id. Raises InputError if it is
     neither.
 
     The store is opened only where `source` isn't a path; `open_store` returns None where there is no data folder.
@@ -373,8 +374,8 @@ class _Pipeline:
             keep(self.store, self._results["diagnose"], examined.improved)
 
     def _kept(self, kind: Goal, model: type[M]) -> M | None:
-        """The newest kept result of a kind, where it may be reused: a folder, unlike a finished session, may have
-        changed."""
+        """Return the newest kept result of a kind, where it may be reused: a folder, unlike a finished session, may
+        have changed."""
         if not self.request.reuse or kind == self.request.goal or self.store is None or self._session is None:
             return None
         if self.store.session(self._session).state != "finished":
@@ -507,7 +508,7 @@ class _Pipeline:
         self._say("resolve", "done", 1.0, remark=f"resolve: {journal.end}: {journal.reason}")
 
     def _with_resolved(self, step: Step) -> RecordingSet:
-        """The recordings with all captures of the resolving, which are taken first where they haven't been."""
+        """Return the recordings with all captures of the resolving, which are taken first where they haven't been."""
         recordings = self.recordings
         for number, taken in enumerate(self._resolver.journal.resolutions if self._resolver is not None else (), 1):
             assert self.store is not None
@@ -553,8 +554,8 @@ class _Pipeline:
         self._keep(self.request.goal, ReportFile(path=str(path), results=dict(self._results)))
 
     def _improved(self) -> Mapping[Side, CameraFile]:
-        """The cameras with the effects that the diagnosis names: those it made, that were given with it, or that are
-        kept with it."""
+        """Return the cameras with the effects that the diagnosis names: those it made, that were given with it, or that
+        are kept with it."""
         if self._examined is not None or self.request.diagnosis is not None or self.store is None:
             return self._examined.improved if self._examined is not None else self.request.improved
         from lab.calibration import camera_models

@@ -59,8 +59,8 @@ class ResolveLimits:
 
 
 def resolve_limits(asked: bool, minutes: float | None = None, rounds: int | None = None) -> ResolveLimits | None:
-    """The limits that a command or a request states; None where resolving isn't asked for. Raises InputError for limits
-    that can't be kept, and for limits without `asked`."""
+    """Return the limits that a command or a request states; None where resolving isn't asked for. Raises InputError for
+    limits that can't be kept, and for limits without `asked`."""
     if not asked:
         if minutes is not None or rounds is not None:
             raise InputError("resolve minutes, resolve rounds: go with resolve; ask for it, or leave them out")
@@ -97,8 +97,8 @@ class Choice:
 
 
 def choose(doubt: Doubt, options: Sequence[Option], policy: DecisionPolicy, left_s: float = math.inf) -> Choice | None:
-    """The best capture, or the better one of the best pair, that fits into `left_s`; None where no single one and no
-    pair tells `resolve_least_share` of the doubt."""
+    """Return the best capture, or the better one of the best pair, that fits into `left_s`; None where no single one
+    and no pair tells `resolve_least_share` of the doubt."""
     least = policy.resolve_least_share * entropy(doubt.odds)
     told = [(option, expected_information([option.capture.forecast], doubt.odds)) for option in options]
     single = [Choice(doubt, option, None, nat) for option, nat in told if option.expected_s <= left_s]
@@ -119,7 +119,7 @@ def choose(doubt: Doubt, options: Sequence[Option], policy: DecisionPolicy, left
 
 
 def read_journal(store: Store, session: str) -> ResolveJournal | None:
-    """The journal of a session's resolving; None where it was never resolved."""
+    """Return the journal of a session's resolving; None where it was never resolved."""
     file = store.folder(session) / JOURNAL
     return read_result(ResolveJournal, file) if file.is_file() else None
 
@@ -141,7 +141,7 @@ class Resolver:
         return sum(self._store.lab_time_s(step.session) for step in self.journal.resolutions)
 
     def next(self, result: DiagnosisResult, doubts: Sequence[Doubt]) -> Choice | None:
-        """The next capture; None at the end, which the journal then tells."""
+        """Return the next capture; None at the end, which the journal then tells."""
         if not doubts:
             if result.verdict in ("explained", "no_mismatch"):
                 self._ended("settled", "no rivals are left")
@@ -175,7 +175,7 @@ class Resolver:
         return None
 
     def _needed(self, lacking: Sequence[tuple[Doubt, OpenCapture, str]], result: DiagnosisResult) -> str:
-        """The capture that would tell most of those that the station lacks something for, and what that is."""
+        """Return the capture that would tell most of those that the station lacks something for, and what that is."""
         told = [
             (expected_information([capture.forecast], doubt.odds) / entropy(doubt.odds), capture.words, lacks)
             for doubt, capture, lacks in lacking
@@ -230,19 +230,19 @@ class Resolver:
 
 
 def _and_then(what: str, result: DiagnosisResult) -> str:
-    """A reason with what the diagnosis proposes, as one line without its full stop."""
+    """Return a reason with what the diagnosis proposes, as one line without its full stop."""
     return what if result.next_capture is None else f"{what}; {result.next_capture.rstrip('.')}"
 
 
 def odds_of(doubt: Doubt) -> tuple[RivalOdds, ...]:
-    """The rivals of a doubt with their probabilities."""
+    """Return the rivals of a doubt with their probabilities."""
     return tuple(
         RivalOdds(name=name, probability=round(p, 4)) for name, p in zip(doubt.rivals, doubt.odds, strict=True)
     )
 
 
 def _odds_on(side: Side, result: DiagnosisResult, doubts: Sequence[Doubt]) -> tuple[RivalOdds, ...]:
-    """The rivals that are left on a side; where none are, the names that stand there."""
+    """Return the rivals that are left on a side; where none are, the names that stand there."""
     left = next((doubt for doubt in doubts if doubt.side == side), None)
     if left is not None:
         return odds_of(left)
@@ -256,7 +256,8 @@ def _odds_on(side: Side, result: DiagnosisResult, doubts: Sequence[Doubt]) -> tu
 def _priced(
     doubt: Doubt, station: Station, times: StepTimes, taken: set[tuple[Side, str]]
 ) -> tuple[list[Option], list[tuple[OpenCapture, str]]]:
-    """The captures of a doubt that the station can take, with their lab time; and the others, with what is lacking."""
+    """Return the captures of a doubt that the station can take, with their lab time; and the others, with what is
+    lacking."""
     options, lacking = [], []
     for capture in doubt.captures:
         if (doubt.side, capture.words) in taken:

@@ -65,8 +65,8 @@ def kept_processes() -> Iterator[None]:
 def in_processes(
     recordings: RecordingSet, tasks: Mapping[Side, Task[F]], report: Callable[[Side, Any], None], doing: str
 ) -> dict[Side, F]:
-    """The findings of every side. `tasks` are partials of functions that a module has by name; `recordings` are those
-    that they read.
+    """Return the findings of every side. `tasks` are partials of functions that a module has by name; `recordings` are
+    those that they read.
 
     `report` is called in the caller's thread with what a task tells. An exception in it, or in a process, ends all
     processes. `doing`: the command, for messages. Raises InputError where a process was ended from outside, and what a
@@ -226,7 +226,7 @@ def _carried_out(say: Callable[[Any], None]) -> bool:
 
 
 def _sendable(error: Exception) -> Exception:
-    """The error itself where it can be pickled, else one with the same text."""
+    """Return the error itself where it can be pickled, else one with the same text."""
     try:
         return error if isinstance(pickle.loads(pickle.dumps(error)), Exception) else RuntimeError(str(error))
     except Exception:

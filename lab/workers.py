@@ -23,7 +23,7 @@ TICK_S = 1.0
 
 
 def dask_client(scheduler: str, timeout_s: float) -> Any:
-    """A client of the Dask scheduler at an address (tcp://HOST:PORT). Raises InputError where none answers."""
+    """Return a client of the Dask scheduler at an address (tcp://HOST:PORT). Raises InputError where none answers."""
     from distributed import Client
 
     try:
@@ -60,7 +60,7 @@ class Workers:
             yield from self._here(work, items, shared)
 
     def in_order(self, work: Callable[..., R], items: Sequence[Any], *shared: Any) -> list[R]:
-        """The results of `done`, in the order of the items."""
+        """Return the results of `done`, in the order of the items."""
         found = dict(self.done(work, items, *shared))
         return [found[number] for number in range(len(items))]
 

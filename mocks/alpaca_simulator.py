@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 
 def _no_sky() -> ModuleType:
-    """What the simulator uses of cabaret."""
+    """Return what the simulator uses of cabaret."""
     stand_in = ModuleType("cabaret")
 
     def picture(camera: SimpleNamespace) -> NDArray[np.uint16]:

@@ -190,7 +190,7 @@ class Bench:
         return 1.0 + 4e-4 * float(np.sin(2 * np.pi * (at_s - self._started_s) / 2400.0))
 
     def radiance(self) -> Spectrum:
-        """What a spectroradiometer aimed at the target measures (350..1000 nm by 1, W sr^-1 m^-2 nm^-1, with its
+        """Return what a spectroradiometer aimed at the target measures (350..1000 nm by 1, W sr^-1 m^-2 nm^-1, with its
         noise).
 
         Of the sphere's port; of a white diffuser beside the chart or board; of the lit half of a knife edge; of the
@@ -273,7 +273,8 @@ class Bench:
         return self.temperature_c + SELF_HEATING_C[side] + warmer
 
     def sensor(self, side: Side) -> tuple[int, int, float]:
-        """What a camera's own registers say of its sensor: rows, columns, distance of neighbouring pixels (um)."""
+        """Return what a camera's own registers say of its sensor: rows, columns, distance of neighbouring pixels
+        (um)."""
         model = self._truth.cameras[side].model
         return model.rows, model.cols, model.pixel_pitch_um
 
@@ -336,8 +337,8 @@ class Bench:
             return max(at_s - self._first_exposure_s, 0.0)
 
     def _seen(self, side: Side) -> tuple[Scene, SceneLight]:
-        """What stands before a camera now, and the electrons a second that its light makes, kept for the scenes seen
-        last."""
+        """Return what stands before a camera now, and the electrons a second that its light makes, kept for the scenes
+        seen last."""
         with self._lock:
             placed, light, shown, stop = self._placed, self._light, self._shown, self._stop
         camera = self._camera(side)
@@ -366,7 +367,7 @@ class Bench:
             return seen, drawn
 
     def _camera(self, side: Side) -> HiddenCamera:
-        """A camera with its lens as the aperture ring stands."""
+        """Return a camera with its lens as the aperture ring stands."""
         hidden = self._truth.cameras[side]
         with self._lock:
             stop = self._stop
@@ -392,6 +393,6 @@ class Bench:
         return station_targets(self._truth.cameras)
 
     def station_cameras(self) -> dict[str, Any]:
-        """What the maker says of each camera, for `[cameras.left.datasheet]`: the keys of the recording set's `Camera`,
-        with `quantum_efficiency.R = {wavelength_nm = [...], value = [...]}` inline."""
+        """Return what the maker says of each camera, for `[cameras.left.datasheet]`: the keys of the recording set's
+        `Camera`, with `quantum_efficiency.R = {wavelength_nm = [...], value = [...]}` inline."""
         return {side: dict(camera.datasheet) for side, camera in self._truth.cameras.items()}

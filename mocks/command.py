@@ -188,7 +188,7 @@ def _check_options(
 
 
 def _calibration_of(name: str) -> str:
-    """The calibration file of one of `CALIBRATED`, as far off as real ones are."""
+    """Return the calibration file of one of `CALIBRATED`, as far off as real ones are."""
     from mocks import scpi_meter, usb2000plus
 
     if name == "scpi-meter":
@@ -197,7 +197,7 @@ def _calibration_of(name: str) -> str:
 
 
 def _before_cameras(name: str, frames: Path | None, real_time: float) -> Bench | ReadyFrames:
-    """What stands before cameras that are served alone: white light, or frames that are ready."""
+    """Return what stands before cameras that are served alone: white light, or frames that are ready."""
     from mocks.bench import Bench
     from mocks.ready_frames import ReadyFrames
 
@@ -210,7 +210,7 @@ def _before_cameras(name: str, frames: Path | None, real_time: float) -> Bench |
 
 
 def _lit(bench: Bench) -> Bench:
-    """The bench with white light before the cameras."""
+    """Return the bench with white light before the cameras."""
     bench.place("sphere")
     bench.set_shutter(True)
     return bench
@@ -328,11 +328,11 @@ class _BenchLine:
     display: str
 
     def advertised(self, address: str) -> str:
-        """The address as another machine writes it."""
+        """Return the address as another machine writes it."""
         return address.replace(f"//{self.host}:", f"//{self.advertise}:", 1)
 
     def display_settings(self) -> tuple[str, dict[str, Any]]:
-        """Where the mock display connects to, and the driver's table of the station file."""
+        """Return where the mock display connects to, and the driver's table of the station file."""
         if not self.display:
             address = f"127.0.0.1:{_free_port()}"
             return address, {"driver": "browser", "address": address}
@@ -343,7 +343,8 @@ class _BenchLine:
 
 
 def _concealed(specs: list[str], healthy: bool) -> Concealed | None:
-    """The effects to conceal, from the command line, else from the environment; None: the bench's default ones."""
+    """Return the effects to conceal, from the command line, else from the environment; None: the bench's default
+    ones."""
     from mocks.conceal import ConcealError, parse
 
     told = specs or [part for part in os.environ.get(CONCEAL_VARIABLE, "").split(";") if part.strip()]
@@ -438,7 +439,7 @@ def _thread(running: contextlib.ExitStack, name: str, work: Callable[[], None]) 
 
 
 def station_toml(addresses: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]) -> str:
-    """The station file (TOML): an address a table, the cameras' data sheets, the targets' nominal layout."""
+    """Return the station file (TOML): an address a table, the cameras' data sheets, the targets' nominal layout."""
     tables: dict[str, Any] = {"name": "mock bench", "cameras": {}}
     for instrument, at in addresses.items():
         family, _, side = instrument.partition(".")
@@ -545,7 +546,7 @@ def _host_and_port(text: str) -> tuple[str, int]:
 
 
 def _free_port() -> int:
-    """A port that nobody listens at now: the display's driver will."""
+    """Return a port that nobody listens at now: the display's driver will."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         return int(probe.getsockname()[1])
 

@@ -115,7 +115,7 @@ def _integers(choice: FieldInfo | None) -> tuple[int, ...]:
 
 
 def _is_one_value(annotation: Any) -> bool:
-    """Whether a field of that type can be given as VALUE."""
+    """Return whether a field of that type can be given as VALUE."""
     if isinstance(annotation, UnionType) or get_origin(annotation) is Union:
         return all(_is_one_value(part) for part in get_args(annotation))
     return annotation in (int, float, bool, type(None)) or get_origin(annotation) is Literal

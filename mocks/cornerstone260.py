@@ -378,6 +378,6 @@ class MockCornerstone260(Grammar):
 
 
 def _plain(value: float, digits: int) -> str:
-    """A number without trailing zeros: 500, 500.025."""
+    """Return a number without trailing zeros: 500, 500.025."""
     text = f"{value:.{digits}f}".rstrip("0").rstrip(".")
     return "0" if text in {"", "-0"} else text

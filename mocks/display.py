@@ -47,12 +47,12 @@ class Page:
         self._announced: dict[str, Any] | None = None
 
     def opened(self) -> list[str]:
-        """What the page says when it has connected."""
+        """Return what the page says when it has connected."""
         self._announced = None
         return [self._tell({"type": "page", "user_agent": "calibench mock display"})]
 
     def receive(self, message: str | bytes) -> list[str]:
-        """What the page answers to one message; a page ignores what it doesn't understand."""
+        """Return what the page answers to one message; a page ignores what it doesn't understand."""
         if isinstance(message, str):
             try:
                 announced = json.loads(message)

@@ -146,7 +146,7 @@ class UsbPeer(Peer):
         self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     def with_file(self, setting: str, text: str) -> UsbPeer:
-        """A file that came with the instrument, named to the driver by a setting."""
+        """Return a file that came with the instrument, named to the driver by a setting."""
         self._folder = tempfile.TemporaryDirectory(prefix="calibench-peer-")
         file = Path(self._folder.name) / f"{setting}.csv"
         file.write_text(text, encoding="utf-8")
@@ -311,7 +311,7 @@ class ProcessPeer(Peer):
         self.plug()
 
     def _answers(self) -> bool:
-        """Whether it can be talked to."""
+        """Return whether it can be talked to."""
         raise NotImplementedError
 
     def plug(self) -> None:
@@ -556,7 +556,7 @@ class DemoCamera(LibraryPeer):
 
 
 def lit_bench() -> Bench:
-    """A bench with white light in front of the cameras, its loops compiled and its first frame drawn."""
+    """Return a bench with white light in front of the cameras, its loops compiled and its first frame drawn."""
     bench = Bench(seed=4)
     bench.place("sphere")
     bench.set_filter(2)

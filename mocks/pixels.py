@@ -29,7 +29,7 @@ def payload_bytes(pixel_format: int, pixels: int) -> int:
 
 
 def encode(raw: UInt16Array, pixel_format: int) -> bytes:
-    """A 12-bit raw frame in one of the camera's formats."""
+    """Return a 12-bit raw frame in one of the camera's formats."""
     if pixel_format == BAYER_RG12P:
         return pack_12p(raw)
     if pixel_format == BAYER_RG8:

@@ -196,7 +196,7 @@ class PhotoResearch(Grammar):
 
 
 def _three_digits(value: float) -> str:
-    """A number of ten characters, its exponent of three digits: 1.234e-003."""
+    """Return a number of ten characters, its exponent of three digits: 1.234e-003."""
     mantissa, _, exponent = f"{value:.3e}".partition("e")
     return f"{mantissa}e{exponent[0]}{int(exponent[1:]):03d}"
 

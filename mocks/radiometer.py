@@ -18,7 +18,8 @@ LEVEL_STEPS = 40
 
 
 def misread(camera: CameraModel, radiance: Spectrum, effects: Sequence[Effect], kind: str) -> Spectrum:
-    """What a radiometer with `effects` says of `radiance`: the reading from which the forward model gets that light.
+    """Return what a radiometer with `effects` says of `radiance`: the reading from which the forward model gets that
+    light.
 
     A scale that is shifted by d reads the light of w + d at w. One that isn't linear reads the shape at a level s that
     the forward model takes back to 1: s <- s / (peak that it makes of s / true peak).

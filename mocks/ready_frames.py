@@ -66,8 +66,8 @@ class ReadyFrames:
 
     @classmethod
     def of_folder(cls, folder: Path, sides: Sequence[Side]) -> ReadyFrames:
-        """The frames `*-left.npy` and `*-right.npy` of a folder (a session's `frames`), by name. Raises ValueError, one
-        line."""
+        """Return the frames `*-left.npy` and `*-right.npy` of a folder (a session's `frames`), by name. Raises
+        ValueError, one line."""
         found: dict[Side, list[UInt16Array]] = {}
         for side in sides:
             found[side] = []
@@ -88,6 +88,6 @@ class ReadyFrames:
         return AIR_C
 
     def expose(self, side: Side, exposure_s: float, gain_db: float, start_s: float) -> UInt16Array:
-        """The next frame of a side once the exposure is over."""
+        """Return the next frame of a side once the exposure is over."""
         self.clock.sleep(start_s + exposure_s - self.clock.now())
         return next(self._turn[side])

@@ -19,13 +19,14 @@ _RANGE_A = 0.02
 
 
 def responsivity_a_per_w(wavelength_nm: FloatArray) -> FloatArray:
-    """A silicon photodiode's: a quantum efficiency that falls off towards 300 nm and 1100 nm."""
+    """Return a silicon photodiode's: a quantum efficiency that falls off towards 300 nm and 1100 nm."""
     efficiency = 0.85 / (1.0 + np.exp((wavelength_nm - 1050.0) / 25.0)) / (1.0 + np.exp((330.0 - wavelength_nm) / 20.0))
     return np.asarray(efficiency * wavelength_nm / 1239.84)
 
 
 def calibration_csv(departure_percent: float = 0.8) -> str:
-    """The calibration that came with the diode; `departure_percent` is by how much it is off, as real ones are."""
+    """Return the calibration that came with the diode; `departure_percent` is by how much it is off, as real ones
+    are."""
     at = np.arange(300.0, 1101.0, 10.0)
     told = responsivity_a_per_w(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 180.0))
     return (
@@ -52,7 +53,7 @@ _ERRORS_THERE, _EVENTS_THERE = 0x04, 0x20
 
 
 def _short(command: str) -> str:
-    """A command without its leading colon and the optional SENSE, each word in its short form."""
+    """Return a command without its leading colon and the optional SENSE, each word in its short form."""
     head, space, argument = command.removeprefix(":").partition(" ")
     asks = "?" if head.endswith("?") else ""
     words = [_SHORT.get(word, word) for word in head.removesuffix("?").split(":")]
@@ -135,7 +136,7 @@ class MockScpiMeter(Grammar):
         return b""
 
     def _common(self, command: str) -> bytes | None:
-        """The answer to a command that IEEE 488.2 asks of every instrument; None: it isn't one that is known."""
+        """Return the answer to a command that IEEE 488.2 asks of every instrument; None: it isn't one that is known."""
         events = self._events
         status = (_ERRORS_THERE if self._errors else 0) | (_EVENTS_THERE if events & self._events_enabled else 0)
         told = {

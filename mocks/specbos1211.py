@@ -167,7 +167,7 @@ class MockSpecbos1211(Grammar):
         return self._told("Error Code: ", f"{code}")
 
     def _told(self, label: str, value: str) -> bytes:
-        """An answer: a spectraval tells the value alone."""
+        """Return an answer: a spectraval tells the value alone."""
         return f"{'' if self._is_spectraval else label}{value}\r".encode("ascii")
 
     def _default(self) -> bytes:
@@ -176,7 +176,7 @@ class MockSpecbos1211(Grammar):
         return ACK
 
     def _whole_range(self) -> tuple[float, float, float]:
-        """A specbos begins with the visible, a spectraval with all that it measures."""
+        """Return a specbos begins with the visible, a spectraval with all that it measures."""
         return (*self._calibrated_nm, 1.0) if self._is_spectraval else (380.0, 780.0, 1.0)
 
     def _save(self) -> bytes:
@@ -242,7 +242,7 @@ class MockSpecbos1211(Grammar):
         return ACK
 
     def _adapts(self) -> bool:
-        """Whether it chooses its integration time: a spectraval does where it is told 0."""
+        """Return whether it chooses its integration time: a spectraval does where it is told 0."""
         return self._settings["tint"] == 0 if self._is_spectraval else self._settings["expo"] == 1
 
     def _integration_ms(self) -> float:
@@ -279,7 +279,7 @@ class MockSpecbos1211(Grammar):
         return self._measured
 
     def _calculate_spectrum(self) -> bytes:
-        """A spectraval's: wavelength and value a line, if it was told to speak text.
+        """Return a spectraval's: wavelength and value a line, if it was told to speak text.
 
         Argyll's spotread takes 8000 bytes of 350..830 nm in steps of 1 nm, and asks again for what is longer.
         """
@@ -290,7 +290,7 @@ class MockSpecbos1211(Grammar):
         return "\r".join([*lines, ""]).encode("ascii") + ETX
 
     def _calculate(self, what: str) -> bytes:
-        """A spectraval's luminance, or its chromaticity."""
+        """Return a spectraval's luminance, or its chromaticity."""
         if not self._is_spectraval:
             raise _SpecbosRefusal(COMMAND)
         x, y, z = tristimulus(self._spectrum())

@@ -85,7 +85,7 @@ class Pose:
 
     @classmethod
     def of(cls, centre_mm: tuple[float, float, float], euler_xyz_deg: tuple[float, float, float]) -> Pose:
-        """A pose from the place of the target's origin and its turns about its own x, y and z."""
+        """Return a pose from the place of the target's origin and its turns about its own x, y and z."""
         return cls(Rotation.from_euler("XYZ", euler_xyz_deg, degrees=True).as_matrix(), np.array(centre_mm))
 
     def before(
@@ -142,7 +142,7 @@ class ShownCells:
 
 @cache
 def _board_texture() -> FloatArray:
-    """The ChArUco board as it is printed, with a white rim of one square: 0..1, `_TEXEL_MM` a sample."""
+    """Return the ChArUco board as it is printed, with a white rim of one square: 0..1, `_TEXEL_MM` a sample."""
     rows, cols = BOARD_SQUARES
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, BOARD_DICTIONARY))
     board = cv2.aruco.CharucoBoard((cols, rows), SQUARE_MM, MARKER_MM, dictionary)
@@ -152,7 +152,7 @@ def _board_texture() -> FloatArray:
 
 
 def board_pose(name: str) -> Pose:
-    """Where a ChArUco pose's board stands; its plane's origin is the board's centre."""
+    """Return where a ChArUco pose's board stands; its plane's origin is the board's centre."""
     (x, y, z), turns = BOARD_POSES[name]
     return Pose.of((float(x), float(y), DISTANCE_MM + z), turns)
 
@@ -163,7 +163,7 @@ def mm_per_px(camera: HiddenCamera) -> float:
 
 
 def _edges(name: str, camera: HiddenCamera) -> tuple[PlaneEdge, ...]:
-    """The edges of one knife-edge target, each a little off the middle of its place, as blades are."""
+    """Return the edges of one knife-edge target, each a little off the middle of its place, as blades are."""
     scale = mm_per_px(camera)
     off = {"centre": (0.31, -0.52), "mid": (-0.77, 0.28), "corner": (0.55, 0.93)}
     found = []
@@ -176,7 +176,8 @@ def _edges(name: str, camera: HiddenCamera) -> tuple[PlaneEdge, ...]:
 
 
 def scene(camera: HiddenCamera, placed: str, light: LightSettings, shown: ShownCells) -> Scene:
-    """What one camera sees of a target: its light is what the lamp and the monochromator give when nothing is wrong.
+    """Return what one camera sees of a target: its light is what the lamp and the monochromator give when nothing is
+    wrong.
 
     First-order light is of the kind "narrowband" on every target: what goes wrong in a monochromator does so whatever
     it lights."""

@@ -106,7 +106,7 @@ class Truth:
 
 
 def makers_efficiency() -> dict[str, Spectrum]:
-    """The maker's QE curves (electrons a photon, 380..780 nm by 5), without infrared filter."""
+    """Return the maker's QE curves (electrons a photon, 380..780 nm by 5), without infrared filter."""
     w = np.arange(380.0, 780.1, 5.0)
     return {channel: Spectrum.of(w, np.round(curve, 4)) for channel, curve in _efficiency(w).items()}
 
@@ -125,8 +125,8 @@ def _efficiency(w: FloatArray) -> dict[str, FloatArray]:
 
 
 def _true_efficiency(rng: np.random.Generator) -> dict[str, Spectrum]:
-    """The maker's curves, off by a scale of 2 %, a tilt of 1.5 % and a bend of 0.5 % (one sd each), on 1 nm up to 1000
-    nm."""
+    """Return the maker's curves, off by a scale of 2 %, a tilt of 1.5 % and a bend of 0.5 % (one sd each), on 1 nm up
+    to 1000 nm."""
     w = np.arange(370.0, 1000.1, 1.0)
     x = (w - 560.0) / 180.0
     curves = {}
@@ -263,9 +263,9 @@ CONCEALED: Concealed = {
 
 
 def hidden_truth(seed: int = 1, concealed: Concealed | None = None, shape: tuple[int, int] = (ROWS, COLS)) -> Truth:
-    """The truth of a seed. `concealed` None: `CONCEALED`, and structure in the pixels' patterns; else that alone, in
-    cameras that are otherwise the same. `shape`: rows and columns of the frames; the same lens before a smaller sensor
-    sees less.
+    """Return the truth of a seed. `concealed` None: `CONCEALED`, and structure in the pixels' patterns; else that
+    alone, in cameras that are otherwise the same. `shape`: rows and columns of the frames; the same lens before a
+    smaller sensor sees less.
 
     Raises `mocks.conceal.ConcealError` for what the bench can't show.
     """

@@ -121,7 +121,7 @@ _OF_FRAMES = ("late", "never", "short", "lost-trailer", "damaged", "torn", "repe
 
 
 def _xml(rows: int, cols: int) -> bytes:
-    """The camera's description of itself, with this sensor's size and the addresses above filled in."""
+    """Return the camera's description of itself, with this sensor's size and the addresses above filled in."""
     places = {name: f"{value:#x}" for name, value in globals().items() if name.isupper() and isinstance(value, int)}
     template = string.Template((importlib.resources.files("mocks") / "u3v.xml").read_text("utf-8"))
     return template.substitute(
@@ -142,7 +142,7 @@ def _zipped(xml: bytes) -> bytes:
 
 
 def _float_of(bits: int) -> float:
-    """A register's 32 bits as a float."""
+    """Return a register's 32 bits as a float."""
     return float(struct.unpack("<f", struct.pack("<I", bits))[0])
 
 
@@ -560,8 +560,8 @@ class U3vDevice(UsbDevice):
                     self._acquiring = False
 
     def _processed(self, raw: UInt16Array) -> UInt16Array:
-        """What the camera makes of the converter's codes: channel by channel times its white balance and its preset for
-        the light."""
+        """Return what the camera makes of the converter's codes: channel by channel times its white balance and its
+        preset for the light."""
         if self._get(TEST_PATTERN):
             ramp = np.linspace(0.0, _MOST_CODE, raw.shape[1]).astype(np.uint16)
             return np.ascontiguousarray(np.broadcast_to(ramp, raw.shape))
@@ -629,7 +629,7 @@ class U3vDevice(UsbDevice):
             self._unplug_for(seconds)
 
     def _split(self, payload: bytes) -> list[bytes]:
-        """The payload in the transfers that the host asked for; the last one is filled up to whole 4 bytes."""
+        """Return the payload in the transfers that the host asked for; the last one is filled up to whole 4 bytes."""
         size, count, final_1, final_2 = struct.unpack_from("<IIII", self._memory["sirm"].data, 0x1C)
         pieces, at = [], 0
         for part in [size] * count + [final_1, final_2]:

@@ -51,7 +51,7 @@ _INSTRUMENTS: dict[str, Callable[[Any], Sequence[UsbDevice]]] = {
 
 
 def devices(name: str, bench: BeforeCameras | MeasuredLight | None = None) -> tuple[UsbDevice, ...]:
-    """The device models of one instrument, on a bench of its own if none is given; cameras need a bench.
+    """Return the device models of one instrument, on a bench of its own if none is given; cameras need a bench.
 
     Raises ValueError for an unknown name.
     """
@@ -61,7 +61,7 @@ def devices(name: str, bench: BeforeCameras | MeasuredLight | None = None) -> tu
 
 
 def backend(name: str, bench: Bench | None = None) -> InProcessBackend:
-    """A pyusb backend with that instrument plugged in (`u3v`, `u3v-stereo`, `cornerstone260b`, `usb2000plus`);
+    """Return a pyusb backend with that instrument plugged in (`u3v`, `u3v-stereo`, `cornerstone260b`, `usb2000plus`);
     `.plugged_in` are its device models."""
     return InProcessBackend(devices(name, bench))
 

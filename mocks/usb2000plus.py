@@ -45,7 +45,7 @@ def response(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def calibration_csv(departure_percent: float = 0.0) -> str:
-    """The calibration that a laboratory would have sent with the instrument, as its driver reads it.
+    """Return the calibration that a laboratory would have sent with the instrument, as its driver reads it.
 
     `departure_percent`: by how much it is off, smoothly over the spectrum; real ones are good to about 2 % (half of the
     expanded uncertainty that calibration laboratories state for spectral radiance).
@@ -129,7 +129,7 @@ class MockUsb2000Plus(UsbDevice):
             self.changed.notify_all()
 
     def _slot(self, number: int) -> bytes:
-        """An EEPROM slot, at most 15 bytes."""
+        """Return an EEPROM slot, at most 15 bytes."""
         if number > 30:
             raise Stalled(f"no EEPROM slot {number}")
         if number == 17:  # autonulling: enabled, temperature compensation, dark, saturation

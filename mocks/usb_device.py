@@ -124,7 +124,7 @@ class UsbDevice:
         return self._strings.index(text)
 
     def device_descriptor(self) -> bytes:
-        """The 18 bytes of the device descriptor."""
+        """Return the 18 bytes of the device descriptor."""
         one = self.identity
         return struct.pack(
             "<BBHBBBBHHHBBBB",
@@ -143,7 +143,7 @@ class UsbDevice:
         )
 
     def configuration_descriptor(self) -> bytes:
-        """The one configuration with all that belongs to it."""
+        """Return the one configuration with all that belongs to it."""
         body = self._association + b"".join(interface.bytes() for interface in self.interfaces)
         return struct.pack("<BBHBBBBB", 9, 2, 9 + len(body), len(self.interfaces), 1, 0, 0x80, 250) + body
 
@@ -240,7 +240,7 @@ class UsbDevice:
             self.changed.notify_all()
 
     def _faults_of_answer(self) -> list[Fault]:
-        """The faults of the answer that is about to go out."""
+        """Return the faults of the answer that is about to go out."""
         self.answers += 1
         return self._line_faults.of(self.answers)
 
@@ -251,7 +251,7 @@ class UsbDevice:
         back.start()
 
     def broken(self, answer: bytes) -> bytes:
-        """An answer as its faults leave it; empty: nothing goes out."""
+        """Return an answer as its faults leave it; empty: nothing goes out."""
         for fault in self._faults_of_answer():
             if fault.kind == "late":
                 time.sleep(3.0 if fault.value is None else fault.value)
@@ -271,7 +271,7 @@ class UsbDevice:
     # --- for subclasses -----------------------------------------------------------------------------------------------
 
     def control(self, setup: bytes, data: bytes, cancelled: Cancelled) -> bytes:
-        """A class or vendor request."""
+        """Return a class or vendor request."""
         raise Stalled(f"request {setup.hex()} isn't known")
 
     def bulk_out(self, endpoint: int, data: bytes, cancelled: Cancelled) -> None:

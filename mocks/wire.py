@@ -77,10 +77,10 @@ class Grammar(ABC):
 
     @abstractmethod
     def receive(self, data: bytes) -> list[bytes]:
-        """What goes out at once when `data` comes in."""
+        """Return what goes out at once when `data` comes in."""
 
     def quiet(self) -> list[bytes]:
-        """What goes out when the host has been silent for `QUIET_S`."""
+        """Return what goes out when the host has been silent for `QUIET_S`."""
         return []
 
     @property
@@ -89,7 +89,7 @@ class Grammar(ABC):
         return None
 
     def elapse(self) -> list[bytes]:
-        """What goes out by itself by now."""
+        """Return what goes out by itself by now."""
         return []
 
     def fail_next(self, code: int | None) -> None:
@@ -126,7 +126,7 @@ class Fault:
     value: float | None = None
 
     def hits(self, number: int) -> bool:
-        """Whether it breaks the answer of this number."""
+        """Return whether it breaks the answer of this number."""
         return number == self.at or (self.onwards and number > self.at)
 
 
@@ -268,7 +268,7 @@ class Endpoint(ABC):
 
     @abstractmethod
     def read(self, timeout_s: float) -> bytes:
-        """What the host sends within the time, or nothing."""
+        """Return what the host sends within the time, or nothing."""
 
     @abstractmethod
     def write(self, data: bytes) -> None:

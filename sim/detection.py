@@ -115,7 +115,7 @@ def _check_radiance(wavelength_nm: FloatArray, radiance: FloatArray) -> None:
 def otf_wavelengths(
     camera: CameraModel, channel: str, wavelength_nm: FloatArray, weight: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """A few wavelengths (nm) and shares (sum 1) over which to average the transfer function for detected light
+    """Return a few wavelengths (nm) and shares (sum 1) over which to average the transfer function for detected light
     `weight`.
     """
     return gauss_rule(*otf_weight(camera, channel, wavelength_nm, weight), count)

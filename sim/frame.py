@@ -104,7 +104,7 @@ def scene_light(
     placed: Literal["ideal", "image"] = "ideal",
     transfers: KeptTransfers | None = None,
 ) -> SceneLight:
-    """The part of `expected_electrons` that no exposure changes, and that takes nearly all its time."""
+    """Return the part of `expected_electrons` that no exposure changes, and that takes nearly all its time."""
     shape = camera.rows, camera.cols
     if isinstance(scene, Darkness):
         return SceneLight(np.zeros(shape))
@@ -196,7 +196,7 @@ def screen_light(
 
 
 def with_reflections(camera: CameraModel, image: FloatArray, effects: Sequence[Effect]) -> FloatArray:
-    """A channel's whole image (rows, cols), in any unit, with what the lens makes of it as a whole, such as a
+    """Return a channel's whole image (rows, cols), in any unit, with what the lens makes of it as a whole, such as a
     reflection of it.
     """
     return image_of(camera, effects).with_copies(image)
@@ -421,7 +421,8 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
 
 
 def _scatter_light(image: FloatArray, state: Image, shade: FloatArray) -> FloatArray:
-    """A channel's irradiance with its reflections, the fall-off, and what is scattered evenly. A traced lens's image is
+    """Return a channel's irradiance with its reflections, the fall-off, and what is scattered evenly. A traced lens's
+    image is
     a mosaic already: colour by colour.
     """
     traced = isinstance(state.camera.lens.imaging, TracedLens)

@@ -337,7 +337,7 @@ def _layer_transfers(blur: Blur, nodes: FloatArray, over: FloatArray, grid: Grid
 
 
 def _show_on_screen(drawing: Drawing, grid: Grid, camera: CameraModel, effects: Sequence[Effect]) -> Drawing:
-    """A screen's pattern as the screen shows it, given what was asked for."""
+    """Return a screen's pattern as the screen shows it, given what was asked for."""
     light = light_of(camera, effects)
     if not light.screen:
         return drawing
@@ -416,8 +416,8 @@ def _node_pictures(
 
 
 def _folded_transfer(blur: Blur, wavelength_nm: float, shape: tuple[int, int]) -> FloatArray | ComplexArray:
-    """The transfer of lens and effects with the pixel's aperture and a picture's square of one pixel, folded onto
-    samples of one pixel.
+    """Return the transfer of lens and effects with the pixel's aperture and a picture's square of one pixel, folded
+    onto samples of one pixel.
     """
     from sim.optics.fold import fold_diffraction, fold_transfer  # here: the compiler's library takes a while to load
 
@@ -457,7 +457,8 @@ def _at_pixels(spectrum: ComplexArray | NDArray[np.complex64], oversample: int, 
 def _shift_px(
     camera: CameraModel, row: FloatArray, col: FloatArray, wavelength_nm: float, effects: Sequence[Effect]
 ) -> tuple[FloatArray, FloatArray]:
-    """How far (rows, columns) the light of one wavelength lands from where the baseline has it, at points in px."""
+    """Return how far (rows, columns) the light of one wavelength lands from where the baseline has it, at points in
+    px."""
     pitch = camera.pixel_pitch_um
     x_um, y_um = (col - 0.5 * (camera.cols - 1)) * pitch, (row - 0.5 * (camera.rows - 1)) * pitch
     right, down = image_of(camera, effects).shifted_um(x_um, y_um, wavelength_nm)
@@ -477,8 +478,8 @@ def _mean_wavelength(
 def _unmoved_px(
     camera: CameraModel, row: FloatArray, col: FloatArray, wavelength_nm: float, effects: Sequence[Effect]
 ) -> tuple[FloatArray, FloatArray]:
-    """The places p with p + shift(p) = (row, col), by fixed-point steps to 1e-4 px: shifts change by less than they
-    are.
+    """Return the places p with p + shift(p) = (row, col), by fixed-point steps to 1e-4 px: shifts change by less than
+    they are.
     """
     from_row, from_col = row, col
     for _ in range(40):
@@ -496,7 +497,7 @@ def _unmoved_px(
 
 
 def _margin_for(camera: CameraModel, effects: Sequence[Effect], margin_px: int) -> int:
-    """The margin that a frame needs for light that is moved in from outside it."""
+    """Return the margin that a frame needs for light that is moved in from outside it."""
     if not image_of(camera, effects).moves:
         return margin_px
     row, col = (np.linspace(0.0, n - 1.0, 33) for n in (camera.rows, camera.cols))
@@ -527,7 +528,7 @@ class _Moved:
         self.alike = bool(np.ptp(ends, axis=0).max() < ALIKE_PX)
 
     def picture(self, drawn: NDArray[np.floating[Any]], wavelength_nm: float = MIDDLE_NM) -> NDArray[np.float32]:
-        """A picture on the grid, moved as light of a wavelength is."""
+        """Return a picture on the grid, moved as light of a wavelength is."""
         from sim.scene.displace import displace_drawing  # here: the compiler's library takes a while to load
 
         row, col = (part + self._grid.margin_px for part in self._from_px(wavelength_nm))
@@ -541,7 +542,7 @@ class _Moved:
 def _relative_to_ground(
     camera: CameraModel, grid: Grid, window: tuple[slice, slice], field: CubicSpline, ground: CubicSpline
 ) -> FloatArray:
-    """How a light's rate changes over the field, over how the ground's does, on a window of the grid."""
+    """Return how a light's rate changes over the field, over how the ground's does, on a window of the grid."""
     row, col = grid.axes_px()
     square = np.minimum(sin_theta_at(camera, row[window[0], None], col[None, window[1]]) ** 2, field.x[-1])
     return np.asarray(field(square) / np.maximum(ground(square), 1e-12))
@@ -553,7 +554,7 @@ def _whole(
     pictures: Sequence[NDArray[np.floating[Any]]],
     factors: Sequence[float],
 ) -> NDArray[np.float32]:
-    """The sum of factor x picture, each on its window of the grid."""
+    """Return the sum of factor x picture, each on its window of the grid."""
     total = np.zeros(grid.shape, np.float32)
     for window, picture, factor in zip(windows, pictures, factors, strict=True):
         total[window] += factor * picture

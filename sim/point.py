@@ -90,7 +90,7 @@ class Blur:
         fy_cy_per_px: FloatArray,
         place_um: tuple[float, float] = (0.0, 0.0),
     ) -> FloatArray | ComplexArray:
-        """The same over the transfer of the lens without effects."""
+        """Return the same over the transfer of the lens without effects."""
         fx, fy = fx_cy_per_px / self.camera.pixel_pitch_um, fy_cy_per_px / self.camera.pixel_pitch_um
         beside = self.image.otf_beside_lens(fx, fy, wavelength_nm, place_um)
         return times(beside, self._in_pixels(wavelength_nm, fx_cy_per_px, fy_cy_per_px))
@@ -130,8 +130,8 @@ def varies_over_field(camera: CameraModel, effects: Sequence[Acts]) -> bool:
 def displaced_um(
     camera: CameraModel, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, effects: Sequence[Acts]
 ) -> tuple[FloatArray, FloatArray] | None:
-    """How far (dx, dy) effects let light of one wavelength land from the place where the baseline has it; None where
-    they don't.
+    """Return how far (dx, dy) effects let light of one wavelength land from the place where the baseline has it; None
+    where they don't.
     """
     image = image_of(camera, effects)
     if not image.moves:
@@ -346,9 +346,8 @@ def wavelength_shares(
     effects: Sequence[Acts] = (),
     kind: str = "slanted_edge",
 ) -> FloatArray:
-    """How much each of `wavelength_nm` (ascending) counts for each of several sights (channel, light) in a mean over
-    the light that it detects, (sights, wavelengths), of what is linear between them: sum 1 over a sight.
-    """
+    """Return how much each of `wavelength_nm` (ascending) counts for each of several sights (channel, light) in a mean
+    over the light that it detects, (sights, wavelengths), of what is linear between them: sum 1 over a sight."""
     seen = _seen_light(camera, sights, effects, kind)
     return np.array([linear_shares(at, part, wavelength_nm) for at, part in seen])
 
@@ -478,7 +477,7 @@ def kernel(
 def _highest_cy_per_px(
     camera: CameraModel, channel: str, radiance: Spectrum | None, effects: Sequence[Acts], kind: str
 ) -> float:
-    """The lens's cutoff at the shortest wavelength that counts."""
+    """Return the lens's cutoff at the shortest wavelength that counts."""
     wavelength_nm, weight = detect_light(camera, channel, [(radiance, None)], effects, kind)
     nodes, _ = otf_wavelengths(camera, channel, wavelength_nm, weight[0], OTF_WAVELENGTHS)
     cutoff = camera.pixel_pitch_um * camera.lens.imaging.cutoff_cy_per_um(float(np.min(nodes)), camera.lens.f_number)

@@ -47,7 +47,7 @@ class Spectrum(Frozen):
 
     @classmethod
     def of(cls, wavelength_nm: ArrayLike, value: ArrayLike) -> Self:
-        """A spectrum from two arrays of the same length."""
+        """Return a spectrum from two arrays of the same length."""
         return cls(
             wavelength_nm=tuple(np.asarray(wavelength_nm, float).tolist()),
             value=tuple(np.asarray(value, float).tolist()),
@@ -79,12 +79,12 @@ class Spectrum(Frozen):
         return float(np.trapezoid(np.interp(grid, knots, value), grid))
 
     def scale(self, factor: float) -> Spectrum:
-        """The same curve times a number."""
+        """Return the same curve times a number."""
         wavelength_nm, value = self.arrays
         return Spectrum.of(wavelength_nm, value * factor)
 
     def resample(self, wavelength_nm: ArrayLike) -> Spectrum:
-        """The curve on other wavelengths (at least two, ascending), conserving what it integrates to.
+        """Return the curve on other wavelengths (at least two, ascending), conserving what it integrates to.
 
         v_i = integral S hat_i / integral hat_i with the triangles hat_i of the new grid: as they add up to 1 and to the
         wavelength, the result has the same integral and the same mean wavelength as `self` over the new grid's range,

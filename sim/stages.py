@@ -100,7 +100,7 @@ class Light(State):
     unsteadiness: tuple[Unsteadiness, ...] = ()
 
     def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
-        """The radiance in front of the lens, given what the radiometer said; `kind` is the capture's."""
+        """Return the radiance in front of the lens, given what the radiometer said; `kind` is the capture's."""
         return reduce(lambda value, law: law(wavelength_nm, value, kind), self.spectrum, radiance)
 
     def source(self, elapsed_s: float) -> float:
@@ -171,7 +171,7 @@ class Image(State):
         return reduce(lambda value, law: value * law(wavelength_nm, sine), self.transmittance, none)
 
     def wavefront(self, wavelength_nm: float, place_um: tuple[float, float] = (0.0, 0.0)) -> Wavefront:
-        """The sum of all path errors (um) at a place."""
+        """Return the sum of all path errors (um) at a place."""
         total = reduce(lambda value, law: value + law(wavelength_nm), self.pupil, Wavefront(()))
         return reduce(lambda value, law: value + law(wavelength_nm, *place_um), self.pupil_at, total)
 
@@ -199,7 +199,7 @@ class Image(State):
         wavelength_nm: float,
         place_um: tuple[float, float] = (0.0, 0.0),
     ) -> FloatArray | ComplexArray:
-        """The same over the lens's own; path errors as those of a perfect lens's pupil over that lens."""
+        """Return the same over the lens's own; path errors as those of a perfect lens's pupil over that lens."""
         value: FloatArray | ComplexArray = np.ones(np.broadcast_shapes(np.shape(fx_cy_per_um), np.shape(fy_cy_per_um)))
         path = self.wavefront(wavelength_nm, place_um)
         if path.terms:
@@ -224,7 +224,7 @@ class Image(State):
     def shifted_um(
         self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float
     ) -> tuple[FloatArray | float, FloatArray | float]:
-        """How far (dx, dy) light of one wavelength lands from where the baseline has it."""
+        """Return how far (dx, dy) light of one wavelength lands from where the baseline has it."""
         right: FloatArray | float = 0.0
         down: FloatArray | float = 0.0
         for law in self.shift:
@@ -237,13 +237,13 @@ class Image(State):
         return replace(self, veils=tuple(replace(veil, even_share=0.0) for veil in self.veils))
 
     def add_veil(self, image: FloatArray) -> FloatArray:
-        """A channel's irradiance (rows, cols) with what is scattered evenly over the frame: (1 - s) I + s <I>.
+        """Return a channel's irradiance (rows, cols) with what is scattered evenly over the frame: (1 - s) I + s <I>.
         Scattered light has met the lens's fall-off already and has none of its own.
         """
         return reduce(lambda v, veil: v + veil.even_share * (np.mean(v) - v), self.veils, image)
 
     def with_copies(self, image: FloatArray) -> FloatArray:
-        """A channel's whole image (rows, cols) with its reflections."""
+        """Return a channel's whole image (rows, cols) with its reflections."""
         return reduce(lambda value, law: law(value), self.copies, image)
 
 
@@ -281,11 +281,11 @@ class Charge(State):
     correlation: tuple[Callable[[FloatArray], FloatArray | float], ...] = ()
 
     def collected_s(self, exposure_s: float) -> float:
-        """The time in which light is collected, given the time that was asked for."""
+        """Return the time in which light is collected, given the time that was asked for."""
         return reduce(lambda value, law: law(value), self.exposure_s, exposure_s)
 
     def leaked_s(self, down: FloatArray) -> FloatArray | float:
-        """The time in which light is collected beside the exposure, at places down the frame, 0..1."""
+        """Return the time in which light is collected beside the exposure, at places down the frame, 0..1."""
         return sum((law(down) for law in self.leak_s), 0.0)
 
     def collect_light(self, electrons: FloatArray) -> FloatArray:
@@ -328,7 +328,7 @@ class Charge(State):
         return reduce(lambda value, law: law(value), self.overflow, electrons)
 
     def hold_lag(self, electrons: FloatArray) -> FloatArray | float:
-        """How many of a frame's electrons aren't read but stay for the next frame: image lag."""
+        """Return how many of a frame's electrons aren't read but stay for the next frame: image lag."""
         return sum((law(electrons) for law in self.lag), 0.0)
 
     def shot_e2(self, electrons: FloatArray) -> FloatArray:
@@ -469,32 +469,32 @@ class Acts(Protocol):
 
 
 def light_of(camera: CameraModel, effects: Iterable[Acts]) -> Light:
-    """The light's state with all that effects add."""
+    """Return the light's state with all that effects add."""
     return reduce(lambda state, effect: effect.on_light(state), effects, Light(camera))
 
 
 def image_of(camera: CameraModel, effects: Iterable[Acts]) -> Image:
-    """The image's."""
+    """Return the image's."""
     return reduce(lambda state, effect: effect.on_image(state), effects, Image(camera))
 
 
 def charge_of(camera: CameraModel, effects: Iterable[Acts]) -> Charge:
-    """The charge's."""
+    """Return the charge's."""
     return reduce(lambda state, effect: effect.on_charge(state), effects, Charge(camera))
 
 
 def signal_of(camera: CameraModel, effects: Iterable[Acts]) -> Signal:
-    """The signal's."""
+    """Return the signal's."""
     return reduce(lambda state, effect: effect.on_signal(state), effects, Signal(camera))
 
 
 def codes_of(camera: CameraModel, effects: Iterable[Acts]) -> Codes:
-    """The codes'."""
+    """Return the codes'."""
     return reduce(lambda state, effect: effect.on_codes(state), effects, Codes(camera))
 
 
 def laws_of(camera: CameraModel, effects: Iterable[Acts]) -> frozenset[str]:
-    """Which quantities effects change, as `stage.field`."""
+    """Return which quantities effects change, as `stage.field`."""
     acting = tuple(effects)
     states = (f(camera, acting) for f in (light_of, image_of, charge_of, signal_of, codes_of))
     return frozenset().union(*(state.list_laws() for state in states))

@@ -19,7 +19,8 @@ RIM_POWERS: dict[type[Effect], dict[str, int]] = {
 
 
 def at_f_number(camera: CameraModel, f_number: float) -> CameraModel:
-    """The camera with its lens at `f_number`. Raises ValueError for a lens that is known at one aperture alone."""
+    """Return the camera with its lens at `f_number`. Raises ValueError for a lens that is known at one aperture
+    alone."""
     if not isinstance(camera.lens.imaging, DiffractionLimited):
         raise ValueError(  # noqa: TRY004  (the lens is of the right type)
             f"a lens that is {camera.lens.imaging.kind} holds for f/{camera.lens.f_number:g} alone"

@@ -89,8 +89,8 @@ def traced_image(
 def _pictures_by_rank(
     camera: CameraModel, table: LensTable, scene: Scene, effects: Sequence[Effect], grid: Grid
 ) -> tuple[FloatArray, FloatArray, Iterator[FloatArray]]:
-    """A scene as an even ground (channels, F, W) and pictures on a grid with their lights (pictures, channels, F, W):
-    the fewest that leave 1e-4 of the strongest's light.
+    """Yield a scene as an even ground (channels, F, W) and pictures on a grid with their lights (pictures, channels, F,
+    W): the fewest that leave 1e-4 of the strongest's light.
     """
     if isinstance(scene, SpectralImage):
         rows, cols, bands = scene.radiance.shape
@@ -131,7 +131,7 @@ def _gram(flat: NDArray[np.floating]) -> FloatArray:
 
 
 def _on_grid(grid: Grid, layers: Sequence[Layer], factors: Sequence[float]) -> FloatArray:
-    """The sum of factor x coverage of some layers."""
+    """Return the sum of factor x coverage of some layers."""
     if len(layers) == 1 and factors[0] == 1.0 and layers[0].coverage.shape == grid.shape:
         return layers[0].coverage
     total = np.zeros(grid.shape)

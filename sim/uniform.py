@@ -67,8 +67,8 @@ class FieldPoints:
 
     @staticmethod
     def of(camera: CameraModel, rows: int = 8, cols: int = 10) -> FieldPoints:
-        """The whole frame: Gauss's points and equal areas would differ by less than 1e-5 of a cos^4 field's mean on
-        8 x 10 cells' centres.
+        """Return the whole frame: Gauss's points and equal areas would differ by less than 1e-5 of a cos^4 field's mean
+        on 8 x 10 cells' centres.
         """
         row = (np.arange(rows) + 0.5) / rows * camera.rows - 0.5
         col = (np.arange(cols) + 0.5) / cols * camera.cols - 0.5
@@ -106,7 +106,7 @@ def electron_rate(
 
 
 def radiance_at_lens(camera: CameraModel, radiance: Spectrum, effects: Sequence[Acts], kind: str) -> Spectrum:
-    """The radiance in front of the lens where the radiometer says `radiance`, in a capture of `kind`."""
+    """Return the radiance in front of the lens where the radiometer says `radiance`, in a capture of `kind`."""
     wavelength_nm, value = radiance.arrays
     return Spectrum.of(wavelength_nm, light_of(camera, effects).radiance(wavelength_nm, value, kind))
 
@@ -142,7 +142,7 @@ class Uniform:
     # --- light -------------------------------------------------------------------------------------------------------
 
     def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
-        """The radiance in front of the lens, given what the radiometer said; `kind` is the capture's."""
+        """Return the radiance in front of the lens, given what the radiometer said; `kind` is the capture's."""
         return self._light.radiance(wavelength_nm, radiance, kind)
 
     def transmittance(self, wavelength_nm: FloatArray) -> FloatArray:
@@ -150,7 +150,7 @@ class Uniform:
         return self._image.transmit(wavelength_nm, 0.0)
 
     def field(self, points: FieldPoints) -> FieldPoints:
-        """The same points in the light that the effects leave there."""
+        """Return the same points in the light that the effects leave there."""
         return replace(points, light=self.shade_light(points.light, points.x_um, points.y_um))
 
     def shade_light(self, light: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
@@ -174,7 +174,7 @@ class Uniform:
         return bool(self._light.rows)
 
     def collected_s(self, exposure_s: float) -> float:
-        """The time in which light is collected, given the time that was asked for."""
+        """Return the time in which light is collected, given the time that was asked for."""
         return self._charge.collected_s(exposure_s)
 
     @property
@@ -183,7 +183,7 @@ class Uniform:
         return bool(self._charge.leak_s)
 
     def leaked_s(self, points: FieldPoints) -> FloatArray:
-        """The time (points,) in which light is collected beside the exposure."""
+        """Return the time (points,) in which light is collected beside the exposure."""
         row = points.y_um / self.camera.pixel_pitch_um + optical_axis_px(self.camera)[0]
         return np.asarray(self._charge.leaked_s(row / (self.camera.rows - 1.0)) * np.ones(row.shape))
 
@@ -199,8 +199,8 @@ class Uniform:
         return np.ones(rows) if factors is None else factors
 
     def row_factors_by_phase(self, rows: int, exposure_s: float, phases: int) -> FloatArray:
-        """The same (phases, rows) of frames that begin at `phases` equally spaced times of one period, the longest of
-        several.
+        """Return the same (phases, rows) of frames that begin at `phases` equally spaced times of one period, the
+        longest of several.
         """
         period_s = max((law.period_s for law in self._light.rows), default=0.0)
         begins_s = period_s * np.arange(phases) / phases
@@ -298,7 +298,7 @@ class Uniform:
         return sum(float(np.mean(hot.sizes((self.camera.rows, self.camera.cols)))) for hot in self.hot)
 
     def lag_e(self, electrons: FloatArray) -> FloatArray | float:
-        """How many of a frame's electrons stay for the next."""
+        """Return how many of a frame's electrons stay for the next."""
         return self._charge.hold_lag(electrons)
 
     def shot_e2(self, electrons: FloatArray) -> FloatArray:
@@ -383,5 +383,5 @@ class Uniform:
 
 
 def _of_each(law: Callable[[float], float], value: FloatArray | float) -> FloatArray:
-    """A law of one number at every number of an array."""
+    """Return a law of one number at every number of an array."""
     return np.array([law(float(one)) for one in np.ravel(value)]).reshape(np.shape(value))

@@ -41,7 +41,7 @@ _STATUS = {
 
 @cache
 def _library() -> Any:
-    """The module `Aravis`. Raises `InstrumentError` where it isn't installed."""
+    """Return the module `Aravis`. Raises `InstrumentError` where it isn't installed."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ImportWarning)  # gi's importer is of an old kind
@@ -185,7 +185,7 @@ class AravisDevice:
         return names[0], names[1], serial_number, firmware
 
     def feature(self, method: str, *arguments: Any) -> Any:
-        """What `_AravisFeatures` has and does."""
+        """Return what `_AravisFeatures` has and does."""
         return getattr(self._nodes, method)(*arguments)
 
     def start(self) -> None:
@@ -203,7 +203,7 @@ class AravisDevice:
         self._nodes.do("stopping", self._camera.stop_acquisition)
 
     def grab(self, timeout_s: float) -> dict[str, Any] | None:
-        """The fields of a `Grabbed`; None if nothing came in time."""
+        """Return the fields of a `Grabbed`; None if nothing came in time."""
         buffer = self._stream.timeout_pop_buffer(round(timeout_s * 1e6))
         if buffer is None:
             return None

@@ -125,8 +125,8 @@ class StreamingCamera(Camera):
 
     @abstractmethod
     def next_frame(self) -> Frame:
-        """The frame of the oldest trigger whose frame wasn't read yet. Ends within exposure + time-out; the camera
-        stays armed.
+        """Return the frame of the oldest trigger whose frame wasn't read yet. Ends within exposure + time-out; the
+        camera stays armed.
 
         Its temperature is at most `TEMPERATURE_NS` old on the camera's clock, read beside the stream. Raises
         `drivers.errors.Garbled` for a torn frame, `drivers.errors.Repeated` for one that came before, and `NoAnswer`.

@@ -19,7 +19,7 @@ _READY_S = 1.0
 
 
 def pylon_library() -> Any:
-    """The module `pypylon.pylon`. Raises `InstrumentError` where it isn't installed."""
+    """Return the module `pypylon.pylon`. Raises `InstrumentError` where it isn't installed."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter(
@@ -34,7 +34,7 @@ def pylon_library() -> Any:
 
 
 def _said(error: Exception) -> str:
-    """What the library says, without the place in its sources."""
+    """Return what the library says, without the place in its sources."""
     return " ".join(str(error).split(" : ")[0].split())
 
 

@@ -32,7 +32,7 @@ class Grabbed:
     give_back: Callable[[], None] = lambda: None
 
     def unpacked(self, who: str) -> tuple[NDArray[np.uint16], PixelFormat]:
-        """The codes, (rows, cols) DN, in memory of their own, and the pixel format.
+        """Return the codes, (rows, cols) DN, in memory of their own, and the pixel format.
 
         Raises `Garbled` for a frame that isn't whole, or whose pixel format isn't known.
         """

@@ -101,7 +101,7 @@ class GenApiFeatures:
             raise InstrumentError(f"{self._who}: feature {name} is of type {kind}: {error}") from error
 
     def has(self, name: str) -> bool:
-        """Whether the camera has the feature, and it is implemented and available now."""
+        """Return whether the camera has the feature, and it is implemented and available now."""
         return bool(self._nodes.has_node(name)) and self._do(name, lambda node: bool(genapi.is_available(node)))
 
     def get(self, name: str) -> Setting:

@@ -102,7 +102,7 @@ class GenCp:
                 raise Garbled(f"{self._who}: not all of {len(piece)} bytes were written at {address + at:#x}")
 
     def integer(self, address: int, length: int = 4) -> int:
-        """An unsigned little-endian integer."""
+        """Return an unsigned little-endian integer."""
         return int.from_bytes(self.read(address, length), "little")
 
     def text(self, address: int) -> str:
@@ -164,7 +164,7 @@ class GenCp:
 
 
 def read_xml(control: GenCp, who: str) -> bytes:
-    """The camera's XML: the newest entry of its manifest, unzipped."""
+    """Return the camera's XML: the newest entry of its manifest, unzipped."""
     table = control.integer(ABRM_MANIFEST, 8)
     count = control.integer(table, 8)
     if not 1 <= count <= 64:

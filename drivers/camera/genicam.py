@@ -132,7 +132,7 @@ class GenicamCamera(StreamingCamera):
 
     @abstractmethod
     def _grab(self, timeout_s: float) -> Grabbed | None:
-        """The next buffer; None if none came in time."""
+        """Return the next buffer; None if none came in time."""
 
     @abstractmethod
     def _release(self) -> None:
@@ -281,7 +281,8 @@ class GenicamCamera(StreamingCamera):
             self._fired = datetime.now(UTC)
 
     def _trigger_source(self, features: CameraFeatures, trigger: Trigger) -> str:
-        """What triggers it: a line of its own, or the computer. Raises `InstrumentError` where it hasn't got that."""
+        """Return what triggers it: a line of its own, or the computer. Raises `InstrumentError` where it hasn't got
+        that."""
         if trigger == "line" and self._wanted_line != "Software":
             return trigger_line(features, self._who, self._wanted_line)
         if "Software" not in features.entries("TriggerSource"):
@@ -352,7 +353,7 @@ class GenicamCamera(StreamingCamera):
             raise Repeated(f"{self._who}: frame {grabbed.frame_id} came twice; it is dropped")
 
     def _temperature_c(self, features: CameraFeatures, time_ns: int | None, most_ns: int) -> float | None:
-        """The sensor's temperature, read again where the one before is `most_ns` older than the frame."""
+        """Return the sensor's temperature, read again where the one before is `most_ns` older than the frame."""
         if not self._has_temperature:
             return None
         at_ns = time.monotonic_ns() if time_ns is None else time_ns

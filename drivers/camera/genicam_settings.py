@@ -20,7 +20,7 @@ class Features(Protocol):
     """A camera's features by name."""
 
     def has(self, name: str) -> bool:
-        """Whether the camera has it, and it is available now."""
+        """Return whether the camera has it, and it is available now."""
 
     def get(self, name: str) -> Setting:
         """Its value; an enumeration's as the entry's name."""
@@ -240,7 +240,7 @@ def _places(features: Features, one: Neutral) -> Iterator[str]:
 
 
 def _selects(features: Features, selector: str, entry: str) -> bool:
-    """Whether the entry could be selected: a camera may list some that it doesn't have now."""
+    """Return whether the entry could be selected: a camera may list some that it doesn't have now."""
     if features.get(selector) == entry:
         return True
     try:
@@ -266,7 +266,7 @@ def _neutralised(features: Features, one: Neutral) -> InstrumentError | None:
 
 
 def _is_neutral(found: Setting, neutral: Setting) -> bool:
-    """Whether a value is the neutral one, but for a register's rounding: a thousandth."""
+    """Return whether a value is the neutral one, but for a register's rounding: a thousandth."""
     if isinstance(neutral, float) and isinstance(found, int | float):
         return abs(found - neutral) <= 1e-3
     return found == neutral
@@ -295,7 +295,7 @@ def _note(features: Features, name: str, key: str, found: dict[str, Setting]) ->
 
 
 def black_level(features: Features) -> float | None:
-    """The black level as the camera counts it (its own unit, mostly codes); None where it doesn't tell."""
+    """Return the black level as the camera counts it (its own unit, mostly codes); None where it doesn't tell."""
     with contextlib.suppress(InstrumentError):
         if features.has("BlackLevel"):
             return float(features.get("BlackLevel"))
@@ -303,8 +303,8 @@ def black_level(features: Features) -> float | None:
 
 
 def trigger_line(features: Features, who: str, wanted: str | None) -> str:
-    """The line that triggers exposures: `wanted`, else Line0. Raises `InstrumentError` that names those the camera
-    has."""
+    """Return the line that triggers exposures: `wanted`, else Line0. Raises `InstrumentError` that names those the
+    camera has."""
     lines = [name for name in features.entries("TriggerSource") if name.startswith("Line")]
     name = wanted or "Line0"
     if name in lines:

@@ -38,7 +38,7 @@ _ASK_S, _REST_S = 1e-4, 2e-3
 
 
 def _library() -> Any:
-    """The module `harvesters.core`. Raises `InstrumentError` where it isn't installed."""
+    """Return the module `harvesters.core`. Raises `InstrumentError` where it isn't installed."""
     try:
         from harvesters import core
     except ImportError as error:
@@ -61,7 +61,7 @@ class _Producer:
 
     @classmethod
     def of(cls, file: Path) -> _Producer:
-        """The producer of a file."""
+        """Return the producer of a file."""
         return cls._all.setdefault(file.resolve(), cls(file.resolve()))
 
     @contextmanager
@@ -102,7 +102,7 @@ class _Producer:
             ]
 
     def take(self, address: str, description: str | None) -> Any:
-        """The camera with this serial number, identifier or name, opened; None if it has none such."""
+        """Return the camera with this serial number, identifier or name, opened; None if it has none such."""
         core = _library()
         key = core.ParameterKey
         asked: dict[Any, Any] = {
@@ -121,7 +121,7 @@ class _Producer:
         return None
 
     def _opened(self, camera: Any, config: Any) -> Any:
-        """The library opens a camera, and leaves it open where what follows fails: close it then."""
+        """Return the library opens a camera, and leaves it open where what follows fails: close it then."""
         made: list[Any] = []
 
         def create_device() -> Any:
@@ -311,7 +311,7 @@ class GentlCamera(GenicamCamera):
 
 
 def _told(of: Any, name: str) -> Any:
-    """What a producer says of a camera or a buffer; None where it doesn't."""
+    """Return what a producer says of a camera or a buffer; None where it doesn't."""
     from genicam import gentl
 
     try:

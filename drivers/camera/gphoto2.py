@@ -35,7 +35,8 @@ _EVENT_MS = 20
 
 
 def seconds(choice: str) -> float | None:
-    """The exposure time (s) that a choice means: `1/60`, `0.0100s`, `2.5`, `30"`; None for `Bulb`, `Auto` and so on."""
+    """Return the exposure time (s) that a choice means: `1/60`, `0.0100s`, `2.5`, `30"`; None for `Bulb`, `Auto` and
+    so on."""
     found = re.fullmatch(r"(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?\s*(?:s|sec|\")?", choice.strip())
     if found is None:
         return None
@@ -141,7 +142,7 @@ class Library:
                 return found
 
     def fetch(self, folder: str, name: str, wanted: bool) -> bytes:
-        """A file's bytes where it is wanted; it is deleted on the camera: it was made for this."""
+        """Return a file's bytes where it is wanted; it is deleted on the camera: it was made for this."""
         data = b""
         if wanted:
             file = self._camera.file_get(folder, name, self._library.GP_FILE_TYPE_NORMAL)

@@ -78,7 +78,7 @@ class Core:
         return {name: str(self.get(name)) for name in self._core.getDevicePropertyNames(self._camera)}
 
     def temperature_c(self) -> float | None:
-        """The sensor's temperature, where the adapter tells."""
+        """Return the sensor's temperature, where the adapter tells."""
         told = self._first(*_TEMPERATURE)
         return float(told) if told else None
 
@@ -340,7 +340,7 @@ class MicroManagerCamera(SingleFrameCamera):
 
 
 def _same(found: Setting, wanted: str) -> bool:
-    """Whether a number is written otherwise: `1` for `1.0000`."""
+    """Return whether a number is written otherwise: `1` for `1.0000`."""
     try:
         return math.isclose(float(found), float(wanted), rel_tol=1e-6)
     except ValueError:

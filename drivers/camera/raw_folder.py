@@ -224,8 +224,8 @@ class RawFolderCamera(Camera):
             )
 
     def _await_file(self, seen: frozenset[Path], exposure_s: float) -> Path:
-        """The file that wasn't there before, once it is complete. Raises `NoAnswer`, `Interrupted`, `Garbled` for
-        two."""
+        """Return the file that wasn't there before, once it is complete. Raises `NoAnswer`, `Interrupted`, `Garbled`
+        for two."""
         until = time.monotonic() + exposure_s + self.timeout_s
         size, since = -1, time.monotonic()
         while True:
@@ -252,7 +252,7 @@ class RawFolderCamera(Camera):
 
 
 def read_raw(source: Path | BytesIO, name: str, who: str) -> RawPicture:
-    """What a raw file holds. Raises `Garbled` for one that LibRaw can't read. `name`: the file's in messages."""
+    """Return what a raw file holds. Raises `Garbled` for one that LibRaw can't read. `name`: the file's in messages."""
     import rawpy
 
     try:

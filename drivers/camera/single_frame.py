@@ -102,11 +102,11 @@ class SingleFrameCamera(Camera):
 
     @abstractmethod
     def _exposed(self) -> bool:
-        """Whether the picture is there."""
+        """Return whether the picture is there."""
 
     @abstractmethod
     def _read(self) -> NDArray[np.uint16]:
-        """The picture, (rows, cols) DN. Raises `Garbled` for one that isn't whole."""
+        """Return the picture, (rows, cols) DN. Raises `Garbled` for one that isn't whole."""
 
     @abstractmethod
     def _abort(self) -> None:
@@ -117,7 +117,7 @@ class SingleFrameCamera(Camera):
         """Let the camera go; may raise whatever it likes."""
 
     def _temperature_c(self) -> float | None:
-        """The sensor's temperature, where it tells."""
+        """Return the sensor's temperature, where it tells."""
         return None
 
     # --- the abstraction ----------------------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ class SingleFrameCamera(Camera):
             self._exposure_s, self._gain_db = self._set(features, exposure_s, gain), gain_db
 
     def _checked(self, exposure_s: float, gain_db: float) -> float | None:
-        """The gain in its own unit; None: as it is. Raises `InstrumentError` for what it can't do."""
+        """Return the gain in its own unit; None: as it is. Raises `InstrumentError` for what it can't do."""
         if not (math.isfinite(exposure_s) and exposure_s > 0 and math.isfinite(gain_db)):
             raise InstrumentError(f"{self._who}: exposure {exposure_s} s at {gain_db} dB; give a positive time")
         limits = self._sensor().exposure_s
@@ -270,7 +270,8 @@ class SingleFrameCamera(Camera):
     # --- inside -------------------------------------------------------------------------------------------------------
 
     def _left_s(self) -> float:
-        """How long (s) an answer may take: the time-out, and what is left of the call under way; 0.01 at least."""
+        """Return how long (s) an answer may take: the time-out, and what is left of the call under way; 0.01 at
+        least."""
         return max(0.01, min(self._timeout_s, self._until - time.monotonic()))
 
     @contextlib.contextmanager

@@ -24,7 +24,7 @@ _LAST_OF_16_BIT = 0xFFFF
 
 
 def frames_between(before: int, now: int) -> int:
-    """How many frames were numbered between two; below 0 for one that comes out of order.
+    """Return how many frames were numbered between two; below 0 for one that comes out of order.
 
     GigE Vision's 16-bit numbers go from 65535 to 1; a camera that doesn't count says 0.
     """
@@ -96,8 +96,8 @@ class FrameStream:
             yield self.next()
 
     def next(self) -> tuple[Frame, ...]:
-        """The next pair. Raises the failure of the last trigger after `MOST_LOST` lost ones in a row, and what no
-        repetition mends."""
+        """Return the next pair. Raises the failure of the last trigger after `MOST_LOST` lost ones in a row, and what
+        no repetition mends."""
         try:
             while True:
                 with self._starting_anew():
@@ -171,7 +171,7 @@ class FrameStream:
     # --- frames -----------------------------------------------------------------------------------------------------
 
     def _pair(self) -> tuple[Frame, ...] | None:
-        """The frames of the oldest trigger that isn't settled; None if one of them got lost."""
+        """Return the frames of the oldest trigger that isn't settled; None if one of them got lost."""
         for side in self._sides:
             while side.trigger < self._settled:
                 self._receive(side)
@@ -229,7 +229,8 @@ class FrameStream:
             self._given.popleft()
 
     def _missed(self) -> _Side | None:
-        """A wired camera whose frame began half an interval later than the others': it belongs to another trigger.
+        """Return a wired camera whose frame began half an interval later than the others': it belongs to another
+        trigger.
 
         The interval is the least one; without one, the time since the pair before, as then each trigger waits for a
         pair."""

@@ -92,7 +92,7 @@ class U3vStream:
         self._thread.start()
 
     def get(self, timeout_s: float) -> Grabbed | None:
-        """The next frame; None if none came in time. Raises the `USBError` that ended the stream."""
+        """Return the next frame; None if none came in time. Raises the `USBError` that ended the stream."""
         with contextlib.suppress(queue.Empty):
             came = self._came.get(timeout=timeout_s)
             if isinstance(came, usb.core.USBError):
@@ -119,8 +119,8 @@ class U3vStream:
             self._came.put(error)
 
     def _next_leader(self) -> _Leader | None:
-        """The leader of the next frame; what comes before one belongs to a frame whose leader was lost. None if nothing
-        comes."""
+        """Return the leader of the next frame; what comes before one belongs to a frame whose leader was lost. None if
+        nothing comes."""
         leader, self._leader = self._leader, None
         if leader is not None:
             return leader
@@ -140,7 +140,7 @@ class U3vStream:
         return into[:count].tobytes()
 
     def _frame(self, leader: _Leader, buffer: NDArray[np.uint8]) -> Grabbed:
-        """The rest of a frame; what is missing of it stands in its `damage`."""
+        """Return the rest of a frame; what is missing of it stands in its `damage`."""
         deadline = time.monotonic() + self.timeout_s
         at, trailer, late = 0, b"", ""
         try:
@@ -207,7 +207,7 @@ def _is(piece: array[int], magic: int) -> bool:
 
 
 def _damage(leader: _Leader, came: int, trailer: bytes, late: str) -> str:
-    """What is wrong with a frame of which `came` bytes of payload came; nothing if it is whole."""
+    """Return what is wrong with a frame of which `came` bytes of payload came; nothing if it is whole."""
     expected = leader.payload_bytes
     if came < expected:
         return f"{came} of {expected} bytes came{late}"

@@ -133,7 +133,8 @@ class CameraContract(FamilyContract):
 
     @staticmethod
     def _within(driver: Camera, exposure_s: float) -> float:
-        """An exposure of about that which the camera has: its shortest may be longer, and some have a few alone."""
+        """Return an exposure of about that which the camera has: its shortest may be longer, and some have a few
+        alone."""
         for longer in (1.0, 1.25, 2.5, 5.0):
             try:
                 driver.check(longer * exposure_s)

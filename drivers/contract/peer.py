@@ -81,12 +81,12 @@ class RealInstrument(Peer):
 
 
 def peers() -> dict[str, EntryPoint]:
-    """The peers that installed packages offer, by the driver's name (`family.name`)."""
+    """Return the peers that installed packages offer, by the driver's name (`family.name`)."""
     return {point.name: point for point in entry_points(group=GROUP)}
 
 
 def start_peer(reference: str) -> Peer:
-    """The peer that `module:callable` makes. Raises `InstrumentError` where there is none."""
+    """Return the peer that `module:callable` makes. Raises `InstrumentError` where there is none."""
     module, _, name = reference.partition(":")
     try:
         make: Callable[[], Peer] = getattr(import_module(module), name)

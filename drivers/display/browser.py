@@ -236,7 +236,7 @@ class BrowserDisplay(Display):
     # --- in the server's threads ------------------------------------------------------------------------------------
 
     def _serve_file(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The page and its script; None lets a WebSocket through.
+        """Return the page and its script; None lets a WebSocket through.
 
         Host and Origin are checked: another page in the same browser must not pass for the screen.
         """

@@ -32,7 +32,7 @@ class LightSource(Instrument):
 
     @abstractmethod
     def level(self, channel: str | None = None) -> float:
-        """The share 0..1 at which a channel is lit; 0 where it is off."""
+        """Return the share 0..1 at which a channel is lit; 0 where it is off."""
 
 
 class SteppedLamp(LightSource):
@@ -64,7 +64,7 @@ class SteppedLamp(LightSource):
 
     @abstractmethod
     def _read(self) -> float:
-        """The step at which it is lit; 0 where it is off."""
+        """Return the step at which it is lit; 0 where it is off."""
 
     @abstractmethod
     def _light(self, step: float) -> None:
@@ -76,7 +76,7 @@ class SteppedLamp(LightSource):
 
     @abstractmethod
     def _is_steady(self) -> bool:
-        """Whether its light doesn't change any more."""
+        """Return whether its light doesn't change any more."""
 
     @abstractmethod
     def _release(self) -> None:
@@ -167,7 +167,8 @@ class SteppedLamp(LightSource):
     # --- inside -------------------------------------------------------------------------------------------------------
 
     def _left_s(self) -> float:
-        """How long (s) an answer may take: the time-out, and what is left of the call under way; 0.01 at least."""
+        """Return how long (s) an answer may take: the time-out, and what is left of the call under way; 0.01 at
+        least."""
         return max(0.01, min(self._timeout_s, self._until - time.monotonic()))
 
     @contextlib.contextmanager

@@ -39,7 +39,8 @@ ORDER_SORTING_FILTERS = (
 
 
 def order_sorting_filters(table: Sequence[object] | None) -> tuple[OrderSortingFilter, ...]:
-    """The filter table of a station file (rows of `place`, `from_nm`, `to_nm`), checked; None: the default table.
+    """Return the filter table of a station file (rows of `place`, `from_nm`, `to_nm`), checked; None: the default
+    table.
 
     Raises `InstrumentError` for a row that lacks a key, an empty or overlapping band.
     """
@@ -180,7 +181,7 @@ SLIT_LIMITS_UM = (4.0, 3000.0)
 
 
 def checked_slit_um(width_um: float) -> float:
-    """The slit width (um) if the slits can be set to it; raises `InstrumentError` if not (a NaN included)."""
+    """Return the slit width (um) if the slits can be set to it; raises `InstrumentError` if not (a NaN included)."""
     low, high = SLIT_LIMITS_UM
     if not low <= width_um <= high:
         raise InstrumentError(
@@ -213,7 +214,7 @@ class HandSlits:
             )
 
     def departures(self, who: str) -> tuple[str, ...]:
-        """What isn't known of the light, in words."""
+        """Return what isn't known of the light, in words."""
         if self.stated_um is not None:
             return ()
         return (f"{who}: its slits are set by hand, and no slit_um is stated: the bandwidth of its light isn't known",)
@@ -235,7 +236,7 @@ def lines_per_mm(told: str, who: str) -> float:
 
 
 def checked_wavelength_nm(wavelength_nm: float, upper_nm: float) -> float:
-    """The wavelength (nm) if a grating can go there; raises `InstrumentError` if not (a NaN included)."""
+    """Return the wavelength (nm) if a grating can go there; raises `InstrumentError` if not (a NaN included)."""
     if not (math.isfinite(wavelength_nm) and 0.0 <= wavelength_nm <= upper_nm):
         raise InstrumentError(
             f"monochromator: {wavelength_nm} nm is outside 0..{upper_nm:g} nm; ask for a wavelength in this range"

@@ -237,8 +237,8 @@ class Cornerstone260(WireInstrument, Monochromator):
             self._do(f"GRAT {self.grating}")
 
     def _first_answer(self) -> tuple[str, bool]:
-        """The reply to INFO?, and whether handshake mode is on; by what comes with it also whether the instrument
-        echoes.
+        """Return the reply to INFO?, and whether handshake mode is on; by what comes with it also whether the
+        instrument echoes.
 
         Late answers to what was sent before are skipped.
         """
@@ -316,7 +316,7 @@ class Cornerstone260(WireInstrument, Monochromator):
             self._transport.pause(_LOOK_S, statement)
 
     def _ask(self, query: str) -> str:
-        """A query: its echo, its reply, its status byte. A refused query has the status byte alone."""
+        """Return a query: its echo, its reply, its status byte. A refused query has the status byte alone."""
         self._say(query)
         reply = self._line(query)
         if reply in _FAILED:

@@ -229,8 +229,8 @@ class ScpiPhotodiode(Photodiode):
         return answer.decode("latin-1").strip()
 
     def _answer(self) -> bytes:
-        """The next line. The library reads on as long as anything comes: here it ends with the time-out, whatever
-        comes."""
+        """Return the next line. The library reads on as long as anything comes: here it ends with the time-out,
+        whatever comes."""
         from pyvisa.constants import StatusCode
 
         until, line = time.monotonic() + self.timeout_s, bytearray()

@@ -115,7 +115,7 @@ class Cr300(WireInstrument, Spectroradiometer):
         return self._transport.read_until(b"\r\n", timeout_s, asked).decode("latin-1").strip()
 
     def _checked(self, asked: str, answer: str) -> str:
-        """The text of an answer. Raises `Refused` with the instrument's code."""
+        """Return the text of an answer. Raises `Refused` with the instrument's code."""
         kind, _, rest = answer.partition(":")
         code, _, rest = rest.partition(":")
         if kind == "OK" and rest.startswith(f"{asked}:"):

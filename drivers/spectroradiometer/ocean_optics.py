@@ -128,7 +128,7 @@ class OceanOptics(Spectroradiometer):
                 )
 
     def _nonlinearity(self) -> FloatArray:
-        """The maker's polynomial; 1 where the model keeps none."""
+        """Return the maker's polynomial; 1 where the model keeps none."""
         found = getattr(self._open.f, "nonlinearity_coefficients", None)
         bend = np.array([] if found is None else found.get_nonlinearity_coefficients(), float)
         return bend if bend.size and np.any(bend != 0) else np.ones(1)

@@ -113,7 +113,7 @@ class Pr655(WireInstrument, Spectroradiometer):
             return None
 
     def _ask(self, command: str) -> str:
-        """What follows the quality code of an answer of one line."""
+        """Return what follows the quality code of an answer of one line."""
         self._transport.write(command.encode("ascii") + b"\r")
         return self._checked(command, self._line(command))
 

@@ -236,7 +236,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
             raise self._strange(command, answer)
 
     def _ask(self, query: str) -> str:
-        """A query: one line, or NAK and the reason."""
+        """Return a query: one line, or NAK and the reason."""
         line = self._transport
         line.write(query.encode("ascii") + b"\r")
         first = self._byte(query)
@@ -246,7 +246,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         return (first + rest).replace(ENQ, b"").decode("latin-1").strip()
 
     def _byte(self, asked: str, timeout_s: float | None = None) -> bytes:
-        """The next byte that isn't ENQ."""
+        """Return the next byte that isn't ENQ."""
         while (one := self._transport.read(1, timeout_s, asked)) == ENQ:
             pass
         return one
@@ -262,7 +262,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         return Refused(f"{self._transport.name}: {command!r} failed: error {code}, {meaning}; {remedy}", code)
 
     def _fetch_spectrum(self) -> Spectrum:
-        """The last measured spectrum; requested again while it arrives incomplete."""
+        """Return the last measured spectrum; requested again while it arrives incomplete."""
         failure: InstrumentError | None = None
         for _ in range(FETCHES):
             try:

@@ -17,7 +17,7 @@ class Stage(Instrument):
 
     @abstractmethod
     def placed(self) -> str:
-        """The target in place; an empty string if it isn't known."""
+        """Return the target in place; an empty string if it isn't known."""
 
     @abstractmethod
     def targets(self) -> tuple[str, ...]:

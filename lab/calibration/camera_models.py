@@ -161,7 +161,7 @@ def records(store: Store, after: str | None = None, limit: int | None = None) ->
 
 
 def count(store: Store) -> int:
-    """How many results have a place for camera models."""
+    """Return how many results have a place for camera models."""
     with store.reading() as db:
         return db.scalars(sa.select(sa.func.count()).select_from(ResultRow).where(ResultRow.kind.in_(KINDS))).one()
 
@@ -176,18 +176,18 @@ def record(store: Store, result_id: str) -> CameraModelRecord:
 
 
 def files(store: Store, result_id: str) -> Iterator[Path]:
-    """The files of a model: each side's, and the arrays beside it."""
+    """Yield the files of a model: each side's, and the arrays beside it."""
     yield from sorted(_folder(store, result_id).iterdir())
 
 
 def camera_files(store: Store, found: CameraModelRecord) -> dict[Side, CameraFile]:
-    """The cameras themselves."""
+    """Return the cameras themselves."""
     folder = _folder(store, found.id)
     return {side: read_camera(folder / f"{side}.toml") for side in found.sides}
 
 
 def cameras(store: Store, found: CameraModelRecord) -> dict[Side, ModelOfCamera]:
-    """What each camera file says."""
+    """Return what each camera file says."""
     return {side: _camera(content) for side, content in camera_files(store, found).items()}
 
 
@@ -208,7 +208,7 @@ def _camera(content: CameraFile) -> ModelOfCamera:
 
 
 def _parameters(model: BaseModel, std: Mapping[str, float]) -> Iterator[ModelParameter]:
-    """The declared quantities of a model that are set."""
+    """Yield the declared quantities of a model that are set."""
     for name, quantity in read_quantities(type(model)).items():
         value = getattr(model, name)
         if isinstance(value, int | float | tuple):

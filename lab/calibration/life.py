@@ -153,7 +153,7 @@ def cameras_of(instruments: Snapshots, station: Station) -> dict[Side, str]:
 
 
 def rig_of(cameras: Mapping[Side, str]) -> str:
-    """The rig of these cameras: a calibration of it supersedes an earlier one of the same."""
+    """Return the rig of these cameras: a calibration of it supersedes an earlier one of the same."""
     return json.dumps(dict(sorted(cameras.items())))
 
 
@@ -253,7 +253,7 @@ def _register(store: Store, missing: Sequence[str]) -> None:
 def _entry(
     result_id: str, created: datetime, document: Any, session_id: str, station: Any, runs: Sequence[Any]
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The rows of a calibration and of its figures."""
+    """Return the rows of a calibration and of its figures."""
     run = RunRecord.model_validate(runs[-1]) if runs else None
     cameras = cameras_of(run.instruments if run is not None else {}, Station.model_validate(station))
     rig = rig_of(cameras)
@@ -339,7 +339,7 @@ def calibrations(store: Store, after: str | None = None, limit: int | None = Non
 
 
 def count_calibrations(store: Store) -> int:
-    """How many calibrations there are."""
+    """Return how many calibrations there are."""
     register(store)
     with store.reading() as db:
         return db.scalars(sa.select(sa.func.count()).select_from(CalibrationRow)).one()
@@ -357,7 +357,7 @@ def calibration(store: Store, id: str) -> CalibrationRecord:
 
 
 def _figure(row: Any) -> Figure:
-    """The figure of a row, which has the columns of `FigureRow`."""
+    """Return the figure of a row, which has the columns of `FigureRow`."""
     sensor = None
     if row.doubling_c is not None:
         sensor = SensorTemperature.model_validate({name: getattr(row, name) for name in SensorTemperature.model_fields})
@@ -365,7 +365,7 @@ def _figure(row: Any) -> Figure:
 
 
 def figures(store: Store, calibration_id: str) -> tuple[Figure, ...]:
-    """The figures of a calibration."""
+    """Return the figures of a calibration."""
     asked = sa.select(FigureRow).where(FigureRow.calibration_id == calibration_id).order_by(FigureRow.id)
     with store.reading() as db:
         return tuple(_figure(row) for row in db.scalars(asked))
@@ -472,7 +472,8 @@ def history(
     limits: CalibrationLimits | None = None,
     false_alarm_rate: float = FALSE_ALARM_RATE,
 ) -> History:
-    """A figure of a camera over its calibrations. A session that was fitted again with the same outcome is entered
+    """Return a figure of a camera over its calibrations. A session that was fitted again with the same outcome is
+    entered
     once: by its newest fit, or by that which was certified.
 
     Each is compared with its reference as `compare` does, by the standard deviation of the difference, dark currents at
@@ -516,7 +517,8 @@ def history(
 
 
 def _once_a_session(rows: Sequence[Any]) -> list[Any]:
-    """The rows, oldest first, less those that a later fit of the same session found again; what was certified stays."""
+    """Return the rows, oldest first, less those that a later fit of the same session found again; what was certified
+    stays."""
     newest = {(row.session_id, row.value, row.std): row.calibration_id for row in rows}
     return [
         row
@@ -526,7 +528,7 @@ def _once_a_session(rows: Sequence[Any]) -> list[Any]:
 
 
 def _points(rows: Sequence[Any], limit: Limit | None, threshold_sigma: float) -> Iterator[HistoryPoint]:
-    """A point for each row, oldest first. The reference is the last one before that was ever certified, else the
+    """Yield a point for each row, oldest first. The reference is the last one before that was ever certified, else the
     first."""
     at = now()
     reference = None
@@ -620,8 +622,8 @@ def drift_board(
 
 
 def _board_columns(store: Store, camera: str, newest: int) -> list[tuple[CalibrationRow, str]]:
-    """The camera's newest calibrations with their sessions' names, the oldest first: the newest of each session, and
-    the newest of all that was certified."""
+    """Return the camera's newest calibrations with their sessions' names, the oldest first: the newest of each session,
+    and the newest of all that was certified."""
     has = sa.select(FigureRow.calibration_id).where(FigureRow.camera == camera)
     with store.reading() as db:
         found = list(db.execute(_asked().where(CalibrationRow.id.in_(has)).order_by(CalibrationRow.created)))
@@ -639,7 +641,7 @@ def _board_row(
     reference_c: float | None,
     false_alarm_rate: float,
 ) -> BoardRow:
-    """The board's row of one figure, of which `rows` has those calibrations that have it."""
+    """Return the board's row of one figure, of which `rows` has those calibrations that have it."""
     one = _figure(rows[-1])
     limit = next((found for found in (limits.limit if limits else ()) if found.concerns(one)), None)
     threshold = sigma_of_probability(sidak_part(false_alarm_rate, max(len(rows) - 1, 1)))
@@ -663,7 +665,7 @@ def _board_row(
 
 
 def _cell(figure: Figure, point: HistoryPoint, reference_c: float | None) -> BoardCell:
-    """A cell; a dark current whose temperature is known at `reference_c`, uncertain by the conversion, too."""
+    """Return a cell; a dark current whose temperature is known at `reference_c`, uncertain by the conversion, too."""
     value, std, corrected = point.value, point.std, False
     if reference_c is not None and figure.sensor is not None and figure.sensor.temperature_c is not None:
         doublings, doublings_std = figure.sensor.doublings(SensorTemperature(temperature_c=reference_c))

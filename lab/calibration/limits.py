@@ -58,7 +58,7 @@ class Limit(Frozen):
         return self
 
     def concerns(self, figure: Figure) -> bool:
-        """Whether this limit is one of that figure."""
+        """Return whether this limit is one of that figure."""
         return (
             fnmatchcase(figure.name, self.figure)
             and self.side in (None, figure.side)
@@ -146,14 +146,14 @@ def judged(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judg
 
 
 def standing_limits(folder: Path) -> CalibrationLimits | None:
-    """The limits of a data folder, `limits.toml`; None where it has none. Raises InputError where they can't be
+    """Return the limits of a data folder, `limits.toml`; None where it has none. Raises InputError where they can't be
     used."""
     file = folder / "limits.toml"
     return read_limits(file) if file.exists() else None
 
 
 def read_limits(file: Path) -> CalibrationLimits:
-    """The limits of a TOML file. Raises InputError, one line for each problem."""
+    """Return the limits of a TOML file. Raises InputError, one line for each problem."""
     table = read_toml(file, "give a file of limits")
     try:
         return CalibrationLimits.model_validate(table)

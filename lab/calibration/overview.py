@@ -39,7 +39,7 @@ class SessionOverview(Frozen):
 
 
 def tags_of(notes: str) -> tuple[str, ...]:
-    """The tags of a session: the words of its notes that begin with #, each once."""
+    """Return the tags of a session: the words of its notes that begin with #, each once."""
     return tuple(dict.fromkeys(_TAG.findall(notes)))
 
 
@@ -99,7 +99,7 @@ def _means(db: Any, calibrations: Sequence[str], patterns: Sequence[str]) -> dic
 
 
 def _reported(runs: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """The cameras of a session's last run as they reported themselves, by side."""
+    """Return the cameras of a session's last run as they reported themselves, by side."""
     instruments: Mapping[str, Mapping[str, str]] = runs[-1]["instruments"] if runs else {}
     return {
         name.removeprefix("camera "): " ".join(

@@ -59,7 +59,7 @@ class _Threads:
                 self._idle.append(mine)
 
     def _next(self, mine: queue.SimpleQueue[_Work]) -> _Work | None:
-        """The next call; None where the thread ends."""
+        """Return the next call; None where the thread ends."""
         try:
             return mine.get(timeout=IDLE_S)
         except queue.Empty:

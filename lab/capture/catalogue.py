@@ -166,7 +166,7 @@ class StepTimes:
         return cls({work: float(np.mean(each)) for work, each in rest.items()}, per_exposure)
 
     def seconds(self, step: Step) -> tuple[float, bool]:
-        """What a step takes, and whether that was learned."""
+        """Return what a step takes, and whether that was learned."""
         work = _work(step)
         mean_s = self.mean_s.get(work)
         whole = (sum(TYPICAL_S[does] for does in work[1]) if mean_s is None else mean_s) + (
@@ -176,7 +176,7 @@ class StepTimes:
 
 
 def step_times(store: Store, station: Station) -> StepTimes:
-    """What the newest finished sessions on the same instruments show."""
+    """Return what the newest finished sessions on the same instruments show."""
     instruments = _instruments(station.model_dump(mode="json"))
     newest = sa.select(SessionRow.id, SessionRow.station).where(SessionRow.state == "finished")
     newest = newest.order_by(SessionRow.created.desc()).limit(LOOKED_AT)

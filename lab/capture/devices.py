@@ -49,7 +49,7 @@ class Device:
         self.name = name
 
     def readings(self) -> dict[str, float | str]:
-        """The device's values in an event, by key. A key's value always has the same type."""
+        """Return the device's values in an event, by key. A key's value always has the same type."""
         raise NotImplementedError
 
     def read(self) -> dict[str, Any]:
@@ -320,7 +320,7 @@ class Shot:
     repeats: int = 0
 
     def same_settings(self, other: Shot) -> bool:
-        """Whether exposures and gain are those of the other shot."""
+        """Return whether exposures and gain are those of the other shot."""
         return dict(self.exposure_s) == dict(other.exposure_s) and self.gain_db == other.gain_db
 
 
@@ -383,8 +383,8 @@ class CamerasDevice(Device):
         return max(camera.readout_s for camera in self.cameras.values())
 
     def _expose(self, shot: Shot) -> Sequence[Frame]:
-        """A frame of each camera, the next of the series under way if there is one. A lost or incomplete frame is taken
-        again."""
+        """Return a frame of each camera, the next of the series under way if there is one. A lost or incomplete frame
+        is taken again."""
         if self._stream is None and shot.repeats:
             streaming = [camera for camera in self.cameras.values() if isinstance(camera, StreamingCamera)]
             if len(streaming) == len(self.cameras):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 
 def npy_bytes(array: NDArray[Any]) -> bytes:
-    """An array as the bytes of its .npy file."""
+    """Return an array as the bytes of its .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()

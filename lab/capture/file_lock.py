@@ -42,7 +42,7 @@ class Lock:
             self._file = None
 
     def is_held(self) -> bool:
-        """Whether any process holds it, this one included."""
+        """Return whether any process holds it, this one included."""
         if self._file is not None:
             return True
         if not self.path.exists():

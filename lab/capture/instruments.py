@@ -144,7 +144,8 @@ class Instruments:
             self._check_screen(name)
 
     def _demands(self, steps: Sequence[Step]) -> Iterator[tuple[Callable[[], None], str]]:
-        """What is asked of the instruments without moving them, and, in words, where the plan's value comes from."""
+        """Yield what is asked of the instruments without moving them, and, in words, where the plan's value comes
+        from."""
         limits = self.limits
         lights = {(nm, step.sequence) for step in steps if (nm := step.setting.wavelength_nm) is not None}
         for wavelength_nm, sequence in sorted(lights):
@@ -210,7 +211,7 @@ class Instruments:
 
 
 def _snapshot(driver: Instrument) -> InstrumentSnapshot:
-    """What a connected instrument says of itself. Raises InstrumentError."""
+    """Return what a connected instrument says of itself. Raises InstrumentError."""
 
     def told(values: Mapping[str, Setting]) -> dict[str, Setting]:
         return {
@@ -260,7 +261,8 @@ def _complaints(stopping: Mapping[str, Future[None]]) -> dict[str, str]:
 
 
 def contradiction(side: str, sensor: SensorInfo, sheet: DataSheet) -> str | None:
-    """What a camera says of itself that its data sheet in the station file contradicts, in a line; None: nothing."""
+    """Return what a camera says of itself that its data sheet in the station file contradicts, in a line; None:
+    nothing."""
     where = "its data sheet in the station file says"
     if (sensor.rows, sensor.cols) != (sheet.rows, sheet.cols):
         return (
@@ -280,6 +282,6 @@ def contradiction(side: str, sensor: SensorInfo, sheet: DataSheet) -> str | None
 
 
 def named_complaint(name: str, error: Exception) -> str:
-    """An instrument's error as a line that names the instrument."""
+    """Return an instrument's error as a line that names the instrument."""
     text = str(error)
     return text if name.split(maxsplit=1)[0] in text.lower() else f"{name}: {text}"

@@ -28,15 +28,15 @@ def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
 
 
 def _chunk(frame: NDArray[np.uint16]) -> bytes:
-    """A frame as HDF5's shuffle and gzip filters encode it. HDF5's own filters would block other threads; zlib
+    """Return a frame as HDF5's shuffle and gzip filters encode it. HDF5's own filters would block other threads; zlib
     doesn't."""
     shuffled = np.ascontiguousarray(frame.astype("<u2").view(np.uint8).reshape(-1, 2).T)
     return zlib.compress(shuffled.tobytes(), _GZIP_LEVEL)
 
 
 def _chunks(recordings: RecordingSet, captures: Sequence[Capture]) -> Generator[bytes, None, None]:
-    """The frames as chunks, packed by threads. Closing it drops those that weren't begun: leaving the pool alone would
-    pack them all."""
+    """Yield the frames as chunks, packed by threads. Closing it drops those that weren't begun: leaving the pool alone
+    would pack them all."""
     with ThreadPoolExecutor(_PACKERS, thread_name_prefix="pack") as pool:
         yield from pool.map(lambda capture: _chunk(recordings.frame(capture)), captures)
 

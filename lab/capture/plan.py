@@ -41,11 +41,12 @@ class CapturePlan:
         return made
 
     def patterns(self, station: Equipment) -> dict[str, Cells]:
-        """The cells (rows, cols) of all patterns that the screen is to show, by path in the session."""
+        """Return the cells (rows, cols) of all patterns that the screen is to show, by path in the session."""
         return {path: cells for sequence in self.sequences for path, cells in sequence.patterns(station).items()}
 
     def document(self) -> dict[str, Any]:
-        """The sequences' parameters by name, as JSON; a list of them where a sequence is taken in several lights."""
+        """Return the sequences' parameters by name, as JSON; a list of them where a sequence is taken in several
+        lights."""
         found: dict[str, list[Any]] = {}
         for sequence in self.sequences:
             found.setdefault(sequence.name, []).append(sequence.model_dump(mode="json", exclude_none=True))
@@ -71,7 +72,7 @@ def full_plan(
 
 
 def _with(sequence: Sequence, values: Mapping[str, Any]) -> Sequence:
-    """The sequence with other values of its parameters. Raises InputError."""
+    """Return the sequence with other values of its parameters. Raises InputError."""
     known = read_quantities(type(sequence))
     if unknown := values.keys() - known.keys():
         raise InputError(f"{sequence.name}.{min(unknown)}: isn't a parameter; {sequence.name} has {', '.join(known)}")

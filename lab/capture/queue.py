@@ -41,7 +41,7 @@ class QueuedSession(Frozen):
 
 
 def queue(store: Store) -> list[QueuedSession]:
-    """The queued sessions in their order."""
+    """Return the queued sessions in their order."""
     with store.reading() as db:
         return [
             QueuedSession(

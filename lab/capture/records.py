@@ -104,5 +104,5 @@ class JournalEntry:
 
 
 def now() -> datetime:
-    """The time, UTC."""
+    """Return the time, UTC."""
     return datetime.now(UTC)

@@ -59,7 +59,8 @@ def make_station_safe(
 
 
 def ended_without_progress_twice(store: Store, session_id: str) -> bool:
-    """Whether the last two runs of a session finished no step: resuming it automatically could repeat for ever."""
+    """Return whether the last two runs of a session finished no step: resuming it automatically could repeat for
+    ever."""
     done, runs = store.session(session_id).steps_done, store.runs(session_id)
     return len(runs) >= 2 and all(run.steps_done == done for run in runs[-2:])
 
@@ -172,7 +173,7 @@ class Recovery:
             lock.release()
 
     def _what_next(self, session_id: str, station: Station) -> tuple[str, bool]:
-        """What happens next to the session, as the end of a sentence, and whether it is resumed."""
+        """Return what happens next to the session, as the end of a sentence, and whether it is resumed."""
         info = self._store.session(session_id)
         if info.steps_done == info.steps:
             return "only packing was left, which goes on by itself", True

@@ -196,8 +196,8 @@ def _say(line: str) -> None:
 
 
 def made_safe_at_start() -> dict[str, Lock]:
-    """The sessions whose stations `make_safe_at_start` made safe, with their locks, which are held. To be called before
-    somebody else speaks to the same instruments."""
+    """Return the sessions whose stations `make_safe_at_start` made safe, with their locks, which are held. To be called
+    before somebody else speaks to the same instruments."""
     return {name: lock for rescue in _at_start for name, lock in rescue.made_safe(INSTRUMENTS_S).items()}
 
 

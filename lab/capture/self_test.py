@@ -49,8 +49,8 @@ def self_tests(drivers: Drivers, sheets: Mapping[str, DataSheet] = MappingProxyT
 
 
 def self_test(station: Station, name: str, connect: Callable[[Station], Drivers] = drivers_of) -> SelfTest:
-    """The self-test of one instrument (`monochromator`, `cameras.left`, ...). Raises InputError if the station hasn't
-    got it."""
+    """Return the self-test of one instrument (`monochromator`, `cameras.left`, ...). Raises InputError if the station
+    hasn't got it."""
     _entry(station, name)
     side = _said(name).partition(" ")[2]
     return _self_test(_said(name), connect(station).all[_said(name)], data_sheets(station).get(side))
@@ -62,7 +62,7 @@ def data_sheets(station: Station) -> dict[str, DataSheet]:
 
 
 def _said(name: str) -> str:
-    """A device's name in messages: `camera left` for `cameras.left`."""
+    """Return a device's name in messages: `camera left` for `cameras.left`."""
     family, _, side = name.partition(".")
     return f"camera {side}" if side else family
 
@@ -107,8 +107,8 @@ def _self_test(name: str, instrument: Instrument, sheet: DataSheet | None = None
 
 
 def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
-    """A self-test of one instrument (`monochromator`, `cameras.left`, ...), with a transcript of its messages in a
-    file.
+    """Return a self-test of one instrument (`monochromator`, `cameras.left`, ...), with a transcript of its messages in
+    a file.
 
     Raises InputError if the station has no such instrument or the file can't be written.
     """
@@ -131,14 +131,14 @@ def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
 
 
 def check_station(station: Station) -> list[SelfTest]:
-    """The self-tests of a whole station."""
+    """Return the self-tests of a whole station."""
     return list(self_tests(drivers_of(station), data_sheets(station)))
 
 
 def station_text(found: Iterable[Found]) -> str:
-    """A station file (TOML) of the instruments that are connected. Cameras are asked for their pixels, colour filters
-    and bit depth; what they don't tell becomes a comment. Raises DeviceError where there is no camera or one doesn't
-    answer."""
+    """Return a station file (TOML) of the instruments that are connected. Cameras are asked for their pixels, colour
+    filters and bit depth; what they don't tell becomes a comment. Raises DeviceError where there is no camera or one
+    doesn't answer."""
     lines = [
         (
             "# Written by `calibench station init` from what is connected. Data sheets hold what the makers say: complete "  # noqa: E501

@@ -349,7 +349,7 @@ class CaptureSession:
                     )
 
     def _provenance(self, found: Snapshots) -> RunRecord:
-        """The record of this run; what differs of the instruments from the run before is told now."""
+        """Return the record of this run; what differs of the instruments from the run before is told now."""
         versions = {"python": platform.python_version()}
         for package in PACKAGES:
             with contextlib.suppress(PackageNotFoundError):
@@ -514,8 +514,8 @@ class _Wakeful(DuringTask):  # type: ignore[misc]  # the library has no types
 
 
 def _has_exposure(result: Mapping[str, Any]) -> bool:
-    """Whether later steps ask for a step's result: for the exposure that it found. Others aren't kept: a session may
-    take a day."""
+    """Return whether later steps ask for a step's result: for the exposure that it found. Others aren't kept: a session
+    may take a day."""
     return "exposure_s" in result
 
 
@@ -530,8 +530,8 @@ def _append(file: Path, name: str, document: dict[str, Any]) -> None:
 
 
 def _plain(error: BaseException, complaints: Sequence[str]) -> BaseException:
-    """The error as an InputError or a DeviceError where its kind is known, with the instruments that didn't reach their
-    safe state."""
+    """Return the error as an InputError or a DeviceError where its kind is known, with the instruments that didn't
+    reach their safe state."""
     while isinstance(error, FailedStatus) and error.__cause__ is not None:
         error = error.__cause__
     unsafe = [line for line in complaints if line not in str(error)]

@@ -171,7 +171,7 @@ class Station(Frozen):
 
 
 def _with_curves(tables: Any, folder: Path) -> Any:
-    """The tables with CSV paths of quantum efficiencies replaced by their curves."""
+    """Return the tables with CSV paths of quantum efficiencies replaced by their curves."""
     if not isinstance(tables, dict) or not isinstance(tables.get("cameras"), dict):
         return tables
     for side, camera in tables["cameras"].items():
@@ -199,7 +199,7 @@ def _complaints(error: ValidationError) -> Iterator[str]:
 
 
 def read_station(path: str | Path) -> Station:
-    """The station in a TOML file. Raises InputError, one line that names every wrong key."""
+    """Return the station in a TOML file. Raises InputError, one line that names every wrong key."""
     file = Path(path)
     tables = read_toml(file, "give a station file, `calibench bench --station FILE` writes one")
     try:
@@ -245,8 +245,8 @@ def _make(family: str, where: str, name: str, address: str, settings: dict[str, 
 
 
 def drivers_of(station: Station) -> Drivers:
-    """The drivers that a station file names. Raises InputError for settings that a driver doesn't know, DeviceError if
-    there is no such driver."""
+    """Return the drivers that a station file names. Raises InputError for settings that a driver doesn't know,
+    DeviceError if there is no such driver."""
 
     def made(family: str, entry: Address | None) -> Any:
         return entry and _make(family, family, entry.driver, entry.address, entry.settings)

@@ -87,7 +87,7 @@ class Store:
 
     @classmethod
     def open(cls, settings: Settings | None = None) -> Store:
-        """The store that the settings (by default the environment) name; made if it isn't there."""
+        """Return the store that the settings (by default the environment) name; made if it isn't there."""
         chosen = settings or Settings()
         return cls(chosen.data, chosen.database_url)
 
@@ -110,11 +110,11 @@ class Store:
     # --- sessions -----------------------------------------------------------------------------------------------------
 
     def folder(self, session_id: str) -> Path:
-        """Where a session's files lie."""
+        """Return where a session's files lie."""
         return self.root / "sessions" / session_id
 
     def lock(self, session_id: str) -> Lock:
-        """The lock of the process that runs a session."""
+        """Return the lock of the process that runs a session."""
         return Lock(self.folder(session_id) / ".lock")
 
     def create_session(
@@ -176,8 +176,8 @@ class Store:
         return row
 
     def _infos(self, db: Session, rows: Sequence[SessionRow]) -> list[SessionInfo]:
-        """The sessions of these rows. Of one that is packed, all steps are done; those of the others are counted in one
-        query."""
+        """Return the sessions of these rows. Of one that is packed, all steps are done; those of the others are counted
+        in one query."""
         counted = sa.select(StepRow.session_id, sa.func.count(StepRow.finished)).group_by(StepRow.session_id)
         open_ones = [row.id for row in rows if not row.packed]
         asked = db.execute(counted.where(StepRow.session_id.in_(open_ones))) if open_ones else ()
@@ -203,7 +203,7 @@ class Store:
         return self._infos(db, [row])[0]
 
     def _now(self, read: SessionInfo) -> SessionInfo:
-        """The state as it is now.
+        """Return the state as it is now.
 
         A session that was read as running, but whose lock is free, is read again: its process may have ended in
         between. It is "interrupted" if that process didn't record how it ended.
@@ -249,7 +249,7 @@ class Store:
         return [self._now(one) for one in found]
 
     def count_sessions(self, *, search: str = "", only: Sequence[str] | None = None) -> int:
-        """How many sessions there are, of those that `sessions` answers."""
+        """Return how many sessions there are, of those that `sessions` answers."""
         with self.reading() as db:
             return db.scalars(_searched(sa.select(sa.func.count()).select_from(SessionRow), search, only)).one()
 
@@ -272,12 +272,12 @@ class Store:
             return list(db.scalars(sa.select(SessionRow.id).where(SessionRow.state.in_(("running", "paused")))))
 
     def has_session(self, session_id: str) -> bool:
-        """Whether there is such a session."""
+        """Return whether there is such a session."""
         with self.reading() as db:
             return db.get(SessionRow, session_id) is not None
 
     def station(self, session_id: str) -> Station:
-        """The station of a session's last run, or that it was started on."""
+        """Return the station of a session's last run, or that it was started on."""
         with self.reading() as db:
             return Station.model_validate(self._row(db, session_id).station)
 
@@ -295,8 +295,8 @@ class Store:
             return [RunRecord.model_validate(run) for run in self._row(db, session_id).runs]
 
     def run_before(self, session_id: str) -> tuple[str, RunRecord] | None:
-        """The last run on the session's station so far, with its session's id: of this session, or of one that was
-        registered earlier. None: there is none."""
+        """Return the last run on the session's station so far, with its session's id: of this session, or of one that
+        was registered earlier. None: there is none."""
         with self.reading() as db:
             row = self._row(db, session_id)
             station = row.station.get("name", "")
@@ -441,7 +441,7 @@ class Store:
         return self._put(session_id, "target", path, npy_bytes(np.ascontiguousarray(cells, np.uint8)))
 
     def files(self, session_id: str) -> list[StoredFile]:
-        """The linked files of a session with their hashes, in the order in which they were linked."""
+        """Return the linked files of a session with their hashes, in the order in which they were linked."""
         with self.reading() as db:
             rows = db.scalars(sa.select(FileRow).where(FileRow.session_id == session_id).order_by(FileRow.id))
             return [StoredFile(row.role, row.path, row.sha256, row.bytes, row.side) for row in rows]  # type: ignore[arg-type]
@@ -458,8 +458,8 @@ class Store:
         newest_first: bool = False,
         limit: int | None = None,
     ) -> list[CaptureInfo]:
-        """The captures of a session in the order in which they were taken, or the newest first: of one kind and side,
-        or all; `limit` at most, those that follow the capture of the id `after` in this order."""
+        """Return the captures of a session in the order in which they were taken, or the newest first: of one kind and
+        side, or all; `limit` at most, those that follow the capture of the id `after` in this order."""
         asked = _captures_of(sa.select(CaptureRow), session_id, kind, side)
         if after is not None:
             asked = asked.where(CaptureRow.id < after if newest_first else CaptureRow.id > after)
@@ -483,12 +483,12 @@ class Store:
             return CaptureInfo.model_validate(row)
 
     def frame(self, capture_id: int) -> NDArray[np.uint16]:
-        """The frame of a capture by its id in the registry."""
+        """Return the frame of a capture by its id in the registry."""
         recordings = self.recording_set(self.capture(capture_id).session_id, (capture_id,))
         return recordings.frame(recordings.captures()[0])
 
     def recording_set(self, session_id: str, only: Sequence[int] | None = None) -> RecordingSet:
-        """The captures of a session so far as a recording set; `only`: those of these ids in the registry."""
+        """Return the captures of a session so far as a recording set; `only`: those of these ids in the registry."""
         asked = sa.select(CaptureRow.document).where(CaptureRow.session_id == session_id)
         files = sa.select(FileRow.path, FileRow.sha256, FileRow.side, FileRow.pack_index)
         files = files.where(FileRow.session_id == session_id)
@@ -610,7 +610,7 @@ class Store:
         return self._keys[1]
 
     def knows_keys(self) -> bool:
-        """Whether `keys(anew=False)` asks nothing of the registry now."""
+        """Return whether `keys(anew=False)` asks nothing of the registry now."""
         return time.monotonic() < self._keys[0]
 
     def add_key(self, name: str, scope: str, sha256: str) -> None:
@@ -633,7 +633,7 @@ class Store:
 
 
 def _searched(asked: Any, search: str, only: Sequence[str] | None) -> Any:
-    """A query of sessions, confined to those that have all words of a text, and to some ids."""
+    """Return a query of sessions, confined to those that have all words of a text, and to some ids."""
     for word in search.split():
         places = (SessionRow.id, SessionRow.name, SessionRow.notes, SessionRow.station["name"].as_string())
         reported = sa.cast(SessionRow.runs, sa.Text)
@@ -642,7 +642,7 @@ def _searched(asked: Any, search: str, only: Sequence[str] | None) -> Any:
 
 
 def _captures_of(asked: Any, session_id: str, kind: str | None = None, side: str | None = None) -> Any:
-    """A query of captures, confined to a session, a kind and a side."""
+    """Return a query of captures, confined to a session, a kind and a side."""
     for column, wanted in ((CaptureRow.session_id, session_id), (CaptureRow.kind, kind), (CaptureRow.side, side)):
         if wanted is not None:
             asked = asked.where(column == wanted)
@@ -656,12 +656,12 @@ def _file_row(session_id: str, file: StoredFile) -> FileRow:
 
 
 def _aware(at: datetime) -> datetime:
-    """The time with its zone, UTC, which SQLite doesn't keep."""
+    """Return the time with its zone, UTC, which SQLite doesn't keep."""
     return at if at.tzinfo is not None else at.replace(tzinfo=UTC)
 
 
 def _capture(session_id: str, document: dict[str, Any]) -> Capture:
-    """A capture of the registry. Raises InputError for a kind that this installation doesn't have."""
+    """Return a capture of the registry. Raises InputError for a kind that this installation doesn't have."""
     if document["kind"] not in CAPTURES.models:
         raise InputError(
             f"session {session_id}: it has captures of the kind {document['kind']!r}, which this version doesn't know; "

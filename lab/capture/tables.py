@@ -196,7 +196,7 @@ class IdempotentRow(Base):
 
 
 def open_engine(url: str) -> sa.Engine:
-    """The database at a URL, PostgreSQL through psycopg. Raises InputError where it can't be opened."""
+    """Return the database at a URL, PostgreSQL through psycopg. Raises InputError where it can't be opened."""
     try:
         address = sa.make_url(url)
         if address.drivername in ("postgres", "postgresql"):

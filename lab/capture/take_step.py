@@ -137,7 +137,7 @@ def _stuck(
     exposure_s: Mapping[Side, float],
     levels: Mapping[Side, float],
 ) -> bool:
-    """Whether a frame is saturated below the data sheet's range: a shorter exposure hardly lowered its level."""
+    """Return whether a frame is saturated below the data sheet's range: a shorter exposure hardly lowered its level."""
     if before is None or levels[side] < 0.3:
         return False
     shortened = exposure_s[side] / before[0][side]
@@ -145,7 +145,7 @@ def _stuck(
 
 
 def repeats_ahead(steps: Sequence[Step | None]) -> list[int]:
-    """How many of the steps that follow each at once only repeat its exposure; None: a step that isn't taken."""
+    """Return how many of the steps that follow each at once only repeat its exposure; None: a step that isn't taken."""
     found = [0] * len(steps)
     for at in range(len(steps) - 2, -1, -1):
         step, other = steps[at], steps[at + 1]
@@ -155,7 +155,7 @@ def repeats_ahead(steps: Sequence[Step | None]) -> list[int]:
 
 
 def _repeats(step: Step, other: Step) -> bool:
-    """Whether the second step does nothing but expose as the first did."""
+    """Return whether the second step does nothing but expose as the first did."""
     return (
         bool(step.captures and other.captures)
         and other.radiance is None
@@ -227,7 +227,7 @@ def take(
 
 
 def _irradiance_meter(step: Step, instruments: Instruments) -> PhotodiodeDevice | None:
-    """The photodiode, for a step beside whose captures it measures."""
+    """Return the photodiode, for a step beside whose captures it measures."""
     photodiode = instruments.photodiode
     if photodiode is None:
         return None
@@ -270,7 +270,7 @@ def _exposures(step: Step, instruments: Instruments, results: Mapping[str, Mappi
 
 
 def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capture, ...]:
-    """The step's captures with the keys that the trigger, the `dummies` before it, and the instruments tell."""
+    """Return the step's captures with the keys that the trigger, the `dummies` before it, and the instruments tell."""
     without = instruments.photodiode if instruments.photodiode and instruments.photodiode.measured is None else None
     readings = {
         key: value

@@ -31,7 +31,7 @@ KEY = "TILED_API_KEY"
 
 
 def open_catalogue(where: str) -> Any:
-    """A Tiled client of a server's address, or of a catalogue in a folder, which is made if it isn't there.
+    """Return a Tiled client of a server's address, or of a catalogue in a folder, which is made if it isn't there.
 
     Raises InputError where calibench's extra `tiled` isn't installed, or the catalogue can't be opened.
     """
@@ -96,7 +96,7 @@ def write_session(
 
 
 def read_session(client: Any, key: str) -> RecordingSet:
-    """A session that `write_session` wrote, as a recording set; frames are fetched when asked for.
+    """Return a session that `write_session` wrote, as a recording set; frames are fetched when asked for.
 
     Raises InputError where the catalogue has no such session, or what it has under the key isn't one.
     """
@@ -146,7 +146,7 @@ def _write_runs(runs: Any, documents: Path) -> None:
 
 
 def _runs(documents: Path) -> Iterator[list[tuple[str, dict[str, Any]]]]:
-    """The documents of each run; a run that was killed gets the stop document that it lacks."""
+    """Yield the documents of each run; a run that was killed gets the stop document that it lacks."""
     run: list[tuple[str, dict[str, Any]]] = []
     lines = documents.read_text(encoding="utf-8").splitlines() if documents.is_file() else []
     for line in [*lines, '["start", {}]']:

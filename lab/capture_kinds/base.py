@@ -13,23 +13,88 @@ The file of a kind declares, where the kind needs its own:
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum
-from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Generic, Literal, Protocol, Self, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
+from pydantic_core import CoreSchema, core_schema
 
-from lab.capture_kinds.registry import ByKind
 from lab.errors import InputError
 from sim.camera import Side
 from sim.parameters import Frozen, Quantity
 from sim.scene.scenes import Scene
 from sim.spectrum import Spectrum
+
+# --- registry --------------------------------------------------------------------------------------------------------
+# Models of one family that a document's `kind` tells apart, as a type for a field of a pydantic model.
+
+
+M = TypeVar("M", bound=BaseModel)
+#: The registry's database keeps a kind in a column of so many characters.
+LONGEST_NAME = 20
+
+
+class ByKind(Generic[M]):
+    """The models of one family, by the value of their field `kind`.
+
+    As an annotation, `Annotated[Base, family]`, it validates a document by the model that its `kind` names. The family
+    may grow after the annotated model was built.
+    """
+
+    def __init__(self, what: str) -> None:
+        self.what = what
+        self.models: dict[str, type[M]] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All kinds, in the order in which they were added."""
+        return tuple(self.models)
+
+    def add(self, model: type[M]) -> None:
+        """Add a model. Its field `kind` is a `Literal` of one name. Raises ValueError where that name is taken or too
+        long."""
+        names = get_args(model.model_fields["kind"].annotation)
+        if len(names) != 1 or not isinstance(names[0], str) or not 0 < len(names[0]) <= LONGEST_NAME:
+            raise ValueError(
+                f'{model.__name__}: write kind: Literal["NAME"], a name of {LONGEST_NAME} characters at most'
+            )
+        if self.models.setdefault(names[0], model) is not model:
+            raise ValueError(f"{model.__name__}: the {self.what} kind {names[0]!r} is taken; choose another name")
+
+    def parse(self, document: Mapping[str, Any]) -> M:
+        """Return the model of a document. Raises ValueError for an unknown kind and `ValidationError` for wrong
+        keys."""
+        kind = document.get("kind")
+        if kind not in self.models:
+            raise ValueError(f"unknown kind {kind!r} of {self.what}; the kinds are {', '.join(self.models)}")
+        return self.models[kind].model_validate(document)
+
+    def _validated(self, value: Any) -> BaseModel:
+        if isinstance(value, BaseModel):
+            if type(value) in self.models.values():
+                return value
+            raise ValueError(f"{type(value).__name__} is no registered kind of {self.what}; register it")
+        if not isinstance(value, Mapping):
+            raise ValueError(f"isn't an object; write the {self.what}'s keys")  # noqa: TRY004  (pydantic reports ValueError)
+        return self.parse(value)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            self._validated, serialization=core_schema.simple_ser_schema("any")
+        )
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"oneOf": [handler(model.__pydantic_core_schema__) for model in self.models.values()]}
+
+
+# --- base ------------------------------------------------------------
+
 
 Cells = NDArray[np.uint8]
 #: Longest exposure of a plan, and of a capture that was exposed in seconds.
@@ -44,7 +109,7 @@ class Open(BaseModel):
     model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
 
     def unknown_keys(self) -> dict[str, Any]:
-        """The keys that the format doesn't know, with their values."""
+        """Return the keys that the format doesn't know, with their values."""
         return dict(self.model_extra or {})
 
 
@@ -111,7 +176,7 @@ class Capture(Open):
             )
 
     def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
-        """The scene for the forward model; None where the manifest doesn't determine it.
+        """Return the scene for the forward model; None where the manifest doesn't determine it.
 
         `spectrum` returns the spectrum at a path of the manifest.
         """
@@ -119,7 +184,7 @@ class Capture(Open):
 
 
 def _mark(annotation: Any) -> Names | None:
-    """The `Names` in a field's annotation, at any depth of unions."""
+    """Return the `Names` in a field's annotation, at any depth of unions."""
     if isinstance(annotation, Names):
         return annotation
     return next((mark for part in get_args(annotation) if (mark := _mark(part)) is not None), None)
@@ -141,7 +206,7 @@ O = TypeVar("O", bound=Open)  # noqa: E741
 
 
 def in_folder(item: O, folder: str) -> O:
-    """The same object, each name and path in it prefixed by `folder/`."""
+    """Return the same object, each name and path in it prefixed by `folder/`."""
     own = {key: f"{folder}/{name}" for key, _, name in names_in(item) if "." not in key}
     nested = {key: in_folder(value, folder) for key, value in item if isinstance(value, Open)}
     return item.model_copy(update=own | nested)
@@ -301,21 +366,23 @@ class Sequence(Frozen):
 
     @classmethod
     def possible(cls, station: Equipment) -> bool:
-        """Whether the station has the sequence's instruments, and a target of each of its kinds."""
+        """Return whether the station has the sequence's instruments, and a target of each of its kinds."""
         return not station.lacks(*cls.instruments) and all(station.list_targets(kind) for kind in cls.targets)
 
     @classmethod
     @abstractmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        """The sequence in a full calibration on this station; `quick`: with fewer frames. None where the station can't
-        take it."""
+        """Return the sequence in a full calibration on this station; `quick`: with fewer frames. None where the station
+        can't take it."""
 
     @abstractmethod
     def steps(self, station: Equipment) -> tuple[Step, ...]:
-        """The steps in the order in which they are taken. Raises InputError if the station lacks what they need."""
+        """Return the steps in the order in which they are taken. Raises InputError if the station lacks what they
+        need."""
 
     def patterns(self, station: Equipment) -> dict[str, Cells]:
-        """The patterns on the screen, arrays (rows, cols) of cells 0 (dark) or 1 (lit), by path in the session."""
+        """Return the patterns on the screen, arrays (rows, cols) of cells 0 (dark) or 1 (lit), by path in the
+        session."""
         return {}
 
     @classmethod
@@ -342,7 +409,7 @@ SEQUENCES: dict[str, type[Sequence]] = {}
 
 
 def name_of(step_id: str) -> str:
-    """A step's id as the stem of a file name."""
+    """Return a step's id as the stem of a file name."""
     return step_id.replace("/", "-")
 
 
@@ -357,13 +424,13 @@ def spectrum_path(step_id: str) -> str:
 
 
 def planned_keys(step_id: str, side: Side) -> dict[str, Any]:
-    """The keys that every capture of a step has before it is taken."""
+    """Return the keys that every capture of a step has before it is taken."""
     return {"id": f"{name_of(step_id)}-{side}", "side": side, "frame": frame_path(step_id, side), "exposure_s": 0.0}
 
 
 def exposure_step(stem: str, what: str, setting: Setting, level: float, *, measures_light: bool = True) -> Step:
-    """The step `STEM/exposure`: with `measures_light` it measures the radiance (at `spectrum_path` of its id), then
-    finds the exposure for `level`."""
+    """Return the step `STEM/exposure`: with `measures_light` it measures the radiance (at `spectrum_path` of its id),
+    then finds the exposure for `level`."""
     id = f"{stem}/exposure"
     return Step(
         id=id,

@@ -99,12 +99,12 @@ class ScreenSequence(Sequence):
 
     @staticmethod
     def kinds() -> dict[str, type[ScreenCapture]]:
-        """The registered patterns by name."""
+        """Return the registered patterns by name."""
         return {name: kind for name, kind in CAPTURES.models.items() if issubclass(kind, ScreenCapture)}
 
     def grid(self, station: Equipment) -> CellGrid:
-        """The largest grid of whole checkerboard squares that all cameras see. Raises InputError if that is less than 2
-        x 2 squares, and where no camera's view of the screen is given."""
+        """Return the largest grid of whole checkerboard squares that all cameras see. Raises InputError if that is less
+        than 2 x 2 squares, and where no camera's view of the screen is given."""
         name = station.one(ScreenTarget)
         screen = station.list_targets(ScreenTarget)[name]
         layouts = [layout for side in station.sides if (layout := getattr(screen, side)) is not None]
@@ -184,7 +184,7 @@ def pattern_path(kind: str) -> str:
 
 
 def whole_screen(screen: ScreenTarget) -> CellGrid:
-    """The whole screen in the largest square cells that fill it exactly."""
+    """Return the whole screen in the largest square cells that fill it exactly."""
     cell_px = math.gcd(screen.rows, screen.cols)
     return CellGrid(rows=screen.rows // cell_px, cols=screen.cols // cell_px, cell_px=cell_px)
 
@@ -207,7 +207,7 @@ class ScreenCapture(Capture):
 
     @classmethod
     def cells(cls, grid: CellGrid, seed: int) -> Cells | None:
-        """The cells, 0 dark and 1 lit; None: the whole screen is dark."""
+        """Return the cells, 0 dark and 1 lit; None: the whole screen is dark."""
         raise NotImplementedError
 
 

@@ -83,8 +83,8 @@ def edge_steps(
     aperture: str | None = None,
     **keys: Any,
 ) -> tuple[Step, ...]:
-    """The steps of a sequence's edges, whose ids begin with `stem`; `keys`: further ones of the captures, `aperture`:
-    the lenses' stop. Raises InputError where the station lacks one of the edges."""
+    """Return the steps of a sequence's edges, whose ids begin with `stem`; `keys`: further ones of the captures,
+    `aperture`: the lenses' stop. Raises InputError where the station lacks one of the edges."""
     station.one(EdgeTarget)
     there = station.list_targets(EdgeTarget)
     if unknown := [name for name in sequence.edges if name not in there]:

@@ -57,7 +57,7 @@ class StoppedEdgeSequence(EdgeSequence):
 
 
 def _stop_of(stops: Mapping[float, str], f_number: float) -> str:
-    """The name of the target that is the stop. Raises InputError where the station has none."""
+    """Return the name of the target that is the stop. Raises InputError where the station has none."""
     if f_number in stops:
         return stops[f_number]
     have = ", ".join(f"f/{one:g}" for one in sorted(stops)) or "none"

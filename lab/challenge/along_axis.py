@@ -61,8 +61,8 @@ Draws = Sequence[tuple[DrawnSession, DrawnSession]]
 
 
 def separability_along(law: UnlistedLaw, camera: ConcealedCamera, draws: Draws) -> float:
-    """The separability of a law. `camera`: without it; `draws`: two pairs of sessions, with and without the law, each
-    with its own draw of the noise."""
+    """Return the separability of a law. `camera`: without it; `draws`: two pairs of sessions, with and without the law,
+    each with its own draw of the noise."""
     spatial = {axis for axis, *_ in law.axes} & SPATIAL
     table = TABLES[law.acts] if spatial or law.acts in {"variance", "widths"} else _levels
     (_, healthy), _ = draws
@@ -103,7 +103,7 @@ class _Group:
 
 
 def _groups(session: DrawnSession, kinds: frozenset[str] | None = None) -> list[_Group]:
-    """The settings of a session in their order, captures that follow one another; `kinds`: None: all."""
+    """Return the settings of a session in their order, captures that follow one another; `kinds`: None: all."""
 
     def setting(numbered: tuple[int, dict[str, Any]]) -> tuple[str, ...]:
         return tuple(str(numbered[1].get(key)) for key in SETTING)
@@ -146,7 +146,7 @@ def _place(law: UnlistedLaw, camera: ConcealedCamera) -> NDArray[np.intp]:
 
 
 def _signal_dn(camera: ConcealedCamera, mean_dn: FloatArray) -> FloatArray:
-    """The signal of a mean over many pixels: what noise leaves below black is none."""
+    """Return the signal of a mean over many pixels: what noise leaves below black is none."""
     return np.maximum(mean_dn - camera.black_level_dn, 0.0)
 
 
@@ -251,7 +251,7 @@ def _levels(law: UnlistedLaw, camera: ConcealedCamera, session: DrawnSession, he
 def _spectral_columns(
     camera: ConcealedCamera, colour: str, wavelength_nm: FloatArray, signal: FloatArray
 ) -> list[FloatArray]:
-    """What else changes the signals (n,) of narrowband light."""
+    """Return what else changes the signals (n,) of narrowband light."""
     away = (wavelength_nm - 560.0) / 100.0
     curve = camera.stated_efficiency[colour]
     at = np.interp(wavelength_nm, WAVELENGTH_NM, curve)

@@ -27,7 +27,7 @@ DEFAULT = "default"
 
 
 def changed_policy(rules: Sequence[str]) -> DecisionPolicy:
-    """The default policy with `NAME=VALUE` in place of its own. Raises InputError for what isn't a rule or not a
+    """Return the default policy with `NAME=VALUE` in place of its own. Raises InputError for what isn't a rule or not a
     number."""
     known = DecisionPolicy.rules()
     values: dict[str, str] = {}
@@ -84,8 +84,8 @@ class Answer(Frozen):
 
 
 def policies_without() -> dict[str, DecisionPolicy]:
-    """The default policy, and by the name of each rule without a derivation, the policy in which that rule doesn't
-    act."""
+    """Return the default policy, and by the name of each rule without a derivation, the policy in which that rule
+    doesn't act."""
     rules = DecisionPolicy.rules()
     changed = {name: DecisionPolicy.model_validate({name: r.off}) for name, r in rules.items() if r.off is not None}
     return {DEFAULT: DecisionPolicy(), **changed}
@@ -93,8 +93,8 @@ def policies_without() -> dict[str, DecisionPolicy]:
 
 @one_blas_thread
 def answers(folder: Path, policies: Mapping[str, DecisionPolicy]) -> dict[str, Answer]:
-    """What each policy says of one recording set, whose measurements are made once. Without a fit, as a challenge is
-    diagnosed."""
+    """Return what each policy says of one recording set, whose measurements are made once. Without a fit, as a
+    challenge is diagnosed."""
     recordings = recording_set.read(folder)
     models = [measurement_model(recordings, side, None)[0] for side in recordings.sides]
     found: dict[str, Answer] = {}
@@ -135,7 +135,7 @@ class Tally(Frozen):
 
 
 def tally(truths: Mapping[str, CaseTruth], by_case: Mapping[str, Mapping[str, Answer]], policy: str) -> Tally:
-    """What one policy reaches on all cases."""
+    """Return what one policy reaches on all cases."""
     effects = families = concealed = wrong = alarms = healthy = differ = 0
     for case, answered in by_case.items():
         truth, one, default = truths[case], answered[policy], answered[DEFAULT]

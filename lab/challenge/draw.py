@@ -51,8 +51,8 @@ class DrawnFrame:
 
     @staticmethod
     def drawn(rng: np.random.Generator) -> DrawnFrame:
-        """A frame unlike those of tuning: 24 to 384 rows, 8 to 16 bit, screen cells of 2 to 6 px, rotated by 0 to 2
-        degrees.
+        """Return a frame unlike those of tuning: 24 to 384 rows, 8 to 16 bit, screen cells of 2 to 6 px, rotated by 0
+        to 2 degrees.
 
         In a third of the cases cells are a whole number of pixels and aren't rotated, as a careful laboratory sets a
         screen up."""
@@ -180,7 +180,7 @@ class _Dealer:
 
 
 def _resized(law: Law, strength: float) -> Law:
-    """The law at another strength, within its limits."""
+    """Return the law at another strength, within its limits."""
     low, high = law.limits
     return type(law)(float(np.clip(strength, low, high)), law.variant, law.seed)
 
@@ -247,5 +247,5 @@ def _sized(
 def _without(
     both: Callable[[tuple[Law, ...]], list[MeasurementModel | None]], laws: list[Law]
 ) -> list[list[MeasurementModel | None]]:
-    """The summaries without each of the laws."""
+    """Return the summaries without each of the laws."""
     return [both(tuple(one for one in laws if one is not law)) for law in laws]

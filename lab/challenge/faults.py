@@ -26,7 +26,7 @@ class CaseFault:
 
 
 def spoilt(session: DrawnSession, fault: CaseFault, rng: np.random.Generator) -> DrawnSession:
-    """A copy of a session with the fault."""
+    """Return a copy of a session with the fault."""
     manifest, frames, spectra = deepcopy(session.manifest), dict(session.frames), dict(session.spectra)
     fault.spoil(manifest, frames, spectra, rng)
     return replace(session, manifest=manifest, frames=frames, spectra=spectra)

@@ -74,13 +74,13 @@ class Challenges:
         return id
 
     def folder(self, id: str) -> Path:
-        """A challenge's folder. Raises InputError where there is none of that id."""
+        """Return a challenge's folder. Raises InputError where there is none of that id."""
         if not _ID.fullmatch(id) or not (self.root / id / "challenge.json").is_file():
             raise InputError(f"no challenge {id[:60]!r}; list them for their ids")
         return self.root / id
 
     def id_of(self, folder: str) -> str | None:
-        """The id of the challenge whose folder this is, or None."""
+        """Return the id of the challenge whose folder this is, or None."""
         path = Path(folder)
         return path.name if path.parent == self.root else None
 
@@ -101,13 +101,13 @@ class Challenges:
         )
 
     def case(self, id: str, case: str) -> Path:
-        """The folder of a case. Raises InputError where it isn't made."""
+        """Return the folder of a case. Raises InputError where it isn't made."""
         if case not in self.challenge(id).seals:  # looked up, never joined: a name can't leave the folder
             raise InputError(f"challenge {id}: no case {case[:20]!r}; `seals` lists those that are made")
         return self.folder(id) / "set" / case
 
     def recordings(self, id: str, case: str) -> RecordingSet:
-        """The recording set of a case. Raises InputError where it isn't made."""
+        """Return the recording set of a case. Raises InputError where it isn't made."""
         return recording_set.read(self.case(id, case))
 
     def opened(self, id: str, what: Literal["score", "truths"]) -> str:

@@ -207,7 +207,7 @@ def run_all(out: Path, kinds: tuple[Kind, ...], most: int | None) -> dict[str, N
 
 
 def table(runs: dict[str, NameRun]) -> str:
-    """The outcome by class as a Markdown table, with every false name below it."""
+    """Return the outcome by class as a Markdown table, with every false name below it."""
     lines = [
         "| class | cases | with a false name | most | all that is concealed named |",
         "| --- | --- | --- | --- | --- |",

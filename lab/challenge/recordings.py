@@ -8,17 +8,17 @@ from sim.spectrum import Spectrum
 
 
 def recordings_of(camera: ConcealedCamera, plan: Plan = WHOLE_SESSION) -> RecordingSet:
-    """The recording set of one camera."""
+    """Return the recording set of one camera."""
     return recording_set(record(camera, plan))
 
 
 def recordings_of_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan) -> RecordingSet:
-    """The recording set of a stereo pair."""
+    """Return the recording set of a stereo pair."""
     return recording_set(record_pair(left, right, plan))
 
 
 def recording_set(session: DrawnSession) -> RecordingSet:
-    """The recording set of a session; raises ValidationError where its manifest doesn't follow the format."""
+    """Return the recording set of a session; raises ValidationError where its manifest doesn't follow the format."""
     spectra = {path: Spectrum.of(WAVELENGTH_NM, values) for path, values in session.spectra.items()}
     manifest = Manifest.model_validate(session.manifest)
     # every field is written, null where it is unknown

@@ -41,7 +41,7 @@ class Rate(Frozen):
 
     @classmethod
     def over(cls, hits: Iterable[bool]) -> Rate:
-        """The rate of hits."""
+        """Return the rate of hits."""
         seen = list(hits)
         count, of = sum(seen), len(seen)
         if of == 0:
@@ -105,7 +105,7 @@ class SinglesScore(Frozen):
 
 
 class FairScore(Frozen):
-    """Cases of one class of separability (`lab.challenge.fair_strength`) for which the oracle was computed."""
+    """Cases of one class of separability (`lab.challenge.noncentrality`) for which the oracle was computed."""
 
     kind: Literal["single", "compound"]
     separability: str
@@ -335,12 +335,12 @@ def _case_score(case: str, truth: CaseTruth, run: CaseRun) -> CaseScore:
 
 
 def _is_listed(truth: CaseTruth) -> bool:
-    """Whether a set of listed effects is the truth."""
+    """Return whether a set of listed effects is the truth."""
     return truth.kind != "outside" and all(c.effect is not None for c in truth.concealed)
 
 
 def _model_sets(found: DiagnosisResult | None) -> set[frozenset[str]]:
-    """The credible sets of effects of a diagnosis; only the empty one where nothing was searched for."""
+    """Return the credible sets of effects of a diagnosis; only the empty one where nothing was searched for."""
     if found is None:
         return set()
     sets = {frozenset(one.effects) for models in found.models for one in models.sets}

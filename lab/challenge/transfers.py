@@ -189,7 +189,7 @@ def case_names() -> tuple[str, ...]:
 
 
 def laws_of(case: str, seed: int = SEED) -> list[Law]:
-    """The concealed laws of a case beside that of the dark current."""
+    """Return the concealed laws of a case beside that of the dark current."""
     kind, _, number = case.partition("-")
     rng = np.random.default_rng([seed, KINDS.index(kind), int(number)])
     is_mono = ConcealedCamera(_seed(case, seed)).cfa == "MONO"
@@ -210,7 +210,7 @@ def _seed(case: str, seed: int) -> int:
 
 
 def concealed_camera(case: str, noise_draw: int = 0, seed: int = SEED, **settings: Any) -> ConcealedCamera:
-    """The camera of a case in a setting."""
+    """Return the camera of a case in a setting."""
     dark = DARK_LAW(1.3, 0, _seed(case, seed))
     settings = {"f_number": F_NUMBER} | settings
     return ConcealedCamera(
@@ -299,7 +299,7 @@ def run_all(out: Path, cases: Sequence[str], seed: int) -> dict[str, CameraRun]:
 
 
 def wrong_names(run: CameraRun) -> dict[str, bool]:
-    """Whether each name of the diagnosis is right: an effect that is concealed, or its family."""
+    """Return whether each name of the diagnosis is right: an effect that is concealed, or its family."""
     concealed = {law.effect: law for law in LISTED if law.name in (*run.concealed, DARK_LAW.name)}
     families = {library()[name].family.value for name in concealed if name is not None}
     return {name: name in concealed or name in families for name in run.told}
@@ -321,7 +321,7 @@ def _row(name: str, runs: Sequence[TransferRun], quantity: str) -> str | None:
 
 
 def section(runs: dict[str, CameraRun]) -> str:
-    """The outcome as Markdown."""
+    """Return the outcome as Markdown."""
     every = [run for camera in runs.values() for run in camera.transfers.values()]
     kinds = {kind: sum(case.startswith(kind) for case in runs) for kind in KINDS}
     said = ", ".join(f"{count} of {OF_EACH} {kind}" for kind, count in kinds.items())

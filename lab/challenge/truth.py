@@ -44,7 +44,7 @@ class Concealed(Frozen):
     parameters: dict[str, float] = {}  # true values of the library's parameters that have the same meaning
     noncentrality: float  # of its change of the summaries (`lab.challenge.noncentrality`)
     conditional: float | None = (
-        None  # the part that the other concealed law can't imitate (`lab.challenge.fair_strength`)
+        None  # the part that the other concealed law can't imitate (`lab.challenge.noncentrality`)
     )
     separability: float | None = None  # the part that no rival can imitate, either
     nearest_rival: str | None = None  # the rival that can imitate most of it
@@ -116,7 +116,7 @@ def seal(salted: SaltedTruth) -> str:
 
 
 def salted(truth: CaseTruth) -> SaltedTruth:
-    """A truth with a random salt of 128 bits, so that its seal can't be guessed from the few likely truths."""
+    """Return a truth with a random salt of 128 bits, so that its seal can't be guessed from the few likely truths."""
     return SaltedTruth(salt=secrets.token_hex(16), truth=truth)
 
 
@@ -130,12 +130,12 @@ def digest(folder: Path) -> str:
 
 
 def purpose_of(seed: int) -> Purpose:
-    """What cases of a seed are for: tuning, a proof, or everyday tests (fresh)."""
+    """Return what cases of a seed are for: tuning, a proof, or everyday tests (fresh)."""
     return "tuning" if seed < FIRST_PROOF_SEED else "proof" if seed < FIRST_FRESH_SEED else "fresh"
 
 
 def load(model: type[Model], file: Path) -> Model:
-    """A model from a JSON file. Raises InputError where it can't be read or isn't valid."""
+    """Return a model from a JSON file. Raises InputError where it can't be read or isn't valid."""
     try:
         return model.model_validate_json(file.read_text(encoding="utf-8"))
     except OSError as error:

@@ -44,8 +44,9 @@ Take = Callable[[tuple[Law, ...], int], DrawnSession]
 
 
 def concealed_in(seed: int, index: int) -> tuple[type[UnlistedLaw] | None, bool]:
-    """The law of case number `index` (from 1 on), None of a healthy camera, and whether it stands beside a listed
-    effect. Every block holds each law once, and in `len(UNLISTED) / BESIDE` blocks each stands beside one once."""
+    """Return the law of case number `index` (from 1 on), None of a healthy camera, and whether it stands beside a
+    listed effect. Every block holds each law once, and in `len(UNLISTED) / BESIDE` blocks each stands beside one
+    once."""
     block, place = divmod(index - 1, BLOCK)
     number = int(np.random.default_rng([seed, 3000, block]).permutation(BLOCK)[place])
     if number >= len(UNLISTED):
@@ -55,8 +56,8 @@ def concealed_in(seed: int, index: int) -> tuple[type[UnlistedLaw] | None, bool]
 
 
 def target_of(seed: int, index: int) -> float:
-    """The separability that the law of a case is drawn for. Over the blocks a law's are spread evenly in the logarithm,
-    by steps of the golden ratio."""
+    """Return the separability that the law of a case is drawn for. Over the blocks a law's are spread evenly in the
+    logarithm, by steps of the golden ratio."""
     law, _ = concealed_in(seed, index)
     first = np.random.default_rng([seed, 3002, 0 if law is None else UNLISTED.index(law)]).random()
     low, high = TARGETS
@@ -146,8 +147,8 @@ def draw_unlisted(
 def sized(
     law: AnyLaw, measured: Callable[[AnyLaw], float], target: float, rounds: int = SIZING_ROUNDS
 ) -> tuple[AnyLaw, float]:
-    """The law at the strength at which it measures about the target, within its limits and after so many `rounds` at
-    most, and what it measures there."""
+    """Return the law at the strength at which it measures about the target, within its limits and after so many
+    `rounds` at most, and what it measures there."""
     size = measured(law)
     low, high = law.limits
     for _ in range(rounds):
@@ -164,6 +165,6 @@ def sized(
 
 
 def _shown(take: Take, present: tuple[Law, ...], absent: tuple[Law, ...]) -> float:
-    """The non-centrality of a change in the diagnosis's own summaries."""
+    """Return the non-centrality of a change in the diagnosis's own summaries."""
     pairs = [tuple(summaries(recording_set(take(laws, k))) for laws in (present, absent)) for k in (0, 1)]
     return noncentrality([(one, other) for one, other in pairs])

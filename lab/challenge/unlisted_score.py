@@ -130,14 +130,14 @@ class UnlistedScore(Frozen):
 
 
 def axes_of(along: str) -> frozenset[str]:
-    """The indices of a discovered law. A table by row and column is one by place."""
+    """Return the indices of a discovered law. A table by row and column is one by place."""
     said = frozenset(BETWEEN.split(along))
     return said | {"place"} if said >= {"row", "column"} else said
 
 
 def axis_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
-    """Whether a discovered law goes along all axes of a law, and no other but those that may stand beside them, and is
-    one of means or one of noise as that is."""
+    """Return whether a discovered law goes along all axes of a law, and no other but those that may stand beside them,
+    and is one of means or one of noise as that is."""
     said = axes_of(told.along)
     right = frozenset(word for alike in law.axes for word in alike)
     if "place" in said:
@@ -147,12 +147,12 @@ def axis_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
 
 
 def stage_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
-    """Whether a discovered law acts at a law's stage, or at one from which recordings can't tell it."""
+    """Return whether a discovered law acts at a law's stage, or at one from which recordings can't tell it."""
     return told.stage == law.stage or told.stage in law.alike
 
 
 def period_is_right(law: type[UnlistedLaw], told: DiscoveredLaw) -> bool:
-    """Whether the shortest table of a discovered law repeats with a period of the law."""
+    """Return whether the shortest table of a discovered law repeats with a period of the law."""
     return told.shown_period in law.periods or told.columns in law.periods
 
 
@@ -175,7 +175,7 @@ def removed(found: DiagnosisResult | None, told: Sequence[DiscoveredLaw], strong
 
 
 def case_score(case: str, truth: CaseTruth, run: CaseRun) -> UnlistedCase:
-    """The score of one case."""
+    """Return the score of one case."""
     found = run.diagnosis
     discovered = found.discovered if found is not None else ()
     kinds = {law.name: law for law in UNLISTED}
@@ -307,7 +307,7 @@ def _instead(case: UnlistedCase) -> str:
 
 
 def table(found: UnlistedScore) -> str:
-    """The scores as Markdown tables, with 95 % intervals (Clopper-Pearson)."""
+    """Return the scores as Markdown tables, with 95 % intervals (Clopper-Pearson)."""
     verdict = {True: "met", False: "missed", None: "no case"}
     lines = ["| goal | wanted | reached | |", "| --- | --- | --- | --- |"]
     for goal in found.goals:

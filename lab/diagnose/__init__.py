@@ -51,7 +51,7 @@ def diagnose(
     *,
     at_once: bool = True,
 ) -> DiagnosisResult:
-    """The result of `examine`, without improved models and proposals."""
+    """Return the result of `examine`, without improved models and proposals."""
     return examine(recordings, fit, progress, at_once=at_once).result
 
 

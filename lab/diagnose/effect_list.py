@@ -38,7 +38,7 @@ class ParameterDescription(Frozen):
 
     @classmethod
     def of(cls, name: str, quantity: Quantity) -> ParameterDescription:
-        """The declaration of the quantity `name`."""
+        """Return the declaration of the quantity `name`."""
         return cls(
             name=name,
             unit=quantity.unit,
@@ -64,7 +64,7 @@ class ChoiceDescription(Frozen):
 
     @classmethod
     def of(cls, name: str, field: FieldInfo) -> ChoiceDescription:
-        """The declaration of the field `name`."""
+        """Return the declaration of the field `name`."""
         return cls(
             name=name,
             meaning=field.description or "",
@@ -74,12 +74,12 @@ class ChoiceDescription(Frozen):
 
 
 def choice_values(field: FieldInfo) -> tuple[str, ...]:
-    """The values among which a field chooses; empty where any value of its type will do."""
+    """Return the values among which a field chooses; empty where any value of its type will do."""
     return tuple(str(value) for value in _literals(field.annotation))
 
 
 def _literals(annotation: Any) -> tuple[Any, ...]:
-    """The values of a `Literal`, at any depth of unions."""
+    """Return the values of a `Literal`, at any depth of unions."""
     if get_origin(annotation) is Literal:
         return get_args(annotation)
     return tuple(value for part in get_args(annotation) for value in _literals(part))

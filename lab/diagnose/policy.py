@@ -499,7 +499,7 @@ class DecisionPolicy(Frozen):
 
     @classmethod
     def rules(cls) -> dict[str, Rule]:
-        """The declaration of every field, in order."""
+        """Return the declaration of every field, in order."""
         hints = get_type_hints(cls, include_extras=True)
         return {name: next(m for m in get_args(hints[name]) if isinstance(m, Rule)) for name in cls.model_fields}
 

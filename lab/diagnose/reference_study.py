@@ -60,7 +60,7 @@ TILTS_DEG = (
 
 
 def reference_study(seed: int = 1) -> RecordingSet:
-    """The recording set of the session, of both sides. `seed`: of its noise and of the random pattern."""
+    """Return the recording set of the session, of both sides. `seed`: of its noise and of the random pattern."""
     rig = _rig()
     frames: dict[str, Any] = {}
     spectra: dict[str, Spectrum] = {}
@@ -119,7 +119,7 @@ class _SideSession:
         self.lamp = Spectrum.of(WAVELENGTH_NM, 0.02 * (1.0 + 0.1 * np.sin(WAVELENGTH_NM / 60.0)))
 
     def stated(self) -> dict[str, Any]:
-        """The camera's entry in the manifest."""
+        """Return the camera's entry in the manifest."""
         names = (
             "rows",
             "cols",

@@ -117,14 +117,15 @@ def read_camera(
 
 
 def _posterior(file: Path, given: Any, sent: bool) -> ModelPosterior:
-    """The posterior in the JSON file that the key `posterior` names."""
+    """Return the posterior in the JSON file that the key `posterior` names."""
     if not isinstance(given, str):
         raise InputError(f"{file}: posterior is {given!r}, not a file's name; name the JSON file, or leave the key out")
     return read_result(ModelPosterior, _beside(file, "posterior", given, sent))
 
 
 def _beside(file: Path, key: str, path: str, sent: bool) -> Path:
-    """A file that a camera file names. Raises InputError where it lies outside the folder of one that was sent."""
+    """Return a file that a camera file names. Raises InputError where it lies outside the folder of one that was
+    sent."""
     found = file.parent / path
     if sent and ("\0" in path or not found.resolve().is_relative_to(file.parent.resolve())):
         raise InputError(f"{file}: {key}: {path[:80]!r} leaves the folder; put the file beside the camera file")
@@ -132,7 +133,7 @@ def _beside(file: Path, key: str, path: str, sent: bool) -> Path:
 
 
 def _curve(file: Path, key: str, given: Any, sent: bool) -> Any:
-    """A spectrum's samples, from the CSV file where it is a path."""
+    """Return a spectrum's samples, from the CSV file where it is a path."""
     if not isinstance(given, str):
         return given
     beside = _beside(file, key, given, sent)
@@ -153,7 +154,7 @@ def _imaging(
     progress: Callable[[str, float], None] | None,
     sent: bool,
 ) -> tuple[Any, Path | None]:
-    """The keys of `lens.imaging` with the files that they name read in, and the prescription among them."""
+    """Return the keys of `lens.imaging` with the files that they name read in, and the prescription among them."""
     values = dict(given)
     key = "lens.imaging"
     if values.get("kind") == "traced_lens":
@@ -204,7 +205,8 @@ def lens_cache() -> Path:
 def traced_table(
     prescription: Path, cache: Path | None = None, progress: Callable[[str, float], None] | None = None
 ) -> LensTable:
-    """The table of a lens from its prescription, from the folder `cache` (None: `lens_cache`) or traced and kept there.
+    """Return the table of a lens from its prescription, from the folder `cache` (None: `lens_cache`) or traced and kept
+    there.
 
     Raises InputError for a prescription that can't be read or traced, and for a folder that can't be written to.
     """
@@ -246,7 +248,7 @@ def _validated(file: Path, at: str, model: type[BaseModel], values: Mapping[str,
 
 
 def _known(model: type[BaseModel], where: Sequence[str]) -> list[str]:
-    """The keys that the table `where` may have."""
+    """Return the keys that the table `where` may have."""
     if where[:1] == ["lens"]:
         return (
             [*Lens.model_fields]
@@ -292,7 +294,7 @@ def _check_levels(file: Path, camera: CameraModel) -> None:
 
 
 def _first(error: Exception) -> str:
-    """The first message of an error, on one line."""
+    """Return the first message of an error, on one line."""
     text = (
         str(error) if not isinstance(error, ValidationError) else error.errors()[0]["msg"].removeprefix("Value error, ")
     )
@@ -413,7 +415,7 @@ def said_of(quantity: Quantity) -> str:
 
 
 def _text(value: Any) -> str:
-    """A value as TOML; numbers in rows of ten."""
+    """Return a value as TOML; numbers in rows of ten."""
     if isinstance(value, tuple):
         parts = [_text(part) for part in value]
         if len(parts) <= 10 and not any(isinstance(part, tuple) for part in value):
@@ -426,7 +428,7 @@ def _text(value: Any) -> str:
 
 
 def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> CameraFile:
-    """The camera that a fit found (`lab.formats.camera_model.camera_model`), with the fit's uncertainties, to be
+    """Return the camera that a fit found (`lab.formats.camera_model.camera_model`), with the fit's uncertainties, to be
     written as a file."""
     model = camera_model(recordings, side, fit)
     std = {}
@@ -441,7 +443,7 @@ def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> Camer
 
 
 def default_camera() -> CameraFile:
-    """A plausible RGB machine-vision camera: 1280 x 960 px of 3.45 um, 12 bit, global shutter, f/4, 8 mm.
+    """Return a plausible RGB machine-vision camera: 1280 x 960 px of 3.45 um, 12 bit, global shutter, f/4, 8 mm.
 
     Its values are like those of data sheets of 1/3 inch sensors. Its curves, with an infrared-cut filter at 650 nm,
     have typical shapes and are of no particular maker.

@@ -28,8 +28,8 @@ class Assumed:
 def camera_model(
     recordings: RecordingSet, side: Side, fit: CameraFit | None = None, *, maker_curves: bool = False
 ) -> CameraModel:
-    """The baseline model of one camera. Each quantity is the fitted one, else the stated one, else a typical value
-    (`assumptions`).
+    """Return the baseline model of one camera. Each quantity is the fitted one, else the stated one, else a typical
+    value (`assumptions`).
 
     `maker_curves`: take the stated sensitivity curves even where they were fitted, as a diagnosis tests them.
     """
@@ -78,7 +78,7 @@ def camera_model(
 
 
 def assumptions(camera: DataSheet, fit: CameraFit | None = None) -> tuple[Assumed, ...]:
-    """The quantities for which `camera_model` takes typical values, given this data sheet and fit."""
+    """Return the quantities for which `camera_model` takes typical values, given this data sheet and fit."""
     found = []
     if camera.f_number is None:
         found.append(Assumed("f_number", "8"))
@@ -139,7 +139,8 @@ def _measured_efficiency(fit: CameraFit | None) -> tuple[float, float] | None:
 
 
 def _continued(fitted: Spectrum, stated: Spectrum) -> Spectrum:
-    """A fitted sensitivity, continued beyond the sweep's wavelengths by the maker's curve, scaled to join at both ends.
+    """Return a fitted sensitivity, continued beyond the sweep's wavelengths by the maker's curve, scaled to join at
+    both ends.
 
     A lamp emits beyond the sweep, too: without this, the last 10 nm at the red end can lack 8 % of a red channel's
     signal."""

@@ -53,7 +53,7 @@ class CgatsSpectra:
 
 
 def get_quantity(name: str) -> Quantity:
-    """The quantity of that name. Raises InputError for another."""
+    """Return the quantity of that name. Raises InputError for another."""
     for known in _WRITTEN:
         if name == known:
             return known
@@ -77,7 +77,7 @@ def read_cgats(file: Path) -> CgatsSpectra:
 
 
 def parse_cgats(text: str) -> CgatsSpectra:
-    """The spectra in CGATS text. Its InputError leaves the path to the caller."""
+    """Return the spectra in CGATS text. Its InputError leaves the path to the caller."""
     keywords, fields, rows = _table(text)
     columns = {at: float(match[1]) for at, field in enumerate(fields) if (match := _FIELD.fullmatch(field))}
     if len(columns) < 2:
@@ -141,7 +141,7 @@ def _words(line: str, number: int) -> list[str]:
 
 
 def _wavelengths(keywords: Mapping[str, str], named_nm: list[float]) -> list[float]:
-    """The wavelengths (nm) of the fields: those that Argyll's keywords give, else those in the fields' names."""
+    """Return the wavelengths (nm) of the fields: those that Argyll's keywords give, else those in the fields' names."""
     keys = ("SPECTRAL_START_NM", "SPECTRAL_END_NM", "SPECTRAL_BANDS")
     if any(key not in keywords for key in keys):
         exact = named_nm

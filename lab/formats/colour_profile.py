@@ -45,7 +45,7 @@ def energy_sensitivities(camera: CameraModel) -> FloatArray:
 
 
 def left_out(content: CameraFile) -> tuple[str, ...]:
-    """A remark on the effects of a camera file, which its curves don't have."""
+    """Return a remark on the effects of a camera file, which its curves don't have."""
     names = ", ".join(one.name for one in content.effects)
     return (f"the curves are those of quantum_efficiency: effects aren't in them ({names})",) if names else ()
 
@@ -152,7 +152,7 @@ def _matrix(tag: int, matrix: FloatArray) -> tuple[int, int, int, bytes]:
 
 
 def _tiff(entries: Sequence[tuple[int, int, int, bytes]]) -> bytes:
-    """A TIFF of one directory, with DCP's magic number `RC` in place of 42."""
+    """Return a TIFF of one directory, with DCP's magic number `RC` in place of 42."""
     head = struct.pack("<2s2sIH", b"II", b"RC", 8, len(entries))
     data_at = len(head) + 12 * len(entries) + 4
     directory, data = b"", b""
@@ -202,5 +202,5 @@ def write_icc(file: Path, content: CameraFile) -> tuple[str, ...]:
 
 
 def _xyz(value: FloatArray) -> bytes:
-    """An XYZType of one colour, in s15Fixed16."""
+    """Return an XYZType of one colour, in s15Fixed16."""
     return b"XYZ " + struct.pack(">4x3i", *(round(float(one) * 65536) for one in value))

@@ -30,7 +30,7 @@ MOST_SAMPLES = 2**29
 
 
 def read_exr(file: Path, weights: Mapping[str, float] | None = None) -> SpectralImage:
-    """The scene in an OpenEXR file: the sum of its lights, each times its weight (1 where none is given).
+    """Return the scene in an OpenEXR file: the sum of its lights, each times its weight (1 where none is given).
 
     Raises InputError, without the path, for a file without spectra, and for a weight of a light that isn't in it.
     """
@@ -48,7 +48,7 @@ def read_exr(file: Path, weights: Mapping[str, float] | None = None) -> Spectral
 
 
 def exr_lights(file: Path) -> dict[str, SpectralImage]:
-    """The radiance of each light by its name, `scene` where it has none. Raises InputError without the path."""
+    """Return the radiance of each light by its name, `scene` where it has none. Raises InputError without the path."""
     try:
         import OpenEXR
     except ImportError as error:

@@ -109,7 +109,7 @@ def _focal_px(camera: CameraModel) -> float:
 
 
 def _geometry(camera: CameraModel) -> Geometry:
-    """The camera's geometry, or the pinhole that its focal length and pitch give."""
+    """Return the camera's geometry, or the pinhole that its focal length and pitch give."""
     if camera.geometry is not None:
         return camera.geometry
     f = _focal_px(camera)
@@ -119,7 +119,7 @@ def _geometry(camera: CameraModel) -> Geometry:
 
 
 def _centre(camera: CameraModel) -> tuple[float, float]:
-    """The optical centre from the frame's middle (x, y), in lensfun's unit."""
+    """Return the optical centre from the frame's middle (x, y), in lensfun's unit."""
     matrix = _geometry(camera).camera_matrix
     x, y = matrix[0][2] - 0.5 * (camera.cols - 1), matrix[1][2] - 0.5 * (camera.rows - 1)
     half = _half_short_px(camera)
@@ -198,7 +198,8 @@ def _pa(camera: CameraModel, effects: Sequence[Effect]) -> tuple[tuple[float, fl
 
 
 def read_lensfun(file: Path, focal_length_mm: float, f_number: float, model: str = "") -> LensfunLens:
-    """The lens `model` of a lensfun file, or its only one, as calibrated nearest to a focal length and an aperture.
+    """Return the lens `model` of a lensfun file, or its only one, as calibrated nearest to a focal length and an
+    aperture.
 
     Raises InputError, one line that begins with the file: it isn't lensfun's, or holds several lenses or not this one.
     """
@@ -233,7 +234,7 @@ def _lens(name: str, element: ET.Element, focal_length_mm: float, f_number: floa
     assert calibration is not None
 
     def nearest(tag: str) -> ET.Element | None:
-        """The entry nearest in focal length, then in aperture, then the farthest."""
+        """Return the entry nearest in focal length, then in aperture, then the farthest."""
         entries = [(_value(one, "focal"), one) for one in calibration.findall(tag) if one.get("model") != "none"]
         return min(
             entries,
@@ -319,8 +320,8 @@ def _vignetting(element: ET.Element) -> tuple[float, float, float]:
 
 
 def with_lens(content: CameraFile, lens: LensfunLens) -> tuple[CameraFile, tuple[str, ...]]:
-    """The camera with a lens of lensfun's before it, in place of its own distortion, lateral colour and fall-off of
-    light; and remarks on what OpenCV's distortion doesn't hold. Raises InputError where the laws make no lens."""
+    """Return the camera with a lens of lensfun's before it, in place of its own distortion, lateral colour and fall-off
+    of light; and remarks on what OpenCV's distortion doesn't hold. Raises InputError where the laws make no lens."""
     camera, remarks = content.camera, []
     taken: list[type[Effect]] = []
     added: list[Effect] = []
@@ -373,7 +374,7 @@ def _brown(
 
 
 def _lateral_colour(camera: CameraModel, tca: tuple[float, float]) -> LateralChromaticAberration:
-    """The lateral colour that gives red and blue these radii over green's."""
+    """Return the lateral colour that gives red and blue these radii over green's."""
     moments, r_um = _moments(camera), camera.half_diagonal_um
     (r1, r2), (g1, g2), (b1, b2) = (moments[channel] for channel in "RGB")
     # (R + a r1 + b r2) = v (R + a g1 + b g2) for red, and for blue: two equations for a, b

@@ -40,11 +40,11 @@ class StoredEffect(Frozen):
 
     @classmethod
     def of(cls, effect: Effect) -> Self:
-        """What is stored of an effect."""
+        """Return what is stored of an effect."""
         return cls(name=effect.name, values=effect.model_dump())
 
     def effect(self) -> Effect:
-        """The effect. Raises ValueError for one that the library doesn't have."""
+        """Return the effect. Raises ValueError for one that the library doesn't have."""
         found: Effect = library_effect(self.name).model_validate(self.values)
         return found
 
@@ -98,7 +98,7 @@ class ModelPosterior(Frozen):
 
     @classmethod
     def of(cls, first: FirstEstimates, names: tuple[str, ...], mean: FloatArray, covariance: FloatArray) -> Self:
-        """The posterior of these arrays, in the nine digits that its file keeps."""
+        """Return the posterior of these arrays, in the nine digits that its file keeps."""
         rows = [[float(f"{value:.9g}") for value in row] for row in 0.5 * (covariance + covariance.T)]
         return cls(
             first=first, names=names, mean=tuple(float(f"{m:.9g}") for m in mean), covariance=tuple(map(tuple, rows))

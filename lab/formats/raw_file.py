@@ -96,7 +96,7 @@ def write_raw(file: Path, frame: Frame, camera: CameraModel, metadata: RawMetada
 
 
 def writer_of(file: Path) -> Callable[[Path, Frame, CameraModel, RawMetadata], None]:
-    """The function that writes files of this ending. Raises InputError for an ending that isn't known."""
+    """Return the function that writes files of this ending. Raises InputError for an ending that isn't known."""
     known = {".npy": _write_npy, ".tif": _write_tiff, ".tiff": _write_tiff, ".dng": _write_dng}
     if file.suffix.lower() not in known:
         raise InputError(
@@ -230,7 +230,7 @@ def _colour_matrix(efficiency: tuple[Spectrum, ...]) -> FloatArray:
 
 
 def electrons_of(light: Spectrum, efficiency: Spectrum, reflectance: Spectrum | None = None) -> float:
-    """A number proportional to the electrons of a channel from `light` (W per nm) that a patch reflects."""
+    """Return a number proportional to the electrons of a channel from `light` (W per nm) that a patch reflects."""
     curves = [light, efficiency, *([reflectance] if reflectance is not None else [])]
     wavelength_nm, weight = quadrature(curves)
     seen = photons_from_energy(wavelength_nm, light.at(wavelength_nm)) * efficiency.at(wavelength_nm)

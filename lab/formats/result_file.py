@@ -13,7 +13,7 @@ Result = TypeVar("Result", bound=BaseModel)
 
 
 def result_json(result: BaseModel) -> str:
-    """The text of a result's file."""
+    """Return the text of a result's file."""
     return result.model_dump_json(indent=1) + "\n"
 
 

@@ -78,7 +78,8 @@ def read_light(file: Path, luminance_cd_m2: float | None = None) -> Spectrum:
 
 
 def _light_curve(file: Path) -> tuple[str, Spectrum]:
-    """The quantity that a light's file holds, by its name in a CSV, and the curve. InputError without the path."""
+    """Return the quantity that a light's file holds, by its name in a CSV, and the curve. InputError without the
+    path."""
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -125,7 +126,7 @@ def read_picture(file: Path) -> NDArray[np.uint8]:
 
 
 def read_cube(file: Path, white: Spectrum | None = None, weights: Mapping[str, float] | None = None) -> SpectralImage:
-    """A spectral image from an .npz, an ENVI header (.hdr) with its data file beside it, or a spectral OpenEXR.
+    """Return a spectral image from an .npz, an ENVI header (.hdr) with its data file beside it, or a spectral OpenEXR.
 
     OpenEXR: the sum of its lights' radiances, each times its weight (`lab.formats.exr_scene`).
 
@@ -168,7 +169,8 @@ def scene(
     distance_mm: float = 1000.0,
     parameters: Mapping[str, object] | None = None,
 ) -> Scene:
-    """A scene before a camera: one of `sim.scene.catalogue.SCENES` by its name, or a picture or a cube by its file.
+    """Return a scene before a camera: one of `sim.scene.catalogue.SCENES` by its name, or a picture or a cube by its
+    file.
 
     `white`: radiance of a perfect white diffuser there. A picture's screen takes its luminance for its own white; a
     cube of radiance has its own light. Raises InputError for anything else.
@@ -197,7 +199,7 @@ def scene(
 
 
 def _weights(suffix: str, parameters: Mapping[str, object]) -> tuple[dict[str, float], dict[str, object]]:
-    """The weights of an OpenEXR scene's lights, by light, and the other parameters."""
+    """Return the weights of an OpenEXR scene's lights, by light, and the other parameters."""
     lights = [key for key in parameters if suffix == ".exr" and key.startswith(WEIGHT)]
     weights = {key.removeprefix(WEIGHT): float(str(parameters[key])) for key in lights}
     return weights, {key: value for key, value in parameters.items() if key not in lights}

@@ -11,7 +11,8 @@ from sim.spectrum import Spectrum
 
 
 def parse_spectrum(text: str) -> Spectrum:
-    """A spectrum from CSV text with the header `wavelength_nm,value`. Its InputError leaves the path to the caller.
+    """Return a spectrum from CSV text with the header `wavelength_nm,value`. Its InputError leaves the path to the
+    caller.
 
     Blank lines and a byte-order mark are ignored. Wavelengths must ascend strictly, and all numbers must be finite.
     """
@@ -49,11 +50,11 @@ def parse_curve(text: str, columns: tuple[str, ...]) -> tuple[str, Spectrum]:
 
 
 def _quoted(row: list[str]) -> str:
-    """The start of a row of cells, which may hold line breaks, on one line."""
+    """Return the start of a row of cells, which may hold line breaks, on one line."""
     return " ".join(",".join(row).split())[:60]
 
 
 def format_spectrum(spectrum: Spectrum) -> str:
-    """A spectrum as the format's CSV; reading it gives the same numbers bit for bit."""
+    """Return a spectrum as the format's CSV; reading it gives the same numbers bit for bit."""
     rows = (f"{at!r},{height!r}\n" for at, height in zip(spectrum.wavelength_nm, spectrum.value, strict=True))
     return "wavelength_nm,value\n" + "".join(rows)

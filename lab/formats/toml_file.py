@@ -10,7 +10,8 @@ from lab.errors import InputError
 
 
 def read_toml(file: Path, remedy: str) -> dict[str, Any]:
-    """The tables of a file. Raises InputError, one line, where it can't be read, with the `remedy`, or isn't TOML."""
+    """Return the tables of a file. Raises InputError, one line, where it can't be read, with the `remedy`, or isn't
+    TOML."""
     try:
         return tomllib.loads(file.read_text(encoding="utf-8"))
     except OSError as error:

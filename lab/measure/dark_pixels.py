@@ -28,7 +28,7 @@ VISIBLE_DN2 = 0.24  # below: rounding hides the noise
 def stack_of(
     recordings: RecordingSet, captures: Sequence[DarkCapture] | Sequence[FlatCapture], bad: BoolArray | None = None
 ) -> Stack:
-    """The repeats of one level as a stack; every frame is read once. `bad` (rows, cols): pixels to leave out."""
+    """Return the repeats of one level as a stack; every frame is read once. `bad` (rows, cols): pixels to leave out."""
     camera = recordings.camera(captures[0].side)
     stack = Stack(camera.cfa, camera.saturation_dn, bad)
     for capture in captures:

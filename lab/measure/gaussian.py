@@ -66,12 +66,12 @@ class Gaussian:
         return np.asarray(whole)
 
     def block_covariance(self, index: int) -> FloatArray:
-        """The part of C of one block's numbers."""
+        """Return the part of C of one block's numbers."""
         shared = self.shared_jacobian[self.slices[index]]
         return np.asarray(self.blocks[index].covariance + shared @ shared.T)
 
     def with_discrepancy(self, index: int, kernel: FloatArray) -> Gaussian:
-        """The distribution with the covariance of a model discrepancy added to one block."""
+        """Return the distribution with the covariance of a model discrepancy added to one block."""
         more = BlockCovariance(self.blocks[index].covariance + kernel)
         return replace(self, blocks=(*self.blocks[:index], more, *self.blocks[index + 1 :]))
 

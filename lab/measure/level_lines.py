@@ -95,7 +95,7 @@ def dark_lines(recorded: RecordedLevels, remarks: Remarks) -> dict[str | None, D
 
 
 def _black_without_darks(recorded: RecordedLevels, remarks: Remarks) -> float:
-    """The stated black level, DN."""
+    """Return the stated black level, DN."""
     if not recorded.black_clipped:
         remarks.add(
             "no darks: read noise, dark current and DSNU aren't determined; capture darks at two exposures or more"
@@ -166,7 +166,8 @@ def saturation_of(recorded: RecordedLevels, dark: DarkSignal) -> Saturation:
 
 
 def _clipped_flats(recorded: RecordedLevels, dark: DarkSignal, name: str) -> tuple[list[bool], float | None]:
-    """Which flats clip in a plane, and the DN at which they do where this was seen: all pixels there, or piled up."""
+    """Return which flats clip in a plane, and the DN at which they do where this was seen: all pixels there, or
+    piled up."""
     flags: list[tuple[MeasuredLevel, bool]] = []
     ratios: list[float] = []
     plateau: float | None = None
@@ -251,7 +252,7 @@ def robust_response(
     clipped: BoolArray,
     rng: np.random.Generator,
 ) -> RobustResponse | None:
-    """The response that most of the levels (n,) follow; None with fewer than five unsaturated levels.
+    """Return the response that most of the levels (n,) follow; None with fewer than five unsaturated levels.
 
     `light`: as stated, in any unit; `signal`, `signal_std`, `saturation`: DN above dark; `clipped`: levels that
     saturate. `rng` draws the subsets of the levels.
@@ -364,7 +365,7 @@ class _LightLaw:
         return np.ones(count, bool)
 
     def _trimmed(self, kept: int, rng: np.random.Generator) -> BoolArray:
-        """The `kept` levels of least trimmed squares."""
+        """Return the `kept` levels of least trimmed squares."""
         count, terms = self.value.size, self.basis.shape[1] - 1
         if math.comb(count, terms) <= SUBSETS:
             subsets = np.array(list(combinations(range(count), terms)))
@@ -387,7 +388,7 @@ class _LightLaw:
         return found[1]
 
     def _concentrated(self, chosen: BoolArray, kept: int) -> BoolArray:
-        """The `kept` levels nearest to the law of the levels `chosen`, and so on until these don't change."""
+        """Return the `kept` levels nearest to the law of the levels `chosen`, and so on until these don't change."""
         scatter = 0.0
         for _ in range(10):
             solution, _ = self.solved(chosen, scatter)

@@ -182,8 +182,8 @@ F = TypeVar("F", bound=np.floating[Any])
 
 
 def shading_factors(image: NDArray[F], degree: int) -> tuple[NDArray[F], NDArray[F]]:
-    """The smooth surface as a product (rows, k) @ (k, cols), in the precision of the image. Least squares on means of
-    blocks.
+    """Return the smooth surface as a product (rows, k) @ (k, cols), in the precision of the image. Least squares on
+    means of blocks.
     """
     rows, cols = image.shape
     # At most 32 blocks an axis; each degree needs three
@@ -687,5 +687,5 @@ class RecordedLevels:
 
 
 def rounded_c(temperature_c: float | None) -> float | None:
-    """A temperature to a degree; levels of one degree belong together."""
+    """Return a temperature to a degree; levels of one degree belong together."""
     return None if temperature_c is None else float(round(temperature_c))

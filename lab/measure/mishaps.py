@@ -64,8 +64,8 @@ class CopiedFrames:
 
 
 def copied_frames(recordings: RecordingSet, side: Side, captures: Sequence[Capture] | None = None) -> CopiedFrames:
-    """The copies among `captures` (all of the side). Frames of a standard deviation below `NOISELESS_DN` may be equal,
-    and aren't tested."""
+    """Return the copies among `captures` (all of the side). Frames of a standard deviation below `NOISELESS_DN` may be
+    equal, and aren't tested."""
     first: dict[bytes, Capture] = {}
     found = []
     for capture in recordings.captures(side=side) if captures is None else captures:
@@ -109,7 +109,7 @@ class JudgedFrame:
     is_off: bool
 
     def fits(self, other: JudgedFrame) -> bool:
-        """Whether this frame has the level of the other's setting."""
+        """Return whether this frame has the level of the other's setting."""
         return abs(self.mean_dn - other.expected_dn) <= other.tolerance_dn
 
 
@@ -131,7 +131,7 @@ class ExchangedFrames:
         return "; ".join(dict.fromkeys(f"{_setting(a.capture)} and {_setting(b.capture)}" for a, b in self.pairs))
 
     def told(self, side: Side) -> str:
-        """Which captures, and what fits, as a sentence."""
+        """Return which captures, and what fits, as a sentence."""
         groups: dict[tuple[str, str], list[tuple[JudgedFrame, JudgedFrame]]] = {}
         for a, b in self.pairs:
             groups.setdefault((_setting(a.capture), _setting(b.capture)), []).append((a, b))
@@ -227,7 +227,7 @@ def _judged(
 
 
 def _put_back(recordings: RecordingSet, pairs: Sequence[tuple[JudgedFrame, JudgedFrame]]) -> RecordingSet:
-    """The recordings with the frames of each pair exchanged."""
+    """Return the recordings with the frames of each pair exchanged."""
     frame_of: dict[str, str] = {}
     for a, b in pairs:
         frame_of |= {a.capture.id: b.capture.frame, b.capture.id: a.capture.frame}
@@ -271,7 +271,7 @@ class AlikePlanes:
     captures: tuple[str, ...]
 
     def told(self, side: Side) -> str:
-        """What is stated and what fits, as a sentence."""
+        """Return what is stated and what fits, as a sentence."""
         return (
             f"The four planes of the {side} camera answer {self.lights} light{'s' if self.lights > 1 else ''} alike "
             f"within {100 * self.largest:.2g} %, as "
@@ -281,8 +281,9 @@ class AlikePlanes:
 
 
 def alike_planes(recordings: RecordingSet, side: Side) -> AlikePlanes | None:
-    """The planes of a stated mosaic, where they are alike in every bright light: of flats and narrowband captures, the
-    brightest frame of each light that doesn't clip. None where they differ, or where no light is bright enough."""
+    """Return the planes of a stated mosaic, where they are alike in every bright light: of flats and narrowband
+    captures, the brightest frame of each light that doesn't clip. None where they differ, or where no light is bright
+    enough."""
     camera = recordings.camera(side)
     if camera.cfa == "MONO":
         return None
@@ -318,7 +319,7 @@ def _planes(frame: FloatArray) -> Sequence[FloatArray]:
 
 
 def _same_gain(recordings: RecordingSet, side: Side, capture: Capture) -> bool:
-    """Whether the planes have one temporal variance in a capture and a repeat of it; False without a repeat."""
+    """Return whether the planes have one temporal variance in a capture and a repeat of it; False without a repeat."""
     setting = (capture.kind, capture.exposure_s, capture.gain_db)
     repeats = [
         c for c in recordings.captures(side=side) if c.id != capture.id and (c.kind, c.exposure_s, c.gain_db) == setting

@@ -8,27 +8,248 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import ndimage
+from numpy.typing import NDArray
+from scipy import ndimage, optimize, special
 
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.flat import FlatCapture
 from lab.formats.results import NoiseFit
-from lab.measure.pixel_outliers import sound_pixels
 from lab.measure.plane_means import channel_pixels
-from lab.measure.repeatability import (
-    LAMP_FLOOR,
-    RepeatedMeans,
-    level_repeatability,
-    repeated_levels,
-    steady,
-)
 from lab.measure.rounding import variance_before_rounding
 from lab.measure.stated_light import most_frequent_gain_db
 from sim.sensor import mosaic
+from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 
 if TYPE_CHECKING:
     from lab.measure.study import Study
+
+# --- repeatability ---------------------------------------------------------------------------------------------------
+# Repeatability of levels: the scatter of repeats of one setting beyond the noise of pixels.
+#
+# It is measured, as no data sheet states it, and is a tolerance of every level. A capture whose shutter or light isn't
+# as stated mustn't widen that tolerance: settings whose scatter is out of line with the others are left out (`steady`),
+# and stay a departure for the diagnosis to find.
+
+
+LAMP_FLOOR = 1.0e-4  # least relative standard deviation of a level, common to the channels of a capture
+#: False-alarm probability, over all settings, of calling one out of line; and the largest share of settings out of
+#: line: with more, the scatter is taken as the light's.
+OUT_OF_LINE_PROBABILITY, OUT_OF_LINE_SHARE = 1.0e-3, 0.25
+#: Efficiency of the median of squares relative to their mean, by which degrees of freedom are multiplied.
+MEDIAN_EFFICIENCY = 0.37
+#: Weight of the common repeatability against that of a single setting, in degrees of freedom.
+COMMON_REPEATS = 4
+
+
+@dataclass(frozen=True)
+class RepeatedMeans:
+    """The n repeats of one setting."""
+
+    captures: tuple[Capture, ...]
+    away: FloatArray  # (n,): levels less their mean
+    elapsed_s: FloatArray  # (n,): times less their mean
+    noise: float  # variance of a level by the noise of pixels
+    signal_dn: float = 0.0  # mean level where these are relative to it; 0: they are in DN
+
+
+def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[RepeatedMeans]:
+    """Return the repeats of every flat setting: levels over all unclipped channels, relative to their mean. Frames that
+    may hold image lag of another level are left out (`Study.settled`). `black` in DN, `gain` in DN/e."""
+    found = []
+    for group in map(study.settled, study.flat_levels()):
+        planes = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
+        if len(group) < 2 or not planes:
+            continue
+        size = np.array([study.levels(group[0]).pixels[c] for c in planes], float)
+        levels = np.array([[study.levels(k).mean[c] or 0.0 for c in planes] for k in group]) - black
+        total = levels @ size
+        if total.mean() <= 0:
+            continue
+        noise = float(((gain * np.maximum(levels.mean(0), 0.0) + read_dn**2) * size).sum()) / total.mean() ** 2
+        elapsed = np.array([study.elapsed_s(k) for k in group])
+        signal_dn = float(total.mean() / size.sum())
+        found.append(
+            RepeatedMeans(tuple(group), total / total.mean() - 1.0, elapsed - elapsed.mean(), noise, signal_dn)
+        )
+    return found
+
+
+def steady(repeats: Sequence[RepeatedMeans]) -> list[RepeatedMeans]:
+    """Return the settings whose scatter is in line with that of the others.
+
+    Setting g with n_g repeats has S_g = sum((a - b t)^2), b the common trend with time (weighted median of the
+    settings' slopes). It is distributed as (s_g^2 + s^2) chi2_f with f = n_g - 1 degrees of freedom and s_g^2 the
+    variance by the noise of pixels. The common variance s^2 is the one at which the median over settings of S_g /
+    (s_g^2 + s^2) / median(chi2_f) is 1. A setting is out of line where S_g / f / (s_g^2 + s^2) exceeds the quantile of
+    the F distribution at `OUT_OF_LINE_PROBABILITY` / number of settings. Where more than `OUT_OF_LINE_SHARE` of the
+    settings are, or where there are fewer than four, all are returned."""
+    if len(repeats) * OUT_OF_LINE_SHARE < 1.0:
+        return list(repeats)
+    noise = np.array([r.noise for r in repeats])
+    free = np.array([len(r.away) - 1 for r in repeats], float)
+    size = np.array([float(r.elapsed_s @ r.elapsed_s) for r in repeats])
+    slope = np.array([float(r.elapsed_s @ r.away) for r in repeats]) / np.where(size > 0, size, 1.0)
+    trend = weighted_median(slope, size / (noise + LAMP_FLOOR**2)) if size.any() else 0.0
+    square = np.array([float(np.sum(np.square(r.away - trend * r.elapsed_s))) for r in repeats])
+    usual = square / special.chdtri(free, 0.5)
+
+    def excess(variance: float) -> float:
+        return float(np.median(usual / np.maximum(noise + variance, 1e-30))) - 1.0
+
+    common = optimize.brentq(excess, 0.0, float(usual.max())) if usual.max() > 0 and excess(0.0) > 0 else 0.0
+    ratio = square / free / (noise + max(common, LAMP_FLOOR**2))
+    worth = MEDIAN_EFFICIENCY * (free.sum() - free)
+    limit = special.fdtri(free, worth, 1.0 - OUT_OF_LINE_PROBABILITY / len(repeats))
+    out = ratio > limit
+    if out.sum() > OUT_OF_LINE_SHARE * len(repeats):
+        return list(repeats)
+    return [r for r, is_out in zip(repeats, out, strict=True) if not is_out]
+
+
+def weighted_median(value: FloatArray, weight: FloatArray) -> float:
+    """Return the value up to which half of the weight lies."""
+    order = np.argsort(value)
+    below = np.cumsum(weight[order])
+    return float(value[order][int(np.searchsorted(below, 0.5 * below[-1]))])
+
+
+def level_repeatability(repeats: Sequence[RepeatedMeans]) -> float:
+    """Relative standard deviation of repeated levels beyond the noise of pixels and a common drift with time, over the
+    settings in line. Settings are weighted by the inverse variance of their noise. 0 without repeats."""
+    repeats = steady(repeats)
+    weight = np.array([1.0 / (r.noise + LAMP_FLOOR**2) for r in repeats])
+    moved = sum(w * float(r.elapsed_s @ r.elapsed_s) for w, r in zip(weight, repeats, strict=True))
+    trend = 0.0
+    if moved > 0:
+        trend = sum(w * float(r.elapsed_s @ r.away) for w, r in zip(weight, repeats, strict=True)) / moved
+    left = [float(np.sum(np.square(r.away - trend * r.elapsed_s))) - (len(r.away) - 1) * r.noise for r in repeats]
+    free = float(sum(w * (len(r.away) - 1) for w, r in zip(weight, repeats, strict=True)))
+    return float(np.sqrt(max(float(weight @ left) / free, 0.0))) if free > 0 else 0.0
+
+
+def level_std(study: Study, groups: list[list[Any]]) -> FloatArray:
+    """Relative standard deviation (groups,) of a frame's level: the common one, or a setting's own where that is
+    larger, as in a flickering light that short exposures don't average. A setting out of line has the common one."""
+    noise = study.noise
+    found = np.full(len(groups), noise.jitter_lamp)
+    place = {c.id: i for i, group in enumerate(groups) for c in group}
+    for repeats in steady(repeated_levels(study, noise.black, noise.gain, noise.read_dn)):
+        moved = float(repeats.elapsed_s @ repeats.elapsed_s)
+        left, free = repeats.away, len(repeats.away) - 1
+        if free > 1 and moved > 0:  # without a linear trend with time
+            left, free = left - float(repeats.elapsed_s @ left) / moved * repeats.elapsed_s, free - 1
+        elif moved > 0:
+            continue
+        own = max(float(np.sum(np.square(left))) / free - repeats.noise, 0.0)
+        pooled = (COMMON_REPEATS * noise.jitter_lamp**2 + free * own) / (COMMON_REPEATS + free)
+        found[place[repeats.captures[0].id]] = np.sqrt(max(pooled, noise.jitter_lamp**2))
+    return found
+
+
+# --- pixel outliers --------------------------------------------------------------------------------------------------
+# Outlying pixels of dark frames, and robust statistics that leave them out.
+
+
+Image = NDArray[np.float32]
+
+if TYPE_CHECKING:
+    from lab.measure.study import Study
+
+CLIP = 4.5  # standard deviations at which pixels are clipped in robust statistics
+MEDIAN_OF = 5  # most frames whose median shows defective pixels
+SMOOTH_PX, LOCAL_PX = 9, 33  # sides of the boxes for the local mean and the local variance of a pixel's surroundings
+#: Standard deviations of the fixed pattern from which on a pixel counts as defective and is left out of the frames'
+#: means.
+DEFECTIVE = 10.0
+
+
+def sound_pixels(study: Study) -> NDArray[np.bool_]:
+    """Mask (rows, cols) of the pixels that aren't defective.
+
+    A defective pixel departs by more than `DEFECTIVE` standard deviations from its surroundings in the median of
+    repeated dark frames, at the longest exposure or at the highest temperature. In a small frame, a single hot pixel of
+    3000 e/s would dominate the noise of the mean, and one that saturates would make it nonlinear.
+    """
+    groups = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
+    sound = np.ones((study.camera.rows, study.camera.cols), bool)
+    if not groups:
+        return sound
+    longest = max(groups, key=lambda g: g[0].exposure_s)
+    warmest = max(groups, key=lambda g: (g[0].temperature_c or 0.0, g[0].exposure_s))
+    for group in (longest, warmest) if longest is not warmest else (longest,):
+        frames = [study.recordings.frame(c).astype(np.float32) for c in group[:MEDIAN_OF]]
+        away, local = from_surroundings([f - np.float32(f.mean(dtype=np.float64)) for f in frames])
+        sound &= np.abs(away) <= DEFECTIVE * local
+    return sound
+
+
+def from_surroundings(frames: list[Image]) -> tuple[Image, Image]:
+    """Departures (rows, cols) of the pixels of the frames' lower median from their local mean, without the means of
+    rows and columns; and their local standard deviation, DN."""
+    level = [f - row_means(f)[:, None] for f in frames]
+    median: Image = np.sort(np.array(level), axis=0)[(len(frames) - 1) // 2]
+
+    std = robust_std(median)
+    flat, _ = without_lines(median, np.clip(median, -CLIP * std, CLIP * std))
+    step = 2
+    for r in range(step):
+        for c in range(step):
+            phase = flat[r::step, c::step]
+            phase -= np.float32(np.mean(np.clip(phase, -CLIP * std, CLIP * std)))
+    around = ndimage.uniform_filter(np.clip(flat, -CLIP * std, CLIP * std), SMOOTH_PX, mode="mirror")
+    steep = np.clip(flat - around, -CLIP * std, CLIP * std)
+    # a second pass, so that hot pixels in a glow don't shift the mean around them
+    around += ndimage.uniform_filter(steep, SMOOTH_PX, mode="mirror")
+    away = flat - around
+    local = np.sqrt(np.maximum(local_variance(np.square(away), 1), 0.25)) * np.sqrt(SMOOTH_PX**2 / (SMOOTH_PX**2 - 1.0))
+    return away, local
+
+
+def robust_std(image: Image) -> float:
+    """Standard deviation of the pixels within five standard deviations of 0, by iteration; at least a quarter of a
+    code."""
+    low, high = np.quantile(image.ravel()[:: max(image.size // 200_000, 1)], [0.02, 0.98])
+    std = max(float(high - low) / 4.107, 0.3)
+    for _ in range(3):
+        inside = image[np.abs(image) < 5.0 * std]
+        std = max(float(inside.std(dtype=np.float64)), 0.25)
+    return std
+
+
+def row_means(image: Image) -> Image:
+    """Means (rows,) of the rows, pixels clipped at `CLIP` standard deviations."""
+    std = robust_std(image)
+    return np.asarray(np.clip(image, -CLIP * std, CLIP * std).mean(axis=1))
+
+
+def without_lines(image: Image, cut: Image) -> tuple[Image, dict[Lines, float]]:
+    """Return an image less the means of the rows and columns of `cut`, the clipped image; and the variance of these
+    means beyond that of independent pixels, by lines. It is taken from differences of neighbouring lines, in which
+    smooth structure cancels."""
+    rows, cols = cut.mean(axis=1, dtype=np.float64), cut.mean(axis=0, dtype=np.float64)
+    own = float(np.var(np.diff(cut, axis=1), dtype=np.float64)) / 2.0
+    spare: dict[Lines, float] = {
+        "rows": float(np.var(np.diff(rows))) / 2.0 - own / cut.shape[1],
+        "columns": float(np.var(np.diff(cols))) / 2.0 - own / cut.shape[0],
+    }
+    mean = float(cut.mean(dtype=np.float64))
+    return (image - (rows - mean)[:, None].astype(np.float32) - cols[None, :].astype(np.float32)), spare
+
+
+def local_variance(squares: Image, freedom: int) -> Image:
+    """Local variance (rows, cols): mean of `squares` over `LOCAL_PX` x `LOCAL_PX` pixels, outliers clipped, over the
+    degrees of freedom of a pixel's sum of squares."""
+    usual = float(np.mean(np.minimum(squares, 16.0 * freedom * np.median(squares) / 0.45)))
+    cap = np.float32(64.0 * usual)
+    rough = ndimage.uniform_filter(np.minimum(squares, cap), LOCAL_PX, mode="mirror")
+    cap_here = 16.0 * rough if freedom == 1 else (1.0 + 12.0 / np.sqrt(freedom)) * rough
+    fine = ndimage.uniform_filter(np.minimum(squares, cap_here), LOCAL_PX, mode="mirror")
+    return np.asarray(np.maximum(fine / np.float32(freedom), np.float32(1e-3)))
+
+
+# --- noise figures ------------------------------------------------------------
+
 
 STATED_BLACK_SHARE, STATED_BLACK_DN = 0.03, 2.0  # standard deviation of a stated black level, relative and absolute
 BLACK_FLOOR_DN = 0.01  # standard deviation of a frame's mean beside noise
@@ -254,7 +475,7 @@ def _transfer_slope(signal: FloatArray, variance: FloatArray, read_dn: float) ->
 
 
 def _even_rows(frame: Any, step: int) -> FloatArray:
-    """A frame whose rows have the same mean in each plane of the mosaic."""
+    """Return a frame whose rows have the same mean in each plane of the mosaic."""
     even = np.array(frame, float)
     for row in range(step):
         for col in range(step):

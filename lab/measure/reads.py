@@ -28,5 +28,5 @@ SHIFT = frozenset({"image.shift"})
 
 
 def acting(effects: Effects, reads: frozenset[str]) -> tuple[Effect, ...]:
-    """The effects that change any of the quantities `reads`."""
+    """Return the effects that change any of the quantities `reads`."""
     return tuple(effect for effect in effects if not reads.isdisjoint(list_changes(effect)))

@@ -108,7 +108,7 @@ def why_not(flats: Sequence[FlatCapture], camera: DataSheet) -> str | None:
 
 
 def light_of(flats: Sequence[FlatCapture], camera: DataSheet) -> dict[str, StatedLight]:
-    """The light of each flat by its id: photons, stated or else measured, or else the exposure."""
+    """Return the light of each flat by its id: photons, stated or else measured, or else the exposure."""
     return {flat.id: stated_light(flat) for flat in flats} | photon_numbers(flats, camera)
 
 

@@ -105,7 +105,7 @@ class Study:
         return 0.0 if capture.time is None or self._start is None else (capture.time - self._start).total_seconds()
 
     def spectrum(self, path: str) -> Spectrum:
-        """A spectrum of the recording set, read once."""
+        """Return a spectrum of the recording set, read once."""
         if path not in self._spectra:
             self._spectra[path] = self.recordings.spectrum(path)
         return self._spectra[path]
@@ -119,7 +119,8 @@ class Study:
         return mask
 
     def levels(self, capture: Capture) -> Levels:
-        """The means of a capture by channel, computed once. A channel clips where `CLIPPED_SHARE` of its pixels do."""
+        """Return the means of a capture by channel, computed once. A channel clips where `CLIPPED_SHARE` of its
+        pixels do."""
         if capture.id not in self._levels:
             found = plane_means(self.recordings.frame(capture), self.camera.cfa, self.saturation_dn)
             self._levels[capture.id] = Levels(

@@ -112,8 +112,8 @@ def parse_glasses(replacements: list[str]) -> dict[str, GlassName]:
 
 
 def with_glasses(prescription: Prescription, glasses: Mapping[str, GlassName]) -> Prescription:
-    """The prescription with glasses replaced; each replacement is a warning. Raises InputError for a glass that it
-    doesn't have."""
+    """Return the prescription with glasses replaced; each replacement is a warning. Raises InputError for a glass that
+    it doesn't have."""
     present = {surface.glass.name for surface in prescription.surfaces if surface.glass is not None}
     for name in glasses:
         if name not in present:

@@ -42,7 +42,8 @@ class Replay:
         return tuple(c for c in self.recordings.captures(side=self.side) if self._tells_its_scene(c))
 
     def _tells_its_scene(self, capture: Capture) -> bool:
-        """Whether manifest and recordings determine the scene. Of screens and boards they don't tell the pose."""
+        """Return whether manifest and recordings determine the scene. Of screens and boards they don't tell the
+        pose."""
         return isinstance(capture, SlantedEdgeCapture) or capture.scene(lambda path: _EQUAL) is not None
 
     @cached_property
@@ -57,7 +58,7 @@ class Replay:
         return sensor.dn_moments(electrons, self.camera, exposure.gain_db, read_out(self.camera, exposure, effects))[0]
 
     def drawn(self, rng: np.random.Generator, effects: Sequence[Effect] = ()) -> RecordingSet:
-        """The recordings with the frames of `captures` drawn from the model, with one fixed pattern for all."""
+        """Return the recordings with the frames of `captures` drawn from the model, with one fixed pattern for all."""
         pattern = sensor.FixedPattern.draw(self.camera, rng)
         frames = {}
         mean: dict[object, tuple[Exposure, FloatArray]] = {}
@@ -99,7 +100,7 @@ class Replay:
         return scene
 
     def _edge(self, capture: SlantedEdgeCapture) -> EdgeMtf:
-        """The edge that the slanted-edge estimator finds in the green (or only) channel."""
+        """Return the edge that the slanted-edge estimator finds in the green (or only) channel."""
         channel = "G" if "G" in self.camera.channels else self.camera.channels[0]
         return measure_edge(self.recordings, [capture], channel)
 
@@ -130,7 +131,7 @@ class Replay:
 
 
 def _placed(region: tuple[int, int, int, int], edge: EdgeMtf) -> EdgeRegion:
-    """A straight edge at the centre and the angle that the estimator found."""
+    """Return a straight edge at the centre and the angle that the estimator found."""
     geometry = edge.geometry
     row, col = geometry.centre_px
     if geometry.transposed:

@@ -112,8 +112,8 @@ class Simulation:
 def camera_for(
     camera: Path | None, lens: Path | None, cache: Path | None = None, progress: Progress | None = None
 ) -> CameraFile:
-    """The camera of a file, or the default camera (None). With `lens`, a prescription, its f-number and focal length
-    are that lens's.
+    """Return the camera of a file, or the default camera (None). With `lens`, a prescription, its f-number and focal
+    length are that lens's.
 
     Raises InputError for a file that can't be used.
     """
@@ -126,8 +126,8 @@ def camera_for(
 def with_lens(
     content: CameraFile, lens: Path, cache: Path | None = None, progress: Progress | None = None
 ) -> CameraFile:
-    """The camera with the lens of a prescription, f-number and focal length included. Raises InputError for a file that
-    can't be used."""
+    """Return the camera with the lens of a prescription, f-number and focal length included. Raises InputError for a
+    file that can't be used."""
     table = traced_table(lens, cache, progress)
     model = content.camera
     try:
@@ -207,8 +207,8 @@ def _distorting(content: CameraFile) -> CameraFile:
 
 
 def automatic_exposure_s(electrons_per_s: FloatArray, camera: CameraModel, gain_db: float = 0.0) -> float:
-    """The exposure (s, three digits) at which the brightest 1 % of the pixels reach 70 % of their capacity. Raises
-    InputError beyond the limits."""
+    """Return the exposure (s, three digits) at which the brightest 1 % of the pixels reach 70 % of their capacity.
+    Raises InputError beyond the limits."""
     bright = float(np.percentile(electrons_per_s, 100.0 - BRIGHTEST_PERCENT))
     bright = bright if bright > 0 else float(electrons_per_s.max())
     seconds = AUTO_SHARE * sensor.capacity_e(camera, gain_db) / bright
@@ -355,8 +355,8 @@ def neutral(camera: CameraModel, white: Spectrum) -> dict[str, float] | None:
 
 
 def preview(frame: Frame, camera: CameraModel, white: Spectrum) -> NDArray[np.uint8]:
-    """A preview (rows, cols, 3: R, G, B), demosaicked, white-balanced on the scene's white, in sRGB. White is a full
-    pixel."""
+    """Return a preview (rows, cols, 3: R, G, B), demosaicked, white-balanced on the scene's white, in sRGB. White is a
+    full pixel."""
     gain = camera.conversion_gain_dn_per_e
     span = min(camera.full_well_e * gain, camera.white_level_dn - camera.black_level_dn)
     if camera.cfa == "MONO":
@@ -387,7 +387,7 @@ def _demosaicked(frame: Frame, camera: CameraModel) -> FloatArray:
 
 
 def _to_srgb(camera: CameraModel) -> FloatArray:
-    """The matrix (3, 3) from balanced camera colours to linear sRGB. White stays white."""
+    """Return the matrix (3, 3) from balanced camera colours to linear sRGB. White stays white."""
     from_srgb = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
     daylight_codes = np.array([electrons_of(daylight(), camera.quantum_efficiency[channel]) for channel in "RGB"])
     balanced = np.diag(1.0 / daylight_codes) @ colour_matrix(camera) @ from_srgb
@@ -396,7 +396,7 @@ def _to_srgb(camera: CameraModel) -> FloatArray:
 
 
 def _line(error: Exception) -> str:
-    """The message of an exception of `sim`, as one line."""
+    """Return the message of an exception of `sim`, as one line."""
     if isinstance(error, ValidationError):
         problem = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in problem["loc"])
@@ -413,7 +413,7 @@ def options_of(values: Mapping[str, Any]) -> SimulateOptions:
 
 
 def parameters_of(given: Sequence[str]) -> dict[str, float]:
-    """The scene's parameters from KEY=VALUE pairs. Raises InputError for anything else."""
+    """Return the scene's parameters from KEY=VALUE pairs. Raises InputError for anything else."""
     found = {}
     for pair in given:
         key, equals, value = pair.partition("=")
@@ -427,7 +427,7 @@ def parameters_of(given: Sequence[str]) -> dict[str, float]:
 
 
 def summary_lines(record: SimulationRecord, file: Path) -> list[str]:
-    """The lines that `calibench simulate` prints."""
+    """Return the lines that `calibench simulate` prints."""
     s, camera = record.summary, record.camera
     how = (
         f"brightest {BRIGHTEST_PERCENT:g} % at {100 * AUTO_SHARE:g} % of a full pixel"

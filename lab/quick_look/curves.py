@@ -111,7 +111,7 @@ class GrowingCurves:
             return  # packed away just now, or no edge there: the fit will say
 
     def _first(self, capture: Capture, what: str) -> bool:
-        """Whether nothing of this side and name was looked at before."""
+        """Return whether nothing of this side and name was looked at before."""
         key = (capture.side, what)
         fresh = key not in self._seen
         self._seen.add(key)
@@ -179,7 +179,8 @@ class GrowingCurves:
 
 
 def centre(frame: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """The middle quarter of a frame, beginning at an even row and column, so that the mosaic stays what it is."""
+    """Return the middle quarter of a frame, beginning at an even row and column, so that the mosaic stays what it
+    is."""
     rows, cols = frame.shape
     row, col = rows // 4 // 2 * 2, cols // 4 // 2 * 2
     return frame[row : rows - row, col : cols - col]

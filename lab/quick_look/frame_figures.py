@@ -32,7 +32,7 @@ class FrameFigures(Frozen):
 
 
 def frame_figures(frame: NDArray[np.uint16], camera: DataSheet) -> FrameFigures:
-    """The figures of `frame` (rows, cols), from one count of the codes of each channel."""
+    """Return the figures of `frame` (rows, cols), from one count of the codes of each channel."""
     top = camera.saturation_dn
     bin_dn = (top + 1.0) / BINS
     found = []

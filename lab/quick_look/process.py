@@ -51,8 +51,8 @@ class QuickLook:
         self._closed = False
 
     def curves(self, session_id: str) -> Curves:
-        """The newest curves of a session; without any yet, `looked_at` is 0. Where they are older than `HOLDS_S`, newer
-        ones are asked for."""
+        """Return the newest curves of a session; without any yet, `looked_at` is 0. Where they are older than
+        `HOLDS_S`, newer ones are asked for."""
         with self._lock:
             known = self._known.get(session_id)
             fresh = known is not None and time.monotonic() - known.at_s < HOLDS_S
@@ -127,7 +127,7 @@ class QuickLook:
 
     @staticmethod
     def _answer(process: subprocess.Popen[str], session_id: str) -> str:
-        """The answer's line; empty where the process ended or doesn't answer."""
+        """Return the answer's line; empty where the process ended or doesn't answer."""
         assert process.stdin is not None and process.stdout is not None
         with contextlib.suppress(OSError):
             process.stdin.write(session_id + "\n")

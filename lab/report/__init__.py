@@ -95,7 +95,7 @@ class _Kernel:
 
 
 def _without_repeats(recordings: RecordingSet, checks: list[Check]) -> list[Check]:
-    """The first check of each edge: repeats of the same region at the same angle would only fill the page."""
+    """Return the first check of each edge: repeats of the same region at the same angle would only fill the page."""
     places = {capture.id: (capture.region, capture.angle_deg) for capture in recordings.captures(SlantedEdgeCapture)}
     first: dict[Any, Check] = {}
     for check in checks:
@@ -138,7 +138,7 @@ def _threshold_text(diagnosis: DiagnosisResult | None) -> str:
 
 
 def page_environment() -> jinja2.Environment:
-    """The templates of the pages, with their filters."""
+    """Return the templates of the pages, with their filters."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,

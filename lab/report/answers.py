@@ -87,7 +87,7 @@ def odds(diagnosis: DiagnosisResult | None) -> list[tuple[Side, list[tuple[str, 
 
 
 def effect_line(effect: NamedEffect) -> str:
-    """An effect, its cameras, and its parameters that differ from zero, in the library's words."""
+    """Return an effect, its cameras, and its parameters that differ from zero, in the library's words."""
     law = library().get(effect.nearest_law)
     described = law.quantities() if law else {}
     fields = law.choices() if law else {}
@@ -300,7 +300,7 @@ def proofs(fit: FitResult, diagnosis: DiagnosisResult | None, both: BothModels |
 
 
 def strip(fit: FitResult) -> list[tuple[str, list[KeyFigure]]]:
-    """The key figures of the first screen: by side, then those of the stereo pair."""
+    """Return the key figures of the first screen: by side, then those of the stereo pair."""
     rows = [
         (
             str(side),
@@ -322,8 +322,8 @@ def answers(
     warnings: int = 0,
     both: BothModels | None = None,
 ) -> list[tuple[str, list[str]]]:
-    """The four questions, each with its answers in sentences. `left_out`: number of skipped steps; `warnings`: number
-    of warnings about the recordings."""
+    """Return the four questions, each with its answers in sentences. `left_out`: number of skipped steps; `warnings`:
+    number of warnings about the recordings."""
     return [
         ("What was found", list(found(fit, diagnosis))),
         ("How sure", list(certainty(diagnosis))),

@@ -26,7 +26,7 @@ PACKED, PACKED_FROM = frozenset({"x", "y", "z", "array", "arrayminus"}), 8
 
 @cache
 def plotly_base64() -> str:
-    """The compressed build as base64; `charts.js` expands it in the page."""
+    """Return the compressed build as base64; `charts.js` expands it in the page."""
     return base64.b64encode(BUILD.read_bytes()).decode("ascii")
 
 
@@ -64,7 +64,7 @@ def _packed(values: Any) -> dict[str, str] | None:
 
 
 def figure_json(figure: Figure) -> str:
-    """A figure as one line of JSON: a trace's numbers as typed arrays, others rounded to 7 digits."""
+    """Return a figure as one line of JSON: a trace's numbers as typed arrays, others rounded to 7 digits."""
 
     def rounded(value: Any, key: str = "") -> Any:
         if key in PACKED and (packed := _packed(value)) is not None:

@@ -36,7 +36,7 @@ def _faded(colour: str, opacity: float = FADED) -> str:
 
 
 def axis(title: str, **more: Any) -> dict[str, Any]:
-    """A labelled axis in the report's style."""
+    """Return a labelled axis in the report's style."""
     return {
         "title": {"text": title, "standoff": 6},
         "gridcolor": "@grid",
@@ -51,7 +51,7 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
 
 
 def layout(height: int, **more: Any) -> dict[str, Any]:
-    """A figure's layout in the report's style."""
+    """Return a figure's layout in the report's style."""
     return {
         "height": height,
         "margin": {"l": 56, "r": 14, "t": 26, "b": 44},
@@ -70,7 +70,7 @@ def _bars(std: Sequence[float | None], colour: str) -> dict[str, Any]:
 def band(
     x: Sequence[float], centre: np.ndarray[Any, Any], half: np.ndarray[Any, Any], colour: str, **more: Any
 ) -> Trace:
-    """A filled band centre +- half."""
+    """Return a filled band centre +- half."""
     return {
         "type": "scatter",
         "x": [*x, *reversed(list(x))],
@@ -345,7 +345,7 @@ def explained_overlays(curves: Sequence[ResidualCurve], measurement: str = "slan
 
 
 def _legend(name: str, **look: Any) -> Trace:
-    """A legend entry without data."""
+    """Return a legend entry without data."""
     return {"type": "scatter", "name": name, "x": [None], "y": [None], "hoverinfo": "skip"} | look
 
 

@@ -20,13 +20,13 @@ LEAST_SIGMA = 0.02  # where a logarithmic axis ends
 
 
 def _label(row: Change) -> str:
-    """The quantity as the chart's axis names it."""
+    """Return the quantity as the chart's axis names it."""
     where = row.where if row.n > 1 else ""
     return " ".join(part for part in (row.side, row.title or row.name, where) if part)
 
 
 def most_significant(comparison: ComparisonResult) -> tuple[Change, ...]:
-    """The rows that are drawn, most significant first."""
+    """Return the rows that are drawn, most significant first."""
     return tuple(sorted(comparison.changes, key=lambda row: -row.significance_sigma)[:SHOWN])
 
 
@@ -79,7 +79,7 @@ def projection_vectors(item: ProjectionChange) -> Figure:
 
 
 def render_comparison(comparison: ComparisonResult) -> str:
-    """The page as HTML text."""
+    """Return the page as HTML text."""
     number = sum(row.changed for row in comparison.changes) + sum(item.changed for item in comparison.projection)
     total = len(comparison.changes) + len(comparison.projection)
     context: dict[str, Any] = {

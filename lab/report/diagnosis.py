@@ -114,8 +114,8 @@ def mood(chi2: float, n: int) -> str:
 
 
 def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) -> list[ResidualCurve]:
-    """The curve of every measurement that the baseline fits worst, of held-out captures where there are any; worst
-    first."""
+    """Return the curve of every measurement that the baseline fits worst, of held-out captures where there are any;
+    worst first."""
 
     def missed(curve: ResidualCurve) -> float:
         std = np.maximum(np.asarray(curve.measured_std), 1e-12)
@@ -198,7 +198,7 @@ def _place_map(places: Sequence[ExaminedPlace], *, after: bool) -> Figure:
 
 
 def _short(sigma: float) -> str:
-    """A significance in at most four characters."""
+    """Return a significance in at most four characters."""
     return f"{sigma:.1f}" if sigma < 9.95 else f"{sigma:.0f}" if sigma < 99.5 else "99+"
 
 

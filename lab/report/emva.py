@@ -3,23 +3,500 @@ spatial stacks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
+from lab.capture_kinds.dark import DarkCapture
+from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
 from lab.fit.noise.pixel_maps import pixel_maps
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import ChannelNoise, Emva1288, FitResult, NoiseFit, PixelDefects
+from lab.formats.results import ChannelNoise, Emva1288, Emva1288Points, FitResult, NoiseFit, PixelDefects
 from lab.formats.results.in_words import measured
-from lab.report.emva_plot import EmvaPlot
-from lab.report.emva_spatial import spatial_plots
-from lab.report.emva_temporal import joint_fit_plots, temporal_plots
+from lab.measure.dark_pixels import stack_of
+from lab.measure.stated_light import light_of
+from lab.report.charts import AFTER, BEFORE, CHANNEL, Trace, axis, layout
+from lab.report.emva_plot import EmvaPlot, curve, floats, markers
 from lab.report.figures import NOISE
 from lab.report.maps import MAPS
 from lab.report.pictures import map_picture, photograph_data_uri
 from sim.camera import Side
+from sim.sensor.mosaic import planes
+from sim.spectrum import FloatArray
+
+# --- emva spatial ----------------------------------------------------------------------------------------------------
+# The data sheet's spatial plots: spectrograms, histograms and profiles of DSNU and PRNU.
+
+
+MOST_POINTS = 700  # of a profile; longer ones are thinned out
+HISTOGRAM_BINS = 256  # at most, as the standard has it
+HIGH_PASS_PX = 5  # side of the box whose mean is subtracted from the bright image
+
+
+@dataclass(frozen=True)
+class _MeanImages:
+    """Mean images of the stacks of one plane of the mosaic."""
+
+    dark: FloatArray  # DN
+    bright: FloatArray | None  # DN
+    dark_left_dn2: float  # temporal variance that remains in the mean dark image
+    bright_left_dn2: float  # the same of the mean bright image
+    dark_step_dn: float  # between possible values of the mean dark image
+
+
+def spatial_plots(recordings: RecordingSet, side: Side, own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
+    """Yield the spatial plots of one plane, whose figures are `own`; none where its stacks aren't in the recordings."""
+    images = _stacks(recordings, side, own.points, plane)
+    if images is None:
+        return
+    gain = own.system_gain_dn_per_e
+    dark = images.dark - images.dark.mean()
+    yield _spectrogram("DSNU", dark / gain, images.dark_left_dn2 / gain**2, "e")
+    bright = None
+    if images.bright is not None:
+        signal = float(images.bright.mean() - images.dark.mean())
+        bright = 100.0 * (images.bright - images.dark - signal) / signal
+        left = 1e4 * (images.bright_left_dn2 + images.dark_left_dn2) / signal**2
+        yield _spectrogram("PRNU", bright, left, "%")
+    yield _histogram("DSNU", dark / gain, images.dark_left_dn2 / gain**2, "e", images.dark_step_dn / gain)
+    if bright is not None:
+        # subtracting the mean of n = 25 pixels leaves 1 - 1/n of the noise variance
+        high = bright - cv2.blur(bright, (HIGH_PASS_PX, HIGH_PASS_PX), borderType=cv2.BORDER_REFLECT)
+        yield _histogram("PRNU", high, left * (1.0 - HIGH_PASS_PX**-2), "%")
+    yield _profiles("DSNU", images.dark, "DN")
+    if bright is not None:
+        yield _profiles("PRNU", 100.0 + bright, "% of the mean")
+
+
+def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane: str) -> _MeanImages | None:
+    """Return the image stacks that the spatial figures were computed from."""
+    darks = [c for c in recordings.captures(DarkCapture, side) if c.exposure_s == points.stack_dark_exposure_s]
+
+    every = recordings.captures(FlatCapture, side)
+    light = light_of(every, recordings.camera(side))
+    flats = [c for c in every if c.exposure_s == points.stack_exposure_s and light[c.id].amount == points.stack_light]
+    if not darks:
+        return None
+
+    def mean(captures: list[DarkCapture] | list[FlatCapture]) -> tuple[FloatArray, float]:
+        stack = stack_of(recordings, captures)
+        camera = recordings.camera(side)
+        left = 0.0
+        if stack.squares is not None:
+            left = float(planes(stack.squares, camera.cfa)[plane].mean(dtype=float)) / (stack.count - 1) / stack.count
+        return np.array(planes(stack.image(), camera.cfa)[plane], float), left
+
+    dark, dark_left = mean(darks)
+    bright, bright_left = mean(flats) if flats else (None, 0.0)
+    return _MeanImages(dark, bright, dark_left, bright_left, 1.0 / len(darks))
+
+
+def spectrogram(image: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Frequencies (cycles/px) and rms amplitude along the rows of an image: the root of the mean power spectrum of its
+    rows, scaled so that a white pattern of standard deviation s has the amplitude s at every frequency. Frequency 0 is
+    left out."""
+    length = image.shape[1]
+    power = np.mean(np.abs(np.fft.rfft(image - image.mean(), axis=1)) ** 2, axis=0) / length
+    return np.asarray(np.fft.rfftfreq(length)[1:], float), np.asarray(np.sqrt(power[1:]), float)
+
+
+def _smoothed(values: FloatArray, most: int = MOST_POINTS) -> FloatArray:
+    """At most `most` values: the largest of each run, as means would hide lines of a spectrum."""
+    if values.size <= most:
+        return values
+    run = -(-values.size // most)
+    padded = np.pad(values, (0, -values.size % run), mode="edge")
+    return padded.reshape(-1, run).max(axis=1)
+
+
+def _spectrogram(name: str, image: FloatArray, left: float, unit: str) -> EmvaPlot:
+    data: list[Trace] = []
+    whole = float(np.sqrt(max(image.var() - left, 0.0)))
+    for text, turned, colour in (("rows (horizontal)", image, AFTER), ("columns (vertical)", image.T, BEFORE)):
+        frequency, amplitude = spectrogram(turned)
+        amplitude = _smoothed(amplitude)
+        data.append(
+            curve(text, floats(np.linspace(frequency[0], frequency[-1], amplitude.size)), floats(amplitude), colour)
+        )
+    for text, value, dash in (
+        (f"{name}1288", whole, "solid"),
+        ("residual temporal noise", float(np.sqrt(left)), "dot"),
+    ):
+        if value > 0:
+            data.append(curve(text, [0.0, 0.5], [value, value], "@fg", dash))
+    return EmvaPlot(
+        f"Spectrograms of the {name}",
+        {
+            "data": data,
+            "layout": layout(
+                320,
+                xaxis=axis("frequency, cycles/px", range=[0.0, 0.5]),
+                yaxis=axis(f"rms amplitude, {unit}", type="log"),
+                margin={"l": 56, "r": 14, "t": 46, "b": 44},
+            ),
+        },
+        "A white pattern is flat at its standard deviation; peaks are periodic patterns, a rise towards low "
+        "frequencies is shading.",
+    )
+
+
+def _histogram(name: str, image: FloatArray, left: float, unit: str, step: float = 0.0) -> EmvaPlot:
+    """Logarithmic histogram with the normal distribution of the same standard deviation, and the cumulative histogram
+    of absolute deviations. `step`: between possible values; a bin holds a whole number of them."""
+    rest = (image - image.mean()).ravel()
+    reach = 1.05 * float(np.abs(rest).max()) or 1.0
+    width = 2.0 * reach / HISTOGRAM_BINS
+    if step > 0:
+        width = step * np.ceil(width / step)
+    first = rest.min() - 0.5 * min(step, width) if step > 0 else -reach
+    counts, edges = np.histogram(rest, first + width * np.arange(np.ceil((reach - first) / width) + 1))
+    middle = (edges[:-1] + edges[1:]) / 2.0
+    spread = float(rest.std()) or 1e-12  # all equal: one bin
+    law = rest.size * (edges[1] - edges[0]) * np.exp(-0.5 * (middle / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
+    moduli = np.sort(np.abs(rest))[::-1]
+    steps = np.unique(np.geomspace(1, moduli.size, 160).astype(int)) - 1
+    shown = counts > 0
+    drawn = law > 0.3
+    return EmvaPlot(
+        f"Histograms of the {name}",
+        {
+            "data": [
+                markers("pixels", floats(middle[shown]), floats(counts[shown].astype(float)), AFTER)
+                | {"marker": {"size": 4, "color": AFTER}},
+                curve("normal distribution, same standard deviation", floats(middle[drawn]), floats(law[drawn]), "@fg"),
+                curve(
+                    "share of pixels beyond",
+                    floats(moduli[steps]),
+                    floats(100.0 * (steps + 1.0) / moduli.size),
+                    BEFORE,
+                    xaxis="x2",
+                    yaxis="y2",
+                ),
+            ],
+            "layout": layout(
+                320,
+                xaxis=axis(f"deviation from the mean, {unit}", domain=[0.0, 0.47]),
+                yaxis=axis("pixels", type="log", range=[-0.3, float(np.log10(max(counts.max(), 2))) + 0.3]),
+                xaxis2=axis(f"absolute deviation, {unit}", domain=[0.58, 1.0], anchor="y2", rangemode="tozero"),
+                yaxis2=axis("share of pixels, %", type="log", anchor="x2"),
+                margin={"l": 56, "r": 14, "t": 46, "b": 44},
+            ),
+        },
+        f"Mean image{', high-passed by 5 × 5 means' if name == 'PRNU' else ''}; residual temporal noise "
+        f"{measured(float(np.sqrt(left)), None, unit)}. "
+        "Defective pixels lie outside the normal distribution.",
+    )
+
+
+def _profiles(name: str, image: FloatArray, unit: str) -> EmvaPlot:
+    """Profiles along rows and columns: middle line, mean, minimum and maximum."""
+    data: list[Trace] = []
+    for number, turned in enumerate((image, image.T)):
+        on = {"xaxis": f"x{number + 1}" if number else "x", "yaxis": "y2" if number else "y", "showlegend": number == 0}
+        curves: tuple[tuple[str, Callable[[FloatArray], FloatArray], str, str], ...] = (
+            ("largest", lambda a: a.max(axis=0), "@muted", "dot"),
+            ("smallest", lambda a: a.min(axis=0), "@muted", "dot"),
+            ("middle", lambda a: a[len(a) // 2], BEFORE, "solid"),
+            ("mean", lambda a: a.mean(axis=0), AFTER, "solid"),
+        )
+        for text, of, colour, dash in curves:
+            values = of(turned)
+            thin = -(-values.size // MOST_POINTS)
+            data.append(curve(text, list(range(0, values.size, thin)), floats(values[::thin]), colour, dash, **on))
+            data[-1]["line"]["width"] = 1.0 if text in ("middle", "largest", "smallest") else 1.8
+    inside = np.percentile(image, [0.05, 99.95])
+    margin = 0.6 * float(inside[1] - inside[0]) or 1.0
+    span = [float(inside[0]) - margin, float(inside[1]) + margin]
+    return EmvaPlot(
+        f"Profiles of the {name}",
+        {
+            "data": data,
+            "layout": layout(
+                320,
+                xaxis=axis("column", domain=[0.0, 0.47]),
+                yaxis=axis(unit, range=span),
+                xaxis2=axis("row", domain=[0.56, 1.0], anchor="y2"),
+                yaxis2=axis("", range=span, anchor="x2"),
+                margin={"l": 56, "r": 14, "t": 46, "b": 44},
+            ),
+        },
+        "Left: horizontal profiles (over the columns), right: vertical ones. Single defects may lie outside the range "
+        "shown.",
+    )
+
+
+# --- emva temporal ---------------------------------------------------------------------------------------------------
+# The data sheet's temporal plots: photon transfer, responsivity, SNR, linearity, dark current; and those of the joint
+# fit.
+
+
+BOLTZMANN_EV_PER_K, ZERO_C_K = 8.617333262e-5, 273.15
+
+
+def _light_axis(points: Emva1288Points) -> str:
+    return "irradiation, photons/pixel" if points.light_unit == "photons" else "exposure, s"
+
+
+def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
+    """Yield the temporal plots of one plane, whose figures are `own`."""
+    points, colour = own.points, CHANNEL.get(plane, "#888888")
+    signal = np.array(points.mean_dn) - np.array(points.dark_mean_dn)
+    excess = np.array(points.variance_dn2) - np.array(points.dark_variance_dn2)
+    light = np.array(points.light)
+    saturation = own.saturation_capacity_e
+    top = saturation * own.system_gain_dn_per_e if saturation is not None else float(signal.max())
+    yield EmvaPlot(
+        "Photon transfer",
+        {
+            "data": [
+                markers("measured", floats(signal), floats(excess), colour),
+                curve(
+                    f"K = {measured(own.system_gain_dn_per_e, own.system_gain_dn_per_e_std, 'DN/e')}",
+                    [0.0, 0.7 * top],
+                    [0.0, 0.7 * top * own.system_gain_dn_per_e],
+                    "@fg",
+                ),
+                curve(
+                    "",
+                    [0.7 * top, top],
+                    [k * top * own.system_gain_dn_per_e for k in (0.7, 1.0)],
+                    "@fg",
+                    "dot",
+                    showlegend=False,
+                ),
+            ],
+            "layout": layout(
+                310,
+                xaxis=axis("μ<sub>y</sub> − μ<sub>y.dark</sub>, DN", rangemode="tozero"),
+                yaxis=axis("σ²<sub>y</sub> − σ²<sub>y.dark</sub>, DN²", range=[0.0, 1.15 * float(excess.max())]),
+            ),
+        },
+        "Temporal variance against mean, dark subtracted. Solid: the line through the origin, fitted to 70 % of "
+        "saturation; dotted: beyond.",
+    )
+    if own.responsivity_dn_per_photon is not None:
+        slope = own.responsivity_dn_per_photon
+        reach = float(light[signal <= 1.02 * top].max())
+        yield EmvaPlot(
+            "Responsivity",
+            {
+                "data": [
+                    markers("measured", floats(light), floats(signal), colour),
+                    curve(
+                        f"R = {measured(slope, own.responsivity_dn_per_photon_std, 'DN/photon')}",
+                        [0.0, reach],
+                        [0.0, slope * reach],
+                        "@fg",
+                    ),
+                ],
+                "layout": layout(
+                    310,
+                    xaxis=axis("irradiation, photons/pixel", rangemode="tozero"),
+                    yaxis=axis("μ<sub>y</sub> − μ<sub>y.dark</sub>, DN", rangemode="tozero"),
+                ),
+            },
+            "Mean minus dark against photons, with the line through the origin, fitted to 70 % of saturation.",
+        )
+    yield _snr(own, light, signal, colour)
+    yield from _linearity(own, light, signal, colour)
+    yield from _dark_current(own, colour)
+
+
+def _snr(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> EmvaPlot:
+    """SNR against light: measured, of the linear model, with nonuniformity, and of an ideal sensor."""
+    points, gain = own.points, own.system_gain_dn_per_e
+    photons = own.quantum_efficiency is not None
+    efficiency = own.quantum_efficiency if own.quantum_efficiency is not None else 1.0
+    x = light if photons else signal / gain
+    # beyond saturation the noise vanishes, and SNR has no meaning
+    seen = (signal > 0) & (np.array(points.variance_dn2) > 0)
+    if own.saturation_capacity_e is not None:
+        seen &= (
+            signal <= 1.001 * own.saturation_capacity_e * gain
+            if not photons
+            else light <= (own.saturation_capacity_photons or np.inf)
+        )
+    noise = np.sqrt(np.where(seen, points.variance_dn2, 1.0))
+    dark_e = own.temporal_dark_noise_dn / gain if own.temporal_dark_noise_dn is not None else 0.0
+    first = own.sensitivity_threshold_photons if photons else own.sensitivity_threshold_e
+    full = own.saturation_capacity_photons if photons else own.saturation_capacity_e
+    low, high = first or 1.0, full or float(x.max())
+    at = np.geomspace(max(0.7 * low, 1e-3), high, 60)
+    electrons = efficiency * at
+    model = electrons / np.sqrt(dark_e**2 + electrons)
+    data = [
+        markers("measured", floats(x[seen]), floats(signal[seen] / noise[seen]), colour),
+        curve("linear model", floats(at), floats(model), "@fg"),
+    ]
+    if own.dsnu_e is not None and own.prnu_percent is not None:
+        spatial = own.dsnu_e**2 + (own.prnu_percent / 100.0 * electrons) ** 2
+        total = electrons / np.sqrt(dark_e**2 + electrons + spatial)
+        data.append(curve("total, with nonuniformity", floats(at), floats(total), BEFORE))
+    data.append(curve("ideal sensor", floats(at), floats(np.sqrt(at)), "@muted", "dash"))
+    for value, text in ((first, "threshold"), (full, "saturation")):
+        if value is not None:
+            data.append(
+                curve(text, [value, value], [1.0, float(np.sqrt(high))], AFTER, "dot", showlegend=text == "threshold")
+            )
+            data[-1]["name"] = "threshold and saturation"
+    label = "irradiation, photons/pixel" if photons else "signal, e"
+    return EmvaPlot(
+        "Signal-to-noise ratio",
+        {
+            "data": data,
+            "layout": layout(
+                340,
+                xaxis=axis(label, type="log"),
+                yaxis=axis("SNR", type="log"),
+                margin={"l": 56, "r": 14, "t": 46, "b": 44},
+            ),
+        },
+        "Logarithmic on both axes. The ideal sensor has a quantum efficiency of 1 and shot noise alone."
+        if photons
+        else "Logarithmic on both axes. The ideal sensor has shot noise alone.",
+    )
+
+
+def _linearity(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> Iterator[EmvaPlot]:
+    points = own.points
+    at = [k for k, value in enumerate(points.linearity_deviation_percent) if value is not None]
+    if not at or own.linearity_error_percent is None:
+        return
+    deviation = [points.linearity_deviation_percent[k] for k in at]
+    x = light[at]
+    # The line's own values: signal = line (1 + deviation).
+    line = signal[at] / (1.0 + np.array(deviation, float) / 100.0)
+    yield EmvaPlot(
+        "Linearity",
+        {
+            "data": [
+                markers("measured", floats(light), floats(signal), colour, showlegend=False),
+                curve("line, 5 to 95 % of saturation", floats(x), floats(line), "@fg"),
+                markers(
+                    "deviation",
+                    floats(x),
+                    [float(v or 0.0) for v in deviation],
+                    colour,
+                    mode="markers+lines",
+                    yaxis="y2",
+                )
+                | {"line": {"color": colour, "width": 1}, "showlegend": False},
+            ],
+            "layout": layout(
+                340,
+                xaxis=axis(_light_axis(points), rangemode="tozero", anchor="y2"),
+                yaxis=axis("signal, DN", rangemode="tozero", domain=[0.45, 1.0]),
+                yaxis2=axis("deviation, %", domain=[0.0, 0.34], zeroline=True),
+            ),
+        },
+        f"Above: mean minus dark with the line that minimises relative deviations; below: the deviations. "
+        f"LE {measured(own.linearity_error_percent, own.linearity_error_percent_std, '%')} is their mean absolute "
+        "value.",
+    )
+
+
+def _dark_current(own: Emva1288, colour: str) -> Iterator[EmvaPlot]:
+    points = own.points
+    if len(set(points.dark_exposure_s)) < 2:
+        return
+    yield EmvaPlot(
+        "Dark signal against exposure",
+        {
+            "data": [
+                markers("mean", points.dark_exposure_s, points.dark_exposure_mean_dn, colour, showlegend=False),
+                markers(
+                    "variance",
+                    points.dark_exposure_s,
+                    points.dark_exposure_variance_dn2,
+                    BEFORE,
+                    yaxis="y2",
+                    showlegend=False,
+                ),
+            ],
+            "layout": layout(
+                310,
+                xaxis=axis("exposure, s", anchor="y2", rangemode="tozero"),
+                yaxis=axis("mean, DN", domain=[0.56, 1.0]),
+                yaxis2=axis("variance, DN²", domain=[0.0, 0.44]),
+            ),
+        },
+        "Above: mean of the darks; below: their temporal variance. Their slopes are the dark current, from means and "
+        "from variances.",
+    )
+
+
+def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
+    """Plots of the joint fit: read noise of single pixels, dark current against temperature."""
+    spread = noise.read_noise_distribution
+    if spread is not None:
+        edges = np.array(spread.noise_e)
+        yield EmvaPlot(
+            "Read noise of single pixels",
+            {
+                "data": [
+                    {
+                        "type": "bar",
+                        "name": "pixels",
+                        "x": floats((edges[:-1] + edges[1:]) / 2.0),
+                        "y": list(spread.pixels),
+                        "marker": {"color": AFTER},
+                        "showlegend": False,
+                    }
+                ],
+                "layout": layout(
+                    310, xaxis=axis("temporal dark noise, e"), yaxis=axis("pixels", type="log"), bargap=0.05
+                ),
+            },
+            f"Over {spread.degrees_of_freedom} degrees of freedom a pixel; median {spread.median_e:.3g} e, 99 % below "
+            f"{spread.percentile_99_e:.3g} e. The pixels' true variances differ by "
+            f"{measured(spread.spread_percent, spread.spread_percent_std, '%')}, sampling error subtracted; "
+            f"{spread.noisy_pixels} noisy pixels.",
+            of_plane=False,
+        )
+    law = noise.dark_current_temperature
+    if law is None or len(law.temperature_c) < 2:
+        return
+    data = [
+        markers(
+            "measured",
+            law.temperature_c,
+            law.dark_current_e_per_s,
+            AFTER,
+            error_y={
+                "type": "data",
+                "array": list(law.dark_current_e_per_s_std),
+                "color": AFTER,
+                "thickness": 1,
+                "width": 2,
+            },
+        )
+    ]
+    caption = "Dark current from means at each temperature, logarithmic."
+    if law.activation_energy_ev is not None and law.reference_current_e_per_s is not None:
+        at = np.linspace(min(law.temperature_c), max(law.temperature_c), 40)
+        reference_k = (law.reference_temperature_c or 0.0) + ZERO_C_K
+        exponent = law.activation_energy_ev / BOLTZMANN_EV_PER_K * (1.0 / reference_k - 1.0 / (at + ZERO_C_K))
+        data.append(curve("Arrhenius", floats(at), floats(law.reference_current_e_per_s * np.exp(exponent)), "@fg"))
+        caption += f" Activation energy {measured(law.activation_energy_ev, law.activation_energy_ev_std, 'eV')}"
+        if law.doubling_temperature_c is not None:
+            caption += f"; doubles every {measured(law.doubling_temperature_c, law.doubling_temperature_c_std, 'K')}"
+        caption += "."
+    yield EmvaPlot(
+        "Dark current against temperature",
+        {
+            "data": data,
+            "layout": layout(310, xaxis=axis("temperature, °C"), yaxis=axis("dark current, e/s", type="log")),
+        },
+        caption,
+        of_plane=False,
+    )
+
+
+# --- emva ------------------------------------------------------------
+
 
 MAP_WIDTH_PX = 300
 
@@ -80,7 +557,8 @@ class EmvaSheet:
 
 
 def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[EmvaSheet]:
-    """A sheet for each camera whose flats and darks gave EMVA 1288 figures. Reads the frames of the spatial stacks."""
+    """Yield a sheet for each camera whose flats and darks gave EMVA 1288 figures. Reads the frames of the spatial
+    stacks."""
     for side, camera in fit.cameras.items():
         noise = camera.noise
         if noise is None or not noise.emva1288:
@@ -116,7 +594,7 @@ def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[EmvaSheet]
 
 
 def table_rows(found: dict[str, Emva1288]) -> Iterator[EmvaRow]:
-    """The quantities that at least one plane has, with standard deviations."""
+    """Yield the quantities that at least one plane has, with standard deviations."""
     for field, (quantity, symbol, unit, factor) in TABLE.items():
         texts = []
         for plane in found.values():
@@ -137,7 +615,7 @@ def table_rows(found: dict[str, Emva1288]) -> Iterator[EmvaRow]:
 
 
 def _channel_rows(noise: NoiseFit) -> Iterator[EmvaRow]:
-    """The joint fit's quantities by colour."""
+    """Yield the joint fit's quantities by colour."""
     for field, (name, unit) in NOISE.items():
         if field not in ChannelNoise.model_fields:
             continue

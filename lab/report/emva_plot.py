@@ -23,7 +23,7 @@ class EmvaPlot:
 
 
 def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **more: Any) -> Trace:
-    """A trace of markers; `more`: further keys of the trace."""
+    """Return a trace of markers; `more`: further keys of the trace."""
     return {
         "type": "scatter",
         "mode": "markers",
@@ -35,7 +35,7 @@ def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **mo
 
 
 def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: str = "solid", **more: Any) -> Trace:
-    """A trace of lines; `more`: further keys of the trace."""
+    """Return a trace of lines; `more`: further keys of the trace."""
     return {
         "type": "scatter",
         "mode": "lines",
@@ -47,5 +47,5 @@ def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: 
 
 
 def floats(values: NDArray[np.floating[Any]]) -> list[float]:
-    """An array (n,) as a list."""
+    """Return an array (n,) as a list."""
     return [float(value) for value in values]

@@ -36,7 +36,7 @@ WORTH_A_PICTURE = 0.1
 
 
 def _taken_away(picture: ResidualPicture) -> float:
-    """The share of the rms residual that the named effects take away."""
+    """Return the share of the rms residual that the named effects take away."""
     before, after = (float(np.sqrt(np.nanmean(np.square(cells)))) for cells in (picture.before, picture.after))
     return 1.0 - after / max(before, 1e-12)
 
@@ -47,7 +47,7 @@ def _proof(curve: ResidualCurve) -> ProofCurve:
 
 
 def findings(fit: FitResult, validation: ValidationResult | None, diagnosis: DiagnosisResult) -> DiagnosisFindings:
-    """What is told of a diagnosis, and of the fit and the validation that go with it."""
+    """Return what is told of a diagnosis, and of the fit and the validation that go with it."""
     verdict, _, headline = words.headline(diagnosis)
     told = [picture for picture in diagnosis.pictures if _taken_away(picture) >= WORTH_A_PICTURE]
     best = {picture.side: picture for picture in sorted(told, key=_taken_away)}

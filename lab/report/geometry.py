@@ -52,7 +52,7 @@ def _height(shape: tuple[float, float]) -> int:
 
 
 def frame_layout(shape: tuple[float, float]) -> dict[str, Any]:
-    """The layout of a chart over a frame of `shape` (rows, cols)."""
+    """Return the layout of a chart over a frame of `shape` (rows, cols)."""
     return layout(_height(shape), **_frame_axes(shape))
 
 
@@ -139,7 +139,7 @@ def residual_vectors(geometry: GeometryFit) -> Figure | None:
 def _map(
     x: tuple[float, ...], y: tuple[float, ...], z: list[list[float | None]], unit: str, tick: str, height: int = 0
 ) -> Figure:
-    """A contour map over the frame, on a logarithmic colour scale where it spans more than a factor of eight."""
+    """Return a contour map over the frame, on a logarithmic colour scale where it spans more than a factor of eight."""
     shape = (y[-1] + 1, x[-1] + 1)
     known = np.array([value for row in z for value in row if value is not None])
     low, high = float(known.min()), float(known.max())

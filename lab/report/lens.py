@@ -235,7 +235,7 @@ def _mosaic(table: LensTable) -> list[dict[str, Any]]:
 
 
 def render_lens(traced: TracedPrescription) -> str:
-    """The page as HTML text."""
+    """Return the page as HTML text."""
     result, table, system = traced.result, traced.table, traced.system
     last = math.tan(math.radians(result.maximum_field_deg))
     window = table.psf.shape[-1] * table.sample_pitch_um

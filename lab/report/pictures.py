@@ -18,27 +18,27 @@ WEBP_QUALITY = 85
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
-    """An image (rows, cols) or (rows, cols, 3: R, G, B) as a PNG file's content."""
+    """Return an image (rows, cols) or (rows, cols, 3: R, G, B) as a PNG file's content."""
     pixels = image if image.ndim == 2 else image[..., ::-1]
     _, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
     return data.tobytes()
 
 
 def png_data_uri(image: NDArray[np.uint8]) -> str:
-    """The same as the text of a PNG data URI."""
+    """Return the same as the text of a PNG data URI."""
     return "data:image/png;base64," + base64.b64encode(png(image)).decode("ascii")
 
 
 def photograph_data_uri(image: NDArray[np.uint8]) -> str:
-    """An image (rows, cols) or (rows, cols, 3: R, G, B) to look at, not to measure in: a WebP data URI, a tenth of the
-    PNG's size."""
+    """Return an image (rows, cols) or (rows, cols, 3: R, G, B) to look at, not to measure in: a WebP data URI, a tenth
+    of the PNG's size."""
     pixels = image if image.ndim == 2 else image[..., ::-1]
     _, data = cv2.imencode(".webp", np.ascontiguousarray(pixels), [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])
     return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
 def kernel_picture(kernel: ArrayLike, peak: float, margin: int = 0) -> str:
-    """A kernel in colours from 0 to `peak` on a square-root scale, `margin` cells cut off at each border."""
+    """Return a kernel in colours from 0 to `peak` on a square-root scale, `margin` cells cut off at each border."""
     values = np.asarray(kernel, float)
     if margin:
         values = values[margin:-margin, margin:-margin]
@@ -48,8 +48,8 @@ def kernel_picture(kernel: ArrayLike, peak: float, margin: int = 0) -> str:
 
 
 def map_picture(values: ArrayLike, width_px: int | None = None) -> tuple[NDArray[np.uint8], float, float]:
-    """A map (rows, cols) in colours (rows, cols, 3: R, G, B) from its 1st percentile (dark) to its 99th (bright), and
-    these two; averaged down to `width_px` columns where it has more."""
+    """Return a map (rows, cols) in colours (rows, cols, 3: R, G, B) from its 1st percentile (dark) to its 99th
+    (bright), and these two; averaged down to `width_px` columns where it has more."""
     given = np.asarray(values, float)
     low, high = (float(limit) for limit in np.percentile(given, [1.0, 99.0]))
     share = np.clip((given - low) / max(high - low, 1e-12), 0.0, 1.0)
@@ -60,7 +60,7 @@ def map_picture(values: ArrayLike, width_px: int | None = None) -> tuple[NDArray
 
 
 def difference_picture(difference: ArrayLike, limit: float, margin: int = 0) -> str:
-    """A signed difference in blue (-limit) through white (0) to red (+limit)."""
+    """Return a signed difference in blue (-limit) through white (0) to red (+limit)."""
     values = np.asarray(difference, float)
     if margin:
         values = values[margin:-margin, margin:-margin]
@@ -106,7 +106,8 @@ def patch_colours(patches: tuple[PatchComparison, ...]) -> dict[str, tuple[str, 
 
 
 def frame_picture(frame: NDArray[np.uint16], camera: DataSheet, width_px: int = 480) -> str:
-    """A frame for display: one pixel per Bayer cell, black subtracted, each channel scaled to its 99.5 % quantile."""
+    """Return a frame for display: one pixel per Bayer cell, black subtracted, each channel scaled to its 99.5 %
+    quantile."""
     split: dict[str, Any] = planes(frame.astype(np.float32) - float(camera.black_level_dn or 0.0), camera.cfa)
     if camera.cfa == "MONO":
         colours = np.stack([split["Y"]] * 3, axis=-1)

@@ -48,7 +48,7 @@ class _Scale:
 
 
 def _style(**properties: str | float) -> str:
-    """A style attribute; the page's colours by their names."""
+    """Return a style attribute; the page's colours by their names."""
     named = {"@fg": "var(--fg)", "@muted": "var(--muted)", "@grid": "var(--grid)"}
     return ";".join(f"{key.replace('_', '-')}:{named.get(str(value), value)}" for key, value in properties.items())
 
@@ -58,7 +58,7 @@ def _text(x: float, y: float, words: str, *, anchor: str = "start", size: float 
 
 
 def _number(value: float) -> str:
-    """A tick's label."""
+    """Return a tick's label."""
     return f"{round(value, 12) + 0.0:g}".replace("-", "\N{MINUS SIGN}")
 
 
@@ -71,7 +71,7 @@ def _pairs(trace: Trace, key: str) -> Iterator[tuple[float, float, float]]:
 
 
 def _range(axis: dict[str, Any], values: Iterable[float]) -> tuple[float, float]:
-    """The range that a figure states, else that of the values with a margin; 0 in it where it is asked for."""
+    """Return the range that a figure states, else that of the values with a margin; 0 in it where it is asked for."""
     low, high = axis.get("range", (0.0, 0.0))
     if math.isfinite(high - low) and low < high:
         return low, high
@@ -169,7 +169,7 @@ def _ordinate(axis: dict[str, Any], y_of: _Scale) -> Iterator[str]:
 
 
 def still(figure: Figure, number: int) -> Markup:
-    """A figure as SVG, in the page's colours. `number`: of the chart on its page, for ids that differ."""
+    """Return a figure as SVG, in the page's colours. `number`: of the chart on its page, for ids that differ."""
     layout, data = figure["layout"], figure["data"]
     height = float(layout["height"])
     legend, legend_px = _legend(data)

@@ -132,7 +132,7 @@ USES: dict[str, Callable[[CameraModel, Effects, float], FloatArray]] = {
 
 
 def parse_uses(text: str) -> tuple[str, ...]:
-    """The uses of "MTF50, patches". Raises InputError for one that isn't known."""
+    """Return the uses of "MTF50, patches". Raises InputError for one that isn't known."""
     names = {name.lower(): name for name in USES}
     found = [one.strip() for one in text.split(",") if one.strip()]
     unknown = [one for one in found if one.lower() not in names]
@@ -147,8 +147,8 @@ def parse_uses(text: str) -> tuple[str, ...]:
 def budget(
     content: CameraFile, uses: tuple[str, ...], station: Station | None = None, times: StepTimes | None = None
 ) -> BudgetResult:
-    """The budget of every use, and with a `station` what its sequences would make of it, at the step `times` that are
-    known there. Raises InputError where the model states no uncertainties."""
+    """Return the budget of every use, and with a `station` what its sequences would make of it, at the step `times`
+    that are known there. Raises InputError where the model states no uncertainties."""
     posterior = posterior_of(content)
     content = replace(content, effects=with_unnamed(content.effects, posterior))
     covariance = np.array(posterior.covariance)
@@ -225,7 +225,7 @@ def _use(
 
 
 def _group(name: str) -> str:
-    """The effect, or the part of the camera, that a parameter belongs to."""
+    """Return the effect, or the part of the camera, that a parameter belongs to."""
     kind, _, rest = name.partition(":")
     return f"sensitivity {rest[0]}" if kind == "curve" else name.partition(".")[0]
 

@@ -44,8 +44,8 @@ class Changes(Frozen):
         return self.f_number is not None or self.lens is not None
 
     def spectrum(self) -> Spectrum | None:
-        """The changed lamp's radiance, W sr^-1 m^-2 nm^-1; None: the plan's. Raises InputError for a file that can't be
-        used."""
+        """Return the changed lamp's radiance, W sr^-1 m^-2 nm^-1; None: the plan's. Raises InputError for a file that
+        can't be used."""
         if self.lamp is None or isinstance(self.lamp, Spectrum):
             return self.lamp
         try:
@@ -59,7 +59,8 @@ class Changes(Frozen):
 
 
 def parse_changes(text: str) -> Changes:
-    """The changes of `key=value,key=value`. Raises InputError for an unknown key and a value that can't be used."""
+    """Return the changes of `key=value,key=value`. Raises InputError for an unknown key and a value that can't be
+    used."""
     values: dict[str, str] = {}
     known = ", ".join(Changes.model_fields)
     for part in filter(None, (one.strip() for one in text.split(","))):
@@ -73,7 +74,7 @@ def parse_changes(text: str) -> Changes:
 
 
 def checked_changes(values: Mapping[str, Any], where: str) -> Changes:
-    """The changes of these values. Raises InputError, beginning with `where`, for one that can't be used."""
+    """Return the changes of these values. Raises InputError, beginning with `where`, for one that can't be used."""
     try:
         return Changes.model_validate(values)
     except ValidationError as error:
@@ -84,7 +85,7 @@ def checked_changes(values: Mapping[str, Any], where: str) -> Changes:
 
 
 def carried(content: CameraFile, changes: Changes) -> CameraFile:
-    """The model with the changes to its lens. Raises InputError where it can't carry one of the changes."""
+    """Return the model with the changes to its lens. Raises InputError where it can't carry one of the changes."""
     if changes.lens is not None:
         if not changes.lens.is_file():
             raise InputError(f"lens: {changes.lens} isn't there; name the prescription, a .zmx file")
@@ -133,7 +134,7 @@ def reference_temperature_c(content: CameraFile) -> float | None:
 
 
 def has_dark_law(content: CameraFile) -> bool:
-    """Whether the model says how dark current changes with temperature."""
+    """Return whether the model says how dark current changes with temperature."""
     acts = any(isinstance(e, DarkCurrentTemperature) and e.doublings_per_c != 0.0 for e in content.effects)
     return acts or content.camera.dark_current_doubling_c is not None
 

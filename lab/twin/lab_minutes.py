@@ -56,7 +56,7 @@ class LabCapture:
     covariance: FloatArray
 
     def known_after(self, covariance: FloatArray, jacobian: FloatArray) -> FloatArray:
-        """The covariance (k, k) of the parameters after the capture, for the Jacobian (n, k) of its numbers."""
+        """Return the covariance (k, k) of the parameters after the capture, for the Jacobian (n, k) of its numbers."""
         known = jacobian @ covariance
         total = cho_factor(known @ jacobian.T + self.covariance, lower=True)
         return np.asarray(covariance - known.T @ cho_solve(total, known))

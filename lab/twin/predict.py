@@ -73,7 +73,7 @@ def predict(
     light_std: float = 0.003,
     fitted: RecordingSet | None = None,
 ) -> SealedPrediction:
-    """The prediction for every side that plan and models have in common.
+    """Return the prediction for every side that plan and models have in common.
 
     light_std : relative standard deviation of the light to come, beside what the plan states
     fitted : the recordings that the models were fitted to. The means of flats are predicted relative to theirs, which
@@ -96,8 +96,8 @@ def predict(
 
 
 def posterior_of(content: CameraFile) -> ModelPosterior:
-    """How well the model's parameters are known: its posterior, else one of independent parameters by the camera's
-    `std`. Raises InputError where it states neither."""
+    """Return how well the model's parameters are known: its posterior, else one of independent parameters by the
+    camera's `std`. Raises InputError where it states neither."""
     if content.posterior is not None:
         return content.posterior
     camera = content.camera
@@ -126,7 +126,8 @@ def posterior_of(content: CameraFile) -> ModelPosterior:
 def measured_blocks(
     study: Study, quantities: tuple[Measurement, ...] = QUANTITIES
 ) -> tuple[list[Block], list[Skipped]]:
-    """The blocks that the recordings determine, with the numbers that a twin predicts, and why others are missing."""
+    """Return the blocks that the recordings determine, with the numbers that a twin predicts, and why others are
+    missing."""
     blocks, skipped = [], []
     for measurement in quantities:
         try:
@@ -137,7 +138,7 @@ def measured_blocks(
 
 
 def is_predicted(block: Block, label: Label) -> bool:
-    """Whether a twin predicts a block's number: transfer functions by their real parts up to Nyquist, all else
+    """Return whether a twin predicts a block's number: transfer functions by their real parts up to Nyquist, all else
     wholly."""
     return block.measurement is not SLANTED_EDGE or (
         label.x <= NYQUIST_CY_PER_PX and not label.condition.endswith(ASIDE)
@@ -243,8 +244,8 @@ def _study(
     side: Side,
     misstated: frozenset[str] = frozenset(),
 ) -> tuple[Study, float]:
-    """The study of the session to come, whose figures are the model's; and the relative standard deviation of its dark
-    current by the camera's own doubling temperature."""
+    """Return the study of the session to come, whose figures are the model's; and the relative standard deviation of
+    its dark current by the camera's own doubling temperature."""
     camera, first = content.camera, posterior.first
     captures: list[Capture] = session.captures(side=side)
     gain = gain_dn_per_e(camera, captures[0].gain_db or 0.0)
@@ -353,7 +354,8 @@ def _beyond_correction(block: Block, model: MeasurementModel, effects: Effects) 
 
 
 def _forms(model: MeasurementModel, effects: Effects) -> FloatArray:
-    """The part (n, n) of a bare model's covariance by other forms of the laws, which the posterior knows better."""
+    """Return the part (n, n) of a bare model's covariance by other forms of the laws, which the posterior knows
+    better."""
     columns = [*model.nuisance_jacobian(effects).values()]
     return np.asarray(sum((np.outer(c, c) for c in columns), np.zeros((len(model.value),) * 2)))
 

@@ -52,7 +52,7 @@ class RelativeLight:
         return max(base * (1.0 + RATE_STD * z) for base, z in zip(self.per_dose.values(), self.value, strict=True))
 
     def about(self, per_dose: Mapping[str, float]) -> RelativeLight:
-        """The same relative to other rates. Raises InputError for a lamp that the fitted flats haven't seen."""
+        """Return the same relative to other rates. Raises InputError for a lamp that the fitted flats haven't seen."""
         unknown = [name for name in per_dose if name not in self.per_dose]
         if unknown:
             raise InputError(
@@ -66,7 +66,8 @@ class RelativeLight:
 
 
 def relative_light(study: Study, effects: Effects, posterior: ModelPosterior) -> RelativeLight:
-    """The light of the flats of `study`, the recordings that the model was fitted to, about whose figures it is linear.
+    """Return the light of the flats of `study`, the recordings that the model was fitted to, about whose figures it is
+    linear.
 
     Raises InputError where their levels can't be compared.
     """

@@ -185,8 +185,8 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
 
 
 def _camera(sealed: SealedPrediction, side: Side) -> CameraModel:
-    """The changed camera of a side. A traced lens is sealed by its hash: its table is the one that is kept on this
-    computer, else traced from the file of the changes. Raises InputError where neither is that lens."""
+    """Return the changed camera of a side. A traced lens is sealed by its hash: its table is the one that is kept on
+    this computer, else traced from the file of the changes. Raises InputError where neither is that lens."""
     content = json.loads(sealed.cameras[side])
     imaging = content["lens"]["imaging"]
     if imaging["kind"] == "traced_lens":
@@ -242,7 +242,7 @@ def _settings(taken: Capture, planned: Capture) -> list[tuple[str, float, float,
 
 
 def _with_curves(recordings: RecordingSet, prediction: SidePrediction, camera: CameraModel, side: Side) -> RecordingSet:
-    """The recordings under the data sheet of the prediction, without which the chart isn't measured."""
+    """Return the recordings under the data sheet of the prediction, without which the chart isn't measured."""
     sheet = recordings.camera(side).model_copy(
         update={"quantum_efficiency": prediction.camera.quantum_efficiency, "pixel_pitch_um": camera.pixel_pitch_um}
     )
@@ -263,7 +263,7 @@ def _moved(
     recordings: RecordingSet,
     measured: dict[tuple[object, ...], tuple[float, float]],
 ) -> float:
-    """The prediction at the exposure, temperature and level that were really set."""
+    """Return the prediction at the exposure, temperature and level that were really set."""
     if number.level_dn is not None:
         return number.predicted + number.level_slope * (measured[number.key][1] - number.level_dn)
     taken = recordings.capture(number.captures[0])
@@ -277,7 +277,7 @@ def _moved(
 
 
 def _square(prediction: SidePrediction) -> FloatArray:
-    """The covariance (n, n) of a prediction."""
+    """Return the covariance (n, n) of a prediction."""
     n = len(prediction.numbers)
     out = np.zeros((n, n))
     out[np.tril_indices(n)] = prediction.covariance
@@ -305,7 +305,7 @@ def _tested(
 
 
 def _judged(plain: TestedEffect, rivals: Sequence[TestedRival], is_told: bool) -> TestedEffect:
-    """The verdict on a name by its gain over nothing and the gains of its rivals over it."""
+    """Return the verdict on a name by its gain over nothing and the gains of its rivals over it."""
     weights = {plain.effect: float(np.log(max(plain.before, LEAST_PROBABILITY)))}
     weights |= {one.name: float(np.log(max(one.before, LEAST_PROBABILITY))) + one.gain for one in rivals}
     top = max(weights.values())
@@ -332,7 +332,7 @@ def _judged(plain: TestedEffect, rivals: Sequence[TestedRival], is_told: bool) -
 
 
 def together(tests: Sequence[Sequence[TestedEffect]]) -> tuple[TestedEffect, ...]:
-    """What several sessions say together of the names of one model: log likelihoods add up."""
+    """Return what several sessions say together of the names of one model: log likelihoods add up."""
     found: dict[tuple[Side, str], list[TestedEffect]] = {}
     for session in tests:
         for one in session:
@@ -372,5 +372,5 @@ def _quantity(name: str, numbers: list[ScoredNumber], value: float) -> QuantityS
 
 
 def title(quantity: str) -> str:
-    """A quantity as a lab reads it."""
+    """Return a quantity as a lab reads it."""
     return measurement_title(quantity)

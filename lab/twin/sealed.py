@@ -100,7 +100,7 @@ class SealedPrediction(Frozen):
 
 
 def seal_path(file: Path) -> Path:
-    """The file that holds the hash of `file`."""
+    """Return the file that holds the hash of `file`."""
     return file.with_name(file.name + ".sha256")
 
 

@@ -45,8 +45,8 @@ def future_session(
     seed: int = SEED,
     dn_per_photon: float | None = None,
 ) -> RecordingSet:
-    """The captures of one side that a twin predicts, with `changes`, as `content` draws them. `dn_per_photon`: the
-    level of flats of which only the photons are stated. Raises InputError where the plan is of another camera,
+    """Return the captures of one side that a twin predicts, with `changes`, as `content` draws them. `dn_per_photon`:
+    the level of flats of which only the photons are stated. Raises InputError where the plan is of another camera,
     doesn't say where its edges are, or holds several gains."""
     stated = plan.camera(side)
     check_sensor(content, stated, plan.source)
@@ -83,7 +83,7 @@ def check_sensor(content: CameraFile, stated: DataSheet, source: str) -> None:
 
 
 def light_path(capture: Capture) -> str | None:
-    """The file of the light before the camera; None in the dark, and where it isn't stated."""
+    """Return the file of the light before the camera; None in the dark, and where it isn't stated."""
     return getattr(capture, "radiance", None) or getattr(capture, "light_radiance", None)
 
 
@@ -107,7 +107,7 @@ def _drawn(
     seed: int,
     dn_per_photon: float | None,
 ) -> dict[str, np.ndarray[Any, Any]]:
-    """A frame (rows, cols), DN, by its path. Captures of one path share one frame."""
+    """Return a frame (rows, cols), DN, by its path. Captures of one path share one frame."""
     camera, effects, rng = content.camera, content.effects, np.random.default_rng(seed)
     pattern = sensor.FixedPattern.draw(camera, rng)
     start = min((c.time.timestamp() for c in captures if c.time is not None), default=0.0)
@@ -139,7 +139,7 @@ def _scene(
     camera: CameraModel,
     dn_per_photon: float | None,
 ) -> Scene:
-    """What stands before the camera. Raises InputError where the plan doesn't tell."""
+    """Return what stands before the camera. Raises InputError where the plan doesn't tell."""
     first, source = members[0], plan.source
     if isinstance(first, FlatCapture) and first.radiance is None and first.photons_per_pixel is not None:
         if dn_per_photon is None:
@@ -167,7 +167,7 @@ def _scene(
 
 
 def _planned(plan: RecordingSet, capture: Capture) -> np.ndarray[Any, Any] | None:
-    """The frame that the plan has of a capture; None where it is a plan alone."""
+    """Return the frame that the plan has of a capture; None where it is a plan alone."""
     try:
         return plan.frame(plan.capture(capture.id)).astype(float)
     except (InputError, KeyError, OSError):

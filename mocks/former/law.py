@@ -75,7 +75,7 @@ class Law:
         self.camera = camera
 
     def rng(self, *key: int) -> np.random.Generator:
-        """A generator of the law's own; the same key gives the same numbers."""
+        """Yield a generator of the law's own; the same key gives the same numbers."""
         return np.random.default_rng([self.seed, 78, *key])
 
     @property
@@ -108,7 +108,7 @@ class Law:
         return 0.0
 
     def screen_pattern(self, pattern: Array, row: Array, col: Array) -> Array:
-        """What a screen shows of `pattern` (0..1), at camera pixels (row, col) from the frame's centre."""
+        """Return what a screen shows of `pattern` (0..1), at camera pixels (row, col) from the frame's centre."""
         return pattern
 
     def scene_factor(self, kind: str) -> float:
@@ -146,7 +146,7 @@ class Law:
         return 1.0
 
     def image(self, image: Array) -> Array:
-        """The image on the sensor (e-/s, one channel)."""
+        """Return the image on the sensor (e-/s, one channel)."""
         return image
 
     # charge

@@ -34,7 +34,8 @@ class BoardPose:
 
 
 def edge(camera: ConcealedCamera, angle_deg: float, radiance: Array, dark: float) -> dict[str, Array]:
-    """A straight edge between `dark` and 1: the running integral of the line spread function along the normal."""
+    """Return a straight edge between `dark` and 1: the running integral of the line spread function along the
+    normal."""
     a = np.deg2rad(angle_deg)
     x, y = camera.field_position
     distance = camera.half_diagonal_px * (x * np.cos(a) + y * np.sin(a))
@@ -54,7 +55,8 @@ def edge(camera: ConcealedCamera, angle_deg: float, radiance: Array, dark: float
 def board(
     camera: ConcealedCamera, texture: Array, texel_mm: float, pose: BoardPose, radiance: Array
 ) -> dict[str, Array]:
-    """A flat printed board of `texture` (0 black .. 1 white) through pinhole, distortion and blur; dark around it."""
+    """Return a flat printed board of `texture` (0 black .. 1 white) through pinhole, distortion and blur; dark
+    around it."""
     a, b, c = np.deg2rad(pose.turn_deg)
     about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
@@ -133,8 +135,8 @@ def pattern(
 
 
 def chart(camera: ConcealedCamera, light: Array, box: tuple[int, int, int, int]) -> dict[str, Array]:
-    """A ColorChecker of published reflectances on a grey card; `box`: first and last row and column (row0, col0, row1,
-    col1)."""
+    """Return a ColorChecker of published reflectances on a grey card; `box`: first and last row and column (row0, col0,
+    row1, col1)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from colour import SDS_COLOURCHECKERS

@@ -105,7 +105,7 @@ def lamp(kind: Lamp = "halogen") -> Array:
 
 
 def line(centre_nm: float, peak: Array) -> Array:
-    """A monochromator's line of 10 nm."""
+    """Return a monochromator's line of 10 nm."""
     return peak * np.exp(-0.5 * ((WAVELENGTH_NM - centre_nm) / LINE_SIGMA_NM) ** 2)
 
 
@@ -122,7 +122,7 @@ class _Recorder:
         self.plan = WHOLE_SESSION
 
     def lamp(self) -> Array:
-        """The plan's lamp. Lamps fill the camera alike, by its stated curves, so that exposures are the same."""
+        """Return the plan's lamp. Lamps fill the camera alike, by its stated curves, so that exposures are the same."""
         first, own = lamp("led"), lamp(self.plan.lamp)
         alike = self.camera.nominal_rate(first) / self.camera.nominal_rate(own) if self.plan.lamp == "tungsten" else 1.0
         return self.plan.light * alike * own
@@ -170,7 +170,7 @@ class _Recorder:
             )  # fmt: skip
 
     def noted(self, spectrum: Array) -> str:
-        """The file in which a spectrum is kept: a reading of the radiometer, or a stated curve."""
+        """Return the file in which a spectrum is kept: a reading of the radiometer, or a stated curve."""
         path = f"spectra/{self.prefix}{len(self.spectra):03d}.csv"
         self.spectra[path] = spectrum
         return path

@@ -78,8 +78,8 @@ class Transfer:
         return any(law.image_shift_px(np.zeros(1), np.zeros(1), 550.0) is not None for law in self.camera.laws)
 
     def unshifted(self, row: Array, col: Array, channel: str, radiance: Array) -> tuple[Array, Array]:
-        """Where (px) the light that arrives at a position would arrive without the laws' shifts, averaged over the
-        detected spectrum."""
+        """Return where (px) the light that arrives at a position would arrive without the laws' shifts, averaged over
+        the detected spectrum."""
         if not self.shifts_image:
             return row, col
         camera = self.camera
@@ -147,7 +147,7 @@ class Transfer:
         return weights / weights.sum()
 
     def _achromatic(self, fx_cy_um: Array, fy_cy_um: Array) -> Array:
-        """What doesn't depend on the wavelength: the pixel's aperture and laws."""
+        """Return what doesn't depend on the wavelength: the pixel's aperture and laws."""
         side_um = np.sqrt(self.camera.fill_factor) * self.camera.pitch_um
         laws = self.camera.laws
         own = next(

@@ -281,7 +281,7 @@ class BentColumnsLaw(UnlistedLaw):
 
 
 def coded(dn: Array, begins: Array) -> Array:
-    """The codes of a converter whose thresholds repeat every len(begins) codes: code n of a period begins at
+    """Return the codes of a converter whose thresholds repeat every len(begins) codes: code n of a period begins at
     begins[n], in codes from the period's first threshold of an even converter. The first may be negative, and the last
     may end later by as much."""
     period = len(begins)

@@ -74,12 +74,12 @@ class Effect(Frozen):
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
-        """The declared parameters, by field name."""
+        """Return the declared parameters, by field name."""
         return read_quantities(cls)
 
     @classmethod
     def choices(cls) -> dict[str, FieldInfo]:
-        """The fields that no fit changes, by name: a material, a corner, the seed of a drawn pattern."""
+        """Return the fields that no fit changes, by name: a material, a corner, the seed of a drawn pattern."""
         quantities = cls.quantities()
         return {name: field for name, field in cls.model_fields.items() if name not in quantities}
 
@@ -96,12 +96,12 @@ class Effect(Frozen):
         return tuple(stage for stage, method in STAGES.items() if getattr(cls, method) is not getattr(Effect, method))
 
     def replace_fields(self, **values: float) -> Self:
-        """The same effect with other values of its fields, checked as any are."""
+        """Return the same effect with other values of its fields, checked as any are."""
         return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | values)
 
     @classmethod
     def from_linear(cls, coordinates: dict[str, float]) -> Self:
-        """The effect at given coordinates u = parameter ** linear_power (measured from `absent`)."""
+        """Return the effect at given coordinates u = parameter ** linear_power (measured from `absent`)."""
         values = {}
         for field, quantity in cls.quantities().items():
             u = coordinates.get(field, 0.0)

@@ -71,7 +71,7 @@ class Crosstalk(Effect):
         return ((cls(share_percent=0.3),),)
 
     def kernel(self) -> FloatArray:
-        """Where the charge of a pixel ends up, (3, 3) of sum 1."""
+        """Return where the charge of a pixel ends up, (3, 3) of sum 1."""
         c = self.share_percent / 100.0
         along, down, across = c * (1.0 + self.row_excess), c * (1.0 - self.row_excess), c * self.corner_share
         own = 1.0 - 2.0 * along - 2.0 * down - 4.0 * across

@@ -32,7 +32,7 @@ def effects() -> dict[str, type[Effect]]:
 
 
 def effect(name: str) -> type[Effect]:
-    """The effect of that name; raises KeyError that lists the names there are."""
+    """Return the effect of that name; raises KeyError that lists the names there are."""
     known = effects()
     if name not in known:
         raise KeyError(f"no effect named {name!r}; there are: {', '.join(known)}")
@@ -46,7 +46,7 @@ def members(family: Family) -> tuple[str, ...]:
 
 
 def candidates() -> tuple[type[Effect], ...]:
-    """The effects that a diagnosis looks for."""
+    """Return the effects that a diagnosis looks for."""
     return tuple(kind for kind in effects().values() if kind.is_candidate)
 
 
@@ -63,20 +63,21 @@ _CAMERA = CameraModel(
 
 @lru_cache(maxsize=4096)
 def list_changes(effect: Effect) -> frozenset[str]:
-    """Which quantities of the stages the effect as it stands changes, as `stage.field`; none where it is absent."""
+    """Return which quantities of the stages the effect as it stands changes, as `stage.field`; none where it is
+    absent."""
     return laws_of(_CAMERA, (effect,))
 
 
 @cache
 def may_change(kind: type[Effect]) -> frozenset[str]:
-    """Which quantities of the stages an effect changes at any of its prototypes."""
+    """Return which quantities of the stages an effect changes at any of its prototypes."""
     every = (one for group in kind.prototypes(_CAMERA) for one in group)
     return frozenset().union(*(list_changes(one) for one in every))
 
 
 def typical(kind: type[Effect]) -> Effect:
-    """An instance of usual size: its first prototype, with each parameter that sizes it one standard deviation of its
-    prior from `absent`.
+    """Return an instance of usual size: its first prototype, with each parameter that sizes it one standard deviation
+    of its prior from `absent`.
 
     Parameters without a prior stay at the prototype's value.
     """

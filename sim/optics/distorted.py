@@ -16,7 +16,7 @@ Float32Array = NDArray[np.float32]
 
 
 def distort(picture: FloatArray, source: Grid, target: Grid, table: LensTable, frame: ImageFrame) -> Float32Array:
-    """A picture on the ideal grid `source` resampled to where the lens images it, on the grid `target`.
+    """Return a picture on the ideal grid `source` resampled to where the lens images it, on the grid `target`.
 
     The light of a sample is its value times the area that its square has in the image. It is distributed around the
     image point with the weights of a cubic B-spline, which add up to 1, so that light is conserved; `superpose` undoes
@@ -55,7 +55,7 @@ def distort(picture: FloatArray, source: Grid, target: Grid, table: LensTable, f
 def _visible(
     picture: FloatArray, row: FloatArray, col: FloatArray, frame: ImageFrame, lens: FieldMapping
 ) -> FloatArray:
-    """The picture with 0 outside the lens's field, where the frame reaches beyond it."""
+    """Return the picture with 0 outside the lens's field, where the frame reaches beyond it."""
     if not exceeds_field(frame, lens):
         return picture
     return np.where(lens.lies_outside(*frame.um(row[:, None], col[None, :])), 0.0, picture)

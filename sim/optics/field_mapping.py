@@ -145,7 +145,7 @@ class FieldMapping:
 
 @lru_cache(maxsize=4)
 def field_mapping(table: LensTable) -> FieldMapping:
-    """The mapping of a table, cached."""
+    """Return the mapping of a table, cached."""
     return FieldMapping(table)
 
 
@@ -190,7 +190,7 @@ def illumination(
 
 
 def over_field(table: LensTable, value: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
-    """A smooth quantity of the table's field points (..., F), interpolated at image points: (..., *points)."""
+    """Return a smooth quantity of the table's field points (..., F), interpolated at image points: (..., *points)."""
     return field_function(table, value)(x_um, y_um)
 
 

@@ -29,7 +29,7 @@ def fold_transfer(
     fill_factor: float,
     cutoff_cy_per_px: float,
 ) -> FloatArray | ComplexArray:
-    """The folded transfer function at the frequencies of a real FFT of `shape`, (rows, cols // 2 + 1).
+    """Return the folded transfer function at the frequencies of a real FFT of `shape`, (rows, cols // 2 + 1).
 
     `transfer(fx, fy)` takes frequencies in cy/px that broadcast, and is negligible beyond `cutoff_cy_per_px`.
     """
@@ -64,7 +64,7 @@ def _orders(cutoff_cy_per_px: float) -> list[int]:
 
 
 def _square(f_cy_per_px: FloatArray, fill_factor: float) -> FloatArray:
-    """The pixel's aperture, and the picture's square of one pixel."""
+    """Return the pixel's aperture, and the picture's square of one pixel."""
     return aperture_otf(f_cy_per_px, 0.0, fill_factor) * np.sinc(f_cy_per_px)
 
 

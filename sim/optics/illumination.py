@@ -89,7 +89,7 @@ class MeasuredIllumination(Frozen):
 
     @classmethod
     def from_flat(cls, flat: FloatArray, degree: int = 6, nodes: tuple[int, int] = (25, 33)) -> Self:
-        """The map of a flat field (rows, cols): any unit, dark subtracted, one channel or an even mosaic's mean.
+        """Return the map of a flat field (rows, cols): any unit, dark subtracted, one channel or an even mosaic's mean.
 
         A polynomial of total degree `degree` in x and y through the means of square blocks, by least squares: noise and
         dust average out, and so does anything sharper than about 1/degree of the frame. Raises ValueError for a flat
@@ -129,7 +129,7 @@ class MeasuredIllumination(Frozen):
         return RectBivariateSpline(y, x, values, kx=min(3, len(y) - 1), ky=min(3, len(x) - 1))
 
     def at(self, down: FloatArray, across: FloatArray) -> FloatArray:
-        """The map at fractions 0..1 of the frame's height and width, which broadcast; constant beyond."""
+        """Return the map at fractions 0..1 of the frame's height and width, which broadcast; constant beyond."""
         down, across = np.clip(down, 0.0, 1.0), np.clip(across, 0.0, 1.0)
         if down.ndim == across.ndim == 2 and down.shape[1] == 1 and across.shape[0] == 1:
             return np.asarray(self._surface(down[:, 0], across[0]))

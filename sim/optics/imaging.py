@@ -195,7 +195,7 @@ class MeasuredPsf(Frozen):
         return value * pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, aberration)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
-        """The highest frequency of the samples: half a cycle a sample each way, along the diagonal."""
+        """Return the highest frequency of the samples: half a cycle a sample each way, along the diagonal."""
         return float(np.sqrt(0.5)) / self.sample_pitch_um
 
 
@@ -271,7 +271,8 @@ class MeasuredOtf(Frozen):
         f_number: float,
         aberration: Wavefront = NONE,
     ) -> FloatArray | ComplexArray:
-        """The interpolated samples, the complex conjugate at -f; frequencies broadcast. `f_number` isn't used."""
+        """Return the interpolated samples, the complex conjugate at -f; frequencies broadcast. `f_number` isn't
+        used."""
         value = np.tensordot(_shares(self.wavelength_nm, wavelength_nm), self._samples, 1)
         ratio = pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, aberration)
         fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float))
@@ -288,7 +289,7 @@ class MeasuredOtf(Frozen):
         return np.asarray(np.where(turned < 0, np.conj(found), found) * ratio)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
-        """The highest frequency of the samples."""
+        """Return the highest frequency of the samples."""
         return float(np.hypot(self.frequency_x_cy_per_um[-1], max(np.abs(self.frequency_y_cy_per_um), default=0.0)))
 
 
@@ -346,7 +347,7 @@ class TracedLens(Frozen):
         return value * pupil_ratio(fx, fy, wavelength_nm, f_number, aberration)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
-        """The table's highest frequency: half a cycle a sample each way, along the diagonal."""
+        """Return the table's highest frequency: half a cycle a sample each way, along the diagonal."""
         return float(np.sqrt(0.5)) / self.table.sample_pitch_um
 
 

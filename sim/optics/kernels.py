@@ -143,8 +143,8 @@ class Kernels:
         self._kept: dict[Tile, Float32Array] = {}
 
     def through_pixels(self, picture: Float32Array) -> Float32Array:
-        """A picture averaged over the pixels' aperture, the blur of its own samples and of `distort` undone; where the
-        kernels hold the aperture, only the latter.
+        """Return a picture averaged over the pixels' aperture, the blur of its own samples and of `distort` undone;
+        where the kernels hold the aperture, only the latter.
         """
         s, side, undo = self.oversample, np.sqrt(self.frame.fill_factor), self._undo
         if self.box > 1:
@@ -222,7 +222,7 @@ class Kernels:
         ]
 
     def _good(self, tile: Tile) -> Iterator[Tile]:
-        """The tile, or its parts in which the polynomials' error is below the limit."""
+        """Yield the tile, or its parts in which the polynomials' error is below the limit."""
         nodes = self.at_nodes(tile)
         if min(tile.bottom - tile.top, tile.right - tile.left) < 2 * SMALLEST_TILE_PX or self.error(tile, nodes) <= 1.0:
             self._kept[tile] = nodes

@@ -77,7 +77,7 @@ class PupilRays:
 def interpolate_rays(
     traced: Sequence[PupilRays], wavelength_nm: Sequence[float] | FloatArray, index: Sequence[float]
 ) -> list[PupilRays]:
-    """The rays at wavelengths that weren't traced, at the same relative positions in the open pupil.
+    """Return the rays at wavelengths that weren't traced, at the same relative positions in the open pupil.
 
     Lagrange's polynomial through all of `traced` in 1 / wavelength^2; a traced wavelength returns its own rays.
     """
@@ -148,14 +148,15 @@ def _terms(x: FloatArray, y: FloatArray, order: int) -> FloatArray:
 
 
 def _dense(closed: FloatArray, factor: int = 8) -> FloatArray:
-    """A closed curve's coordinate at `factor` times as many points, by a periodic cubic spline."""
+    """Return a closed curve's coordinate at `factor` times as many points, by a periodic cubic spline."""
     count = closed.size
     spline = CubicSpline(np.arange(count + 1), np.append(closed, closed[0]), bc_type="periodic")
     return np.asarray(spline(np.arange(count * factor) / factor))
 
 
 def _chords(rim_along: FloatArray, rim_across: FloatArray, across: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where lines at `across` enter and leave the rim's polygon: its lower and upper end along the other axis."""
+    """Return where lines at `across` enter and leave the rim's polygon: its lower and upper end along the other
+    axis."""
     a0, c0 = rim_along, rim_across
     a1, c1 = np.roll(a0, -1), np.roll(c0, -1)
     line = across[:, None]

@@ -77,7 +77,7 @@ class Wavefront:
         return total
 
     def at_square(self, square: FloatArray) -> FloatArray:
-        """An isotropic W at squared radii."""
+        """Return an isotropic W at squared radii."""
         radial = {i // 2: um for i, j, um in self.terms if j == 0}
         total: FloatArray | float = 0.0
         for power in range(max(radial, default=0), -1, -1):
@@ -114,7 +114,7 @@ class Wavefront:
         return Wavefront(tuple(term for term in self.terms if term[0] + term[1] > 1))
 
     def part(self, odd: int) -> Wavefront:
-        """The terms of odd (1) or even (0) degree."""
+        """Return the terms of odd (1) or even (0) degree."""
         return Wavefront(tuple(term for term in self.terms if (term[0] + term[1]) % 2 == odd))
 
     @cached_property
@@ -295,7 +295,7 @@ def _bend_ratio(
 
 
 def _ratio_along(share: FloatArray, angle: float, wavelength_um: float, bend: Wavefront) -> FloatArray | ComplexArray:
-    """The ratio at shares of the cutoff in one direction."""
+    """Return the ratio at shares of the cutoff in one direction."""
     odd = bool(bend.part(1).terms)
     if share.size > SOME:
         radius, value = _line(angle, wavelength_um, bend)
@@ -327,7 +327,7 @@ def _mean(
 def _mean_of_few(
     share: bytes, cos: bytes, sin: bytes, wavelength_um: float, bend: Wavefront
 ) -> FloatArray | ComplexArray:
-    """The same of arrays' bytes, kept: whoever changes something else asks for the same again."""
+    """Return the same of arrays' bytes, kept: whoever changes something else asks for the same again."""
     half, along, across = (np.frombuffer(part) for part in (share, cos, sin))
     return _mean(half, along, across, wavelength_um, bend)
 
@@ -454,7 +454,7 @@ def _octave(angle: float, shape: Wavefront, octave: int) -> ComplexArray | None:
 
 
 def _expand(angle: float, shape: Wavefront, waves: float) -> ComplexArray:
-    """The expansion over the share, of `waves` times a shape."""
+    """Return the expansion over the share, of `waves` times a shape."""
     bend, count = shape.scale(waves), 16
     while True:
         node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
@@ -468,7 +468,7 @@ def _expand(angle: float, shape: Wavefront, waves: float) -> ComplexArray:
 
 @lru_cache(maxsize=32)
 def _line(angle: float, wavelength_um: float, bend: Wavefront) -> tuple[FloatArray, ComplexArray]:
-    """The ratio in one direction on even steps of the share of the cutoff."""
+    """Return the ratio in one direction on even steps of the share of the cutoff."""
     radius = np.linspace(0.0, 1.0, RADII_LINE + 1)
     series = _series(angle, wavelength_um, bend)
     return radius, np.asarray(chebyshev.chebval(2.0 * radius - 1.0, series), complex)
@@ -511,7 +511,7 @@ def _polar_table(bend: Wavefront, wavelength_um: float) -> ComplexArray:
 
 
 def _extrapolate(edge: ComplexArray, steps: FloatArray) -> ComplexArray:
-    """A cubic through four rows (the outermost first), 1, 2, ... rows beyond the first."""
+    """Return a cubic through four rows (the outermost first), 1, 2, ... rows beyond the first."""
     x = -steps[:, None]
     basis = np.ones((steps.size, 4))
     for a in range(4):

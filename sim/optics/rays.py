@@ -223,7 +223,7 @@ def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, shape: A
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _turn(r: Any, a: float, b: float, c: float) -> Any:
-    """A vector of the old frame expressed in the new one."""
+    """Return a vector of the old frame expressed in the new one."""
     return (
         r[0, 0] * a + r[1, 0] * b + r[2, 0] * c,
         r[0, 1] * a + r[1, 1] * b + r[2, 1] * c,
@@ -233,7 +233,7 @@ def _turn(r: Any, a: float, b: float, c: float) -> Any:
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _propagate_derivative(p: Any, d: Any, t: float, direction: Any, gradient: Any) -> Any:
-    """A ray's derivative after propagation by t to a surface of the given gradient."""
+    """Return a ray's derivative after propagation by t to a surface of the given gradient."""
     qx, qy, qz = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
     across = gradient[0] * direction[0] + gradient[1] * direction[1] + gradient[2] * direction[2]
     dt = -(gradient[0] * qx + gradient[1] * qy + gradient[2] * qz) / across
@@ -242,7 +242,7 @@ def _propagate_derivative(p: Any, d: Any, t: float, direction: Any, gradient: An
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _refract_derivative(p: Any, d: Any, bend: Any, direction: Any, normal: Any, length: float, optics: Any) -> Any:
-    """The derivative of the refracted direction: D' = mu D + gamma n, gamma = cos T - mu cos I."""
+    """Return the derivative of the refracted direction: D' = mu D + gamma n, gamma = cos T - mu cos I."""
     sxx, sxy, syy = bend
     mu, cos_i, cos_t = optics
     gx, gy = -(sxx * p[0] + sxy * p[1]) / length, -(sxy * p[0] + syy * p[1]) / length
@@ -394,8 +394,8 @@ def trace_rays(surfaces: Any, index: Any, field: Any, px: Any, py: Any) -> Any:
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def aim(surfaces: Any, index: Any, field: Any, px: float, py: float) -> Any:
-    """The point of the entrance pupil's plane whose ray passes the centre of the stop, from a start near it: (x, y,
-    found).
+    """Return the point of the entrance pupil's plane whose ray passes the centre of the stop, from a start near it: (x,
+    y, found).
 
     Newton's method with the ray's own derivatives; steps are halved until the ray arrives and comes closer.
     """

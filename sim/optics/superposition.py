@@ -124,8 +124,8 @@ def _light_correction(kernels: Kernels, tile: Tile, shape: tuple[int, ...]) -> F
 
 
 def _by_pixel(at_nodes: Float32Array, kernels: Kernels, height: int, width: int) -> Float32Array:
-    """A tile's kernels (4, 4, C, size, size) as polynomials in the position of the *pixel* instead of the source:
-    (C, 4, 4, size, size).
+    """Return a tile's kernels (4, 4, C, size, size) as polynomials in the position of the *pixel* instead of the
+    source: (C, 4, 4, size, size).
 
     With the nodes t_m, L_i(t + tau) = sum_m L_i(t_m + tau) L_m(t): a polynomial in the position of a source at tau from
     the pixel is one in the position of the pixel.

@@ -120,7 +120,7 @@ class LensTable:
 
 
 def load_cached(folder: Path, content_hash: str) -> LensTable | None:
-    """The table with that hash from a cache folder; None where it isn't there, is damaged or is another's."""
+    """Return the table with that hash from a cache folder; None where it isn't there, is damaged or is another's."""
     file = folder / f"{content_hash}.npz"
     if not file.is_file():
         return None

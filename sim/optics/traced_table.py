@@ -98,7 +98,7 @@ def lens_table(
 def cached_table(
     prescription: Prescription, folder: Path, settings: TableSettings | None = None, progress: Progress | None = None
 ) -> LensTable:
-    """The table of a lens from the cache folder; computed and stored there where it is missing or damaged."""
+    """Return the table of a lens from the cache folder; computed and stored there where it is missing or damaged."""
     settings = settings or TableSettings()
     stored = load_cached(folder, content_hash(prescription, settings))
     if stored is not None:
@@ -147,7 +147,7 @@ class OpticalTable:
         return [(corner * a, corner * b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
 
     def _field_points(self) -> list[tuple[float, float]]:
-        """The table's field points, limited to those that the lens images."""
+        """Return the table's field points, limited to those that the lens images."""
         settings, outermost = self.settings, self._outermost()
         if min(settings.fields, settings.grid) < 2 and outermost > 0:
             raise PrescriptionError("a table needs two field points at least; ask for more")
@@ -303,7 +303,7 @@ class OpticalTable:
     def _pupils(
         self, tangent: tuple[float, float], centre: tuple[float, float], span: float, solid_angle: FloatArray
     ) -> list[PupilRays]:
-        """The pupil at every wavelength of the table.
+        """Return the pupil at every wavelength of the table.
 
         Rays are traced at a few wavelengths and interpolated between them: at a fixed relative position in the open
         pupil, rays are as smooth in 1 / wavelength^2 as the indices are. Where the interpolated solid angles differ

@@ -89,7 +89,7 @@ def read_zmx(path: Path | str) -> Prescription:
 
 
 def parse_zmx(text: str, *, fallback_name: str = "lens") -> Prescription:
-    """A prescription from the text of a `.zmx` file.
+    """Return a prescription from the text of a `.zmx` file.
 
     Surfaces STANDARD, EVENASPH, ODDASPHE and COORDBRK; apertures FLAP, CLAP, SQAP with OBDC; the system's aperture
     ENPD, FNUM, OBNA or FLOA; fields FTYP, XFLN, YFLN; wavelengths WAVM or WAVL with PWAV; units MM, CM, IN, METER;
@@ -131,7 +131,7 @@ def _split(text: str) -> tuple[list[tuple[str, str]], list[_SurfaceBlock], list[
 
 
 def _number(text: str, keyword: str, meaning: str, where: str, position: int = 0) -> float:
-    """The number at a position of a keyword's line."""
+    """Return the number at a position of a keyword's line."""
     parts = text.split()
     if len(parts) <= position:
         raise PrescriptionError(f"{where}: {keyword} has no {meaning}; the file is damaged, export it again")
@@ -333,7 +333,7 @@ class _Reader:
         return wavelengths, wavelengths[primary - 1]
 
     def _stated_focal_length(self) -> float | None:
-        """The focal length that the file's merit function asks for with a weight, if it does."""
+        """Return the focal length that the file's merit function asks for with a weight, if it does."""
         for keyword, rest in self.tail:
             if keyword in ("EFLY", "EFLX", "EFFL"):
                 target, weight = _optional(rest, 6), _optional(rest, 7)
@@ -342,8 +342,8 @@ class _Reader:
         return None
 
     def _stated_stop(self, stop: _SurfaceBlock) -> float | None:
-        """The stop's semi-diameter where it is fixed or was found by aiming rays at the stop: else it is the beams'
-        extent.
+        """Return the stop's semi-diameter where it is fixed or was found by aiming rays at the stop: else it is the
+        beams' extent.
         """
         stated = stop.last("DIAM") or ""
         aimed = int(_optional(self._header("RAIM") or "", 1)) != 0

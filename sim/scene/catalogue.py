@@ -62,7 +62,7 @@ class View:
 
     @classmethod
     def of(cls, camera: CameraModel, distance_mm: float) -> Self:
-        """The view of a camera, whatever its lens's distortion."""
+        """Return the view of a camera, whatever its lens's distortion."""
         return cls(camera.rows, camera.cols, camera.pixel_pitch_um, camera.lens.focal_length_mm, distance_mm)
 
     @property
@@ -97,14 +97,14 @@ class View:
         return Geometry(camera_matrix=((focal_px, 0.0, col), (0.0, focal_px, row), (0.0, 0.0, 1.0)))
 
     def centre_pattern(self, rows: float, cols: float, cell_px: float) -> Warp:
-        """A pattern of rows x cols cells of `cell_px`, centred in the frame."""
+        """Return a pattern of rows x cols cells of `cell_px`, centred in the frame."""
         row, col = self.centre
         return Warp.of(
             [(cell_px, 0.0, col - 0.5 * cols * cell_px), (0.0, cell_px, row - 0.5 * rows * cell_px), (0.0, 0.0, 1.0)]
         )
 
     def cell_px_to_fill(self, rows: int, cols: int) -> float:
-        """The cell's size at which a pattern of rows x cols just fits into the frame."""
+        """Return the cell's size at which a pattern of rows x cols just fits into the frame."""
         return min(self.rows / rows, self.cols / cols)
 
     def corner_mm(self, rows: float, cols: float, cell_px: float) -> tuple[float, float, float]:
@@ -123,13 +123,13 @@ class Declared(Frozen):
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
-        """The declared parameters, by field name."""
+        """Return the declared parameters, by field name."""
         return read_quantities(cls)
 
     @classmethod
     def choose(cls, parameters: Mapping[str, object] | None) -> Self:
-        """The declaration with some parameters set. Raises ValueError, in one line, for an unknown one or a value
-        outside its bounds.
+        """Return the declaration with some parameters set. Raises ValueError, in one line, for an unknown one or a
+        value outside its bounds.
         """
         try:
             return cls.model_validate(dict(parameters or {}))
@@ -147,7 +147,8 @@ class NamedScene(Declared):
     """A scene that is defined by a name and its parameters."""
 
     def place(self, view: View, white: Spectrum) -> Scene:
-        """The scene before a camera. `white`: radiance of a perfect white diffuser at the scene, or of full light."""
+        """Return the scene before a camera. `white`: radiance of a perfect white diffuser at the scene, or of full
+        light."""
         raise NotImplementedError
 
 
@@ -368,7 +369,7 @@ class Cube(Declared):
     ] = 1.0
 
     def show(self, image: SpectralImage, view: View) -> SpectralImage:
-        """The image centred in the view; of the frame's own shape and at a `fill` of 1, sample on pixel."""
+        """Return the image centred in the view; of the frame's own shape and at a `fill` of 1, sample on pixel."""
         rows, cols = image.radiance.shape[:2]
         if self.fill == 1.0 and (rows, cols) == (view.rows, view.cols):
             return replace(image, to_camera=None)
@@ -383,7 +384,8 @@ TEXELS_PER_SQUARE = 56
 def charuco_texture(
     squares: tuple[int, int], marker_share: float = 0.75, dictionary: str = "DICT_5X5_1000"
 ) -> NDArray[np.uint8]:
-    """A printed ChArUco board of `squares` (rows, cols), 0 or 1, `TEXELS_PER_SQUARE` texels a square (OpenCV)."""
+    """Return a printed ChArUco board of `squares` (rows, cols), 0 or 1, `TEXELS_PER_SQUARE` texels a square
+    (OpenCV)."""
     named = getattr(cv2.aruco, dictionary, None)
     if named is None:
         raise ValueError(f"dictionary {dictionary!r} is not one of OpenCV's: name one such as DICT_5X5_1000")
@@ -427,7 +429,7 @@ def scene_by_name(
     distance_mm: float = 1000.0,
     parameters: Mapping[str, object] | None = None,
 ) -> Scene:
-    """The named scene before a camera.
+    """Return the named scene before a camera.
 
     `illuminant`: radiance (W sr^-1 m^-2 nm^-1) of a perfect white diffuser at the scene
     (`sim.scene.light.illuminant`); full light has it. `parameters`: those of the scene's declaration in `SCENES`;

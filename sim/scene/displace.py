@@ -19,7 +19,7 @@ from sim.spectrum import FloatArray
 def displace_drawing(
     drawn: NDArray[np.floating[Any]], from_row_px: FloatArray, from_col_px: FloatArray, oversample: int
 ) -> FloatArray:
-    """A drawing's samples taken at other places, (n oversample, m oversample) as `drawn`.
+    """Return a drawing's samples taken at other places, (n oversample, m oversample) as `drawn`.
 
     `from_row_px`, `from_col_px`: (n + 2, m + 2) places in pixels of the drawing, the first of which has its centre at
     (0, 0), that the light at its pixels comes from, with one more pixel all round; linear between them. Outside the

@@ -16,7 +16,7 @@ LUMENS_PER_WATT = 683.0
 
 
 def colour_science() -> ModuleType:
-    """The library, imported on first use: it takes a second to load."""
+    """Return the library, imported on first use: it takes a second to load."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns at import that it can't draw
         import colour
@@ -40,7 +40,7 @@ def luminance_cd_m2(radiance: Spectrum) -> float:
 
 
 def at_luminance(curve: Spectrum, wanted_cd_m2: float) -> Spectrum:
-    """A spectral curve of any scale, scaled to a luminance. Raises ValueError for one without visible light."""
+    """Return a spectral curve of any scale, scaled to a luminance. Raises ValueError for one without visible light."""
     if not (np.isfinite(wanted_cd_m2) and wanted_cd_m2 >= 0):
         raise ValueError(f"luminance {wanted_cd_m2} cd/m^2 is below the limit of 0 or not finite: give cd/m^2")
     has = luminance_cd_m2(curve)
@@ -78,7 +78,7 @@ def screen(
     falloff_exponent: float = 0.0,
     sub_pixels: SubPixels | None = None,
 ) -> Screen:
-    """A liquid-crystal screen with the measured primaries of colour-science's "Apple Studio Display", white of
+    """Return a liquid-crystal screen with the measured primaries of colour-science's "Apple Studio Display", white of
     `white_cd_m2`, black of white / `contrast_ratio` in white's colour.
     """
     if not contrast_ratio > 1:

@@ -82,7 +82,8 @@ class Drawing:
 
 
 def draw(scene: Scene, grid: Grid) -> Drawing:
-    """A scene drawn on a grid. Raises TypeError for one that can't be drawn: darkness, or one of another module."""
+    """Return a scene drawn on a grid. Raises TypeError for one that can't be drawn: darkness, or one of another
+    module."""
     if isinstance(scene, UniformField):
         return Drawing((scene.radiance, None), ())
     if isinstance(scene, ReflectanceChart):
@@ -133,8 +134,8 @@ def half_plane(distance: FloatArray, slope_x: FloatArray | float, slope_y: Float
 
 
 def cells(pattern: FloatArray, warp: Warp, grid: Grid, surround: float) -> FloatArray:
-    """A pattern of cells (values 0..1) seen through a warp: the mean of `pattern`, and of `surround` outside it, over
-    every sample's square.
+    """Return a pattern of cells (values 0..1) seen through a warp: the mean of `pattern`, and of `surround` outside it,
+    over every sample's square.
 
     A square across a cell's border is split by exact area (`half_plane`), one that contains a cell's corner by the
     product of two such shares. Squares larger than a cell are subdivided. Raises ValueError for a pattern that isn't

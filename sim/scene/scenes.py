@@ -140,7 +140,7 @@ class Posed:
         return Warp.of(np.asarray(self.geometry.camera_matrix, float) @ pose, self.geometry)
 
     def pose_for_rig(self, rig: StereoRig) -> tuple[Self, Self]:
-        """The same thing before both cameras of a rig, this pose being that in the left one's frame: what stands
+        """Return the same thing before both cameras of a rig, this pose being that in the left one's frame: what stands
         at x before the left camera stands at rotation x + translation_mm before the right one. Geometries are the
         cameras'.
         """
@@ -408,7 +408,8 @@ class SpectralImage:
     def from_photons(
         cls, wavelength_nm: tuple[float, ...], photons: NDArray[np.floating], to_camera: Warp | None = None
     ) -> Self:
-        """The same from `photons`, s^-1 sr^-1 m^-2 nm^-1: radiance = photons x h c / wavelength at every band."""
+        """Return the same from `photons`, s^-1 sr^-1 m^-2 nm^-1: radiance = photons x h c / wavelength at every
+        band."""
         photons = np.asarray(photons)
         if photons.ndim != 3 or photons.shape[2] != len(wavelength_nm):
             raise ValueError(

@@ -28,7 +28,7 @@ class Warp:
 
     @classmethod
     def of(cls, homography: ArrayLike, geometry: Geometry | None = None) -> Self:
-        """A warp from a (3, 3) array."""
+        """Return a warp from a (3, 3) array."""
         a = np.asarray(homography, float)
         if a.shape != (3, 3) or not np.all(np.isfinite(a)) or abs(np.linalg.det(a)) == 0.0:
             raise ValueError(
@@ -39,8 +39,8 @@ class Warp:
 
     @classmethod
     def from_corners(cls, width: float, height: float, corners: ArrayLike, geometry: Geometry | None = None) -> Self:
-        """The homography that maps the pattern's corners (0, 0), (width, 0), (width, height), (0, height) to the four
-        `corners`, [row, col] in undistorted camera px."""
+        """Return the homography that maps the pattern's corners (0, 0), (width, 0), (width, height), (0, height) to the
+        four `corners`, [row, col] in undistorted camera px."""
         source = np.array([(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)])
         target = np.asarray(corners, float)[:, ::-1]
         system, right = np.zeros((8, 8)), np.zeros(8)
@@ -82,8 +82,8 @@ class Warp:
     def mapper(
         self, rows: tuple[float, float], col: FloatArray
     ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-        """A function from ascending camera `row` (px, within `rows`) to pattern (u, v) on their grid with ascending
-        `col`.
+        """Return a function from ascending camera `row` (px, within `rows`) to pattern (u, v) on their grid with
+        ascending `col`.
 
         The lens's distortion is smooth: it is inverted on nodes some 8 px apart and interpolated by cubic splines
         (1e-5 px).
@@ -109,7 +109,7 @@ class _RowSpline:
 
     @classmethod
     def through(cls, row_nodes: FloatArray, col_nodes: FloatArray, values: FloatArray, col: FloatArray) -> Self:
-        """The spline that takes `values`, (rows, cols), at the nodes, at the columns `col` within them."""
+        """Return the spline that takes `values`, (rows, cols), at the nodes, at the columns `col` within them."""
         from scipy.interpolate import make_interp_spline  # here: the library takes a while to load
 
         across = make_interp_spline(col_nodes, values, k=3, axis=1)(col)
@@ -160,7 +160,7 @@ def distort(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[FloatArray,
 
 
 def undistort(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
-    """The inverse of `distort`: Newton's method with a numerical Jacobian, to 1e-10 of the focal length."""
+    """Return the inverse of `distort`: Newton's method with a numerical Jacobian, to 1e-10 of the focal length."""
     _check_distortion(geometry)
     k = np.asarray(geometry.camera_matrix, float)
     yd = (np.asarray(y, float) - k[1, 2]) / k[1, 1]

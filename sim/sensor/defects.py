@@ -79,7 +79,7 @@ class Defects:
         return self.mean_size * defect_sizes(shape, self.share, self.seed, self.relative_std)
 
     def nodes(self) -> tuple[FloatArray, FloatArray]:
-        """The distribution of sizes by nodes: shares of all pixels (k,) and sizes (k,)."""
+        """Return the distribution of sizes by nodes: shares of all pixels (k,) and sizes (k,)."""
         weights, sizes = size_nodes(self.relative_std)
         return self.share * weights, self.mean_size * sizes
 

@@ -56,7 +56,7 @@ class LineNoise:
         return np.asarray(wave[: max(along)]).reshape(along)
 
     def mean_e(self, shape: tuple[int, ...]) -> FloatArray | float:
-        """The fixed part, of the same shape; 0 for none."""
+        """Return the fixed part, of the same shape; 0 for none."""
         if self.fixed_e == 0.0 and self.odd_even_e == 0.0:
             return 0.0
         along = self._axis_shape(shape)

@@ -40,8 +40,8 @@ def phases(cfa: Cfa) -> dict[str, list[tuple[int, int]]]:
 
 
 def planes(frame: NDArray[Scalar], cfa: Cfa) -> dict[str, NDArray[Scalar]]:
-    """The mosaic taken apart, as views of `frame` (..., rows, cols): `R`, `G1` (green on red rows), `G2` (green on blue
-    rows), `B`; or `Y` of a MONO sensor."""
+    """Return the mosaic taken apart, as views of `frame` (..., rows, cols): `R`, `G1` (green on red rows), `G2` (green
+    on blue rows), `B`; or `Y` of a MONO sensor."""
     if cfa == "MONO":
         return {"Y": frame}
     at = phases(cfa)

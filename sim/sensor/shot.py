@@ -71,7 +71,7 @@ def _fill(
 
 @njit(cache=True)
 def _few(mu: float, u: float, v: float, share: FloatArray, guide: NDArray[np.int64]) -> int:
-    """A variable of mean below 10, from two uniform variables."""
+    """Return a variable of mean below 10, from two uniform variables."""
     whole = int(mu)
     count = guide[whole, int(u * _GUIDE)]
     while u >= share[whole, count]:

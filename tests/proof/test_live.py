@@ -12,11 +12,16 @@ import pytest
 
 from lab.challenge.live import (
     HEALTHY_SEEDS,
+    HIGH,
+    LABEL_PX,
+    LOW,
     NOT_SHOWN_BY_BENCH,
     PAIRS,
+    PLOT_PX,
     SIZES,
     LiveCase,
     LiveRun,
+    drawing,
     drawn,
     every_case,
     isotropic_cases,
@@ -24,9 +29,11 @@ from lab.challenge.live import (
     judged,
     run_all,
     run_case,
+    summary,
+    table,
     typical_spec,
+    write_page,
 )
-from lab.challenge.live_page import HIGH, LABEL_PX, LOW, PLOT_PX, drawing, summary, table, write_page
 from lab.challenge.truth import store
 from lab.formats.results import DiagnosisResult, NamedEffect, ParameterValue, Rival
 from mocks.conceal import NOT_SHOWN, parse

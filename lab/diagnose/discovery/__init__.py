@@ -124,7 +124,8 @@ def _gain(one: PredictiveTable) -> float:
 
 
 def _takes_enough(one: PredictiveTable, policy: DecisionPolicy) -> bool:
-    """Whether it takes `least_discovery_share` off chi2, a curve twice the standard deviation of chi2 at least."""
+    """Return whether it takes `least_discovery_share` off chi2, a curve twice the standard deviation of chi2 at
+    least."""
     least = 2.0 * np.sqrt(2.0 * one.chi2[2]) if one.look.at else 0.0
     return _gain(one) >= max(policy.least_discovery_share * one.chi2[0], float(least))
 
@@ -152,7 +153,8 @@ def _smallest_cells(found: Sequence[PredictiveTable]) -> list[PredictiveTable]:
 
 
 def _predicts_other_half(profile: Profile, form: Form) -> bool:
-    """Whether a form fitted to each half of the index lowers chi2 of the other half: a few outlying lines don't."""
+    """Return whether a form fitted to each half of the index lowers chi2 of the other half: a few outlying lines
+    don't."""
     for one, other in ((profile.low, ~profile.low), (~profile.low, profile.low)):
         table, judge = fitted(profile.part(one), form).departure, profile.part(other)
         if judge.chi2(table) >= judge.chi2(np.zeros(1)):
@@ -161,7 +163,7 @@ def _predicts_other_half(profile: Profile, form: Form) -> bool:
 
 
 def _is_sharp(look: Look, table: Table) -> bool:
-    """Whether steps some lines aside take much less off chi2: a smooth wave's don't."""
+    """Return whether steps some lines aside take much less off chi2: a smooth wave's don't."""
     none, seen = look.seen.chi2(np.zeros(1)), look.seen
     gain, aside = none - seen.chi2(table.departure), BESIDE_LINES * look.step
     for move in (-aside, aside):
@@ -173,7 +175,7 @@ def _is_sharp(look: Look, table: Table) -> bool:
 
 
 def _lies_in_one_half(profile: Profile, form: Form) -> bool:
-    """Whether a step shows in residuals of one half alone: there is nothing that the other could say of it."""
+    """Return whether a step shows in residuals of one half alone: there is nothing that the other could say of it."""
     shown = np.abs(np.asarray(profile.matrix @ form.basis)).sum(axis=1)
     return bool(min(shown[profile.low].sum(), shown[~profile.low].sum()) < 0.1 * shown.sum())
 
@@ -252,8 +254,8 @@ def _curves(
 
 
 def _beats_smooth(one: PredictiveTable, left: Verdict) -> bool:
-    """Whether a law predicts the captures held out as well as the smooth discrepancies of its measurements do, or to
-    their noise. What they predict better has no form.
+    """Return whether a law predicts the captures held out as well as the smooth discrepancies of its measurements do,
+    or to their noise. What they predict better has no form.
     """
     names = one.look.shown_in
     blocks = [i for i, block in enumerate(left.model.blocks) if block.measurement.name in names]

@@ -80,8 +80,8 @@ def _code_profile(codes: CodeCounts, effects: Effects, study: Study) -> Profile:
 
 
 def _lit_images(study: Study, effects: Effects) -> dict[bool, FloatArray]:
-    """The mean flat, each plane over its mean, less the dark offsets and over the pattern that effects give even light:
-    of seen (False) and of held-out captures.
+    """Return the mean flat, each plane over its mean, less the dark offsets and over the pattern that effects give even
+    light: of seen (False) and of held-out captures.
     """
     try:
         levels, images = study.once(flats)
@@ -113,7 +113,7 @@ def _pattern(study: Study, levels: Sequence[FlatLevel], effects: Effects) -> Flo
 
 
 def _dark_images(study: Study, effects: Effects) -> dict[bool, FloatArray]:
-    """The mean dark frame, DN, less the offsets that the effects add."""
+    """Return the mean dark frame, DN, less the offsets that the effects add."""
     dark = study.once(dark_readout)
     if dark is None:
         return {}
@@ -127,8 +127,8 @@ def _dark_images(study: Study, effects: Effects) -> dict[bool, FloatArray]:
 
 
 def _dark_variances(study: Study) -> dict[bool, FloatArray]:
-    """The temporal variance of dark frames over that of their surroundings, without noise of lines, of the condition
-    with most repeats.
+    """Return the temporal variance of dark frames over that of their surroundings, without noise of lines, of the
+    condition with most repeats.
     """
     try:
         most = max(study.once(dark_frames), key=lambda one: len(one.condition.captures))

@@ -79,9 +79,9 @@ def _healthy_draw(
 
 
 def image_threshold(draws: Sequence[HealthyDraw], false_alarm_rate: float) -> float:
-    """The score that a share `false_alarm_rate` of healthy cameras exceeds: the quantile of Gumbel's extreme-value
-    distribution with the draws' mean and standard deviation. The largest of many scores follows it, and few draws fix
-    it."""
+    """Return the score that a share `false_alarm_rate` of healthy cameras exceeds: the quantile of Gumbel's
+    extreme-value distribution with the draws' mean and standard deviation. The largest of many scores follows it, and
+    few draws fix it."""
     tops = np.array([d.top_score for d in draws])
     scale = float(np.std(tops, ddof=1)) * np.sqrt(6.0) / np.pi
     return float(np.mean(tops)) - scale * (np.euler_gamma + float(np.log(-np.log1p(-false_alarm_rate))))
@@ -99,8 +99,8 @@ def _draw_of(model: MeasurementModel) -> HealthyDraw:
 
 
 def _at_recorded_levels(recordings: RecordingSet, side: Side, camera: CameraModel) -> CameraModel:
-    """The camera with sensitivities scaled so that it gives the recorded levels. Their scale is a nuisance parameter of
-    the baseline; at a wrong one, frames would clip or be lost in noise."""
+    """Return the camera with sensitivities scaled so that it gives the recorded levels. Their scale is a nuisance
+    parameter of the baseline; at a wrong one, frames would clip or be lost in noise."""
     replay = Replay(recordings, side, camera)
     ratios = []
     for capture in replay.captures:

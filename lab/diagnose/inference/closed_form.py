@@ -68,9 +68,9 @@ class LinearProblem:
         return cls(stacked.T @ white, stacked.T @ stacked, tuple(owners), columns, cost)
 
     def best(self, size: int) -> tuple[LinearSet, ...]:
-        """The sets of `size` members whose log odds are higher than those of each set without one of them, highest
-        first. All singles and all pairs are compared; of larger sets those that extend the best of the next smaller
-        size."""
+        """Return the sets of `size` members whose log odds are higher than those of each set without one of them,
+        highest first. All singles and all pairs are compared; of larger sets those that extend the best of the next
+        smaller size."""
         if size not in self._found:
             made = (
                 list(self.singles.values())
@@ -87,7 +87,7 @@ class LinearProblem:
         return self._found[size]
 
     def scored(self, members: Sequence[int]) -> LinearSet:
-        """The score of the alternatives `members` together."""
+        """Return the score of the alternatives `members` together."""
         where = np.concatenate([self.columns[m] for m in members]).astype(int)
         size = self._size[where]
         square = self.gram[np.ix_(where, where)] / np.outer(size, size)
@@ -117,7 +117,7 @@ class LinearProblem:
         return np.array([number[self.owners[a]] for a in self._alternative], int)
 
     def names(self, one: LinearSet) -> frozenset[str]:
-        """The owners of a set's members."""
+        """Return the owners of a set's members."""
         return frozenset(self.owners[m] for m in one.members)
 
     def _is_worth_its_members(self, one: LinearSet, known: Mapping[frozenset[str], LinearSet]) -> bool:
@@ -154,8 +154,8 @@ class LinearProblem:
         return found
 
     def _larger(self, smaller: Sequence[LinearSet]) -> list[LinearSet]:
-        """The best smaller sets, each with the owners that promise most beside it: by what one column takes of what the
-        set leaves."""
+        """Return the best smaller sets, each with the owners that promise most beside it: by what one column takes of
+        what the set leaves."""
         found: dict[frozenset[str], LinearSet] = {}
         for start in smaller[:EXTENDED]:
             gain = self._gain_beside(start)
@@ -176,7 +176,7 @@ class LinearProblem:
         return list(found.values())
 
     def _gain_beside(self, start: LinearSet) -> FloatArray:
-        """What every column by itself takes of the residual that a set leaves, its active columns free to move,
+        """Return what every column by itself takes of the residual that a set leaves, its active columns free to move,
         (p,)."""
         where = np.concatenate([self.columns[m] for m in start.members]).astype(int)
         active = where[np.concatenate(start.share) > 0]

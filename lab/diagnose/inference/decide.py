@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,20 +13,240 @@ from lab.diagnose.inference.discrepancy import (
     no_discrepancy,
     predictive_discrepancy,
 )
-from lab.diagnose.inference.families import family_claim, tied_family
 from lab.diagnose.inference.held_out import VetoedCandidate, held_out_mismatches, predicts_held_out, vetoed
 from lab.diagnose.inference.locate import Slice, mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.naming import excludes_rivals, named_members
 from lab.diagnose.inference.outlying import OutlyingLevel, freed, outlying_levels
-from lab.diagnose.inference.refit import is_of_usual_size, log_likelihood, profile_interval, refit, refit_alone
-from lab.diagnose.inference.score import prototype_changes, signatures_of
+from lab.diagnose.inference.refit import Fit, is_of_usual_size, log_likelihood, profile_interval, refit, refit_alone
+from lab.diagnose.inference.score import prototype_changes, signatures, signatures_of
 from lab.diagnose.inference.search import ModelSet, Search
-from lab.diagnose.inference.weigh import UNKNOWN, Candidate
+from lab.diagnose.inference.shown_in_means import shown_in_means
+from lab.diagnose.inference.weigh import UNKNOWN, Candidate, closes_somewhere, explained, weigh
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
 from sim.effects.library import candidates
+from sim.effects.library import effects as library
 from sim.spectrum import FloatArray
+
+# --- families --------------------------------------------------------------------------------------------------------
+# Families: what is named where recordings show which physics is missing, and no single law of it.
+#
+# A family is claimed for a candidate whose own name doesn't hold. Given that the cause is one of the weighed effects,
+# with a discrepancy beside each, the family has to hold `family_probability`, and the nearest law has to explain
+# `family_least_share` of the excess chi2 in the measurements that it acts on. A family is also told in place of a name
+# that holds where other members fit about as well.
+
+
+def family_claim(search: Search, named: Sequence[Candidate], candidate: Candidate) -> Candidate | None:
+    """Return a candidate without a name as one that its family is named for, with the likeliest law fitted beside what
+    is named; None where no family holds it."""
+    model, policy = search.model, search.policy
+    others = tuple(c.effect for c in named)
+    if not candidate.among_listed or candidate.remark:  # what wrong metadata would explain as well is no claim
+        return None
+    kind = library()[candidate.among_listed[0][0]]
+    members = tuple((name, p) for name, p in candidate.among_listed if library()[name].family is kind.family)
+    probability = sum(p for _, p in members)
+    if probability < policy.family_probability or kind.name in {e.name for e in others}:
+        return None
+    start = candidate.effect if isinstance(candidate.effect, kind) else _start(search, others, kind)
+    if start is None:
+        return None
+    without = search.fitted(others, converged=True)
+    fit = search.fitted((*others, start), converged=True)
+    log_odds = fit.log_posterior - without.log_posterior
+    if log_odds < search.needed_log_odds:
+        return None
+    share, is_closed = explained(model, fit, without, model.affected_blocks(start), policy)
+    if share < policy.family_least_share:
+        return None
+    at = fit.names.index(kind.name)
+    # a law whose name was given up for what it leaves isn't exact; one that others of its family fit as well may be
+    is_tie = members[0][1] < policy.family_probability
+    return replace(
+        candidate,
+        effect=fit.effects[at],
+        std=fit.std[at],
+        probability=probability,
+        rivals=tuple((name, p) for name, p in candidate.among_listed if library()[name].family is not kind.family),
+        log_odds=log_odds,
+        explained_share=share,
+        is_closed=is_closed and is_tie,
+        members=members,
+    )
+
+
+def _start(search: Search, others: tuple[Effect, ...], kind: type[Effect]) -> Effect | None:
+    """Return where a fit of an effect beside others begins; None where nothing shows it."""
+    scores = signatures(search.model, search.model.camera, others, [kind]).scores()
+    return scores[0].start if scores else None
+
+
+def tied_family(candidate: Candidate, policy: DecisionPolicy) -> Candidate:
+    """Return the candidate as its family where the recordings can't tell its members apart: no member reaches
+    `family_probability`, and all together do."""
+    if candidate.members or candidate.probability >= policy.family_probability:
+        return candidate
+    family = type(candidate.effect).family
+    members = [(candidate.effect.name, candidate.probability)]
+    members += [(n, p) for n, p in candidate.rivals if n in library() and library()[n].family is family]
+    members = [(n, p) for n, p in members if p >= policy.least_rival_probability]
+    together = sum(p for _, p in members)
+    if len(members) < 2 or together < policy.family_probability:
+        return candidate
+    outside = tuple((n, p) for n, p in candidate.rivals if n not in dict(members))
+    return replace(candidate, probability=together, rivals=outside, members=tuple(sorted(members, key=lambda m: -m[1])))
+
+
+# --- naming ----------------------------------------------------------------------------------------------------------
+# Which members of the best set are named: each has to hold against rivals, an unknown cause and the other members.
+
+
+def named_members(
+    search: Search, best: Fit, report: Callable[[str], None], barred: Collection[frozenset[str]] = ()
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Return the members of a set whose names hold, and those that were given up, in that order. `barred`: sets that
+    aren't returned to, by their effects' names.
+
+    One at a time: the weakest member that is too weak for any name; then the member for which a rival is likelier; then
+    members that one discrepancy replaces, or whose name doesn't hold. After each change the rest is fitted and weighed
+    again. What was given up and explains nothing isn't told.
+    """
+    model, policy = search.model, search.policy
+    current = best
+    given_up: list[Candidate] = []
+    weighed = set(barred)
+    certain: dict[str, Candidate] = {}
+    before = current
+    while current.effects:
+        weighed.add(frozenset(current.names))
+        certain = _still_certain(search, certain, before, current)
+        before = current
+        index = _too_weak(search, current)
+        if index is not None:
+            report(f"weighing {current.effects[index].name} against its rivals")
+            candidate, better = weigh(search, current, index)
+            if better is not None and frozenset(better.names) not in weighed:
+                current = search.fitted(better.effects, converged=True)
+                continue
+            without = search.without(current, index)
+            gain, needed = current.log_posterior - without.log_posterior, search.needed_log_odds
+            if gain < needed or search.member_log_odds(current, index) >= needed:
+                given_up.append(replace(candidate, among_listed=()))  # no claim, of its family neither
+            # else it explains no more than what the other members' laws may lack: a mismatch beyond that is located
+            # without it
+            current = without
+            continue
+        members, likelier = [], None
+        for index, e in enumerate(current.effects):
+            if e.name in certain:
+                # what is left to explain changes
+                without = search.without(current, index)
+                share, is_closed = explained(model, current, without, model.affected_blocks(e), policy)
+                kept = replace(
+                    certain[e.name],
+                    effect=e,
+                    std=current.std[index],
+                    explained_share=share,
+                    is_closed=is_closed,
+                    is_closed_somewhere=is_closed or closes_somewhere(model, current, index, policy),
+                )
+                members.append(kept)
+                continue
+            report(f"weighing {e.name} against its rivals")
+            candidate, better = weigh(search, current, index)
+            members.append(candidate)
+            if candidate.probability > policy.certain_probability and candidate.log_odds > search.threshold:
+                certain[e.name] = candidate
+            likelier = likelier or better
+        if likelier is not None and frozenset(likelier.names) not in weighed:
+            current = search.fitted(likelier.effects, converged=True)
+            continue
+        replaceable = _replaced_by_a_discrepancy(search, current)
+        failing = sorted((c for c in members if not holds(c, policy)), key=lambda c: c.log_odds)
+        lost = [members[i] for i in replaceable] or failing[:1]
+        if not lost:
+            return members, [c for c in given_up if c.explained_share > 0.0]
+        given_up += lost
+        current = search.fitted(tuple(c.effect for c in members if c not in lost), converged=True)
+    return [], [c for c in given_up if c.explained_share > 0.0]
+
+
+def _still_certain(search: Search, certain: dict[str, Candidate], before: Fit, now: Fit) -> dict[str, Candidate]:
+    """Return the certain names that stay so when members leave or come: those that share no measurement that shows
+    both. What was certain beside an effect which took up what its law lacks has to be weighed again without that."""
+    changed = [e for e in (*before.effects, *now.effects) if (e.name in before.names) != (e.name in now.names)]
+    if not changed or not certain:
+        return certain
+    by_name = {e.name: e for e in before.effects}
+    measured = {e.name: _shown_blocks(search, e, before if e.name in by_name else now) for e in changed}
+    moved = set().union(*measured.values())
+    return {n: c for n, c in certain.items() if n in by_name and not moved & _shown_blocks(search, by_name[n], before)}
+
+
+def _shown_blocks(search: Search, effect: Effect, fit: Fit) -> set[int]:
+    """Indices of the blocks that show a member of a fitted set, by `shown_chi2`."""
+    others = tuple(e for e in fit.effects if e.name != effect.name)
+    model = search.model
+    return {i for i in model.affected_blocks(effect) if model.change_chi2(effect, others, i) > search.policy.shown_chi2}
+
+
+def holds(candidate: Candidate, policy: DecisionPolicy) -> bool:
+    """Return whether a name is likely enough and explains enough."""
+    is_held = candidate.is_closed or excludes_rivals(candidate, policy)
+    least_share = policy.least_explained_share if is_held else policy.least_explained_share_open
+    return candidate.probability >= policy.least_probability and candidate.explained_share >= least_share
+
+
+def excludes_rivals(candidate: Candidate, policy: DecisionPolicy) -> bool:
+    """Say whether rivals and an unknown cause are excluded, a discrepancy allowed beside each, and the law holds in a
+    measurement that shows it: what another measurement leaves is then told beside the name."""
+    first = candidate.among_listed[0] if candidate.among_listed else None
+    return (
+        candidate.is_closed_somewhere
+        and candidate.probability >= policy.certain_probability
+        and first is not None
+        and first[0] == candidate.effect.name
+        and first[1] >= policy.certain_probability
+    )
+
+
+def _too_weak(search: Search, fit: Fit) -> int | None:
+    """Return the weakest member that can't be named whatever its rivals: too small a gain, or none in the means that it
+    must show in. Tested before anything is weighed, as that fits every rival of every member."""
+    log_odds = [search.member_log_odds(fit, i) for i in range(len(fit.effects))]
+    weak = [
+        odds
+        for i, (odds, e) in enumerate(zip(log_odds, fit.effects, strict=True))
+        if odds < search.needed_log_odds
+        or not shown_in_means(search.model, e, fit.effects, search.without(fit, i).effects, search.policy)
+    ]
+    return log_odds.index(min(weak)) if weak else None
+
+
+def _replaced_by_a_discrepancy(search: Search, fit: Fit) -> list[int]:
+    """Indices of two or more members that change the same block most, where one discrepancy in their place is
+    likelier."""
+    model, policy = search.model, search.policy
+    by_block: dict[int, list[int]] = {}
+    for i, e in enumerate(fit.effects):
+        by_block.setdefault(model.strongest_block(e, fit.effects), []).append(i)
+
+    def log_posterior(one: Fit, index: int) -> float:
+        gaussian = model.seen_gaussian(one.effects)
+        return one.log_posterior + likeliest_discrepancy(model, gaussian, index, policy).log_odds
+
+    for index, members in by_block.items():
+        if len(members) < 2:
+            continue
+        fewer = search.fitted(tuple(e for i, e in enumerate(fit.effects) if i not in members), converged=True)
+        if log_posterior(fewer, index) > log_posterior(fit, index):
+            return members
+    return []
+
+
+# --- decide ------------------------------------------------------------
+
 
 #: Refits that end within this share of an effect's size of each other found the same mode.
 SAME_MODE = 0.1
@@ -75,7 +295,8 @@ def decide(
     *,
     least_threshold: float = 0.0,
 ) -> Verdict:
-    """The whole chain on one side's measurement model; deterministic for a given generator. `least_threshold` of the
+    """Return the whole chain on one side's measurement model; deterministic for a given generator. `least_threshold` of
+    the
     scores: from drawn healthy cameras, where there are any (`bootstrap.py`)."""
     known = candidates()
     changes = prototype_changes(model, model.camera, (), known)
@@ -141,7 +362,8 @@ def decide(
 
 
 def _verdict(told: Verdict, left: Sequence[int], refused: Sequence[VetoedCandidate], policy: DecisionPolicy) -> Verdict:
-    """The verdict with what is left without a name, in the blocks `left` and where held-out numbers contradict the
+    """Return the verdict with what is left without a name, in the blocks `left` and where held-out numbers contradict
+    the
     model: single captures that are outlying, or a discrepancy that predicts held-out captures."""
     model, effects = told.model, told.effects
     gaussian = model.seen_gaussian(effects)
@@ -168,7 +390,7 @@ def _verdict(told: Verdict, left: Sequence[int], refused: Sequence[VetoedCandida
 
 
 def _refitted(search: Search, named: Sequence[Candidate], gone: Candidate | None = None) -> list[Candidate]:
-    """The named candidates, without one of them, fitted again."""
+    """Return the named candidates, without one of them, fitted again."""
     rest = search.fitted(tuple(c.effect for c in named if c is not gone), converged=True)
     kept = {c.effect.name: c for c in named}
     return [replace(kept[e.name], effect=e, std=s) for e, s in zip(rest.effects, rest.std, strict=True)]
@@ -193,7 +415,7 @@ def _weighed_anew(
 
 
 def _of_any_size(model: MeasurementModel, named: list[Candidate], policy: DecisionPolicy) -> list[Candidate]:
-    """The named candidates with values that aren't drawn towards usual ones, where one lies far from those."""
+    """Return the named candidates with values that aren't drawn towards usual ones, where one lies far from those."""
     effects = tuple(c.effect for c in named)
     if is_of_usual_size(effects, model.camera):
         return named
@@ -202,7 +424,7 @@ def _of_any_size(model: MeasurementModel, named: list[Candidate], policy: Decisi
 
 
 def _veto(search: Search, named: Sequence[Candidate], candidate: Candidate) -> VetoedCandidate | None:
-    """The held-out captures' veto on one of the named candidates."""
+    """Return the held-out captures' veto on one of the named candidates."""
     without = search.fitted(tuple(c.effect for c in named if c is not candidate), converged=True)
     return vetoed(search.model, candidate, tuple(c.effect for c in named), without.effects, search.policy)
 

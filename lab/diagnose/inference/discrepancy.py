@@ -41,15 +41,15 @@ class Discrepancy:
 def likeliest_discrepancy(
     model: MeasurementModel, gaussian: Gaussian, index: int, policy: DecisionPolicy
 ) -> Discrepancy:
-    """The discrepancy of one block that maximises the marginal likelihood of the seen numbers, or none where that is
-    likelier. `gaussian`: the distribution of the seen numbers without it."""
+    """Return the discrepancy of one block that maximises the marginal likelihood of the seen numbers, or none where
+    that is likelier. `gaussian`: the distribution of the seen numbers without it."""
     return max(_fitted(model, gaussian, index, LENGTHS, policy), key=lambda d: d.log_odds)
 
 
 def predictive_discrepancy(
     model: MeasurementModel, gaussian: Gaussian, index: int, policy: DecisionPolicy
 ) -> Discrepancy:
-    """The discrepancy of one block that best predicts captures which it hasn't seen, or none where none does.
+    """Return the discrepancy of one block that best predicts captures which it hasn't seen, or none where none does.
 
     Captures are left out in turn (cross-validation); of the discrepancies with positive log odds, the one of the least
     chi2 over what was left out is taken, if that beats none by twice `discrepancy_log_odds`. Longer lengths, and points
@@ -153,7 +153,7 @@ def _fitted(
 
 
 def _groupings(block: Block) -> dict[str, NDArray[np.intp]]:
-    """The ways in which numbers share a draw: in words, and each number's group (m,)."""
+    """Return the ways in which numbers share a draw: in words, and each number's group (m,)."""
     channel = np.unique([label.channel for label in block.labels], return_inverse=True)[1]
     condition = np.unique([label.condition for label in block.labels], return_inverse=True)[1]
     both = np.unique(condition * len(channel) + channel, return_inverse=True)[1]
@@ -184,5 +184,5 @@ def _kernel_factor(x: FloatArray, length: float) -> FloatArray:
 
 
 def _by_group(factor: FloatArray, group: NDArray[np.intp]) -> FloatArray:
-    """The factor's columns once for every group, zero outside it: independent draws of the groups."""
+    """Return the factor's columns once for every group, zero outside it: independent draws of the groups."""
     return np.concatenate([np.where((group == g)[:, None], factor, 0.0) for g in range(int(group.max()) + 1)], axis=1)

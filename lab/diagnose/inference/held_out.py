@@ -75,7 +75,8 @@ def held_out_mismatches(
 
 
 def predicts_held_out(model: MeasurementModel, effects: Effects, index: int, kernel: FloatArray) -> bool:
-    """Whether a discrepancy lowers the held-out chi2 of its measurement; True where nothing of it is held out."""
+    """Return whether a discrepancy lowers the held-out chi2 of its measurement; True where nothing of it is held
+    out."""
     where = model.mask(index)
     before, n = model.held_out(effects, where)
     after, _ = model.held_out(effects, where, {index: kernel})
@@ -94,8 +95,8 @@ def _kernels(
 def vetoed(
     model: MeasurementModel, candidate: Candidate, effects: Effects, without: Effects, policy: DecisionPolicy
 ) -> VetoedCandidate | None:
-    """The veto of held-out numbers on a name, or None. `effects`: the named set; `without`: the set fitted without the
-    candidate.
+    """Return the veto of held-out numbers on a name, or None. `effects`: the named set; `without`: the set fitted
+    without the candidate.
 
     Let w be the difference of both sets' predictions in standard deviations of the held-out numbers, lambda = |w|^2. If
     the name is right, chi2 rises by it by 2 w.e - lambda, with e normal of variance 1 + lambda / G along w, where G = 2

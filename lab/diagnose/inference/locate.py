@@ -59,7 +59,7 @@ def chi2_by_slice(model: MeasurementModel, gaussian: Gaussian, policy: DecisionP
 
 
 def mismatches(model: MeasurementModel, gaussian: Gaussian, policy: DecisionPolicy) -> tuple[Slice, ...]:
-    """The slices whose corrected probability is below `slice_false_alarm_rate`, most significant first."""
+    """Return the slices whose corrected probability is below `slice_false_alarm_rate`, most significant first."""
     limit = np.log(policy.slice_false_alarm_rate)
     return tuple(s for s in chi2_by_slice(model, gaussian, policy) if s.log_probability < limit)
 
@@ -73,7 +73,7 @@ def log_tail(value: float, n: int) -> float:
 
 
 def _slices(block: Block, at: slice, seen: np.ndarray) -> list[tuple[Block, str, str, np.ndarray]]:
-    """The block as a whole, its channels, its conditions, and the quarters of its axis: (block, axis, words,
+    """Return the block as a whole, its channels, its conditions, and the quarters of its axis: (block, axis, words,
     indices)."""
     index = np.arange(at.start, at.stop)
     use = seen[index]
@@ -112,7 +112,7 @@ def _range(block: Block, x: FloatArray) -> str:
 
 
 def describe(model: MeasurementModel, gaussian: Gaussian, part: Slice) -> tuple[str, tuple[str, ...]]:
-    """A mismatch in words, and the captures concerned: of held-out numbers, where the slice is of those.
+    """Return a mismatch in words, and the captures concerned: of held-out numbers, where the slice is of those.
 
     The words give range, channels and conditions of the numbers whose residuals are largest: at least 3 standard
     deviations and 0.3 of the largest; where all are smaller, by noise alone, 2 standard deviations and 0.5 of the

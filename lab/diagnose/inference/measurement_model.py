@@ -115,7 +115,7 @@ class MeasurementModel:
         return {}
 
     def acts(self, effect: type[Effect]) -> tuple[bool, ...]:
-        """Whether an effect may change each block: its mean or its scatter."""
+        """Return whether an effect may change each block: its mean or its scatter."""
         if effect not in self._acting:
             self._acting[effect] = tuple(block.touched_by(effect) or block.scatters_by(effect) for block in self.blocks)
         return self._acting[effect]
@@ -198,7 +198,7 @@ class MeasurementModel:
         return frozenset(name for name, blocks in count.items() if blocks == 1)
 
     def _shared_jacobian(self, effects: Effects) -> FloatArray:
-        """The Jacobian by nuisance parameters of several blocks, (n, k)."""
+        """Return the Jacobian by nuisance parameters of several blocks, (n, k)."""
         columns = list(self.nuisance_jacobian(effects, self._single_block_nuisances).values())
         return np.column_stack(columns) if columns else np.zeros((len(self.value), 0))
 
@@ -227,8 +227,8 @@ class MeasurementModel:
         tolerated: float = 1.0,
         least_tolerance: float = 0.0,
     ) -> Gaussian:
-        """The distribution under these effects, of all numbers or of those that `where` (n,) marks. `tolerated`: share
-        of the declared form tolerances; each is `least_tolerance` at least."""
+        """Return the distribution under these effects, of all numbers or of those that `where` (n,) marks. `tolerated`:
+        share of the declared form tolerances; each is `least_tolerance` at least."""
         where = np.ones(len(self.value), bool) if where is None else where
         acting = self._numbered((*self.always, *effects))
         blocks = tuple(
@@ -238,7 +238,7 @@ class MeasurementModel:
         return Gaussian(self.mean(effects)[where], blocks, self._shared_jacobian(effects)[where])
 
     def seen_gaussian(self, effects: Effects = (), tolerated: float = 1.0, least_tolerance: float = 0.0) -> Gaussian:
-        """The distribution of the seen numbers; arguments as of `gaussian`."""
+        """Return the distribution of the seen numbers; arguments as of `gaussian`."""
         return self.gaussian(effects, self.seen, tolerated, least_tolerance)
 
     def _block_covariance(

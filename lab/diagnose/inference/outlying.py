@@ -77,8 +77,8 @@ def outlying_levels(
 
 
 def freed(model: MeasurementModel, outlying: Mapping[int, Sequence[OutlyingLevel]]) -> MeasurementModel:
-    """The model with the light of outlying captures as nuisance parameters: what is stated of these moves nothing that
-    other measurements share with them, as the black level. `outlying`: by block."""
+    """Return the model with the light of outlying captures as nuisance parameters: what is stated of these moves
+    nothing that other measurements share with them, as the black level. `outlying`: by block."""
     if not outlying:
         return model
     columns = dict(model.unstated_jacobian)
@@ -95,7 +95,7 @@ def freed(model: MeasurementModel, outlying: Mapping[int, Sequence[OutlyingLevel
 def _agrees(
     model: MeasurementModel, effects: Effects, index: int, moved: FloatArray, freed: int, policy: DecisionPolicy
 ) -> bool:
-    """Whether the measurement's numbers agree with the model once the outlying ones are `moved`."""
+    """Return whether the measurement's numbers agree with the model once the outlying ones are `moved`."""
     mine = model.mask(index)
     value = model.value - moved
     both, others = (

@@ -60,7 +60,7 @@ class Coordinate:
         return float(np.sign(away) * abs(away) ** self.quantity.linear_power)
 
     def to_value(self, u: float) -> float:
-        """The parameter's value of u, within its bounds."""
+        """Return the parameter's value of u, within its bounds."""
         if self.quantity.logarithmic:
             value = float(np.exp(u))
         else:
@@ -76,7 +76,7 @@ class Coordinate:
         return (-np.inf if low is None else self.to_u(low), np.inf if high is None else self.to_u(high))
 
     def typical(self, value: float) -> float:
-        """A typical size of u for a parameter at `value`."""
+        """Return a typical size of u for a parameter at `value`."""
         if self.quantity.logarithmic:
             return TYPICAL_LOG
         width = self.quantity.prior[1] if self.quantity.prior is not None else 5.0
@@ -123,7 +123,7 @@ def coordinates(effects: Effects, camera: CameraModel) -> list[Coordinate]:
 
 
 def moved(effects: Effects, coords: Sequence[Coordinate], u: FloatArray) -> tuple[Effect, ...]:
-    """The effects with these coordinates at `u`."""
+    """Return the effects with these coordinates at `u`."""
     values: list[dict[str, float]] = [{} for _ in effects]
     for c, at in zip(coords, u, strict=True):
         values[c.index][c.name] = c.to_value(float(at))
@@ -146,8 +146,8 @@ class _Tolerated(NamedTuple):
 def _likeliest_tolerance(
     model: MeasurementModel, effects: Effects, policy: DecisionPolicy, tolerance: float | None = None
 ) -> _Tolerated:
-    """The share of the form tolerances, down to `least_tolerated_share`, by which the seen numbers are likeliest; the
-    whole, and `tolerance` at least, where that is given.
+    """Return the share of the form tolerances, down to `least_tolerated_share`, by which the seen numbers are
+    likeliest; the whole, and `tolerance` at least, where that is given.
 
     By the declared tolerances alone, of two laws that fit equally well the one with the smaller tolerance is far
     likelier: by 8 in the logarithm for a low-pass filter of 1 % beside a vibration of 5 %, even where the numbers meet
@@ -418,7 +418,8 @@ def _covariance(
 
 
 def displaced(model: MeasurementModel, effects: Effects, index: int) -> list[tuple[Effect, ...]]:
-    """The effects with member `index` moved by one standard deviation along each principal direction of its parameters'
+    """Return the effects with member `index` moved by one standard deviation along each principal direction of its
+    parameters'
     posterior, within bounds: a set for each direction. Predictions by these, less that by `effects`, are a square root
     of the covariance that the member's parameters give to a prediction."""
     coords = coordinates(effects, model.camera)
@@ -452,7 +453,7 @@ def _promised_gain(
 
 
 def _usual_log_odds(effect: Effect, std: dict[str, float | None]) -> float:
-    """The effect's `log_prior`, the largest within a standard deviation of the values found: noise makes nothing
+    """Return the effect's `log_prior`, the largest within a standard deviation of the values found: noise makes nothing
     unusual."""
     if type(effect).log_prior is Effect.log_prior:
         return 0.0

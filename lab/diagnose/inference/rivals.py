@@ -55,7 +55,7 @@ def parallel_pairs(
 
 
 def symmetric(names: Iterable[str], pairs: Iterable[tuple[str, str]]) -> dict[str, frozenset[str]]:
-    """The pairs as a mapping from each name to its partners."""
+    """Return the pairs as a mapping from each name to its partners."""
     partners: dict[str, set[str]] = {name: set() for name in names}
     for a, b in pairs:
         partners[a].add(b)

@@ -76,8 +76,8 @@ class Signatures:
         return sorted(found, key=lambda s: -s.value)
 
     def _nearest(self, scaled: Effect, prototypes: Sequence[tuple[float, Effect]]) -> Effect:
-        """The prototype as it stands where that takes more of the residual than the linearly scaled one: of large
-        changes, linear scaling may be far off."""
+        """Return the prototype as it stands where that takes more of the residual than the linearly scaled one: of
+        large changes, linear scaling may be far off."""
         taken, prototype = max(prototypes, key=lambda one: one[0], default=(0.0, scaled))
         is_nearer = taken > 0.0 and taken > self._chi2_taken(self.whitened_changes([scaled])[:, 0])
         return prototype if is_nearer else scaled
@@ -87,11 +87,11 @@ class Signatures:
         return float(2.0 * signature @ self.white - signature @ signature)
 
     def problem(self, cost: Mapping[str, float]) -> LinearProblem:
-        """The linear problem of all sets of candidates; `cost`: log odds that each has to earn, by name."""
+        """Return the linear problem of all sets of candidates; `cost`: log odds that each has to earn, by name."""
         return LinearProblem.of(self.white, [t for _, _, t in self.columns], [e.name for e, _, _ in self.columns], cost)
 
     def starts(self, one: LinearSet) -> tuple[Effect, ...]:
-        """Where a refit of a set of this problem starts: its members scaled by their shares; a single one as
+        """Return where a refit of a set of this problem starts: its members scaled by their shares; a single one as
         `Score.start`."""
         found = []
         for member, share in zip(one.members, one.share, strict=True):
@@ -104,7 +104,7 @@ class Signatures:
         return tuple(found)
 
     def threshold(self, rng: np.random.Generator, quantile: float, draws: int) -> float:
-        """The quantile of the largest score over draws of white noise, projected on the span of the signatures.
+        """Return the quantile of the largest score over draws of white noise, projected on the span of the signatures.
 
         Of several prototypes, the norm of the projection on their span is an upper bound of the cone's score.
         """
@@ -134,8 +134,8 @@ Changes = Sequence[tuple[type[Effect], tuple[Effect, ...], FloatArray]]
 def prototype_changes(
     model: MeasurementModel, camera: CameraModel, current: Effects, candidates: Iterable[type[Effect]]
 ) -> Changes:
-    """What all prototypes of the candidates change beside a set of `current` effects. Candidates that change nothing
-    that was measured are left out."""
+    """Return what all prototypes of the candidates change beside a set of `current` effects. Candidates that change
+    nothing that was measured are left out."""
     base = model.mean(current)
     return [
         (effect, prototypes, np.stack([model.mean((*current, e)) - base for e in prototypes], axis=1)[model.seen])
@@ -164,9 +164,9 @@ def signatures_of(
     jacobian: FloatArray | None = None,
     tolerated: float = 1.0,
 ) -> Signatures:
-    """The same of changes that are known, by the covariance that `current` effects give with a share of their form
-    tolerances. Those beside a smaller set stand for those beside `current`: an effect's change depends little on what
-    it stands beside."""
+    """Return the same of changes that are known, by the covariance that `current` effects give with a share of their
+    form tolerances. Those beside a smaller set stand for those beside `current`: an effect's change depends little on
+    what it stands beside."""
     gaussian = model.seen_gaussian(current, tolerated)
     white = gaussian.whiten(model.seen_value - gaussian.mean)
     out = np.zeros((len(white), 0))
@@ -213,7 +213,7 @@ def _cone_score(table: FloatArray, white: FloatArray) -> tuple[float, FloatArray
 
 
 def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: FloatArray, camera: CameraModel) -> Effect:
-    """The effect whose coordinates u are the sum of the prototypes', each times its share, within bounds."""
+    """Return the effect whose coordinates u are the sum of the prototypes', each times its share, within bounds."""
     likeliest = prototypes[int(np.argmax(share))]
     values: dict[str, float] = {}
     for name, quantity in effect.quantities_of(camera).items():

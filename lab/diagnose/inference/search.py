@@ -135,8 +135,8 @@ class Search:
         return current
 
     def _refitted(self, current: Fit, *, wide: bool) -> Fit | None:
-        """The likeliest of the sets about the current one, refitted as far as the budget goes; None where it is no
-        better."""
+        """Return the likeliest of the sets about the current one, refitted as far as the budget goes; None where it is
+        no better."""
         for proposal in self._proposals(current, wide=wide):
             if self.is_spent:
                 self.leave(proposal.start)
@@ -145,7 +145,8 @@ class Search:
         return self._better(current)
 
     def _better(self, current: Fit) -> Fit | None:
-        """The likeliest set that was fitted, to convergence, if it is likelier than the current one by what counts."""
+        """Return the likeliest set that was fitted, to convergence, if it is likelier than the current one by what
+        counts."""
         best: Fit | None = None
         for fit in sorted(self._listed(), key=self.promised_log_odds, reverse=True):
             if self.promised_log_odds(fit) <= self.log_odds(best or current) + self.policy.exchange_log_odds:
@@ -160,7 +161,7 @@ class Search:
         return best
 
     def _listed(self) -> list[Fit]:
-        """The sets that hold nothing but effects of the library."""
+        """Return the sets that hold nothing but effects of the library."""
         return [f for f in self.fits.values() if self._is_listed(f)]
 
     def _is_listed(self, fit: Fit) -> bool:
@@ -174,7 +175,7 @@ class Search:
         return self.log_odds(fit) + fit.promised_gain + self.policy.parameter_log_odds * dispensable
 
     def is_known(self, effects: Effects) -> bool:
-        """Whether these effects were fitted together."""
+        """Return whether these effects were fitted together."""
         return frozenset(e.name for e in effects) in self.fits
 
     def leave(self, effects: Effects) -> None:
@@ -183,8 +184,8 @@ class Search:
             self.not_weighed[frozenset(e.name for e in effects)] = tuple(e.name for e in effects)
 
     def _proposals(self, current: Fit, *, wide: bool) -> list[_Proposal]:
-        """The sets to be refitted next, of every kind the best in turn, as a linear problem compares sets about one fit
-        better than about several."""
+        """Return the sets to be refitted next, of every kind the best in turn, as a linear problem compares sets about
+        one fit better than about several."""
         extended, exchanged = (
             (self._wide_extensions, self._wide_exchanges) if wide else (self._extensions, self._exchanges)
         )
@@ -240,19 +241,19 @@ class Search:
         return [proposal for _, proposal in sorted(found, key=lambda item: -item[0])]
 
     def _less(self, fit: Fit, index: int) -> Fit:
-        """The set without one of its members."""
+        """Return the set without one of its members."""
         return self.fitted((*fit.effects[:index], *fit.effects[index + 1 :]), converged=True)
 
     def _seen_sets(self, origin: Fit, size: int) -> list[LinearSet]:
-        """The sets of `size` effects beside `origin` that promise what they have to earn, or whose score, as refits may
-        gain more, is above the threshold for every member; best first."""
+        """Return the sets of `size` effects beside `origin` that promise what they have to earn, or whose score, as
+        refits may gain more, is above the threshold for every member; best first."""
         if len(origin.effects) + size > self.policy.most_effects:
             return []
         sets = self.problem(origin).best(size)
         return [one for one in sets if one.log_odds > 0.0 or one.score > self.threshold * size]
 
     def problem(self, fit: Fit) -> LinearProblem:
-        """The linear problem about a fitted set."""
+        """Return the linear problem about a fitted set."""
         if fit.effects not in self._problems:
             self._problems[fit.effects] = self.signatures(fit).problem(self._cost)
         return self._problems[fit.effects]
@@ -261,8 +262,8 @@ class Search:
         return _Proposal(self._start(origin, self.signatures(origin).starts(one)), origin)
 
     def _start(self, origin: Fit, linear: Effects) -> tuple[Effect, ...]:
-        """Where the refit of a set starts: at the linear problem's coefficients, or where its members stood when each
-        was fitted by itself, as a large effect isn't linear: whichever is likelier."""
+        """Return where the refit of a set starts: at the linear problem's coefficients, or where its members stood when
+        each was fitted by itself, as a large effect isn't linear: whichever is likelier."""
         alone = [self.fits.get(frozenset((e.name,))) for e in linear]
         if origin.effects or len(linear) < 2 or not any(alone):
             return (*origin.effects, *linear)
@@ -272,7 +273,7 @@ class Search:
     # --- fits --------------------------------------------------------------------------------------------------------
 
     def fitted(self, start: Effects, *, converged: bool = False, beside: Fit | None = None) -> Fit:
-        """The fit of a set of effects, made once: rough, which is enough to rank sets, or to convergence.
+        """Return the fit of a set of effects, made once: rough, which is enough to rank sets, or to convergence.
 
         `beside`: the set that `start` grew from, whose Jacobian a rough fit reuses.
         """
@@ -288,7 +289,7 @@ class Search:
         return made
 
     def without(self, fit: Fit, index: int) -> Fit:
-        """The set fitted without one of its members."""
+        """Return the set fitted without one of its members."""
         rest = (*fit.effects[:index], *fit.effects[index + 1 :])
         return self.fitted(rest, converged=True)
 

@@ -17,22 +17,22 @@ from sim.uniform import LEVEL
 
 
 def must_show_in_means(model: MeasurementModel, kind: type[Effect]) -> bool:
-    """Whether an effect changes variances that were measured, and each only through quantities that mean levels depend
-    on."""
+    """Return whether an effect changes variances that were measured, and each only through quantities that mean levels
+    depend on."""
     shared = [b.reads & may_change(kind) for b in model.blocks if b.measurement.of_variances and b.touched_by(kind)]
     return bool(shared) and all(quantities <= LEVEL for quantities in shared)
 
 
 def is_judged_in_means(model: MeasurementModel, kind: type[Effect]) -> bool:
-    """Whether a measurement other than of variances tells of the effect."""
+    """Return whether a measurement other than of variances tells of the effect."""
     return any(not b.measurement.of_variances and b.touched_by(kind) for b in model.blocks)
 
 
 def shown_in_means(
     model: MeasurementModel, effect: Effect, effects: Effects, without: Effects, policy: DecisionPolicy
 ) -> bool:
-    """Whether the seen numbers that aren't variances are likelier with an effect, by `least_means_log_odds`, where it
-    must show in them.
+    """Return whether the seen numbers that aren't variances are likelier with an effect, by `least_means_log_odds`,
+    where it must show in them.
 
     `effects`: the fitted set; `without`: the set fitted without the effect. True for effects that needn't show in
     means."""

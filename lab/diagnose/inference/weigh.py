@@ -173,8 +173,8 @@ def _among_listed(weights: Mapping[str, float]) -> tuple[tuple[str, float], ...]
 
 
 def _rival_fits(search: Search, fit: Fit, index: int, without: Fit) -> dict[str, Fit]:
-    """The set with each effect in the place of a member that promises enough in closed form: fitted roughly, and to
-    convergence where it isn't far behind. What the budget leaves is noted."""
+    """Return the set with each effect in the place of a member that promises enough in closed form: fitted roughly, and
+    to convergence where it isn't far behind. What the budget leaves is noted."""
     policy = search.policy
     log_odds = fit.log_posterior - without.log_posterior
     scores = [s for s in search.signatures(without).scores() if s.effect.name not in fit.names]

@@ -98,9 +98,9 @@ class Block:
         return np.array([label.x for label in self.labels]) if self.along is None else self.along
 
     def touched_by(self, effect: type[Effect]) -> bool:
-        """Whether the effect may change the predicted mean."""
+        """Return whether the effect may change the predicted mean."""
         return not self.reads.isdisjoint(may_change(effect))
 
     def scatters_by(self, effect: type[Effect]) -> bool:
-        """Whether the effect may add scatter to the numbers."""
+        """Return whether the effect may add scatter to the numbers."""
         return not self.scattered_by.isdisjoint(may_change(effect))

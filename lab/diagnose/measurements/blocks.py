@@ -40,7 +40,7 @@ _NEAR_FULL = 0.985
 def study_of(
     recordings: RecordingSet, side: Side, fit: FitResult | None = None, baseline: CameraFile | None = None
 ) -> Study:
-    """The study of one side, with the baseline camera that `measurement_model` describes."""
+    """Return the study of one side, with the baseline camera that `measurement_model` describes."""
     camera_fit = fit.cameras.get(side) if fit is not None else None
     camera = baseline.camera if baseline else camera_model(recordings, side, camera_fit, maker_curves=True)
     misstated = frozenset(name for level in misstated_levels(camera_fit) for name in level.captures)
@@ -55,7 +55,8 @@ def measurement_model(
     baseline: CameraFile | None = None,
     study: Study | None = None,
 ) -> tuple[MeasurementModel | None, tuple[Skipped, ...]]:
-    """The measurement model of one side (None where no measurement is determined), and what was skipped or assumed.
+    """Return the measurement model of one side (None where no measurement is determined), and what was skipped or
+    assumed.
 
     The baseline camera is made of the data sheet and of the side's `fit`. `baseline` stands in place of both: a camera
     file, whose effects are then part of the baseline. `study`: that of `study_of`, where it is there already."""
@@ -91,7 +92,8 @@ def measurement_model(
 
 
 def _far_from_full(study: Study) -> list[Skipped]:
-    """A remark where no flat reaches `LEAST_REACH` of the full well, to which parameters of the response refer."""
+    """Return a remark where no flat reaches `LEAST_REACH` of the full well, to which parameters of the response
+    refer."""
     flats = study.recordings.captures(FlatCapture, study.side)
     highest = max((level for flat in flats for level in study.levels(flat).whole.values()), default=np.inf)
     reach = (highest - study.noise.black) / (study.saturation_dn - study.noise.black)

@@ -39,8 +39,8 @@ REFERENCE_NM = 550.0
 
 
 def views_of(study: Study, side: Side) -> tuple[list[BoardView], list[Skipped]]:
-    """The boards found in the charuco captures of a side, and the captures in which none was found. Computed once a
-    study."""
+    """Return the boards found in the charuco captures of a side, and the captures in which none was found. Computed
+    once a study."""
     kept: dict[Side, tuple[list[BoardView], list[Skipped]]] = study.once(_no_views)
     if side not in kept:
         kept[side] = find_boards(study.recordings, side)
@@ -52,7 +52,7 @@ def _no_views(_: Study) -> dict[Side, tuple[list[BoardView], list[Skipped]]]:
 
 
 def calibration_of(study: Study) -> Calibration:
-    """The side's camera, calibrated by its boards. Raises NotDetermined where they don't determine it."""
+    """Return the side's camera, calibrated by its boards. Raises NotDetermined where they don't determine it."""
     views, missed = views_of(study, study.side)
     if not views and not missed:
         raise NotDetermined("boards", "no charuco captures")

@@ -13,8 +13,7 @@ from lab.diagnose.measurements.curves import CurveJacobian
 from lab.diagnose.measurements.dark_level import added_dark_dn
 from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
 from lab.errors import NotDetermined
-from lab.measure.halo_light import halo_light
-from lab.measure.patches import Patch, patch_covariance, patch_levels
+from lab.measure.patches import Patch, halo_light, patch_covariance, patch_levels
 from lab.measure.reads import DARK_CURRENT
 from lab.measure.study import Study
 from sim.effects.base import Effects

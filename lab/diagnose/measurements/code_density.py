@@ -162,7 +162,7 @@ class _Counts:
 
 
 def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
-    """A plane's pixels by level, as `_Counts.groups`.
+    """Yield a plane's pixels by level, as `_Counts.groups`.
 
     Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels, and by as much beside it as its row is on
     the whole. Its variance is proportional to the signal above black, and scaled so that its mean is the measured mean
@@ -205,7 +205,7 @@ def counted(study: Study) -> dict[bool, _Counts]:
 
 
 def prepared(study: Study, counts: _Counts) -> CodeCounts | None:
-    """The histogram over the usable codes, None where they are too few."""
+    """Return the histogram over the usable codes, None where they are too few."""
     level = np.arange(len(counts.count), dtype=float)
     noise = np.sqrt(np.maximum(study.noise.gain * (level - study.noise.black), 0.0) + study.noise.read_dn**2)
     high = min(float(study.saturation_dn), float(len(level) - 1))
@@ -331,8 +331,8 @@ class _Part:
 
 
 def _parts(codes: CodeCounts) -> list[_Part]:
-    """The parts with codes enough. Var(chi2) = 2 n sum_k r_k^2 with the residuals' autocorrelation r of the smoothing
-    filter."""
+    """Return the parts with codes enough. Var(chi2) = 2 n sum_k r_k^2 with the residuals' autocorrelation r of the
+    smoothing filter."""
     square = codes.rough.power(2)
     variance = np.asarray(square @ np.maximum(codes.smooth, 1.0))
     unequal = np.asarray(square @ np.square(codes.smooth))

@@ -170,8 +170,9 @@ def curve_modes(wavelength_nm: FloatArray) -> FloatArray:
 
 
 def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) -> Spectrum:
-    """A maker's curve, corrected by fitted nuisance parameters. `quantities`: names as of `CurveJacobian.jacobian`,
-    values in prior standard deviations. The curve itself where none is of this channel. Values are limited to 0..1."""
+    """Return a maker's curve, corrected by fitted nuisance parameters. `quantities`: names as of
+    `CurveJacobian.jacobian`, values in prior standard deviations. The curve itself where none is of this channel.
+    Values are limited to 0..1."""
     names = [name for name in quantities if name.startswith(f"curve:{channel}:")]
     if not names:
         return curve
@@ -194,7 +195,7 @@ def _beyond(curve: Spectrum, wavelength_nm: FloatArray) -> FloatArray:
 
 
 def _last_place(value: FloatArray) -> float:
-    """The unit in the last decimal of a curve's values: 10^-d for d decimals, d <= `MOST_DECIMALS`."""
+    """Return the unit in the last decimal of a curve's values: 10^-d for d decimals, d <= `MOST_DECIMALS`."""
     for decimals in range(1, MOST_DECIMALS):
         if np.all(np.abs(value * 10**decimals - np.round(value * 10**decimals)) < 1e-3):
             return float(10.0**-decimals)

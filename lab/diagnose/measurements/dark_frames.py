@@ -17,7 +17,7 @@ from scipy import ndimage
 from lab.capture_kinds.dark import DarkCapture
 from lab.diagnose.measurements.line_spectra import periodogram, pooled, pooled_along
 from lab.errors import NotDetermined
-from lab.measure.pixel_outliers import (
+from lab.measure.noise_figures import (
     CLIP,
     MEDIAN_OF,
     SMOOTH_PX,
@@ -158,8 +158,8 @@ def conditions(study: Study) -> list[DarkCondition]:
 
 
 def dark_frames(study: Study) -> list[DarkStatistics]:
-    """The statistics of all dark captures by condition. Raises NotDetermined where there are none, or where the frames
-    are too small to be split into cells."""
+    """Return the statistics of all dark captures by condition. Raises NotDetermined where there are none, or where the
+    frames are too small to be split into cells."""
     every = conditions(study)
     least_px = LEAST_CELL_PX * max(CELLS)
     if min(study.camera.rows, study.camera.cols) < least_px:
@@ -178,7 +178,8 @@ def dark_frames(study: Study) -> list[DarkStatistics]:
 
 
 def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDArray[np.bool_]) -> DarkStatistics:
-    """The statistics of one condition. `sound` (rows, cols): mask of the pixels that count in the frames' means."""
+    """Return the statistics of one condition. `sound` (rows, cols): mask of the pixels that count in the frames'
+    means."""
     means: dict[str, float] = {}
     mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
     changing: dict[bool, _Contrasts] = {}
@@ -271,7 +272,8 @@ class _Mean:
 
 
 def _pattern(mean: Image, part: list[Image], captures: tuple[str, ...]) -> DarkPattern:
-    """The fixed pattern of the mean of the frames of `captures`, and of the median of `part`, the first of them."""
+    """Return the fixed pattern of the mean of the frames of `captures`, and of the median of `part`, the first of
+    them."""
     away, local = from_surroundings(part)
     z = away / local
     edges = np.array([-np.inf, -TAIL_EDGES[1], -TAIL_EDGES[0], *TAIL_EDGES, np.inf])
@@ -327,13 +329,14 @@ def fine_conditions(step: str, frames: Sequence[DarkStatistics], least_dn: float
 
 
 def by_part(frames: Sequence[DarkStatistics]) -> dict[bool, list[DarkNoise]]:
-    """The temporal statistics of all conditions: seen (False) and held out (True), each only where there are any."""
+    """Return the temporal statistics of all conditions: seen (False) and held out (True), each only where there are
+    any."""
     parts = {out: [f.changing[out] for f in frames if out in f.changing] for out in (False, True)}
     return {out: part for out, part in parts.items() if part}
 
 
 def too_coarse(frames: Sequence[DarkStatistics], limit_dn: float) -> str:
-    """The reason why dark frames of so little noise aren't judged, in one line."""
+    """Return the reason why dark frames of so little noise aren't judged, in one line."""
     noise = min(np.sqrt(c.pixel_dn2) for f in frames for c in f.changing.values())
     return (
         f"the temporal noise of dark frames is {noise:.2f} DN, below the limit of {limit_dn} DN: codes are too coarse "

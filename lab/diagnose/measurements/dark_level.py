@@ -110,7 +110,7 @@ def _rounding_dn(frames: DarkStatistics) -> float:
 
 
 def black_level_block(study: Study) -> Block:
-    """The measured black level against the stated one, DN. No effect changes it: a wrong statement is no effect.
+    """Return the measured black level against the stated one, DN. No effect changes it: a wrong statement is no effect.
 
     Raises NotDetermined where none is stated.
     """

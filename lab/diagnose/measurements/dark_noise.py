@@ -9,7 +9,7 @@ from lab.diagnose.measurements.block import Block, Label, Measurement, Predictio
 from lab.diagnose.measurements.dark_frames import DEFECTS, captures_of, dark_frames, too_coarse
 from lab.diagnose.measurements.dark_level import added_dark_e_per_s
 from lab.errors import NotDetermined
-from lab.measure.pixel_outliers import CLIP
+from lab.measure.noise_figures import CLIP
 from lab.measure.study import Study
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
@@ -83,7 +83,7 @@ def dark_noise_block(study: Study) -> Block:
 
 
 def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn2: float) -> float:
-    """What defective pixels add to the mean variance (DN^2) of contrasts that are clipped at `CLIP` standard
+    """Return what defective pixels add to the mean variance (DN^2) of contrasts that are clipped at `CLIP` standard
     deviations."""
     cut = CLIP * np.sqrt(variance_dn2)
     more = 0.0

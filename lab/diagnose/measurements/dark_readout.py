@@ -5,16 +5,256 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from lab.diagnose.measurements.dark_frames import DarkCondition, conditions
-from lab.diagnose.measurements.dark_lines import LEAST_LINE_DN
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
+from lab.diagnose.measurements.dark_frames import (
+    CELL_FLOOR_DN,
+    DarkCondition,
+    DarkStatistics,
+    by_part,
+    captures_of,
+    conditions,
+    dark_frames,
+    fine_conditions,
+)
+from lab.diagnose.measurements.line_spectra import LEVEL_BAND, Bands, log_mean_bias, log_mean_variance
+from lab.errors import NotDetermined
+from lab.measure.reads import ADDED, LINES
 from lab.measure.study import Study
+from sim.effects.base import Effects
 from sim.sensor import mosaic
+from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+# --- dark lines ------------------------------------------------------------------------------------------------------
+# Row and column noise of dark frames, fixed row and column patterns, and the correlation of noise along rows and
+# columns.
+
+
+BANDS = 6  # of a spectrum across lines
+POWER_FLOOR = 0.02  # relative standard deviation of a band's power: a healthy read-out isn't exactly white
+LEAST_LINE_DN = 0.3  # temporal noise of a pixel below which codes are too coarse
+
+
+def temporal_line_block(lines: Lines, study: Study) -> Block:
+    """Temporal row (column) noise: ln of the power spectrum of the lines' means over that of white noise, by frequency
+    band.
+
+    0 where pixels are independent. Raises NotDetermined without repeats, and where codes are too coarse.
+    """
+    frames = study.once(dark_frames)
+    name = "row_noise" if lines == "rows" else "column_noise"
+    fine = fine_conditions(f"dark_{name}", frames, LEAST_LINE_DN)
+    parts = by_part(fine)
+    frequency = next(iter(parts.values()))[0].lines[lines][0]
+    # narrow bands at low frequencies tell a ripple of a few cycles a frame from correlated row noise
+    bands = Bands.of(frequency, 8, 1.5)
+    length = study.camera.cols if lines == "rows" else study.camera.rows
+    value, variance, labels, inverse = [], [], [], []
+    for out, part in parts.items():
+        weight = np.array([min(c.contrasts, 6) for c in part], float)
+        power = np.average([c.lines[lines][1] for c in part], axis=0, weights=weight)
+        modes, level = bands.modes * weight.sum(), sum(c.lines[lines][2] for c in part)
+        value.append(np.log(bands.mean(power)) - log_mean_bias(modes) - log_mean_bias(level))
+        variance.append(log_mean_variance(modes) + 1.0 / level + POWER_FLOOR**2)
+        inverse.append(np.full(len(modes), float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))))
+        ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
+        labels += [Label(float(x), "all", "temporal", ids, out) for x in bands.middle]
+    over = np.concatenate(inverse) * study.noise.gain**2 * length
+    sets = len(parts)
+
+    def predict(effects: Effects) -> Prediction:
+        total = np.zeros(len(frequency))
+        for one in Uniform(study.camera, effects).lines:
+            if one.lines == lines:
+                total += one.spectrum_e2(frequency, fixed=False)
+        return Prediction(np.log1p(over * np.tile(bands.mean(total), sets)), {})
+
+    n = len(labels)
+    return Block(
+        measurement=ROW_NOISE if lines == "rows" else COLUMN_NOISE, reach=0.1, value=np.concatenate(value),
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES,
+        predict=predict, scale=np.ones(n),
+    )  # fmt: skip
+
+
+def fixed_line_block(lines: Lines, study: Study) -> Block:
+    """Fixed row (column) pattern in the mean frame of the shortest exposure.
+
+    The numbers are ln of the power spectrum of the lines' means over that of white noise, by frequency band, and the
+    mean of odd lines less that of even ones, DN. Raises NotDetermined where codes are too coarse.
+    """
+    frames = study.once(dark_frames)
+    name = "row_pattern" if lines == "rows" else "column_pattern"
+    first = next(f for f in frames if f.fixed)
+    if min(part.white_dn2 for part in first.fixed.values()) < 1e-3:
+        raise NotDetermined(
+            f"dark_{name}", "dark frames have no noise and no pattern: codes are too coarse to show one"
+        )
+    frequency = next(iter(first.fixed.values())).lines[lines][0]
+    bands = Bands.of(frequency, BANDS)
+    length = study.camera.cols if lines == "rows" else study.camera.rows
+    size = study.camera.rows * study.camera.cols
+    value: list[FloatArray] = []
+    labels: list[Label] = []
+    factor: list[FloatArray] = []
+    share = _fixed_share(first)
+    for out, part in first.fixed.items():
+        _, power, level = part.lines[lines]
+        value.append(np.log(bands.mean(power)) - log_mean_bias(bands.modes) - log_mean_bias(level))
+        labels += [Label(float(x), "all", "fixed", part.captures, out) for x in bands.middle]
+        factor.append(np.full(len(bands.middle), study.noise.gain**2 * length / part.white_dn2))
+    pieces = len(first.fixed)
+    one = np.diag(log_mean_variance(bands.modes))
+    correlation = np.array([[1.0 if a == b else share[a] * share[b] for b in first.fixed] for a in first.fixed])
+    covariance = np.kron(correlation, one) + np.eye(pieces * len(one)) * (POWER_FLOOR**2 + 0.01**2)
+    parity = np.array([part.parity_dn[lines] for part in first.fixed.values()])
+    pixel = np.array([4.0 * part.white_dn2 / size for part in first.fixed.values()])
+    offset = np.array([4.0 * part.line_dn2[lines] * length / size for part in first.fixed.values()])
+    parity_cov = (
+        np.sqrt(np.outer(pixel, pixel)) * correlation
+        + np.sqrt(np.outer(offset, offset))
+        + np.eye(pieces) * CELL_FLOOR_DN**2
+    )
+    n = len(covariance)
+    whole = np.zeros((n + pieces, n + pieces))
+    whole[:n, :n], whole[n:, n:] = covariance, parity_cov
+    labels += [Label(0.5, "all", "odd and even", part.captures, out) for out, part in first.fixed.items()]
+    std = np.sqrt(np.diag(parity_cov))
+
+    def predict(effects: Effects) -> Prediction:
+        still, moving, odd = np.zeros(len(frequency)), np.zeros(len(frequency)), 0.0
+        model = Uniform(study.camera, effects)
+        if model.adds_signal:
+            means = model.added_e.mean(axis=1 if lines == "rows" else 0)
+            # the periodogram's frequencies above 0 and below 0.5 cy/px
+            still += (np.abs(np.fft.rfft(means)) ** 2 / len(means))[1 : 1 + len(frequency)]
+            odd += float(means[1::2].mean() - means[::2].mean())
+        for one in model.lines:
+            if one.lines == lines:
+                still += one.spectrum_e2(frequency, fixed=True)
+                moving += one.spectrum_e2(frequency, fixed=False)
+                odd += one.odd_even_e
+        parts = zip(factor, first.fixed.values(), strict=True)
+        power = np.concatenate([np.log1p(f * bands.mean(still + moving / part.frames)) for f, part in parts])
+        return Prediction(np.concatenate([power, np.full(pieces, study.noise.gain * odd)]), {})
+
+    return Block(
+        measurement=ROW_PATTERN if lines == "rows" else COLUMN_PATTERN, reach=0.1,
+        value=np.concatenate([*value, parity]), covariance=whole, labels=tuple(labels),
+        reads=LINES | ADDED, predict=predict,
+        scale=np.concatenate([np.ones(n), 10.0 * std]),
+    )  # fmt: skip
+
+
+def _fixed_share(frames: DarkStatistics) -> dict[bool, float]:
+    """Share of the mean frame's pixel variance that is fixed, and so common to seen and held-out frames, by part."""
+    changing = next((c.white_dn2 for c in frames.changing.values()), None)
+    if changing is None:
+        return dict.fromkeys(frames.fixed, 0.0)
+    return {
+        out: float(np.clip(1.0 - changing / part.frames / part.white_dn2, 0.0, 1.0))
+        for out, part in frames.fixed.items()
+    }
+
+
+def correlation_block(study: Study) -> Block:
+    """Correlation of temporal noise along rows and columns: ln of its power at low frequencies over that of white
+    noise.
+
+    The means of the lines are excluded. 0 where pixels are independent. Raises NotDetermined where codes are too coarse
+    or frames too small.
+    """
+    fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN)
+    value, variance, labels = [], [], []
+    for out, part in by_part(fine).items():
+        ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
+        weight = np.array([min(c.contrasts, 6) for c in part], float)
+        for lines in ("rows", "columns"):
+            frequency = part[0].along[lines][0]
+            if len(frequency) < 1:
+                continue
+            power = np.average([c.along[lines][1] for c in part], axis=0, weights=weight)
+            modes = np.sum([c.along[lines][2] for c in part], axis=0)
+            level = sum(c.lines[lines][2] for c in part)
+            bands = Bands.of(frequency, 3)
+            total = np.array([modes[a:b].sum() for a, b in zip(bands.first, bands.last, strict=True)])
+            value.append(np.log(bands.mean(power)) - log_mean_bias(total) - log_mean_bias(level))
+            variance.append(1.0 / total + 1.0 / level + POWER_FLOOR**2)
+            labels += [Label(float(x), "all", f"along {lines}", ids, out) for x in bands.middle]
+    if not labels:
+        raise NotDetermined(
+            "dark_correlation",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share is measured from "
+            f"{int(np.ceil(1.0 / LEVEL_BAND[0]))} px a side on",
+        )
+    n = len(labels)
+    # no effect predicts an excess: row and column noise has no spectrum along its lines
+    return Block(
+        measurement=DARK_CORRELATION, reach=0.03, value=np.concatenate(value),
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES,
+        predict=lambda effects: Prediction(np.zeros(n), {}), scale=np.ones(n),
+    )  # fmt: skip
+
+
+DARK_CORRELATION = Measurement(
+    "dark_correlation",
+    title="correlation along the lines of dark frames",
+    order=180,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=correlation_block,
+    quantity="power over white noise, ln",
+    conditions="direction",
+)
+ROW_NOISE = Measurement(
+    "dark_row_noise",
+    title="row noise of dark frames",
+    order=140,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(temporal_line_block, "rows"),
+    quantity="power over single pixels', ln",
+)
+COLUMN_NOISE = Measurement(
+    "dark_column_noise",
+    title="column noise of dark frames",
+    order=150,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(temporal_line_block, "columns"),
+    quantity="power over single pixels', ln",
+)
+ROW_PATTERN = Measurement(
+    "dark_row_pattern",
+    title="fixed row pattern of dark frames",
+    order=160,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(fixed_line_block, "rows"),
+    quantity="power over single pixels', ln",
+    conditions="pattern",
+)
+COLUMN_PATTERN = Measurement(
+    "dark_column_pattern",
+    title="fixed column pattern of dark frames",
+    order=170,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(fixed_line_block, "columns"),
+    quantity="power over single pixels', ln",
+    conditions="pattern",
+)
+
+
+# --- dark readout ------------------------------------------------------------
+
 
 MOST_FRAMES = 12  # of a condition
 #: Prior relative standard deviation of the cube root of a band's power about its neighbours': a factor of 2.2 in power.
@@ -49,7 +289,7 @@ class DarkReadOut:
     frames: int  # that it is the mean of
 
     def noise(self, bands: Sequence[range]) -> DarkRowPower:
-        """The noise of rows in `bands`, each a range of cycles a frame.
+        """Return the noise of rows in `bands`, each a range of cycles a frame.
 
         With a = `contrasts` x cycles of the band, its power P is gamma-distributed about the true one, tau, and P^(1/3)
         has the mean tau^(1/3) G(a + 1/3) / G(a) / a^(1/3), G the gamma function. Without other knowledge tau^(1/3) then
@@ -72,8 +312,8 @@ class DarkReadOut:
         return DarkRowPower(power, np.hypot(std, LIGHT_STD * np.maximum(power, 0.0)))
 
     def offsets(self, bands: Sequence[range], step: int) -> DarkRowPower:
-        """The power of the rows of `offsets_dn` that isn't in those of light frames: their noise, and what may differ
-        by `OFFSETS_STD`."""
+        """Return the power of the rows of `offsets_dn` that isn't in those of light frames: their noise, and what may
+        differ by `OFFSETS_STD`."""
         rows = row_profile(self.offsets_dn, step)
         fixed = np.abs(np.fft.rfft(rows)) ** 2 / len(rows)
         modes = np.array([len(band) for band in bands], float)
@@ -90,8 +330,8 @@ def row_profile(frame: NDArray[np.floating], step: int) -> FloatArray:
 
 
 def dark_readout(study: Study) -> DarkReadOut | None:
-    """What repeated dark frames show of the read-out; None where there are none, or their codes are too coarse to show
-    it.
+    """Return what repeated dark frames show of the read-out; None where there are none, or their codes are too coarse
+    to show it.
 
     Noise is measured by Helmert contrasts: frame k less the mean of those before it, times sqrt(k / (k + 1)). Fixed
     offsets are those of exposures up to the longest flat's, as a dark current that differs from pixel to pixel grows

@@ -16,7 +16,7 @@ from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.errors import NotDetermined
-from lab.measure.halo_light import Surroundings, halo_light, harmonics
+from lab.measure.patches import Surroundings, halo_light, harmonics
 from lab.measure.plane_means import channel_pixels
 from lab.measure.reads import REFLECTIONS, acting
 from lab.measure.rounding import rounding_std_dn
@@ -147,8 +147,8 @@ def _dark_squares(
     held_out: bool,
     blacks: int,
 ) -> list[_DarkSquares]:
-    """The dark squares of a pattern in each channel. `part`: its captures; `shown`, `white`, `black`: mean frames of
-    the pattern, of the lit and of the dark screen; `blacks`: number of dark-screen captures."""
+    """Return the dark squares of a pattern in each channel. `part`: its captures; `shown`, `white`, `black`: mean
+    frames of the pattern, of the lit and of the dark screen; `blacks`: number of dark-screen captures."""
     camera, noise = study.camera, study.noise
     found = []
     step = mosaic.step(camera.cfa)

@@ -142,7 +142,7 @@ class _DefectClass:
 
 
 def _defect_classes(model: Uniform, gain: float, exposure_s: float) -> list[_DefectClass]:
-    """The defective pixels of a model's effects, by the nodes of their distributions of size."""
+    """Return the defective pixels of a model's effects, by the nodes of their distributions of size."""
     found = []
     for hot in model.hot:
         found += [_DefectClass(float(s), gain * float(x) * exposure_s, 0.0) for s, x in zip(*hot.nodes(), strict=True)]

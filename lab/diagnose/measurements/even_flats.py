@@ -26,7 +26,7 @@ class FlatLevel:
 
 
 def _unclipped(study: Study, capture: Any) -> bool:
-    """Whether no channel of the capture clips."""
+    """Return whether no channel of the capture clips."""
     return all(m is not None for m in study.levels(capture).mean.values())
 
 
@@ -87,8 +87,8 @@ def _green_dark(study: Study) -> float:
 
 
 def green_planes(study: Study, frame: Any) -> tuple[Any, Any]:
-    """The green pixels on red rows, without those at the border, and for each the mean of its four diagonal neighbours,
-    the greens on blue rows. A gradient of the light cancels in their ratio."""
+    """Return the green pixels on red rows, without those at the border, and for each the mean of its four diagonal
+    neighbours, the greens on blue rows. A gradient of the light cancels in their ratio."""
     row, col = mosaic.phases(study.camera.cfa)["G"][0]
     red_rows = frame[row + 2 * (row == 0) : -1 : 2, col + 2 * (col == 0) : -1 : 2]
     first = row + 2 * (row == 0) - 1, col + 2 * (col == 0) - 1

@@ -99,8 +99,8 @@ def shading_block(study: Study) -> Block:
 
 
 def _planes(study: Study) -> list[_ChannelCells]:
-    """The mean of the brightest levels' frames by channel, seen and held-out ones apart. Levels are ranked by rounded
-    means, so that noise doesn't choose."""
+    """Return the mean of the brightest levels' frames by channel, seen and held-out ones apart. Levels are ranked by
+    rounded means, so that noise doesn't choose."""
     out = study.once(held_out_flats)
     groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
     groups.sort(key=lambda g: -float(np.round(np.mean(list(study.levels(g[0]).whole.values())), 0)))
@@ -115,7 +115,7 @@ def _planes(study: Study) -> list[_ChannelCells]:
 
 
 def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_ChannelCells]:
-    """The mean of some captures above the dark level, by channel."""
+    """Return the mean of some captures above the dark level, by channel."""
     noise, step = study.noise, mosaic.step(study.camera.cfa)
     total: dict[str, FloatArray] = {}
     inverse_per_dn: dict[str, float] = {}

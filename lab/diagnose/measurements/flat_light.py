@@ -27,7 +27,7 @@ class FlatLight:
 
 
 def reading(study: Study, flat: FlatCapture) -> FlatLight | None:
-    """The stated light of a flat; None where nothing is stated, or where exposure or photon number is 0."""
+    """Return the stated light of a flat; None where nothing is stated, or where exposure or photon number is 0."""
     if flat.radiance is not None:
         return FlatLight(flat.radiance, study.lamps[flat.radiance], flat.radiance)
     light = stated_light(flat)

@@ -129,8 +129,8 @@ def differing_light(camera: CameraModel, effects: Effects) -> FloatArray | None:
 def without_dark(
     study: Study, dark: DarkReadOut, levels: Sequence[FlatLevel], image: FloatArray
 ) -> tuple[FloatArray, float]:
-    """The mean image of flat `levels` without the offsets of dark frames, (rows, cols), and the variance that their
-    noise adds to a pixel."""
+    """Return the mean image of flat `levels` without the offsets of dark frames, (rows, cols), and the variance that
+    their noise adds to a pixel."""
     signal = np.array([float(np.mean(list(u.mean.values()))) for u in levels])
     # each frame of the image counts by its signal, and is divided by that of the plane
     weight = np.where(signal >= LEAST_SIGNAL * study.noise.read_dn, signal * [len(u.captures) for u in levels], 0.0)

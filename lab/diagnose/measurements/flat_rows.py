@@ -142,8 +142,8 @@ def flicker_block(study: Study) -> Block:
 
 
 def _is_lit(study: Study, capture: Any) -> bool:
-    """Whether a flat's signal exceeds the noise by as much as one that is part of a mean image: rows are relative to
-    it."""
+    """Return whether a flat's signal exceeds the noise by as much as one that is part of a mean image: rows are
+    relative to it."""
     signal = float(np.mean(list(study.levels(capture).whole.values()))) - dark_level_dn(study, capture)
     return signal >= LEAST_SIGNAL * study.noise.read_dn
 
@@ -166,7 +166,7 @@ def _bands(rows: int, highest_cy_per_row: float) -> list[range]:
 def _measured(
     study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[range], offsets_dn: FloatArray
 ) -> list[_Level]:
-    """The levels of groups of repeated flats, without the rows' fixed `offsets_dn` (rows,)."""
+    """Return the levels of groups of repeated flats, without the rows' fixed `offsets_dn` (rows,)."""
     step, cols = mosaic.step(study.camera.cfa), study.camera.cols
     out = study.once(held_out_flats)
     profiles, pixels, signals = [], [], []
@@ -218,8 +218,8 @@ def _measured(
 
 
 def _any_row_noise(study: Study, levels: Sequence[_Level]) -> DarkRowPower:
-    """The noise of rows where no dark frames tell it: what is most like the seen flats beside light that varies from
-    row to row, and so wide a standard deviation that any other is as good.
+    """Return the noise of rows where no dark frames tell it: what is most like the seen flats beside light that varies
+    from row to row, and so wide a standard deviation that any other is as good.
 
     A prediction is linear in this power, and so it is taken about the likeliest: of the seen levels' power P = 1 + x
     `row_share` + y / `variance` by least squares with x, y >= 0, x up to `MOST_ROW_NOISE` times the read noise's
@@ -269,8 +269,8 @@ def _added_power(
 
 
 def _nearest(rows: FloatArray, by_phase: FloatArray) -> FloatArray:
-    """The light (frames, rows) of least squares from rows (frames, rows), of `by_phase` (phases, rows), interpolated
-    linearly between
+    """Return the light (frames, rows) of least squares from rows (frames, rows), of `by_phase` (phases, rows),
+    interpolated linearly between
     phases: it is continuous in the law's parameters."""
     phases = len(by_phase)
     mismatch = np.square(by_phase).sum(1) - 2.0 * rows @ by_phase.T

@@ -143,7 +143,7 @@ def _cell_shares(shape: tuple[int, int]) -> FloatArray:
 
 
 def _by_level(study: Study, levels: Sequence[FlatLevel], rows_dn2: float) -> list[_Ratio]:
-    """The ratios of flats, one a level."""
+    """Return the ratios of flats, one a level."""
     found = []
     for u in levels:
         signal = u.mean["G2"]
@@ -161,7 +161,7 @@ def _by_level(study: Study, levels: Sequence[FlatLevel], rows_dn2: float) -> lis
 
 
 def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
-    """The ratios of unclipped narrowband captures, one a capture."""
+    """Return the ratios of unclipped narrowband captures, one a capture."""
     found = []
     groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
     for i, group in enumerate(groups):
@@ -192,7 +192,7 @@ GREENS = COLLECTED | KERNELS
 
 
 def _predicted_ratio(ratio: _Ratio, effects: Effects, study: Study) -> float:
-    """The ratio less 1 in a small uniform frame of the measured signals, with effects."""
+    """Return the ratio less 1 in a small uniform frame of the measured signals, with effects."""
     shape = TILE_ROWS, TILE_COLS
     electrons = {c: np.full(shape, max(m, 0.0) / study.noise.gain) for c, m in ratio.mean.items()}
     tile = mosaic.assemble(electrons, study.camera.cfa)

@@ -8,8 +8,8 @@ import numpy as np
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.row_light import ROW_LIGHT, row_light_variance
 from lab.errors import NotDetermined
+from lab.measure.noise_figures import RepeatedMeans, repeated_levels, steady
 from lab.measure.reads import LAG, acting
-from lab.measure.repeatability import RepeatedMeans, repeated_levels, steady
 from lab.measure.study import Study, held_out_flats
 from sim.effects.base import Effects
 from sim.uniform import Uniform
@@ -76,7 +76,7 @@ def level_repeats_block(study: Study) -> Block:
 
 
 def _seen(study: Study) -> list[RepeatedMeans]:
-    """The repeats that aren't held out, of settings in line with each other (`steady`)."""
+    """Return the repeats that aren't held out, of settings in line with each other (`steady`)."""
     noise, out = study.noise, study.once(held_out_flats)
     found = []
     for one in repeated_levels(study, noise.black, noise.gain, noise.read_dn):

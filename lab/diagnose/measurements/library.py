@@ -23,5 +23,5 @@ def measurements() -> tuple[Measurement, ...]:
 
 
 def measurement_title(name: str) -> str:
-    """A measurement's title in reports; its name in words where it no longer exists, as in an older result."""
+    """Return a measurement's title in reports; its name in words where it no longer exists, as in an older result."""
     return next((one.title for one in measurements() if one.name == name), name.replace("_", " "))

@@ -53,7 +53,7 @@ class LineMeans:
         return columns
 
     def _of_captures(self, lines: str, name: str, std_dn: float) -> Iterator[tuple[str, FloatArray]]:
-        """The columns of one strength, one for each capture."""
+        """Yield the columns of one strength, one for each capture."""
         sign = {c: 1.0 if name == "mean" else _even_over_odd(self._study, lines, c) for c in {*self._channels}}
         change = std_dn * np.array([sign[c] for c in self._channels])
         for capture, mine in self._at.items():

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import digamma, polygamma
 
-from lab.measure.pixel_outliers import Image
+from lab.measure.noise_figures import Image
 from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 
@@ -70,7 +70,7 @@ class Periodogram:
 
 
 def periodogram(image: Image) -> Periodogram:
-    """The periodogram of an image less its mean."""
+    """Return the periodogram of an image less its mean."""
     spectrum = fft.rfft2(image - np.float32(image.mean(dtype=np.float64)))
     table = (spectrum.real.astype(float) ** 2 + spectrum.imag.astype(float) ** 2) / image.size
     return Periodogram(table, fft.fftfreq(image.shape[0]), fft.rfftfreq(image.shape[1]))

@@ -12,8 +12,8 @@ from lab.diagnose.measurements.block import LEVEL_REACH, Block, Label, Measureme
 from lab.diagnose.measurements.flat_light import FlatLight, reading, relative_rates
 from lab.diagnose.measurements.uniform_levels import UniformLevels
 from lab.errors import NotDetermined
+from lab.measure.noise_figures import level_std, weighted_median
 from lab.measure.reads import DARK_CURRENT, LAG, LINES, acting
-from lab.measure.repeatability import level_std, weighted_median
 from lab.measure.rounding import rounding_std_dn
 from lab.measure.study import Study, held_out_flats
 from sim.effects.base import Effects
@@ -149,7 +149,7 @@ def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], 
 
 
 def _setting(capture: FlatCapture) -> str:
-    """The setting of a flat in words: exposure, and photons where they are stated."""
+    """Return the setting of a flat in words: exposure, and photons where they are stated."""
     if capture.photons_per_pixel is None:
         return f"{capture.exposure_s:.4g} s"
     return f"{capture.photons_per_pixel:.6g} photons, {capture.exposure_s:.4g} s"

@@ -16,39 +16,447 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import fft, ndimage
+from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
-from lab.diagnose.measurements.pattern_canvas import (
-    BeyondPart,
-    Canvas,
-    below_nyquist,
-    channel_pixels,
-    from_middle,
-    lens_otf,
-    mask_points,
-    pattern_window,
-)
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.errors import NotDetermined
 from lab.measure.reads import SHOWN, acting
-from lab.measure.screen_registration import ScreenWarp, register
+from lab.measure.screen_registration import ScreenWarp, draw_by_area, register
 from lab.measure.study import Study, held_out_of
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
-from sim.frame import with_reflections
+from sim.frame import screen_light, with_reflections
 from sim.optics.diffraction import aperture_otf
+from sim.point import (
+    TRANSFER_AT,
+    common_wavelengths,
+    detected_transfer,
+    mix_channels,
+    mixes_colours,
+    optical_transfer,
+    transfer_at,
+)
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import electron_rate
+
+# --- pattern canvas --------------------------------------------------------------------------------------------------
+# A random pattern on a screen, drawn at the place in the camera's frame where the registration finds it.
+
+
+OVERSAMPLE = 4  # samples a pixel, along rows and columns
+LARGEST_PX = 320  # largest side of the window that is fitted: enough for a band's contrast to 1e-3
+MARGIN_PX = 12  # border of frame and window that isn't fitted, as the drawing lacks the light from outside
+MARGIN_CELLS = 2.0  # border of the pattern that isn't fitted
+#: Rings above 0.5 cy/px, by the larger of |fx| and fy, that alias. Each is one term of the fit and isn't reported. The
+#: inner edges divide it into finer rings, at whose mean frequencies an effect's OTF is evaluated.
+BEYOND_CY_PER_PX = ((0.5, 0.54, 0.58, 0.62), (0.62, 0.68, 0.74, 0.8), (0.8, 0.9, 1.0, 1.15, 1.35, 4.0))
+LEAST_PIXELS = 1500  # of a channel
+
+
+def mask_points(mask: NDArray[np.bool_], window: tuple[slice, slice]) -> FloatArray:
+    """(x, y) in the frame, px, of the pixels that a mask of the window marks, (pixels, 2)."""
+    row, col = np.nonzero(mask)
+    return np.column_stack([col + window[1].start, row + window[0].start]).astype(float)
+
+
+def from_middle(camera: CameraModel, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """x and y of points (n, 2) from the frame's middle, in half diagonals, and the squared distance; (n,) each."""
+    half = camera.half_diagonal_px
+    u, v = ((points - 0.5 * np.array([camera.cols - 1, camera.rows - 1])) / half).T
+    return u, v, u * u + v * v
+
+
+def pattern_window(seen: FloatArray, warp: ScreenWarp, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Return the window of the frame that is fitted: rows and columns about the pattern's middle, in even numbers and
+    beginning at even ones.
+
+    Raises NotDetermined where the pattern lies outside the frame.
+    """
+    row, col = (np.arange(0, n, 4) for n in seen.shape)
+    x, y = np.meshgrid(col, row)
+    cells = warp.cells(np.column_stack([x.ravel(), y.ravel()]).astype(float)).reshape(*x.shape, 2)
+    inside = (cells[..., 0] > 0) & (cells[..., 0] < shape[1]) & (cells[..., 1] > 0) & (cells[..., 1] < shape[0])
+    if not inside.any():
+        raise NotDetermined("bernoulli", "the pattern lies outside the frame")
+    slices = []
+    for at, length in ((y[inside], seen.shape[0]), (x[inside], seen.shape[1])):
+        low, high = max(int(at.min()) - MARGIN_PX, 0), min(int(at.max()) + MARGIN_PX + 4, length)
+        size = 2 * (min(high - low, LARGEST_PX) // 2)
+        low += (high - low - size) // 2
+        low -= low % 2  # the mosaic keeps its phase
+        slices.append(slice(low, low + size))
+    return slices[0], slices[1]
+
+
+@dataclass(frozen=True)
+class BeyondPart:
+    """A part of the drawn pattern at frequencies beyond the bands."""
+
+    picture: FloatArray  # at the window's pixels
+    fx: tuple[float, float]  # mean |fx| and |fy| of its power, cy/px, in two quadrants: (fx, fy) and (fx, -fy)
+    fy: tuple[float, float]
+
+    @staticmethod
+    def of(picture: FloatArray, fx: FloatArray, fy: FloatArray, power: FloatArray) -> BeyondPart:
+        """Return the part whose power spectrum is `power` (rows, cols / 2 + 1), at the frequencies `fx` (1, cols / 2 +
+        1) and `fy` (rows, 1)."""
+        x, y = (float(np.average(np.broadcast_to(np.abs(f), power.shape), weights=power)) for f in (fx, fy))
+        return BeyondPart(picture, (x, x), (y, -y))
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """The pattern drawn on a window of the frame, each sample the mean over its area, `OVERSAMPLE` samples a pixel."""
+
+    warp: ScreenWarp
+    window: tuple[slice, slice]
+    fine: FloatArray  # (OVERSAMPLE rows, OVERSAMPLE cols): 0 on dark cells, 1 on lit ones
+    inside: NDArray[np.bool_]  # (rows, cols): pixels inside the margins of pattern and window
+
+    @staticmethod
+    def of(target: FloatArray, warp: ScreenWarp, window: tuple[slice, slice]) -> Canvas:
+        """Draw the cells `target` (rows, columns of the pattern), where `warp` places them."""
+        y, x = (np.arange(w.start - 16.0, w.stop + 24.0, 8.0) for w in window)
+        at = warp.cells(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
+        row, col = (w.start + (np.arange(OVERSAMPLE * (w.stop - w.start)) + 0.5) / OVERSAMPLE - 0.5 for w in window)
+        cell_x, cell_y = (RectBivariateSpline(y, x, at[:, :, k])(row, col) for k in (0, 1))
+        inside = np.ones((window[0].stop - window[0].start, window[1].stop - window[1].start), bool)
+        for cell, count in ((cell_x, target.shape[1]), (cell_y, target.shape[0])):
+            middle = cell[OVERSAMPLE // 2 :: OVERSAMPLE, OVERSAMPLE // 2 :: OVERSAMPLE]
+            inside &= (middle > MARGIN_CELLS) & (middle < count - MARGIN_CELLS)
+        inside[:MARGIN_PX] = inside[-MARGIN_PX:] = False
+        inside[:, :MARGIN_PX] = inside[:, -MARGIN_PX:] = False
+        return Canvas(warp, window, np.asarray(draw_by_area(target, cell_x, cell_y), float), inside)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the window, px."""
+        return self.inside.shape[0], self.inside.shape[1]
+
+    @cached_property
+    def drawn(self) -> NDArray[np.complex128]:
+        """Fourier transform of `fine`, at all its frequencies."""
+        return np.asarray(fft.rfft2(self.fine))
+
+    @cached_property
+    def low(self) -> NDArray[np.complex128]:
+        """Fourier transform of the drawn pattern up to 0.5 cy/px, (rows, cols / 2 + 1), as of point samples at the
+        pixels' centres."""
+        return self._below(self.drawn)
+
+    def as_shown(self, effects: Effects, camera: CameraModel) -> NDArray[np.complex128]:
+        """As `low`, for the pattern as a screen with effects shows it, over the lit screen with the same effects."""
+        y, x = (
+            (w.start + (np.arange(n) + 0.5) / OVERSAMPLE - 0.5 * whole) * camera.pixel_pitch_um
+            for w, n, whole in zip(self.window, self.fine.shape, (camera.rows, camera.cols), strict=True)
+        )
+        shown, lit = self.fine, np.ones_like(self.fine)
+        shown, lit = (screen_light(camera, part, x[None, :], y[:, None], effects) for part in (shown, lit))
+        return self._below(np.asarray(fft.rfft2(shown / lit)))
+
+    def _below(self, whole: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        rows, cols = self.shape
+        part = whole[:, : cols // 2 + 1] / OVERSAMPLE**2
+        part = np.concatenate([part[: rows // 2], part[len(part) - rows // 2 :]])
+        fy, fx = self.frequencies
+        # divided by the sinc of a sample's square, and shifted from the first sample's centre to the pixel's
+        turn = np.exp(1j * np.pi * (fx + fy) * (1.0 - 1.0 / OVERSAMPLE))
+        return np.asarray(part * turn / (np.sinc(fx / OVERSAMPLE) * np.sinc(fy / OVERSAMPLE)))
+
+    @property
+    def frequencies(self) -> tuple[FloatArray, FloatArray]:
+        """fy (rows, 1) and fx (1, cols / 2 + 1), cy/px."""
+        return fft.fftfreq(self.shape[0])[:, None], fft.rfftfreq(self.shape[1])[None, :]
+
+    def passed(self, otf: CubicSpline, fill_factor: float) -> FloatArray:
+        """OTF of a lens, symmetric about the axis, times that of the pixel's aperture at `frequencies`, (rows, cols / 2
+        + 1)."""
+        fy, fx = self.frequencies
+        return np.asarray(otf(np.hypot(fx, fy)) * aperture_otf(fx, fy, fill_factor))
+
+    def picture(self, spectrum: NDArray[np.complex128]) -> FloatArray:
+        """Inverse Fourier transform: the picture (rows, cols) at the window's pixels."""
+        return np.asarray(fft.irfft2(spectrum, self.shape))
+
+    @cached_property
+    def whole(self) -> _Spectrum:
+        """Spectrum of the drawn pattern at all frequencies of the drawing, as of point samples at the pixels'
+        centres."""
+        rows, cols = self.fine.shape
+        fy, fx = fft.fftfreq(rows, 1.0 / OVERSAMPLE)[:, None], fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
+        # divided by the sinc of a sample's square, and shifted from the first sample's centre to the pixel's
+        across, down = (np.exp(1j * np.pi * f * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(f / OVERSAMPLE) for f in (fx, fy))
+        return _Spectrum(self.drawn * across * down / OVERSAMPLE**2, fx, fy)
+
+    def sampled(self, spectrum: NDArray[np.complex128]) -> FloatArray:
+        """Return the picture (rows, cols) of a spectrum like `whole`'s, sampled at the pixels, aliases included."""
+        cols = self.fine.shape[1]
+        folded = spectrum.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) * OVERSAMPLE
+        return np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE])
+
+    def beyond(self, otf: CubicSpline, fill_factor: float) -> list[list[BeyondPart]]:
+        """Return the aliased parts of the picture, from frequencies above 0.5 cy/px that the lens passes: a list for
+        each ring and each pair of opposite sectors (|fx| >= |fy| or not), of its finer rings.
+
+        Where cells are a whole number of pixels the spectrum repeats, and aliases are coherent with what lies below 0.5
+        cy/px."""
+        above = self._above(otf, fill_factor)
+        found = []
+        for edges in BEYOND_CY_PER_PX:
+            for side in (above.fx >= np.abs(above.fy), above.fx < np.abs(above.fy)):
+                parts = []
+                for low, end in pairwise(edges):
+                    part = np.where(above.between(low, end) & side, above.spectrum, 0.0)
+                    power = np.abs(part) ** 2
+                    if power.any():
+                        parts.append(BeyondPart.of(self._aliased(part, above.rows), above.fx, above.fy, power))
+                if parts:
+                    found.append(parts)
+        return found
+
+    def _above(self, otf: CubicSpline, fill_factor: float) -> _Above:
+        """Return the spectrum of the drawn pattern behind lens and pixel, up to the lens's cutoff."""
+        rows, cols = (OVERSAMPLE * n for n in self.shape)
+        highest = min(float(otf.x[-1]), 0.5 * OVERSAMPLE)
+        keep = np.abs(fft.fftfreq(rows, 1.0 / OVERSAMPLE)) < highest
+        fy = fft.fftfreq(rows, 1.0 / OVERSAMPLE)[keep, None]
+        fx = fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
+        fx = fx[:, fx[0] < highest]
+        radius = np.hypot(fy, fx)
+        high = self.drawn[keep][:, : fx.shape[1]] * otf(np.minimum(radius, highest)) * aperture_otf(fx, fy, fill_factor)
+        high *= np.exp(1j * np.pi * fx * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fx / OVERSAMPLE)
+        high *= np.exp(1j * np.pi * fy * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fy / OVERSAMPLE)
+        return _Above(np.where(radius < highest, high, 0.0), fx, fy, keep)
+
+    def _aliased(self, part: NDArray[np.complex128], rows: NDArray[np.bool_]) -> FloatArray:
+        """Return the picture (rows, cols) of a part of that spectrum, sampled at the pixels. `rows`: which rows of the
+        full spectrum it has."""
+        cols = OVERSAMPLE * self.shape[1]
+        spread = np.zeros((len(rows), part.shape[1]), complex)
+        spread[rows] = part
+        folded = np.zeros((self.shape[0], cols // 2 + 1), complex)
+        folded[:, : part.shape[1]] = spread.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) / OVERSAMPLE
+        return np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE])
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """The spectrum of the drawn pattern, and its frequencies, cy/px."""
+
+    spectrum: NDArray[np.complex128]  # (OVERSAMPLE rows, OVERSAMPLE cols / 2 + 1)
+    fx: FloatArray  # (1, OVERSAMPLE cols / 2 + 1)
+    fy: FloatArray  # (OVERSAMPLE rows, 1)
+
+
+@dataclass(frozen=True)
+class _Above:
+    """The spectrum of the drawn pattern up to the lens's cutoff."""
+
+    spectrum: NDArray[np.complex128]  # (kept rows, kept columns)
+    fx: FloatArray  # (1, kept columns), cy/px
+    fy: FloatArray  # (kept rows, 1), cy/px
+    rows: NDArray[np.bool_]  # mask of the kept rows
+
+    def between(self, low: float, end: float) -> NDArray[np.bool_]:
+        """Mask of the frequencies with low <= max(|fy|, fx) < end."""
+        largest = np.maximum(np.abs(self.fy), self.fx)
+        return np.asarray((largest >= low) & (largest < end))
+
+
+def lens_otf(study: Study, channel: str, light: Spectrum | None) -> CubicSpline:
+    """OTF of the baseline's lens without the pixel's aperture, against frequency (cy/px). On axis it is the same in all
+    directions."""
+    f = np.linspace(0.0, 2.0, 101)
+    whole = np.real(optical_transfer(study.camera, channel, light, f, 0.0 * f, (), "bernoulli"))
+    return CubicSpline(f, whole / aperture_otf(f, 0.0 * f, study.camera.fill_factor))
+
+
+def channel_pixels(study: Study, canvas: Canvas, channel: str, seen: FloatArray) -> NDArray[np.bool_]:
+    """Mask (rows, cols) of the window's pixels of a channel inside the pattern. `seen`: the frame, NaN where the screen
+    isn't.
+
+    Raises NotDetermined for fewer than `LEAST_PIXELS`.
+    """
+    mask = canvas.inside & np.isfinite(seen[canvas.window])
+    step = mosaic.step(study.camera.cfa)
+    own = np.zeros_like(mask)
+    for row, col in mosaic.phases(study.camera.cfa)[channel]:
+        own[row::step, col::step] = True
+    mask &= own
+    if mask.sum() < LEAST_PIXELS:
+        raise NotDetermined(
+            "bernoulli", f"only {mask.sum()} pixels of channel {channel} see the pattern, {LEAST_PIXELS} needed"
+        )
+    return mask
+
+
+def below_nyquist(canvas: Canvas) -> NDArray[np.bool_]:
+    """Mask of the frequencies below 0.5 cy/px along both axes."""
+    fy, fx = canvas.frequencies
+    return np.asarray((np.abs(fy) < 0.5) & (fx < 0.5))
+
+
+# --- pattern contrast ------------------------------------------------------------------------------------------------
+# Contrast of the image of a random pattern over that of the baseline camera, by spatial frequency, orientation and
+# channel.
+
+
+LARGEST_STD = 0.04  # bands of a larger standard deviation aren't used
+CONTRAST_FLOOR = 0.0015  # standard deviation of a band's contrast beside noise: drawing and registration
+CONTRAST_SCALE_STD = (
+    0.01  # prior standard deviation of the contrast's scale, for each channel of seen and held-out repeats
+)
+SCREEN_BLUR_PX = 0.08  # prior standard deviation of the Gaussian blur of the cells' borders
+PLACINGS = 4  # Gauss-Newton steps that find an image's shift
+
+
+def contrast_block(study: Study) -> Block:
+    """Contrast of a random pattern over that of the baseline, by frequency, orientation and channel: the bands'
+    coefficients of `pattern_fit`.
+
+    Nuisance parameters: the contrast's scale, and a blur of the screen's cells. Raises NotDetermined where no band is
+    known to `LARGEST_STD`.
+    """
+    found = patterns(study)
+    labels: list[Label] = []
+    places: list[tuple[int, Pattern, int]] = []
+    for number, group in enumerate(found):
+        for p in group:
+            spread = np.sqrt(np.diag(p.shown + p.common))
+            for b, band in enumerate(p.bands):
+                if spread[b] < LARGEST_STD and b > 0:  # the lowest band is that of white and black levels
+                    places.append((number, p, b))
+                    labels.append(Label(band.frequency, p.channel, f"{band.angle_deg:.0f} deg", p.captures, p.held_out))
+    if not places:
+        raise NotDetermined("bernoulli", "the patterns are too noisy, or too few of their cells are in view")
+    value = np.array([p.value[b] for _, p, b in places])
+    frequency = np.array([label.x for label in labels])
+    covariance = joint_covariance(places, study) + np.diag(np.full(len(value), CONTRAST_FLOOR**2))
+    scales = [f"pattern:{number}:{p.channel}:{p.held_out}" for number, p, _ in places]
+    # seen and held-out repeats of a pattern share one prediction
+    poses: list[dict[str, tuple[Pattern, list[int], list[int]]]] = [{} for _ in found]
+    for k, (number, p, b) in enumerate(places):
+        _, members, parts = poses[number].setdefault(p.channel, (p, [], []))
+        members.append(k)
+        parts.append(b)
+    poses = [sights for sights in poses if sights]
+    plain = [_transfers(study, sights, ()) for sights in poses]
+    weights = {id(p): _node_weights(p) for sights in poses for p, *_ in sights.values()}
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.ones(len(places))
+        if effects:
+            for sights, before in zip(poses, plain, strict=True):
+                changed = _transfers(study, sights, effects) / np.where(np.abs(before) > 1e-3, before, np.inf)
+                for (p, members, parts), ratio in zip(sights.values(), changed, strict=True):
+                    real, imaginary, outside = weights[id(p)]
+                    within, beyond = np.split(ratio, [real.shape[1]])
+                    placed = _in_place(p, within)
+                    kept = real @ np.real(placed) + imaginary @ np.imag(placed) + outside @ (np.real(beyond) - 1.0)
+                    kept = kept + p.shown_by(effects)[: len(real)]
+                    mean[members] = kept[parts]
+            mean[~np.isfinite(mean)] = 1.0
+        jacobian = {"pattern:blur": -2.0 * np.square(np.pi * SCREEN_BLUR_PX * frequency) * mean}
+        for name in dict.fromkeys(scales):
+            jacobian[name] = CONTRAST_SCALE_STD * mean * np.array([s == name for s in scales])
+        return Prediction(mean, jacobian)
+
+    return Block(
+        measurement=BERNOULLI, reach=0.2, value=value, covariance=covariance,
+        labels=tuple(labels), reads=TRANSFER_AT | SHOWN | {"image.transmittance"}, predict=predict,
+        scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+def _transfers(
+    study: Study, sights: dict[str, tuple[Pattern, list[int], list[int]]], effects: Effects
+) -> NDArray[np.complex128]:
+    """OTFs of the channels of one pose, (channels, nodes), at the nodes of all bands and then of the parts beyond the
+    bands."""
+    camera, first = study.camera, next(iter(sights.values()))[0]
+    fx = np.concatenate([*(b.fx for b in first.bands), first.beyond[:, 0].ravel()])
+    fy = np.concatenate([*(b.fy for b in first.bands), first.beyond[:, 1].ravel()])
+    mixing = mixes_colours(camera, effects)
+    channels = camera.channels if mixing else tuple(sights)  # neighbours of other colours count
+    nodes, shares = common_wavelengths(camera, [(c, first.light) for c in channels], effects, "bernoulli")
+    whole = np.array([transfer_at(camera, float(w), fx, fy, effects, moving=not mixing) for w in nodes])
+    found = detected_transfer(camera, nodes, shares, whole, fx, fy, effects, first.places_um)
+    if not mixing:
+        return found
+    rates = [1.0 if first.light is None else max(electron_rate(camera, c, first.light), 0.0) for c in channels]
+    return mix_channels(camera, found, np.array(rates), fx, fy, effects)[[channels.index(c) for c in sights]]
+
+
+def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weights that take a ratio of OTFs to the bands' coefficients: of its real part and of its imaginary part at the
+    bands' nodes, (bands, nodes) each, and of its real part at the frequencies of the parts beyond, (bands,
+    frequencies).
+
+    The real part is split into even powers of the frequency, fitted over the nodes by least squares, and a rest. The
+    rest, and the imaginary part, enter by their means over the lower and the upper half of each band.
+    """
+    fx, fy = (np.concatenate([getattr(band, name) for band in p.bands]) for name in ("fx", "fy"))
+    halves = np.zeros((2 * len(p.bands), len(fx)))
+    start = 0
+    for k, band in enumerate(p.bands):
+        own = slice(start, start + len(band.fx))
+        start += len(band.fx)
+        for row, use in zip(halves[2 * k : 2 * k + 2], (~band.upper, band.upper), strict=True):
+            share = np.where(use, band.share, 0.0)
+            row[own] = share / share.sum() if share.sum() > 0 else band.share
+    ends = np.cumsum([EVEN_TERMS, len(halves), len(halves)])
+    smooth, by_half, by_phase, by_part = np.split(p.mix, ends, axis=1)
+    powers = np.transpose(even_powers(fx, fy))
+    weight = np.sqrt(np.concatenate([band.power * band.share for band in p.bands]))
+    fit = np.linalg.pinv(weight[:, None] * powers) * weight
+    outside = 0.5 * np.repeat(by_part, 2, axis=1)  # two frequencies each
+    return smooth @ fit + by_half @ (halves - halves @ powers @ fit), by_phase @ halves, outside
+
+
+def _in_place(p: Pattern, ratio: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return a ratio of OTFs without the shift s that the registration would take up.
+
+    s solves sum over nodes of P f Im(ratio exp(-2 pi i f s)) = 0 along both axes, P the power of the pattern, by
+    Gauss-Newton steps."""
+    if not np.any(np.abs(np.imag(ratio)) > 1e-6):
+        return ratio
+    turn = 2.0 * np.pi * np.array([np.concatenate([b.fx for b in p.bands]), np.concatenate([b.fy for b in p.bands])])
+    weight = np.concatenate([b.power * b.share for b in p.bands])
+    for _ in range(PLACINGS):
+        slope = (turn * weight * np.maximum(np.real(ratio), 0.0)) @ turn.T
+        shift = np.linalg.lstsq(slope, (turn * weight) @ np.imag(ratio), rcond=1e-9)[0]
+        ratio = ratio * np.exp(-1j * shift @ turn)
+    return ratio
+
+
+BERNOULLI = Measurement(
+    "bernoulli",
+    title="contrast of random patterns",
+    order=410,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=contrast_block,
+    quantity="contrast over the baseline's",
+    conditions="orientation",
+    conditions_words="bands at",
+)
+
+
+# --- pattern fit ------------------------------------------------------------
+
 
 RINGS_CY_PER_PX = (0.0, 0.03, 0.08, 0.14, 0.2, 0.27, 0.34, 0.42, 0.5)  # edges of the bands in frequency
 SECTORS = 4  # bands in orientation: about 0, 45, 90, 135 degrees
@@ -121,8 +529,8 @@ class Band:
 
 
 def patterns(study: Study) -> list[list[Pattern]]:
-    """The fits of all Bernoulli patterns, computed once a study: a list for each (pose, target), by channel, seen and
-    held out.
+    """Return the fits of all Bernoulli patterns, computed once a study: a list for each (pose, target), by channel,
+    seen and held out.
 
     Raises NotDetermined where f-number or pixel pitch isn't stated, and where no pattern is fitted.
     """
@@ -179,8 +587,8 @@ def _measured(
     boards: Sequence[Any],
     out: set[str],
 ) -> list[Pattern]:
-    """The fits of one pattern at one pose. `group`: its captures, of which those in `out` are held out; `boards`:
-    checkerboards."""
+    """Return the fits of one pattern at one pose. `group`: its captures, of which those in `out` are held out;
+    `boards`: checkerboards."""
     camera = study.camera
     white, black = mean_rate(study, whites), mean_rate(study, blacks)
     contrast = white - black
@@ -323,7 +731,7 @@ def _refined(
     channel: str,
     light: Spectrum | None,
 ) -> ScreenWarp:
-    """The registration `warp`, improved on the pattern itself by a Gauss-Newton step."""
+    """Return the registration `warp`, improved on the pattern itself by a Gauss-Newton step."""
     canvas, otf = Canvas.of(target, warp, window), lens_otf(study, channel, light)
     mask = channel_pixels(study, canvas, channel, seen)
     whole = canvas.whole
@@ -391,8 +799,8 @@ class _LinearModel:
         turned: FloatArray,
         laid: FloatArray,
     ) -> _LinearModel:
-        """The model of a channel. `seen`: the recorded image; `turned`: the same, blurred and rotated by 180 degrees;
-        `laid` (rows, cols / 2 + 1): power spectrum by which the nodes of the bands are placed."""
+        """Return the model of a channel. `seen`: the recorded image; `turned`: the same, blurred and rotated by 180
+        degrees; `laid` (rows, cols / 2 + 1): power spectrum by which the nodes of the bands are placed."""
         camera = study.camera
         fy, fx = canvas.frequencies
         radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
@@ -483,7 +891,7 @@ class _LinearModel:
 def even_powers(
     fx: FloatArray, fy: FloatArray, order: int = EVEN_ORDER, end: float = RINGS_CY_PER_PX[-1]
 ) -> list[FloatArray]:
-    """The products fx^i fy^j of even i + j up to `order`, frequencies over `end`."""
+    """Return the products fx^i fy^j of even i + j up to `order`, frequencies over `end`."""
     x, y = fx / end, fy / end
     return [x ** (n - k) * y**k for n in range(0, order + 1, 2) for k in range(n + 1)]
 
@@ -499,8 +907,8 @@ def _band(
     *,
     whole: bool,
 ) -> Band:
-    """The band of the frequencies `part` and its nodes: the band is divided into `NODES` cells in radius and angle, and
-    each has its node at the mean of the power `laid`, and its share of `power`."""
+    """Return the band of the frequencies `part` and its nodes: the band is divided into `NODES` cells in radius and
+    angle, and each has its node at the mean of the power `laid`, and its share of `power`."""
     r, a = radius[part], away[part]
     on, p = (np.where(r > 0, at[part], 0.0) for at in (laid, power))  # no blur changes frequency 0
     span = np.pi if whole else np.pi / SECTORS

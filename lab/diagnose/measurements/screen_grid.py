@@ -90,7 +90,7 @@ def grid_block(study: Study) -> Block:
 
 
 def _line(study: Study, group: Sequence[Any], channel: str) -> _Line:
-    """The strongest line in one channel of the mean of some captures."""
+    """Return the strongest line in one channel of the mean of some captures."""
     step = mosaic.step(study.camera.cfa)
     row, col = mosaic.phases(study.camera.cfa)[channel][0]
     plane = mean_rate(study, group)[row::step, col::step]
@@ -115,7 +115,7 @@ def _line(study: Study, group: Sequence[Any], channel: str) -> _Line:
 
 
 def _box(bright: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """A rectangle inside the lit part. Raises NotDetermined where that is too small."""
+    """Return a rectangle inside the lit part. Raises NotDetermined where that is too small."""
     slices = []
     for axis in (0, 1):
         share = bright.mean(axis=1 - axis)

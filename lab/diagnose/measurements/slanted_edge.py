@@ -6,38 +6,30 @@ nonlinear response included. A pair (channel, light) is called a sight.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag
 from scipy.special import ndtr
 
-from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
+from lab.capture_kinds.slanted_edge import EdgeCapture, SlantedEdgeCapture
 from lab.capture_kinds.stopped_edge import StoppedEdgeCapture
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.edge_estimator import (
-    GRID_PX,
-    IMAGINARY_AT,
-    REAL_AT,
-    ComplexArray,
-    Estimator,
-    Operators,
-    Quadrature,
-    departure_shapes,
-    profile_interpolation,
-    relative_covariance,
-    spread_operator,
-)
-from lab.diagnose.measurements.edge_profiles import MeasuredEdge, f_number_of, measured_edges
 from lab.errors import NotDetermined
+from lab.measure.edge_finding import Region
+from lab.measure.edge_mtf import ROUGHNESS_SHARE, EdgeGeometry, EdgeMtf
+from lab.measure.edges import check_phases, find_edges, measure_edge
 from lab.measure.reads import acting
 from lab.measure.rounding import rounding_waves_dn
-from lab.measure.study import Study
+from lab.measure.study import Study, held_out_of
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
 from sim.optics.illumination import optical_axis_px, relative_illumination
@@ -57,6 +49,322 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
 from sim.stop_down import at_f_number, effects_at_f_number
 from sim.uniform import SHADING, SPECTRAL, Uniform, electron_rate
+
+# --- edge estimator --------------------------------------------------------------------------------------------------
+# The slanted-edge estimator of the diagnosis, as a linear operator on the values of an edge's pixels.
+#
+# `lab.fit.mtf` locates the edge, measures its noise, and sets up the normal equations of the spline that describes its
+# edge spread function (ESF). From these, `Estimator` estimates by weighted least squares how the optical transfer
+# function (OTF) departs from the baseline's at a few frequencies. `Operators` applies the same estimator to a model:
+# OTF -> ESF (`Quadrature`) -> right side of the normal equations -> reported numbers.
+
+
+ComplexArray = NDArray[np.complex128]
+#: Frequencies at which the OTF's real and imaginary parts are measured, as shares of the highest one. The imaginary
+#: part is taken as 0 up to `STILL`, as a phase in proportion to frequency only moves the edge.
+REAL_AT = np.array([0.04, 0.09, 0.15, 0.22, 0.30, 0.39, 0.49, 0.60, 0.72, 0.86, 1.0])
+IMAGINARY_AT = np.array([0.28, 0.42, 0.57, 0.72, 0.86, 1.0])
+STILL = 0.14
+#: Prior standard deviation of a departure of the OTF: so wide that it matters only where samples tell nothing.
+DEPARTURE_STD = 0.5
+GRID_PX, FINE_PX = 0.05, 0.0125  # steps of the grids of distances from the edge: of profiles, and of the pixels' values
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """The ESF as a weighted sum of the OTF H at nodes f_k.
+
+    ESF(d) = 1/2 + integral over f > 0 of [Re H sin(2 pi f d) + Im H cos(2 pi f d)] / (pi f) df
+           = 1/2 + sum over k of Re H(f_k) odd[k](d) + (Im H(f_k) / f_k) even[k](d)
+
+    with H interpolated by piecewise polynomials. The tables are at the distances d = 0, `GRID_PX`, 2 `GRID_PX`, ...
+    """
+
+    frequency: FloatArray  # (nodes,), cy/px
+    odd: FloatArray  # (nodes, distances)
+    even: FloatArray  # (nodes, distances)
+
+    @staticmethod
+    def of(highest: float, reach_px: float) -> Quadrature:
+        """For frequencies up to `highest` (cy/px) and distances up to `reach_px`.
+
+        Pieces are 1/4 cy/px wide below 1 cy/px, 1/2 below 2, and 1 above, with 8, 6 and 6 Gauss-Legendre nodes. A
+        double image 3 px away is integrated to 1e-4.
+        """
+        cuts = np.concatenate([np.arange(0.0, 1.0, 0.25), np.arange(1.0, 2.0, 0.5), np.arange(2.0, 64.0)])
+        cuts = np.append(cuts[cuts < highest], highest)
+        distance = np.arange(int(np.ceil(reach_px / GRID_PX)) + 2) * GRID_PX
+        nodes, odd, even = [], [], []
+        for low, high in pairwise(cuts):
+            unit = np.polynomial.legendre.leggauss(8 if high <= 1.0 else 6)[0]
+            fine, weight = np.polynomial.legendre.leggauss(int(16 + 4.0 * (high - low) * reach_px))
+            f, width = 0.5 * (low + high) + 0.5 * (high - low) * fine, 0.5 * (high - low) * weight
+            hats = _lagrange(unit, fine)
+            phase = 2.0 * np.pi * np.outer(f, distance)
+            nodes.append(0.5 * (low + high) + 0.5 * (high - low) * unit)
+            odd.append((hats * (width / (np.pi * f))) @ np.sin(phase))
+            even.append((hats * (width / np.pi)) @ np.cos(phase))
+        return Quadrature(np.concatenate(nodes), np.concatenate(odd), np.concatenate(even))
+
+
+def _lagrange(nodes: FloatArray, at: FloatArray) -> FloatArray:
+    """Lagrange polynomials of the nodes (1 at one node, 0 at the others) at `at`, (nodes, at)."""
+    basis = np.ones((len(nodes), len(at)))
+    for k, node in enumerate(nodes):
+        for other in np.delete(nodes, k):
+            basis[k] *= (at - other) / (node - other)
+    return basis
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """Weighted least squares of how an edge's profile departs from the baseline's, linear in the pixels' values.
+
+    profile = level + contrast x (baseline + shift x slope + sum of departures x shapes) + gradients of the illumination
+
+    A shape is the change of the profile by a unit change of the OTF at one frequency. The rows of the result are
+    contrast, then contrast x shift, and contrast x departures.
+    """
+
+    rows: FloatArray  # (rows, distances): the operator on a profile
+    value: FloatArray  # (rows,): estimate from the recording
+    covariance: FloatArray  # (rows, rows): of `value`
+
+    @staticmethod
+    def of(geometry: EdgeGeometry, spread: FloatArray, shapes: FloatArray) -> Estimator:
+        """Return the estimator at an edge's geometry. `spread` (k + g, distances): takes a profile to the right side of
+        the normal equations of k spline and g gradient coefficients (`spread_operator`). `shapes` (j, distances):
+        level, contrast, slope, departures."""
+        size = geometry.spline.size
+        matrix, right = geometry.gram[:-1, :-1], geometry.gram[:-1, -1]
+        bridged = matrix[:size, :size] + geometry.spline.roughness(
+            ROUGHNESS_SHARE * np.trace(matrix[:size, :size]) / size
+        )
+        count = len(shapes)
+        columns = np.zeros((len(matrix), count + len(matrix) - size))
+        columns[:size, :count] = np.linalg.solve(bridged, spread[:size] @ shapes.T)
+        columns[size:, count:] = np.eye(len(matrix) - size)
+        normal = columns.T @ matrix @ columns
+        normal[np.arange(3, count), np.arange(3, count)] += DEPARTURE_STD**-2
+        solve = (np.linalg.inv(normal) @ columns.T)[1:count]
+        return Estimator(solve @ spread, solve @ right, solve @ matrix @ solve.T)
+
+
+@dataclass(frozen=True)
+class Operators:
+    """The estimators of all edges as operators on OTFs, each at its own geometry; rows as in `Estimator`."""
+
+    constant: FloatArray  # (edges, rows): by the constant part of the profile
+    odd: FloatArray  # (edges, rows, nodes): on the OTF's real part
+    even: FloatArray  # (edges, rows, nodes): on the OTF's imaginary part over frequency
+    profile: FloatArray  # (edges, rows, distances): on any other change of the profile
+    distance: FloatArray  # (distances,), px
+    offset: FloatArray  # (edges,): level of the dark side over the contrast
+    shade: FloatArray  # (edges, distances): relative illumination, which the operators contain
+
+    def report(self, otf: ComplexArray, frequency: FloatArray, change: FloatArray | None = None) -> FloatArray:
+        """Return the estimates (edges, rows) for a model's OTFs (edges, nodes), at the quadrature's `frequency`, and a
+        further `change` of its profiles (edges, distances)."""
+        rows = self.constant + (self.odd @ np.real(otf)[..., None])[..., 0]
+        if np.any(np.imag(otf)):
+            rows = rows + (self.even @ (np.imag(otf) / frequency)[..., None])[..., 0]
+        if change is not None:
+            rows = rows + (self.profile @ change[..., None])[..., 0]
+        return np.asarray(rows)
+
+
+@lru_cache(maxsize=4)
+def profile_interpolation(reach_px: float) -> tuple[FloatArray, FloatArray, sparse.csr_array]:
+    """Distances of the fine and of the coarse grid, px, and the cubic interpolation matrix (fine, coarse)."""
+    count = int(np.ceil(reach_px / GRID_PX)) + 1
+    coarse = GRID_PX * np.arange(-count, count + 1, dtype=float)
+    ratio = round(GRID_PX / FINE_PX)
+    fine = FINE_PX * np.arange(-(count - 2) * ratio, (count - 2) * ratio + 1, dtype=float)
+    place = (fine - coarse[0]) / GRID_PX
+    left = np.floor(place + 1e-9).astype(int)
+    t = place - left
+    weights = np.stack(
+        [0.5 * t * (-1 + t * (2 - t)), 1 + 0.5 * t * t * (-5 + 3 * t), 0.5 * t * (1 + t * (4 - 3 * t)),
+        0.5 * t * t * (t - 1)], axis=1
+    )  # fmt: skip
+    index = left[:, None] + np.array([-1, 0, 1, 2])
+    rows = np.repeat(np.arange(len(fine)), 4)
+    return fine, coarse, sparse.csr_array((weights.ravel(), (rows, index.ravel())), shape=(len(fine), len(coarse)))
+
+
+def spread_operator(geometry: EdgeGeometry, reach_px: float) -> FloatArray:
+    """Operator (k + g, coarse distances) that takes a profile to the right side of an edge's normal equations: k spline
+    and g gradient coefficients."""
+    fine, _, between = profile_interpolation(reach_px)
+    distance = np.asarray(geometry.distance_px, float)
+    weight = _shared_out(distance, np.asarray(geometry.weight, float), fine)
+    used = np.flatnonzero(weight)
+    table = np.zeros((geometry.spline.size + len(geometry.gradients), len(fine)))
+    table[: geometry.spline.size, used] = (geometry.spline.design(fine[used]).T * weight[used]).toarray()
+    for k, row in enumerate(geometry.gradients):
+        table[geometry.spline.size + k] = _shared_out(distance, np.asarray(row * geometry.weight, float), fine)
+    return np.asarray(table @ between)
+
+
+def departure_shapes(quadrature: Quadrature, top: float) -> tuple[FloatArray, FloatArray]:
+    """Cubic splines that are 1 at one of the measured frequencies and 0 at the others, at the quadrature's nodes:
+    (nodes, real parts) and (nodes, imaginary parts). All are 0 at frequency 0 and from 1.25 `top` on; `top` is the
+    highest measured frequency, cy/px."""
+    f = quadrature.frequency
+    tables = []
+    for at, still in ((REAL_AT, np.zeros(1)), (IMAGINARY_AT, np.array([0.0, 0.5 * STILL, STILL]))):
+        knots = np.concatenate([still, at, [1.25, 1.6]]) * top
+        cardinal = CubicSpline(knots, np.eye(len(knots))[:, len(still) : -2], bc_type="natural")
+        tables.append(np.where((f < knots[-1])[:, None], cardinal(np.minimum(f, knots[-1])), 0.0))
+    return tables[0], tables[1]
+
+
+def _shared_out(distance: FloatArray, amount: FloatArray, grid: FloatArray) -> FloatArray:
+    """Sums (grid,) of amounts at any distances, each shared between the two nearest points of a regular grid as in
+    linear interpolation."""
+    place = (distance - grid[0]) / FINE_PX
+    left = place.astype(int)
+    right_part = amount * (place - left)
+    return np.asarray(np.bincount(left, amount - right_part, len(grid)) + np.bincount(left + 1, right_part, len(grid)))
+
+
+def relative_covariance(covariance: FloatArray, rows: FloatArray) -> FloatArray:
+    """Covariance of the departures over the contrast, to first order, from an estimate's `rows` and their
+    `covariance`."""
+    departure = rows[2:] / rows[0]
+    jacobian = (
+        np.concatenate([-departure[:, None], np.zeros((len(departure), 1)), np.eye(len(departure))], axis=1) / rows[0]
+    )
+    return np.asarray(jacobian @ covariance @ jacobian.T)
+
+
+# --- edge profiles ---------------------------------------------------------------------------------------------------
+# The slanted edges of a side: their regions, seen and held-out repeats, and the share of their noise that repeats have
+# in common.
+
+
+PLAIN = np.array([0.25])  # cy/px: where `measure_edge` evaluates its own MTF, which isn't used here
+
+
+@dataclass(frozen=True)
+class MeasuredEdge:
+    """One edge in one channel, measured on the mean of its seen or of its held-out repeats."""
+
+    part: tuple[EdgeCapture, ...]  # the repeats
+    channel: str
+    measured: EdgeMtf
+    held_out: bool
+    region: Region
+    direction_deg: float  # of the normal towards the light side, from x (columns) to y (rows)
+    fixed_share: float  # share of the noise's variance that repeats have in common (PRNU)
+
+    @property
+    def orientation(self) -> str:
+        """The edge's nominal angle, or the measured one where none is stated, in words."""
+        nominal = self.part[0].angle_deg
+        return f"{self.measured.angle_deg if nominal is None else nominal:.3g} deg"
+
+    @property
+    def setting(self) -> tuple[Region, float, str]:
+        """Equal for edges on the same pixels in the same direction."""
+        return self.region, round(self.direction_deg), self.channel
+
+
+def measured_edges(study: Study, kind: type[EdgeCapture]) -> list[MeasuredEdge]:
+    """All edges of the captures of a kind, by region and channel. Edges are searched for where no region is stated.
+
+    Raises NotDetermined where f-number or pixel pitch isn't stated, without slanted-edge captures, and where no edge is
+    measured."""
+    if not study.diffraction_is_known:
+        raise NotDetermined(
+            "slanted_edge", "f-number or pixel pitch isn't stated: no diffraction to hold the edges against"
+        )
+    groups = study.groups(
+        kind,
+        lambda c: (f_number_of(c), c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm),
+    )
+    if not groups:
+        raise NotDetermined("slanted_edge", "no slanted-edge captures")
+    edges: list[MeasuredEdge] = []
+    reasons = []
+    for i, group in enumerate(groups):
+        out = held_out_of(group, i, len(groups))
+        try:
+            regions = [group[0].region] if group[0].region else _found(study, group[0])
+        except NotDetermined as refused:
+            reasons.append(refused.reason)
+            continue
+        for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
+            for channel in study.channels if part else ():
+                for region in regions:
+                    try:
+                        measured = measure_edge(study.recordings, part, channel, None, PLAIN, region)
+                        check_phases("slanted_edge", study.stated.cfa, channel, region, measured.angle_deg)
+                    except NotDetermined as refused:
+                        reasons.append(refused.reason)
+                        continue
+                    direction = _direction_deg(study, part[0], region, measured.angle_deg)
+                    share = _fixed_share(study, group, len(part), channel, region, measured)
+                    edges.append(
+                        MeasuredEdge(tuple(part), channel, measured, part[0].id in out, region, direction, share)
+                    )  # fmt: skip
+    if not edges:
+        raise NotDetermined("slanted_edge", reasons[0])
+    return edges
+
+
+def f_number_of(capture: EdgeCapture) -> float | None:
+    """Return the f-number of a capture; None: the data sheet's."""
+    return capture.f_number if isinstance(capture, StoppedEdgeCapture) else None
+
+
+def _found(study: Study, capture: EdgeCapture) -> list[Region]:
+    """Regions of the edges that are found in a capture's frame."""
+    return [f.region for f in find_edges(study.recordings.frame(capture), study.stated.cfa, study.saturation_dn)]
+
+
+def _direction_deg(study: Study, capture: EdgeCapture, region: Region, angle_deg: float) -> float:
+    """Direction of the edge's normal towards the light side, from x (columns) to y (rows)."""
+    row0, col0, row1, col1 = region
+    frame = np.asarray(study.recordings.frame(capture)[row0:row1, col0:col1], float)
+    angle = np.deg2rad(angle_deg)
+    row, col = np.arange(row1 - row0) - 0.5 * (row1 - row0 - 1), np.arange(col1 - col0) - 0.5 * (col1 - col0 - 1)
+    side = np.cos(angle) * col[None, :] + np.sin(angle) * row[:, None]
+    return angle_deg if float(np.sum(side * (frame - frame.mean()))) > 0 else angle_deg + 180.0
+
+
+def _fixed_share(
+    study: Study, group: Sequence[EdgeCapture], frames: int, channel: str, region: Region, measured: EdgeMtf
+) -> float:
+    """Share of the noise variance of a mean of `frames` frames that is fixed (PRNU): 1 - temporal variance / total
+    variance.
+
+    The temporal variance is taken from the difference of two repeats on the light side, else from shot and read noise.
+    0 where neither is known; at most 0.95.
+    """
+    total = measured.noise_std_light**2
+    if len(group) > 1:
+        row0, col0, row1, col1 = region
+        mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))[row0:row1, col0:col1]
+        first, second = (
+            np.asarray(study.recordings.frame(c)[row0:row1, col0:col1], float)[mask] for c in (group[0], group[1])
+        )
+        black = study.stated.black_level_dn or 0.0
+        middle = black + 0.5 * (measured.dark_level + measured.light_level)
+        light = 0.5 * (first + second) > middle + 0.35 * (measured.light_level - measured.dark_level)
+        apart = (first - second)[light]
+        if apart.size < 64:
+            return 0.0
+        temporal = 0.5 * float(np.var(apart))
+    elif study.stated.conversion_gain_dn_per_e is not None:
+        temporal = study.noise.gain * measured.light_level + study.noise.read_dn**2
+    else:
+        return 0.0
+    return float(np.clip(1.0 - temporal / frames / max(total, 1e-300), 0.0, 0.95))
+
+
+# --- slanted edge ------------------------------------------------------------
+
 
 # standard deviation of the OTF beside noise: numerical error of the estimator and of the model's wavelength sampling
 EDGE_FLOOR = 3e-4
@@ -87,8 +395,8 @@ _Key = tuple[Effect, ...]
 
 
 def _kept(store: dict[K, V], key: K, make: Callable[[], V]) -> V:
-    """The value of `key` in the cache `store`, computed by `make` if it is missing. The oldest of `KEPT` entries is
-    dropped."""
+    """Return the value of `key` in the cache `store`, computed by `make` if it is missing. The oldest of `KEPT` entries
+    is dropped."""
     if key not in store:
         if len(store) >= KEPT:
             store.pop(next(iter(store)))
@@ -108,8 +416,8 @@ def edge_block(study: Study) -> Block:
 
 
 def stopped_edge_block(study: Study) -> Block:
-    """The same of edges at other f-numbers than the data sheet's. Raises NotDetermined as `edge_block` does, and for a
-    lens that is known at one aperture alone."""
+    """Return the same of edges at other f-numbers than the data sheet's. Raises NotDetermined as `edge_block` does, and
+    for a lens that is known at one aperture alone."""
     edges = measured_edges(study, StoppedEdgeCapture)
     found = []
     for f_number in dict.fromkeys(f_number_of(edge.part[0]) for edge in edges):
@@ -122,7 +430,7 @@ def stopped_edge_block(study: Study) -> Block:
 
 
 def _block(measurement: Measurement, parts: list[_Edges]) -> Block:
-    """The block of edges at one f-number, or at several."""
+    """Return the block of edges at one f-number, or at several."""
     sizes = [part.value.size for part in parts]
 
     def predict(effects: Effects) -> Prediction:
@@ -248,8 +556,9 @@ class _Edges:
     def _reported(
         self, effects: tuple[Effect, ...], more: FloatArray | None = None, otf: ComplexArray | None = None
     ) -> FloatArray:
-        """The estimators' rows (edges, rows) for the model, whose profiles are shifted to the recorded ones' position.
-        `more` (edges, distances): a further change of the profiles; `otf` (edges, nodes): in place of the effects'."""
+        """Return the estimators' rows (edges, rows) for the model, whose profiles are shifted to the recorded ones'
+        position. `more` (edges, distances): a further change of the profiles; `otf` (edges, nodes): in place of the
+        effects'."""
         otf, change = self._otf(effects) if otf is None else otf, self._change(effects)
         if more is not None:
             change = more if change is None else change + more
@@ -266,7 +575,7 @@ class _Edges:
         return rows
 
     def _estimated(self, reach_px: float) -> tuple[list[Estimator], Operators]:
-        """The estimator of every edge, linear about the baseline, and all of them as operators on OTFs."""
+        """Return the estimator of every edge, linear about the baseline, and all of them as operators on OTFs."""
         distance = profile_interpolation(reach_px)[1]
         quadrature = self._quadrature
         half, count = len(distance) // 2, quadrature.odd.shape[1]
@@ -295,7 +604,7 @@ class _Edges:
         return estimators, Operators(constant, by_odd, by_even, rows, distance, offsets, shades)
 
     def _mean_cutoff(self) -> float:
-        """The lens's cutoff at the mean detected wavelength of all sights, cy/px."""
+        """Return the lens's cutoff at the mean detected wavelength of all sights, cy/px."""
         nodes, shares = common_wavelengths(self._camera, self._lit)
         lens = self._camera.lens
         mean = float((shares @ nodes).mean())
@@ -334,8 +643,8 @@ class _Edges:
     def _wavelengths(
         self, spectral: tuple[Effect, ...], dispersed: bool
     ) -> tuple[FloatArray, FloatArray, ComplexArray]:
-        """A few wavelengths (w,), nm, their weights (sights, w), and the error of the diffraction-limited OTF with
-        these few (sights, directions, nodes).
+        """Return a few wavelengths (w,), nm, their weights (sights, w), and the error of the diffraction-limited OTF
+        with these few (sights, directions, nodes).
 
         Where the image is displaced by wavelength (`dispersed`), or weights would be large, the wavelengths are chosen
         for this spectrum."""

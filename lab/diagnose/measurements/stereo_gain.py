@@ -68,7 +68,7 @@ class _Darks:
             self._black = study.recordings.camera(side).black_level_dn or 0.0
 
     def at(self, exposure_s: float) -> float:
-        """The mean signal without light, DN."""
+        """Return the mean signal without light, DN."""
         return self._black + self._slope * exposure_s
 
 
@@ -173,13 +173,13 @@ class _UniformLight:
     lift: dict[str, float]  # by channel: mean `_Seen.lift`
 
     def like(self, other: _UniformLight) -> bool:
-        """Whether both are readings of one lamp: their normalised spectra differ by less than `SAME_LAMP`."""
+        """Return whether both are readings of one lamp: their normalised spectra differ by less than `SAME_LAMP`."""
         there = np.interp(self.wavelength_nm, other.wavelength_nm, other.shape, left=0.0, right=0.0)
         return bool(np.abs(there / max(there.sum(), 1e-300) - self.shape).sum() < SAME_LAMP)
 
 
 def _uniform(study: Study, side: Side, dark: _Darks) -> list[_UniformLight]:
-    """The uniform lights of a side's flats, by radiance file, in which every channel has an unclipped signal."""
+    """Return the uniform lights of a side's flats, by radiance file, in which every channel has an unclipped signal."""
     recordings = study.recordings
     white = recordings.camera(side).saturation_dn
     gathered: dict[str, dict[str, list[_Seen]]] = {}
@@ -202,7 +202,7 @@ def _uniform(study: Study, side: Side, dark: _Darks) -> list[_UniformLight]:
 
 
 def _signals(study: Study, capture: Any, side: Side, dark: _Darks, mask: np.ndarray | None) -> dict[str, _Seen]:
-    """The unclipped channels of a capture in the pixels of `mask`, or in the middle half of the frame."""
+    """Return the unclipped channels of a capture in the pixels of `mask`, or in the middle half of the frame."""
     camera, frame = study.recordings.camera(side), study.recordings.frame(capture)
     rows, cols = frame.shape
     row, col = np.arange(rows)[:, None], np.arange(cols)[None, :]
@@ -228,7 +228,7 @@ def _signals(study: Study, capture: Any, side: Side, dark: _Darks, mask: np.ndar
 def _rates(
     study: Study, side: Side, dark: _Darks, captures: Sequence[Capture], mask: np.ndarray | None
 ) -> dict[str, _Seen]:
-    """The channels in a region, means over captures."""
+    """Return the channels in a region, means over captures."""
     white = study.recordings.camera(side).saturation_dn
     found: dict[str, list[_Seen]] = {}
     for capture in captures:
@@ -258,7 +258,7 @@ def _scenes(study: Study) -> dict[str, list[tuple[list[Any], np.ndarray | None]]
 
 
 def _screen_captures(study: Study, side: Side) -> dict[str, list[Any]]:
-    """The captures of the lit screen without gain in dB, by pose."""
+    """Return the captures of the lit screen without gain in dB, by pose."""
     found: dict[str, list[Any]] = {}
     for capture in study.recordings.captures(WhiteCapture, side):
         if not capture.gain_db:
@@ -285,7 +285,7 @@ def _glare(study: Study, side: Side) -> tuple[float, float]:
 
 
 def _same_colour(rates: dict[str, _Seen], lamp: _UniformLight) -> bool:
-    """Whether a grey scene is lit by the lamp of the flats: its channel ratios agree to `SAME_COLOUR`.
+    """Return whether a grey scene is lit by the lamp of the flats: its channel ratios agree to `SAME_COLOUR`.
 
     In another light a difference of the two cameras' filters would look like a gain. False for a camera of one channel.
     """

@@ -59,7 +59,7 @@ class Repeats:
 
 
 def flat_repeats(study: Study) -> list[Repeats]:
-    """The temporal noise of all repeated flat settings, seen and held-out repeats apart, darkest first."""
+    """Return the temporal noise of all repeated flat settings, seen and held-out repeats apart, darkest first."""
     out = study.once(held_out_flats)
     found = []
     for group in study.flat_levels():
@@ -70,13 +70,14 @@ def flat_repeats(study: Study) -> list[Repeats]:
 
 
 def dark_repeats(study: Study) -> list[Repeats]:
-    """The temporal noise of all repeated dark settings, of three or more of which every third is held out."""
+    """Return the temporal noise of all repeated dark settings, of three or more of which every third is held out."""
     groups = [g for g in study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db)) if len(g) > 1]
     return [repeats_of(study, g, len(groups) >= 3 and i % 3 == 1) for i, g in enumerate(groups)]
 
 
 def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats:
-    """The temporal noise of two or more repeats of one setting. Raises NotDetermined where the frames are too small."""
+    """Return the temporal noise of two or more repeats of one setting. Raises NotDetermined where the frames are too
+    small."""
     cfa, lit = study.camera.cfa, captures[0].kind != "dark"
     first = study.recordings.frame(captures[0])
     least_px = LEAST_PLANE_PX * mosaic.step(cfa)

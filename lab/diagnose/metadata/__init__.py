@@ -40,7 +40,7 @@ _CHECKS = (
 
 
 def misstatements(recordings: RecordingSet, side: Side) -> tuple[RecordingSet, tuple[Misstatement, ...]]:
-    """The recordings with wrong statements of a side replaced by the values that fit, and what was replaced."""
+    """Return the recordings with wrong statements of a side replaced by the values that fit, and what was replaced."""
     found: list[Misstatement] = []
     for check in _CHECKS:
         one = check(recordings, side)

@@ -15,8 +15,8 @@ LEAST_BITS = 6  # of fewer bits, the highest code is too likely to be any level
 
 
 def misstated_bit_depth(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """A bit depth that is stated too large: no frame has a code above 2^k - 1, k less than the stated bits, and pixels
-    are clipped there.
+    """Return a bit depth that is stated too large: no frame has a code above 2^k - 1, k less than the stated bits, and
+    pixels are clipped there.
 
     Pixels at a full well below the converter's range are spread over codes by read noise, and that well is 2^k - 1 with
     a probability of one in thousands. A bit depth that is stated too small is refused when the recording set is read.

@@ -18,7 +18,8 @@ SIGMA = 5.0  # standard deviations of the measured black level beyond the tolera
 
 
 def misstated_black_level(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """A black level that differs from the dark frames' mean, extrapolated to zero exposure, by more than `TOLERANCE`.
+    """Return a black level that differs from the dark frames' mean, extrapolated to zero exposure, by more than
+    `TOLERANCE`.
 
     A line is fitted to the means by exposure, of the frames at the gain and temperature of the shortest. With a single
     exposure, dark current can't be told from black level. None where nothing is found.

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.pattern_contrast import BERNOULLI
+from lab.diagnose.measurements.pattern_fit import BERNOULLI
 from lab.diagnose.metadata.misstatement import Misstatement
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
@@ -17,8 +17,8 @@ TOLERANCE = 0.05  # relative: the stated size is nominal, and cells of a tilted 
 
 
 def misstated_cell_size(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """A `cell_camera_px` that differs by more than `TOLERANCE` from the size of the cells in the middle of the pattern;
-    None where it fits.
+    """Return a `cell_camera_px` that differs by more than `TOLERANCE` from the size of the cells in the middle of the
+    pattern; None where it fits.
 
     The registration finds the size by itself: the stated one is only its start.
     """

@@ -123,7 +123,7 @@ def _drifts(exposure: FloatArray, times: list[float | None]) -> FloatArray:
 def _candidates(
     exposure: FloatArray, mean: FloatArray, noise: FloatArray, drifts: FloatArray, floor_dn: FloatArray
 ) -> list[_Candidate]:
-    """The exposures that may be the one that is wrong. `noise` (n,): variance of each mean by its pixels' noise;
+    """Return the exposures that may be the one that is wrong. `noise` (n,): variance of each mean by its pixels' noise;
     `floor_dn` (exposures,). Frames scatter by as much more as their residuals about the means of their exposures and
     the drifts do."""
     levels = np.unique(exposure)

@@ -174,8 +174,8 @@ def _told(
     measurement: Measurement,
     rule: ExchangeRule,
 ) -> Misstatement | None:
-    """The exchange of two lights that fits, None where none passes `rule`. `errors` (n, n): of the captures of light i
-    with the statement of light j."""
+    """Return the exchange of two lights that fits, None where none passes `rule`. `errors` (n, n): of the captures of
+    light i with the statement of light j."""
     typical = max(float(np.median(np.diag(errors))), LEAST_ERROR)
     every = [
         _Exchange(i, j, _rms(errors[i, i], errors[j, j]), _rms(errors[i, j], errors[j, i]))
@@ -221,7 +221,7 @@ def _name(light: LitPlanes) -> str:
 
 
 def _exchanged(recordings: RecordingSet, one: LitPlanes, other: LitPlanes) -> RecordingSet:
-    """The recordings with the statements of the two lights exchanged."""
+    """Return the recordings with the statements of the two lights exchanged."""
     keys = ("radiance", "wavelength_nm", "bandwidth_nm")
     by_id = {c.id: c for c in recordings.manifest.captures}
     update: dict[str, dict[str, Any]] = {}

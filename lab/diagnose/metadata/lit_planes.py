@@ -41,7 +41,7 @@ class LitPlanes:
 
 
 def narrowband_planes(recordings: RecordingSet, side: Side) -> list[LitPlanes]:
-    """The planes in each narrowband light: one item a wavelength, the mean of its captures."""
+    """Return the planes in each narrowband light: one item a wavelength, the mean of its captures."""
     darks = _dark_levels(recordings, side)
     groups: dict[float, list[NarrowbandCapture]] = {}
     for capture in _exposed(recordings.captures(NarrowbandCapture, side)):
@@ -60,8 +60,8 @@ def narrowband_planes(recordings: RecordingSet, side: Side) -> list[LitPlanes]:
 
 
 def chart_planes(recordings: RecordingSet, side: Side) -> list[list[LitPlanes]]:
-    """The planes of each patch, in every light of a chart. Each plane is taken from the longest exposure that doesn't
-    clip it."""
+    """Return the planes of each patch, in every light of a chart. Each plane is taken from the longest exposure that
+    doesn't clip it."""
     darks = _dark_levels(recordings, side)
     groups: dict[str, list[ChartCapture]] = {}
     for capture in _exposed(recordings.captures(ChartCapture, side)):

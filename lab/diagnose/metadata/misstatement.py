@@ -26,7 +26,7 @@ class Misstatement:
     corrected: RecordingSet  # the recordings with the value that fits
 
     def told(self, side: Side) -> Unexplained:
-        """The misstatement as an item of a result."""
+        """Return the misstatement as an item of a result."""
         return Unexplained(
             side=side,
             measurement=self.measurement.name,
@@ -44,7 +44,7 @@ class Misstatement:
 
 
 def restated_camera(recordings: RecordingSet, side: Side, **values: Any) -> RecordingSet:
-    """The recordings with other values stated of the camera of `side`."""
+    """Return the recordings with other values stated of the camera of `side`."""
     manifest = recordings.manifest
     camera = manifest.cameras[side].model_copy(update=values)
     return recordings.under(manifest.model_copy(update={"cameras": {**manifest.cameras, side: camera}}))

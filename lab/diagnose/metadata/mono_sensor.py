@@ -10,7 +10,7 @@ from sim.camera import Side
 
 
 def misstated_mosaic(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """A stated mosaic whose planes are alike in every light (`lab.measure.mishaps`); None where they differ. The
+    """Return a stated mosaic whose planes are alike in every light (`lab.measure.mishaps`); None where they differ. The
     maker's curves are of colours, and are left out."""
     found = alike_planes(recordings, side)
     if found is None:

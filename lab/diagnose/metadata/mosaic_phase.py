@@ -29,7 +29,7 @@ ROUNDS = 6
 
 
 def misstated_mosaic_phase(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """A stated mosaic that fits the planes' rates worse than another one; None where it fits.
+    """Return a stated mosaic that fits the planes' rates worse than another one; None where it fits.
 
     r = ln(rate of a plane) - ln(predicted rate of its channel) - level of the light - gain of the channel, over
     narrowband lights and patches of a chart. The mosaic with the least rms of r is the best. Where no sensitivity

@@ -11,7 +11,7 @@ from sim.camera import Side
 
 
 def unchecked(recordings: RecordingSet, side: Side) -> Iterator[Skipped]:
-    """The bit depth, where no pixel reaches its highest bit, and the length of a board's squares; and what the
+    """Yield the bit depth, where no pixel reaches its highest bit, and the length of a board's squares; and what the
     instruments themselves said couldn't be set as a measurement wants it."""
     own = f"camera {side}"
     for name, one in recordings.manifest.instruments.items():

@@ -53,8 +53,8 @@ class _Departure:
 def board_departure(
     side: Side, geometry: GeometryFit | None, shape: tuple[int, int], policy: DecisionPolicy
 ) -> Unexplained | None:
-    """Where and by how much the corners of a fit depart from its camera; None where noise and `corner_tolerance_px`
-    explain them.
+    """Return where and by how much the corners of a fit depart from its camera; None where noise and
+    `corner_tolerance_px` explain them.
 
     All corners, those of each view, and those of each ninth of a frame of `shape` (rows, cols) are tested. A part
     departs where its chi2 against noise is beyond `slice_false_alarm_rate`, corrected for the number of parts, and its

@@ -22,8 +22,7 @@ from lab.diagnose.measurements.narrowband import NARROWBAND_FLOOR
 from lab.diagnose.outcome.expected_information import Forecast
 from lab.diagnose.outcome.settling_capture import FEW_REPEATS, MORE_REPEATS, repeats_of
 from lab.formats.recording_set import RecordingSet
-from lab.measure.noise_figures import BLACK_FLOOR_DN
-from lab.measure.repeatability import LAMP_FLOOR
+from lab.measure.noise_figures import BLACK_FLOOR_DN, LAMP_FLOOR
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.optics.imaging import DiffractionLimited
@@ -78,7 +77,7 @@ class CandidateCapture:
     needs: str = BY_HAND  # what a station lacks where `plan` is None
 
     def forecast(self, rivals: Sequence[Hypothesis]) -> Forecast:
-        """What rivals predict of it, with what their parameters and their laws leave open."""
+        """Return what rivals predict of it, with what their parameters and their laws leave open."""
         mean = np.array([self.predict(h) for h in rivals])
         jacobian, law_error = [], []
         for h, own in zip(rivals, mean, strict=True):
@@ -105,7 +104,7 @@ def candidate_captures(
 
 
 def _lamp(recordings: RecordingSet, side: Side) -> Spectrum:
-    """The light of the flats or the chart, else of equal energy."""
+    """Return the light of the flats or the chart, else of equal energy."""
     for kind in ("flat", "chart"):
         for capture in recordings.captures(kind, side):
             path = getattr(capture, "radiance", None)
@@ -209,14 +208,14 @@ def _edges(
 
 
 def _edge_angles(station: Equipment | None) -> dict[str, float]:
-    """The knife edges of a station by name, with their angles (deg) from the vertical; those of any station where it
-    has none."""
+    """Return the knife edges of a station by name, with their angles (deg) from the vertical; those of any station
+    where it has none."""
     there = station.list_targets(EdgeTarget) if station is not None else {}
     return {name: edge.angle_deg for name, edge in there.items()} or {f"edge {a:g}": a for a in EDGE_ANGLES_DEG}
 
 
 def _stops(station: Equipment | None, usual: float) -> tuple[float, ...]:
-    """The f-numbers that a station's lenses are set to; without any, twice the usual one."""
+    """Return the f-numbers that a station's lenses are set to; without any, twice the usual one."""
     there = station.list_targets(ApertureTarget) if station is not None else {}
     return tuple(sorted({stop.f_number for stop in there.values()} - {usual})) or (2.0 * usual,)
 
@@ -278,7 +277,8 @@ def _exposure_series(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateC
 
 
 def _steady(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateCapture]:
-    """The same flat, repeated over an hour. The lamp's level is a nuisance parameter, its change with time isn't."""
+    """Yield the same flat, repeated over an hour. The lamp's level is a nuisance parameter, its change with time
+    isn't."""
     full = _filling_exposure_s(camera, lamp)
     times = np.linspace(0.0, SESSION_S, 13)
     if full <= 0:

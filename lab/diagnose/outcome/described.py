@@ -52,7 +52,8 @@ def described(verdict: Verdict, found: Sequence[PredictiveTable], laws: Sequence
 
 
 def _is_smoother(verdict: Verdict, laws: Sequence[EmpiricalLaw], index: int) -> bool:
-    """Whether a block's smooth discrepancy predicts its held-out numbers, beyond their noise, better than laws do."""
+    """Return whether a block's smooth discrepancy predicts its held-out numbers, beyond their noise, better than
+    laws do."""
     if index not in verdict.kernels:
         return False
     model, where = verdict.model, verdict.model.mask(index)

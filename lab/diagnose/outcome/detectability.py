@@ -20,7 +20,7 @@ from sim.spectrum import FloatArray
 
 
 def detectable(threshold: float, probability: float = DecisionPolicy().detection_probability) -> float:
-    """The non-centrality lambda with P(chi2_1(lambda) > threshold) = probability."""
+    """Return the non-centrality lambda with P(chi2_1(lambda) > threshold) = probability."""
     return float(
         optimize.brentq(lambda x: 1.0 - special.chndtr(threshold, 1, x) - probability, 1e-6, 10.0 * threshold + 100.0)
     )

@@ -14,7 +14,7 @@ LISTED_SETS = 5
 
 
 def side_models(side: Side, found: ModelSet, policy: DecisionPolicy) -> SideModels:
-    """The sets of effects of one side, as a result."""
+    """Return the sets of effects of one side, as a result."""
     return SideModels(
         side=side,
         share=policy.model_set_share,

@@ -41,8 +41,8 @@ class Forecast:
         law_error: Sequence[FloatArray],
         covariance: FloatArray,
     ) -> Forecast:
-        """The forecast of numbers with that `covariance` (n, n). Only directions in which rivals differ are kept: in
-        all others every rival predicts the same, with the same noise."""
+        """Return the forecast of numbers with that `covariance` (n, n). Only directions in which rivals differ are
+        kept: in all others every rival predicts the same, with the same noise."""
         whole = np.concatenate([(mean - mean[0]).T, *jacobian, *law_error], axis=1)
         white = solve_triangular(cholesky(covariance, lower=True), whole, lower=True)
         basis = np.linalg.qr(white)[0]
@@ -63,8 +63,8 @@ def entropy(odds: Sequence[float]) -> float:
 
 
 def expected_information(forecasts: Sequence[Forecast], odds: Sequence[float]) -> float:
-    """The information (nat) that captures taken together give about which rival acts. `odds`: probabilities of the
-    rivals, which sum to 1."""
+    """Return the information (nat) that captures taken together give about which rival acts. `odds`: probabilities of
+    the rivals, which sum to 1."""
     p = np.asarray(odds, float)
     mean = np.concatenate([f.mean for f in forecasts], axis=1)
     variance = []
@@ -79,7 +79,7 @@ def expected_information(forecasts: Sequence[Forecast], odds: Sequence[float]) -
 
 
 def _bhattacharyya(apart: FloatArray, one: FloatArray, other: FloatArray) -> float:
-    """The Bhattacharyya distance of two normal distributions with means `apart` (n,) and covariances (n, n)."""
+    """Return the Bhattacharyya distance of two normal distributions with means `apart` (n,) and covariances (n, n)."""
     lower = cholesky(0.5 * (one + other), lower=True)
     white = solve_triangular(lower, apart, lower=True)
     log_det = 2.0 * float(np.log(np.diag(lower)).sum())

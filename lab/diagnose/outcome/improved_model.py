@@ -60,9 +60,9 @@ def improved_model(
     effects: Sequence[Effect],
     discrepancies: Sequence[Discrepancy],
 ) -> tuple[CameraFile, tuple[Correction, ...]]:
-    """The baseline with the named effects, with the maker's sensitivity curves at the posterior mean of their nuisance
-    parameters, and with a correction for each discrepancy that a stage of the model can hold. Noise and levels are the
-    fit's where there is one.
+    """Return the baseline with the named effects, with the maker's sensitivity curves at the posterior mean of their
+    nuisance parameters, and with a correction for each discrepancy that a stage of the model can hold. Noise and levels
+    are the fit's where there is one.
 
     Returns the camera and one `Correction` for each discrepancy.
     """
@@ -127,7 +127,8 @@ def _nearest_form(effect: Effect, estimates: Mapping[str, float]) -> Effect:
 def _applied(
     model: MeasurementModel, discrepancies: Sequence[Discrepancy]
 ) -> tuple[list[tuple[Applied | None, str]], dict[int, FloatArray]]:
-    """The stage that each discrepancy is applied to, or None and why; and the kernels of those that are, by block."""
+    """Return the stage that each discrepancy is applied to, or None and why; and the kernels of those that are, by
+    block."""
     kernels: dict[int, FloatArray] = {}
     found: list[tuple[Applied | None, str]] = []
     for one in discrepancies:
@@ -145,7 +146,7 @@ def _applied(
 
 
 def _place_for(block: Block) -> Applied | None:
-    """The stage that a smooth factor along the measurement's axis can act on."""
+    """Return the stage that a smooth factor along the measurement's axis can act on."""
     if block.measurement.places:
         return None
     return next(
@@ -177,7 +178,7 @@ def _factor(
 def _correction(
     kind: Applied, block: Block, x: FloatArray, factor: FloatArray, camera: CameraModel
 ) -> ModelDiscrepancy:
-    """The factor on its stage, in that stage's unit."""
+    """Return the factor on its stage, in that stage's unit."""
     gain = camera.conversion_gain_dn_per_e
     if kind == "transfer":
         from_zero = x > 0.0  # where a transfer function is 1
@@ -205,7 +206,7 @@ def _scaled(curve: Spectrum, factor: float) -> Spectrum:
 
 
 def _multiplied(curve: Spectrum, at: FloatArray, factor: FloatArray) -> Spectrum:
-    """A curve times a factor that is held beyond its ends."""
+    """Return a curve times a factor that is held beyond its ends."""
     grid = np.union1d(np.array(curve.wavelength_nm), at)
     grid = grid[(grid >= curve.wavelength_nm[0]) & (grid <= curve.wavelength_nm[-1])]
     return Spectrum.of(grid, np.clip(curve.at(grid) * np.interp(grid, at, factor), 0.0, 1.0))

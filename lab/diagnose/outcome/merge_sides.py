@@ -72,7 +72,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
 
 
 def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedEffect]:
-    """The named effects of all sides, one item a name."""
+    """Return the named effects of all sides, one item a name."""
     by_name: dict[str, list[tuple[Side, NamedCandidate]]] = {}
     with_gain = {findings.side for findings in found if findings.gain_is_known}
     for findings in found:
@@ -156,7 +156,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
 
 
 def _choices(effect: Effect, alike: Sequence[Effect] = ()) -> dict[str, str]:
-    """Which of its alternatives an effect is, by field; and those that the recordings don't tell from it."""
+    """Return which of its alternatives an effect is, by field; and those that the recordings don't tell from it."""
     told: dict[str, str] = {}
     for name in type(effect).told_choices():
         values = dict.fromkeys(getattr(one, name) for one in (effect, *alike))
@@ -166,7 +166,7 @@ def _choices(effect: Effect, alike: Sequence[Effect] = ()) -> dict[str, str]:
 
 
 def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:
-    """The effects of a named family over all sides, by their mean probability, likeliest first."""
+    """Return the effects of a named family over all sides, by their mean probability, likeliest first."""
     total: dict[str, float] = {}
     for candidate in candidates:
         for name, probability in candidate.members:
@@ -177,8 +177,8 @@ def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:
 def _family_statement(
     family: Family, members: Sequence[Member], is_exact: bool, seen: str, values: str, corrections: Sequence[str]
 ) -> str:
-    """The sentences about a named family: how well its laws hold, which they are, and the capture that tells them
-    apart."""
+    """Return the sentences about a named family: how well its laws hold, which they are, and the capture that tells
+    them apart."""
     names = [f"{effect_title(m.name)} ({100 * m.probability:.0f} %)" for m in members[:TOLD_MEMBERS]]
     told = [family.sentence, f"{seen}."]
     if is_exact:
@@ -202,7 +202,7 @@ def _plain_name(field: str, unit: str) -> str:
 
 
 def _interval(field: str, candidates: Sequence[Candidate]) -> tuple[float, float] | None:
-    """The interval of a parameter that at least one side tells by an interval: it holds those of all sides."""
+    """Return the interval of a parameter that at least one side tells by an interval: it holds those of all sides."""
     if all(field not in c.intervals for c in candidates):
         return None
     ends = list[tuple[float, float]]()
@@ -252,7 +252,7 @@ def _summary(
     held_out: HeldOut | None,
     policy: DecisionPolicy,
 ) -> list[str]:
-    """The diagnosis in sentences."""
+    """Return the diagnosis in sentences."""
     lines = []
     if verdict == "nothing_judged":
         lines.append("These recordings determine no measurement, so nothing is said about the camera.")

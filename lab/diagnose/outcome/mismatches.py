@@ -32,8 +32,8 @@ LEAST_TOLD = 0.05
 
 
 def located(side: Side, verdict: Verdict) -> list[Mismatch]:
-    """The most significant slice of every measurement. Where only an effect's score shows a mismatch, the measurement
-    that it changes most, with the significance of its log odds: sqrt(2 log odds)."""
+    """Return the most significant slice of every measurement. Where only an effect's score shows a mismatch, the
+    measurement that it changes most, with the significance of its log odds: sqrt(2 log odds)."""
     model = verdict.model
     baseline = model.gaussian()
     found: dict[str, Mismatch] = {}
@@ -73,7 +73,7 @@ def located(side: Side, verdict: Verdict) -> list[Mismatch]:
 
 
 def vetoed_names(side: Side, verdict: Verdict) -> list[VetoedName]:
-    """The names that held-out captures contradict, in words."""
+    """Return the names that held-out captures contradict, in words."""
     return [
         VetoedName(
             side=side,
@@ -101,7 +101,7 @@ def held_by_families(verdict: Verdict, policy: DecisionPolicy) -> frozenset[str]
 def family_corrections(
     verdict: Verdict, candidate: Candidate, corrections: Sequence[Correction], policy: DecisionPolicy
 ) -> tuple[str, ...]:
-    """What stands in the improved model beside a family's nearest law, in words."""
+    """Return what stands in the improved model beside a family's nearest law, in words."""
     if not candidate.holds_a_remainder:
         return ()
     shown = shown_in(verdict, candidate, policy)
@@ -198,7 +198,7 @@ def _seen_chi2(model: MeasurementModel, gaussian: Gaussian, index: np.ndarray) -
 
 
 def _level_check(recordings: RecordingSet, level: OutlyingLevel) -> str:
-    """The exposure, or the light, that a level out of line with its statement would fit, as a sentence."""
+    """Return the exposure, or the light, that a level out of line with its statement would fit, as a sentence."""
     stated = {c.id: c.exposure_s for c in recordings.captures() if c.id in level.captures}
     exposure_s = float(np.mean(list(stated.values())))
     many = len(level.captures) > 1
@@ -212,7 +212,7 @@ def _level_check(recordings: RecordingSet, level: OutlyingLevel) -> str:
 
 
 def _held_out_shape(outlying: Sequence[OutlyingLevel]) -> str:
-    """The shape of a mismatch that only held-out captures show, in words."""
+    """Return the shape of a mismatch that only held-out captures show, in words."""
     if outlying:
         return "single captures aren't in line with the others"
     return "held-out captures contradict the other captures"
@@ -226,7 +226,7 @@ def _shape(
     outlying: Sequence[OutlyingLevel],
     policy: DecisionPolicy,
 ) -> str:
-    """The shape of a discrepancy, and the law nearest to it, in words."""
+    """Return the shape of a discrepancy, and the law nearest to it, in words."""
     if outlying:
         return _held_out_shape(outlying)
     block = verdict.model.blocks[one.index]

@@ -50,7 +50,7 @@ def model_posterior(
     gain_db: float = 0.0,
     is_corrected: bool = False,
 ) -> ModelPosterior | None:
-    """The posterior of the parameters of `model` with `effects`, about `camera`, the improved model.
+    """Return the posterior of the parameters of `model` with `effects`, about `camera`, the improved model.
 
     discrepancies : covariances of model discrepancies by block, which stand beside the effects
     is_corrected : whether the improved model has a correction of the noise, which holds what gain and read noise were
@@ -138,8 +138,8 @@ def _first(noise: NoiseFigures) -> FirstEstimates:
 
 
 def _from_first(noise: NoiseFigures, camera: CameraModel, gain_db: float) -> dict[str, float]:
-    """What the first estimates differ by from what `camera` states, in prior standard deviations, by the nuisance
-    parameter's name."""
+    """Return what the first estimates differ by from what `camera` states, in prior standard deviations, by the
+    nuisance parameter's name."""
     gain = gain_dn_per_e(camera, gain_db)
     return {
         "gain": (noise.gain / gain - 1.0) / GAIN_STD,
@@ -149,14 +149,14 @@ def _from_first(noise: NoiseFigures, camera: CameraModel, gain_db: float) -> dic
 
 
 def with_unnamed(effects: Sequence[Effect], posterior: ModelPosterior) -> tuple[Effect, ...]:
-    """The effects, and those that nobody named whose sizes a posterior knows, at none."""
+    """Return the effects, and those that nobody named whose sizes a posterior knows, at none."""
     there = {e.name for e in effects}
     more = dict.fromkeys(name.partition(".")[0] for name in posterior.names if "." in name)
     return (*effects, *(library()[name]() for name in more if name in library() and name not in there))
 
 
 def coordinate_name(effects: Sequence[Effect], coordinate: Coordinate) -> str:
-    """How a posterior calls the parameter of an effect."""
+    """Return how a posterior calls the parameter of an effect."""
     return f"{effects[coordinate.index].name}.{coordinate.name}"
 
 

@@ -76,7 +76,7 @@ class Doubt:
     captures: tuple[OpenCapture, ...]
 
     def listed(self, policy: DecisionPolicy) -> tuple[NextCapture, ...]:
-        """The captures in which the two nearest rivals lie furthest apart, the best first."""
+        """Return the captures in which the two nearest rivals lie furthest apart, the best first."""
         found = []
         for capture in self.captures:
             apart = capture.forecast.distances()
@@ -101,8 +101,8 @@ class Doubt:
 def doubt_of(
     recordings: RecordingSet, side: Side, verdict: Verdict, policy: DecisionPolicy, station: Equipment | None = None
 ) -> Doubt | None:
-    """What a verdict leaves in doubt, and the captures that could be taken, by the sequences of `station`; None where
-    no rivals are left."""
+    """Return what a verdict leaves in doubt, and the captures that could be taken, by the sequences of `station`; None
+    where no rivals are left."""
     rivals = _rivals(verdict, policy)
     if len(rivals) < 2:
         return None
@@ -116,8 +116,8 @@ def doubt_of(
 
 
 def _rivals(verdict: Verdict, policy: DecisionPolicy) -> list[tuple[float, Hypothesis]]:
-    """The effect whose rivals are likeliest, and these rivals, each fitted in its place: as many as together hold
-    `next_capture_share`; with their probabilities."""
+    """Return the effect whose rivals are likeliest, and these rivals, each fitted in its place: as many as together
+    hold `next_capture_share`; with their probabilities."""
     model, least = verdict.model, policy.least_rival_probability
 
     def rival_probability(candidate: Candidate) -> float:
@@ -146,7 +146,7 @@ def _rivals(verdict: Verdict, policy: DecisionPolicy) -> list[tuple[float, Hypot
 
 
 def _hypothesis(model: MeasurementModel, effects: tuple[Effect, ...]) -> Hypothesis:
-    """The rival that is the last of `effects`, beside the others."""
+    """Return the rival that is the last of `effects`, beside the others."""
     estimates = model.nuisance_estimates(effects)
     curves = {c: freed_curve(q, c, estimates) for c, q in model.camera.quantum_efficiency.items()}
     camera = model.camera.model_copy(update={"quantum_efficiency": curves})
@@ -161,8 +161,8 @@ def _hypothesis(model: MeasurementModel, effects: tuple[Effect, ...]) -> Hypothe
 
 
 def next_sentence(found: Sequence[NextCapture], settling: str | None, policy: DecisionPolicy) -> str | None:
-    """The best capture of all sides as a sentence. `settling`: what to capture for a mismatch that is left without a
-    name."""
+    """Return the best capture of all sides as a sentence. `settling`: what to capture for a mismatch that is left
+    without a name."""
     if not found:
         return settling
     best = max(found, key=lambda one: one.distance)
@@ -190,6 +190,6 @@ def next_sentence(found: Sequence[NextCapture], settling: str | None, policy: De
 
 
 def _shows_in(effect: str, kind: str | None) -> bool:
-    """Whether an effect shows in captures of a kind."""
+    """Return whether an effect shows in captures of a kind."""
     kinds = set(visibility()[effect].capture_kinds) if effect in visibility() else set()
     return kind is None or bool(kinds - {"dark"} if kind == LIT else kinds & {kind})

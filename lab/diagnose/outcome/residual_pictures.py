@@ -57,7 +57,7 @@ def residual_pictures(
 
 
 def _brightness(recordings: RecordingSet, capture: Capture, camera: CameraModel) -> float:
-    """A frame's 99.9 % quantile (DN); -1 where it is clipped."""
+    """Return a frame's 99.9 % quantile (DN); -1 where it is clipped."""
     high = float(np.quantile(recordings.frame(capture), 0.999))
     return -1.0 if high >= 0.97 * camera.white_level_dn else high
 
@@ -103,7 +103,7 @@ def _judged(capture: Capture, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def _region(capture: Capture, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """The middle of an edge, pixel by pixel; else the whole frame."""
+    """Return the middle of an edge, pixel by pixel; else the whole frame."""
     if not isinstance(capture, SlantedEdgeCapture):
         return slice(None), slice(None)
     row0, col0, row1, col1 = capture.region or (0, 0, *shape)

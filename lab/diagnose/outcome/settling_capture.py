@@ -40,7 +40,7 @@ ELSE = "again after a break, in the reverse order: a drift with time differs the
 
 
 def repeats_of(captures: Iterable[Capture]) -> int:
-    """The median number of captures of one setting; 0 for none."""
+    """Return the median number of captures of one setting; 0 for none."""
     setting: dict[Hashable, int] = {}
     for capture in captures:
         key = capture.model_dump_json(exclude={"id", "frame", "time", "temperature_c"})
@@ -50,7 +50,8 @@ def repeats_of(captures: Iterable[Capture]) -> int:
 
 
 def settling_sentence(recordings: RecordingSet, side: Side, left: Sequence[Unexplained]) -> str | None:
-    """What to capture for the most significant mismatch that has no name, as a sentence; None where there is none.
+    """Return what to capture for the most significant mismatch that has no name, as a sentence; None where there is
+    none.
 
     Captures that contradict what is stated of them are to be corrected before anything is captured.
     """

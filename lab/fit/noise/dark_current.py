@@ -63,8 +63,8 @@ class SensorTemperature(Frozen):
 
 
 def temperature_law(found: Sequence[tuple[float, float, float]], gain_error: float = 0.0) -> DarkCurrentLaws:
-    """The Arrhenius law and the doubling temperature of EMVA 1288 through dark currents `found`: (deg C, e/s, its
-    standard deviation).
+    """Return the Arrhenius law and the doubling temperature of EMVA 1288 through dark currents `found`: (deg C, e/s,
+    its standard deviation).
 
         ln I = ln I_ref - E / k (1/T - 1/T_ref),    ln I = a + ln 2 (T - T_ref) / T_d
 
@@ -160,7 +160,7 @@ def black_level(e: Evaluation) -> tuple[float | None, float | None]:
 
 
 def dark_signal_hidden(e: Evaluation) -> bool:
-    """Whether rounding hides the dark signal; reported where it does.
+    """Return whether rounding hides the dark signal; reported where it does.
 
     Where neither noise nor pattern spreads the values over codes, their means don't follow the signal.
     """

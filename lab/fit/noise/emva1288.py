@@ -183,7 +183,7 @@ Figures = dict[str, Measured]
 
 
 def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
-    """The figures of one plane, or the reason why there are none."""
+    """Return the figures of one plane, or the reason why there are none."""
     if not any(level.repeats > 1 for level in given.darks):
         return (
             "no repeated darks: EMVA 1288 compares bright with dark pairs; capture two darks at each of the flats' "
@@ -237,7 +237,8 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
 
 
 def _calibration(at: EmvaLevels, found: Figures, remarks: list[str]) -> dict[str, float]:
-    """What the calibration of the reference that measured the light adds: a factor common to all numbers of photons."""
+    """Return what the calibration of the reference that measured the light adds: a factor common to all numbers of
+    photons."""
     relative = max((level.light_calibration_std for level in at.flats), default=0.0)
     if not relative or "quantum_efficiency" not in found:
         return {}
@@ -275,7 +276,7 @@ def _saturation(at: EmvaLevels, given: EmvaInput, remarks: list[str]) -> tuple[f
 
 
 def _widened_gain(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list[str]) -> Measured:
-    """The system gain with what its line leaves of the variances in its standard deviation."""
+    """Return the system gain with what its line leaves of the variances in its standard deviation."""
     std = np.hypot(at.variance_std, at.below(at.dark_variance_std, None))
     ratio = mean_ratio(at.signal[used], (at.variance - at.below_variance)[used], std[used], gain)
     if ratio is None:
@@ -418,7 +419,7 @@ class _Stacks:
 
 
 def _stacks(given: EmvaInput, at: EmvaLevels, saturation: float, remarks: list[str]) -> _Stacks:
-    """The level of most images near half of saturation, and the dark of most images nearest to its exposure."""
+    """Return the level of most images near half of saturation, and the dark of most images nearest to its exposure."""
 
     every = EmvaLevels(replace(given, flats=given.spatial)) if given.spatial else at
 

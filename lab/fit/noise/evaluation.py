@@ -145,7 +145,7 @@ def _described(
 def _source(
     own: Sequence[MeasuredLevel], number: int, recorded: RecordedLevels, dark: DarkSignal, saturation: Saturation
 ) -> str:
-    """What the exposure says where the light is a number of photons of its own."""
+    """Return what the exposure says where the light is a number of photons of its own."""
     level = own[number]
     if level.light == level.exposure_s:
         return "either the exposure or the frames are of another level"
@@ -409,6 +409,6 @@ def _remark_on_transfer(e: Evaluation) -> None:
 
 
 def in_electrons(e: Evaluation, value: float, std: float) -> tuple[float, float]:
-    """A `value` in DN with its standard deviation in electrons, with that of the gain."""
+    """Return a `value` in DN with its standard deviation in electrons, with that of the gain."""
     gain = e.transfer.gain
     return value / gain, float(np.hypot(std / gain, value * e.transfer.gain_std / gain**2))

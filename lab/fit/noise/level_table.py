@@ -102,7 +102,7 @@ def _level(row: TableRow, camera: DataSheet) -> tuple[Setting, PlaneStatistics]:
 
 
 def _without_patterns(fit: NoiseFit) -> NoiseFit:
-    """The fit less the figures that need frames."""
+    """Return the fit less the figures that need frames."""
 
     def emptied(part: NoiseFit | ChannelNoise | Emva1288) -> dict[str, object]:
         return {name: None for name in type(part).model_fields if name.startswith(SPATIAL)}

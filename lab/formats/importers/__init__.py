@@ -83,8 +83,8 @@ KINDS: dict[str, Importer] = {
 
 
 def read_foreign(kind: str, path: Path, options: ImportOptions | None = None) -> RecordingSet:
-    """The recordings at `path`, which are of `kind`; InputError where there is no such kind, it doesn't take one of the
-    options, or the recordings can't be used."""
+    """Return the recordings at `path`, which are of `kind`; InputError where there is no such kind, it doesn't take one
+    of the options, or the recordings can't be used."""
     options = options or ImportOptions()
     if kind not in KINDS:
         raise InputError(f"--from {kind}: no such format; choose {', '.join(KINDS)}")
@@ -106,7 +106,8 @@ def read_foreign(kind: str, path: Path, options: ImportOptions | None = None) ->
 
 
 def _with_notes(recordings: RecordingSet, path: Path) -> Manifest:
-    """The manifest with the warnings in its notes, one a line, without the folder in which the recordings were."""
+    """Return the manifest with the warnings in its notes, one a line, without the folder in which the recordings
+    were."""
     folder = path if path.is_dir() else path.parent
     lines = [line.removeprefix(f"{folder}: ") for line in recordings.warnings]
     if folder != Path():

@@ -53,7 +53,7 @@ class ImageDescriptor:
 
 
 def parse_descriptor(text: str) -> ImageDescriptor:
-    """The descriptor in `text`; InputError with `line N: ...` where a line can't be understood."""
+    """Return the descriptor in `text`; InputError with `line N: ...` where a line can't be understood."""
     found = ImageDescriptor()
     other: Counter[str] = Counter()
     for number, line in enumerate(text.removeprefix("\ufeff").splitlines(), start=1):
@@ -101,7 +101,7 @@ def _numbers(words: list[str], least: int, line: int, what: str) -> list[float]:
 
 
 def find_descriptor(path: Path) -> Path:
-    """The descriptor: `path` itself, or the only descriptor among the text files in the folder, else one folder
+    """Return the descriptor: `path` itself, or the only descriptor among the text files in the folder, else one folder
     deeper."""
     if path.is_file():
         return path
@@ -141,13 +141,13 @@ class _Images:
                 self.by_stem.setdefault(relative.rsplit(".", 1)[0], file)
 
     def find(self, listed: str) -> Path | None:
-        """The file at a listed path, or one of the same name in another image format; None: there is none."""
+        """Return the file at a listed path, or one of the same name in another image format; None: there is none."""
         path = re.sub(r"/+", "/", listed.replace("\\", "/")).lower().removeprefix("./")
         return self.by_name.get(path) or self.by_stem.get(path.rsplit(".", 1)[0])
 
 
 def read_emva1288(path: Path) -> RecordingSet:
-    """The recordings of an EMVA 1288 measurement as a recording set of one (left) camera.
+    """Return the recordings of an EMVA 1288 measurement as a recording set of one (left) camera.
 
     Images that are listed but missing are left out and counted. Raises InputError where no image is there, an image is
     damaged or of another size than the others, or the descriptor can't be understood.

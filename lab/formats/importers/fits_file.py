@@ -44,12 +44,13 @@ class FitsHeader:
 
 
 def is_fits(file: Path) -> bool:
-    """Whether a file is a FITS file by its ending, `.fits.gz` included."""
+    """Return whether a file is a FITS file by its ending, `.fits.gz` included."""
     return file.name.lower().removesuffix(GZIP).endswith(FITS)
 
 
 def load_fits(file: Path) -> Frame:
-    """The only image of a FITS file, uint16 (rows, cols) with BZERO and BSCALE applied. InputError without the path."""
+    """Return the only image of a FITS file, uint16 (rows, cols) with BZERO and BSCALE applied. InputError without
+    the path."""
     found, _ = _opened(file)
     if found.ndim != 2:
         raise InputError(f"has the shape {found.shape}, not (rows, cols); save one file a frame")
@@ -63,8 +64,8 @@ def load_fits(file: Path) -> Frame:
 
 
 def fits_header(file: Path, *, with_image: bool = True) -> FitsHeader:
-    """What the header says; InputError without the path. Without `with_image`, the image isn't read, and damage in it
-    stays unseen."""
+    """Return what the header says; InputError without the path. Without `with_image`, the image isn't read, and damage
+    in it stays unseen."""
     header = _opened(file)[1] if with_image else _header(file)
     stated = header.get("IMAGETYP", header.get("OBSTYPE"))
     words = str(stated).lower() if stated is not None else ""
@@ -96,7 +97,7 @@ def _stream(file: Path) -> Iterator[IO[bytes]]:
 
 
 def _header(file: Path) -> Any:
-    """The header of the first image that isn't empty, with that of the file's beginning."""
+    """Return the header of the first image that isn't empty, with that of the file's beginning."""
     from astropy.io import fits
 
     with warnings.catch_warnings():
@@ -113,7 +114,7 @@ def _header(file: Path) -> Any:
 
 
 def _opened(file: Path) -> tuple[Any, Any]:
-    """The image's values and header. A file whose data or checksum is damaged is refused."""
+    """Return the image's values and header. A file whose data or checksum is damaged is refused."""
     from astropy.io import fits
     from astropy.io.fits.verify import VerifyWarning
     from astropy.utils.exceptions import AstropyUserWarning

@@ -19,7 +19,7 @@ from lab.formats.recording_set import RecordingError, RecordingSet
 
 
 def read_fits_folder(path: Path, tap: str = "") -> RecordingSet:
-    """The FITS frames in the folder `path` as a recording set. `tap`: that tap of the sensor alone.
+    """Return the FITS frames in the folder `path` as a recording set. `tap`: that tap of the sensor alone.
 
     Raises RecordingError with one line for every frame that can't be used: damaged, without an exposure. Frames whose
     image type is neither dark nor flat need an `index.csv`; without one they are left out with a warning.
@@ -58,7 +58,7 @@ def read_fits_folder(path: Path, tap: str = "") -> RecordingSet:
 
 
 def _cells(header: FitsHeader) -> dict[str, str]:
-    """What a header states, as cells of an index."""
+    """Return what a header states, as cells of an index."""
     stated = {
         "exposure_s": None if header.exposure_s is None else f"{header.exposure_s:.12g}",
         "temperature_c": None if header.temperature_c is None else f"{header.temperature_c:.6g}",
@@ -68,7 +68,7 @@ def _cells(header: FitsHeader) -> dict[str, str]:
 
 
 def _with_headers(path: Path) -> Index:
-    """The index, with what the headers state in empty cells."""
+    """Return the index, with what the headers state in empty cells."""
     rows: list[tuple[int, dict[str, str]]] = []
     problems: list[str] = []
     index = read_index(path / INDEX)

@@ -53,7 +53,7 @@ class FrameHeader:
 
 
 def frame_header(file: Path) -> FrameHeader | None:
-    """The header of a frame's file; None where it states nothing that is known here."""
+    """Return the header of a frame's file; None where it states nothing that is known here."""
     suffix = file.suffix.lower()
     found: FrameHeader | None = None
     try:
@@ -92,7 +92,7 @@ def _of_raw(file: Path) -> FrameHeader | None:
 
 
 def _of_tiff(stream: Any) -> FrameHeader | None:
-    """The tags of a TIFF, which EXIF is too, in its first directory and in the one of EXIF."""
+    """Return the tags of a TIFF, which EXIF is too, in its first directory and in the one of EXIF."""
     with _silent():
         try:
             with tifffile.TiffFile(stream) as opened:
@@ -116,7 +116,7 @@ def _of_tiff(stream: Any) -> FrameHeader | None:
 
 
 def _camera(tags: Mapping[str, Any]) -> InstrumentSnapshot | None:
-    """The camera that EXIF names, with what else it says of its settings; None where it names none."""
+    """Return the camera that EXIF names, with what else it says of its settings; None where it names none."""
     maker, model, serial = (_text(tags.get(name)) for name in ("Make", "Model", "BodySerialNumber"))
     if not (maker or model or serial):
         return None
@@ -131,7 +131,7 @@ def _text(value: Any) -> str:
 
 
 def _above_zero(value: Any) -> float | None:
-    """A number or a fraction (numerator, denominator); None where it isn't one, or isn't above 0."""
+    """Return a number or a fraction (numerator, denominator); None where it isn't one, or isn't above 0."""
     try:
         if isinstance(value, tuple) and len(value) == 2:
             value = value[0] / value[1]

@@ -43,23 +43,24 @@ def read_image(file: Path) -> Frame:
 
 
 def is_frame(file: Path) -> bool:
-    """Whether a file is one that can be read as a frame, by its ending."""
+    """Return whether a file is one that can be read as a frame, by its ending."""
     return file.suffix.lower() in (*IMAGES, *RAWS, ".npy") or is_fits(file)
 
 
 def frame_name(path: str) -> str:
-    """The name of a frame's file without its ending, `.fits.gz` included."""
+    """Return the name of a frame's file without its ending, `.fits.gz` included."""
     name = path.rpartition("/")[2]
     return Path(name[: -len(GZIP)] if is_fits(Path(name)) and name.lower().endswith(GZIP) else name).stem
 
 
 def has_alpha(image: NDArray[Any]) -> bool:
-    """Whether an image (rows, cols[, channels]) has a channel of transparency beside its grey values or colours."""
+    """Return whether an image (rows, cols[, channels]) has a channel of transparency beside its grey values or
+    colours."""
     return image.shape[2:] in ((2,), (4,))
 
 
 def decoded(file: Path) -> NDArray[Any]:
-    """An image file's samples as they're stored, channels in OpenCV's order. InputError without the path."""
+    """Return an image file's samples as they're stored, channels in OpenCV's order. InputError without the path."""
     data = file.read_bytes()
     if why := _damage(data):
         raise InputError(f"damaged image ({why}); copy it again or recapture")
@@ -93,8 +94,8 @@ def _damage(data: bytes) -> str | None:
 
 
 def grey(image: NDArray[Any]) -> Frame:
-    """The grey values (rows, cols) of a decoded image; a channel of transparency is dropped. InputError for colours and
-    other numbers."""
+    """Return the grey values (rows, cols) of a decoded image; a channel of transparency is dropped. InputError for
+    colours and other numbers."""
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"its values are {image.dtype}; save grey values of 8 or 16 bit")
     if image.ndim == 3:
@@ -129,8 +130,8 @@ class ImageFiles(FolderFiles):
 
 
 def described_sides(file: Path) -> dict[Side, dict[str, Any]]:
-    """What `camera.toml` says of each side: its keys at the top are of a single (left) camera, or of every side where
-    it has the tables `[left]` and `[right]`. A missing file says nothing of the left one."""
+    """Return what `camera.toml` says of each side: its keys at the top are of a single (left) camera, or of every side
+    where it has the tables `[left]` and `[right]`. A missing file says nothing of the left one."""
     written: dict[str, Any] = {}
     if file.is_file():
         try:
@@ -149,8 +150,8 @@ def described_sides(file: Path) -> dict[Side, dict[str, Any]]:
 
 
 def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> dict[Side, DataSheet]:
-    """The cameras that `camera.toml` describes, by the keys of a recording set's camera. Keys that it leaves out come
-    from that side's `defaults`; a missing file is an empty one."""
+    """Return the cameras that `camera.toml` describes, by the keys of a recording set's camera. Keys that it leaves out
+    come from that side's `defaults`; a missing file is an empty one."""
     cameras = {}
     for side, keys in described_sides(file).items():
         known = {key: value for key, value in keys.items() if key != "taps"}  # of the readout, not of the data sheet

@@ -28,7 +28,7 @@ class Index:
 
 
 def read_index(file: Path, needed: tuple[str, ...] = ("frame", "kind")) -> Index:
-    """The rows of `file`, whose header has the columns `needed`; cells without blanks, empty ones left out.
+    """Return the rows of `file`, whose header has the columns `needed`; cells without blanks, empty ones left out.
 
     Raises InputError with one line where it can't be read, a column is missing, or one that isn't known is a known one
     in another unit or misspelled. Other unknown columns are left out with a remark.
@@ -63,8 +63,8 @@ def read_index(file: Path, needed: tuple[str, ...] = ("frame", "kind")) -> Index
 
 
 def _check_header(file: Path, header: list[str], needed: tuple[str, ...]) -> list[str]:
-    """The columns that aren't used. Raises InputError for one that is missing, stands twice, or is meant to be a known
-    one."""
+    """Return the columns that aren't used. Raises InputError for one that is missing, stands twice, or is meant to be a
+    known one."""
     known = _columns()
     unknown = [name for name in header if name and name not in known]
     meant = [(name, near) for name in unknown if (near := nearest_name(name, known)) is not None and near not in header]
@@ -84,7 +84,7 @@ def _check_header(file: Path, header: list[str], needed: tuple[str, ...]) -> lis
 
 
 def _columns() -> list[str]:
-    """The keys of all kinds of capture, those of objects in them with a dot."""
+    """Return the keys of all kinds of capture, those of objects in them with a dot."""
     names: dict[str, None] = {}
     for kind in CAPTURES.models.values():
         for key, field in kind.model_fields.items():
@@ -95,8 +95,8 @@ def _columns() -> list[str]:
 
 
 def capture_of_row(row: dict[str, str]) -> dict[str, Any]:
-    """A row as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`. Raises InputError
-    without the row."""
+    """Return a row as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`. Raises
+    InputError without the row."""
     if "frame" not in row or "kind" not in row:
         raise InputError("the frame or its kind is missing; write both")
     if row["kind"] == "checkerboard" and "squares" in row and "square_mm" in row:

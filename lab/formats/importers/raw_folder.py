@@ -48,8 +48,8 @@ INDEX, CAMERA = "index.csv", "camera.toml"
 
 
 def read_raw_folder(path: Path, tap: str = "") -> RecordingSet:
-    """The captures that `index.csv` in the folder `path` lists, as a recording set. `tap`: that tap of the sensor
-    alone.
+    """Return the captures that `index.csv` in the folder `path` lists, as a recording set. `tap`: that tap of the
+    sensor alone.
 
     Raises RecordingError with one line for every row that can't be used.
     """
@@ -57,8 +57,8 @@ def read_raw_folder(path: Path, tap: str = "") -> RecordingSet:
 
 
 def recordings_of_index(path: Path, index: Index, where: str, tap: str = "") -> RecordingSet:
-    """The captures of the rows of `index`, with the `camera.toml` of the folder `path`. `where`: what lists them, for
-    messages."""
+    """Return the captures of the rows of `index`, with the `camera.toml` of the folder `path`. `where`: what lists
+    them, for messages."""
     cameras = path / CAMERA
     if not cameras.is_file():
         raise InputError(f"{cameras}: missing; write the camera's keys, `cfa` at least")

@@ -65,7 +65,8 @@ class Readout:
         return len(self.rows), len(self.cols)
 
     def applied(self, frame: Frame) -> Frame:
-        """A frame as it is stored, cropped, joined, and with its taps at one black level; codes don't fall below 0."""
+        """Return a frame as it is stored, cropped, joined, and with its taps at one black level; codes don't fall
+        below 0."""
         made = np.zeros(frame.shape, np.int64)
         for tap, shift in zip(self.taps, self.shift_dn, strict=True):
             made[_box(tap.region)] = frame[_box(tap.region)].astype(np.int64) + shift
@@ -101,8 +102,8 @@ def parse_taps(listed: Any, where: str) -> tuple[Tap, ...]:
 
 
 def readout(taps: Sequence[Tap], files: Sequence[Path], shape: tuple[int, int], where: str) -> Readout:
-    """How frames of `shape` (rows, cols) are cropped and levelled. Raises InputError where a region isn't inside the
-    frame, the regions don't tile a rectangle, or a black level isn't known."""
+    """Return how frames of `shape` (rows, cols) are cropped and levelled. Raises InputError where a region isn't inside
+    the frame, the regions don't tile a rectangle, or a black level isn't known."""
     for tap in taps:
         _check_inside(tap, shape, where)
     kept_rows, kept_cols, cut = _tiled(taps, shape, where)
@@ -158,7 +159,7 @@ def _check_inside(tap: Tap, shape: tuple[int, int], where: str) -> None:
 def _tiled(
     taps: Sequence[Tap], shape: tuple[int, int], where: str
 ) -> tuple[tuple[int, ...], tuple[int, ...], list[str]]:
-    """The rows and the columns that the regions tile, and the runs between them that are cut out, in words."""
+    """Return the rows and the columns that the regions tile, and the runs between them that are cut out, in words."""
     count, overscan = np.zeros(shape, np.uint8), np.zeros(shape, bool)
     for tap in taps:
         count[_box(tap.region)] += 1

@@ -45,7 +45,7 @@ Corners = tuple[tuple[float, float], ...]
 
 
 def read_slanted_edge(path: Path, options: ImportOptions) -> RecordingSet:
-    """A picture with slanted edges as a recording set of one capture, whose edges are looked for.
+    """Return a picture with slanted edges as a recording set of one capture, whose edges are looked for.
 
     Raises InputError with all that isn't stated, in one line, or where no edge is found in the picture.
     """
@@ -65,8 +65,8 @@ def read_slanted_edge(path: Path, options: ImportOptions) -> RecordingSet:
 
 
 def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
-    """A picture of a ColorChecker of 24 patches as a recording set of one capture; the patches are located, or given by
-    their corners.
+    """Return a picture of a ColorChecker of 24 patches as a recording set of one capture; the patches are located, or
+    given by their corners.
 
     Raises InputError with all that isn't stated, in one line, or where no chart is found.
     """
@@ -117,8 +117,8 @@ def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
 
 
 def _upright(frame: Frame, camera: DataSheet, corners: Corners) -> Corners:
-    """The corners in the order of a chart that isn't mirrored, of whose two the grey row falls: the detector may take
-    it turned or mirrored where light has one colour."""
+    """Return the corners in the order of a chart that isn't mirrored, of whose two the grey row falls: the detector may
+    take it turned or mirrored where light has one colour."""
     orders = ((0, 1, 2, 3), (2, 3, 0, 1), (1, 0, 3, 2), (3, 2, 1, 0))
     found = [tuple(corners[k] for k in order) for order in orders]
 
@@ -136,7 +136,7 @@ def _picture(
     plane_of: Callable[[NDArray[Any]], tuple[Frame, str]],
     missing: tuple[str, ...],
 ) -> tuple[Frame, DataSheet, tuple[str, ...]]:
-    """The frame, its camera, and what was done to it. Raises InputError that names everything that isn't stated.
+    """Return the frame, its camera, and what was done to it. Raises InputError that names everything that isn't stated.
     `plane_of`: frame and mosaic of a colour picture (rows, cols, 3) in R, G, B."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give one picture")
@@ -183,7 +183,7 @@ def _picture(
 
 
 def _stated_camera(path: Path, options: ImportOptions) -> tuple[Path, dict[str, Any]]:
-    """The camera file of a picture, and its keys."""
+    """Return the camera file of a picture, and its keys."""
     file = options.camera if options.camera is not None else path.parent / CAMERA
     if options.camera is not None and not file.is_file():
         raise InputError(f"{file}: no such file; give the camera file of --camera")
@@ -213,7 +213,7 @@ def _one_channel(image: NDArray[Any], options: ImportOptions) -> tuple[Frame, st
 
 
 def _remosaiced(image: NDArray[Any]) -> tuple[Frame, str]:
-    """A colour picture (rows, cols, 3) sampled like a mosaic."""
+    """Return a colour picture (rows, cols, 3) sampled like a mosaic."""
     rows, cols = (n // 2 * 2 for n in image.shape[:2])
     made = np.empty((rows, cols), image.dtype)
     for channel, places in mosaic.phases("RGGB").items():
@@ -223,8 +223,8 @@ def _remosaiced(image: NDArray[Any]) -> tuple[Frame, str]:
 
 
 def _small_colours(frame: Frame, camera: DataSheet) -> NDArray[np.uint8]:
-    """The mosaic binned to its period as a picture for a screen, (rows, cols, 3) in B, G, R: each channel over its
-    brightest per mille."""
+    """Return the mosaic binned to its period as a picture for a screen, (rows, cols, 3) in B, G, R: each channel over
+    its brightest per mille."""
     step = mosaic.step(camera.cfa)
     black = camera.black_level_dn or 0.0
     rows, cols = (n // step for n in frame.shape)

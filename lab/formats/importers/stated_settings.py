@@ -37,8 +37,8 @@ FEWEST_ROWS, FEWEST_OFF = 4, 2
 
 
 def held_against_frames(manifest: Manifest, images: Mapping[str, Path], where: str) -> tuple[Manifest, list[str]]:
-    """The manifest with the cameras that the frames' own files name; and one line for each quantity of it that these
-    files contradict, and for exposures that are hardly meant in seconds.
+    """Return the manifest with the cameras that the frames' own files name; and one line for each quantity of it that
+    these files contradict, and for exposures that are hardly meant in seconds.
 
     `images`: the file of each frame by its path. Raises InputError where the exposures can't be right: `where` names
     what lists them."""
@@ -65,7 +65,7 @@ def held_against_frames(manifest: Manifest, images: Mapping[str, Path], where: s
 def _contradictions(
     manifest: Manifest, seen: Sequence[_HeaderSeen], images: Mapping[str, Path], where: str
 ) -> list[str]:
-    """The lines of `held_against_frames` on quantities."""
+    """Return the lines of `held_against_frames` on quantities."""
     timed = [one for one in seen if one.capture.exposure_s is not None and one.header.exposure_s is not None]
     off = [one for one in timed if not same_exposure(one.capture.exposure_s, one.header)]
     if off and (unit := _unit(off)):
@@ -122,7 +122,7 @@ def _check_limit(too_long: Sequence[Capture], images: Mapping[str, Path]) -> Non
 
 
 def same_exposure(stated_s: float | None, header: FrameHeader) -> bool:
-    """Whether an exposure is that of a header, as far as this is rounded; yes where one is unknown."""
+    """Return whether an exposure is that of a header, as far as this is rounded; yes where one is unknown."""
     header_s = header.exposure_s
     if not stated_s or not header_s:
         return True
@@ -131,7 +131,7 @@ def same_exposure(stated_s: float | None, header: FrameHeader) -> bool:
 
 
 def same_f_number(stated: float | None, header: float | None) -> bool:
-    """Whether two f-numbers are one marking; yes where one is unknown."""
+    """Return whether two f-numbers are one marking; yes where one is unknown."""
     return not stated or not header or max(stated / header, header / stated) <= F_NUMBER_FACTOR
 
 
@@ -140,7 +140,7 @@ def _differ(stated: float | None, header: float | None, allowed: float) -> bool:
 
 
 def _unit(off: Sequence[_HeaderSeen]) -> str | None:
-    """The unit in which all these exposures are, where it isn't the second."""
+    """Return the unit in which all these exposures are, where it isn't the second."""
     for factor, name in UNIT_FACTORS.items():
         if all(same_exposure((one.capture.exposure_s or 0.0) / factor, one.header) for one in off):
             return name
@@ -148,7 +148,7 @@ def _unit(off: Sequence[_HeaderSeen]) -> str | None:
 
 
 def _moved(timed: Sequence[_HeaderSeen], off: Sequence[_HeaderSeen]) -> str | None:
-    """The rows whose frames all exposures fit, where these aren't their own."""
+    """Return the rows whose frames all exposures fit, where these aren't their own."""
     if len(timed) < FEWEST_ROWS or len(off) < FEWEST_OFF:
         return None
     stated, taken = [one.capture.exposure_s for one in timed], [one.header for one in timed]
@@ -166,7 +166,7 @@ def _and(off: Sequence[object]) -> str:
 
 
 def _said(key: str, unit: str, off: Sequence[tuple[_HeaderSeen, float | None, float | None]]) -> str:
-    """The line for a quantity of which frames, what is stated and what their files say differ; empty where none
+    """Return the line for a quantity of which frames, what is stated and what their files say differ; empty where none
     does."""
     if not off:
         return ""
@@ -178,7 +178,7 @@ def _said(key: str, unit: str, off: Sequence[tuple[_HeaderSeen, float | None, fl
 
 
 def _uneven_gain(own: Sequence[_HeaderSeen]) -> str:
-    """The line for frames of one side whose ISO speeds differ otherwise than their gains."""
+    """Return the line for frames of one side whose ISO speeds differ otherwise than their gains."""
     known = [one for one in own if one.header.iso is not None]
     if not known:
         return ""
@@ -201,7 +201,7 @@ def _uneven_gain(own: Sequence[_HeaderSeen]) -> str:
 
 
 def _long(doubted: Sequence[Capture], images: Mapping[str, Path]) -> str:
-    """The line for exposures with light that are longer than usual; empty where there is none."""
+    """Return the line for exposures with light that are longer than usual; empty where there is none."""
     long = [c for c in doubted if c.kind != "dark" and c.exposure_s > LONGEST_LIT_S]
     if not long:
         return ""
@@ -214,7 +214,7 @@ def _long(doubted: Sequence[Capture], images: Mapping[str, Path]) -> str:
 
 
 def _overlapping(captures: Sequence[Capture], images: Mapping[str, Path]) -> list[str]:
-    """The line for the first exposure of each side that is longer than the time to the next frame."""
+    """Return the line for the first exposure of each side that is longer than the time to the next frame."""
     lines = []
     timed = [(c.time.timestamp(), c) for c in captures if c.time is not None and c.exposure_s is not None]
     for side in dict.fromkeys(c.side for _, c in timed):

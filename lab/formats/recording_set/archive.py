@@ -30,13 +30,13 @@ class _Sent(io.RawIOBase):
         return len(written)
 
     def taken(self) -> bytes:
-        """What came since the last call."""
+        """Return what came since the last call."""
         held, self._held = bytes(self._held), bytearray()
         return held
 
 
 def packed(files: Iterable[tuple[str, bytes]], form: ArchiveForm = "zip") -> Iterator[bytes]:
-    """The pieces of an archive of files, (path, content) each: one of them in memory at a time, stored without
+    """Yield the pieces of an archive of files, (path, content) each: one of them in memory at a time, stored without
     compression. Where `files` raises, the archive has no end (a .zip: no list of files), so nobody takes it for a whole
     one."""
     sent = _Sent()
@@ -57,6 +57,6 @@ def packed(files: Iterable[tuple[str, bytes]], form: ArchiveForm = "zip") -> Ite
 
 
 def archive(recordings: RecordingSet, form: ArchiveForm = "zip") -> Iterator[bytes]:
-    """The pieces of an archive of the set, as `packed` makes it. Raises InputError where a frame is missing or
+    """Yield the pieces of an archive of the set, as `packed` makes it. Raises InputError where a frame is missing or
     damaged."""
     return packed(contents(recordings), form)

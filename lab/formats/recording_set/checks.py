@@ -164,7 +164,7 @@ def _check_captures(recordings: RecordingSet, found: Findings) -> None:
 
 
 def _some(ids: Sequence[str]) -> str:
-    """The first three of some captures and the last."""
+    """Return the first three of some captures and the last."""
     return ", ".join(ids[:3]) + (f" .. {ids[-1]}" if len(ids) > 3 else "")
 
 

@@ -50,7 +50,7 @@ class ClippedLevel:
 
 
 def channel_planes(frame: Frame, camera: DataSheet) -> dict[str, list[Frame]]:
-    """The planes of each channel: two for `G`, the whole frame for `Y`."""
+    """Return the planes of each channel: two for `G`, the whole frame for `Y`."""
     step = 1 if camera.cfa == "MONO" else 2
     planes: dict[str, list[Frame]] = defaultdict(list)
     for row in range(step):
@@ -79,7 +79,7 @@ def clipped_share(frame: Frame, camera: DataSheet) -> dict[str, float]:
 
 
 def _light(recordings: RecordingSet, flat: FlatCapture) -> tuple[float, str]:
-    """The light of a flat, and the name of its scale: photons, exposure times radiance, or exposure alone."""
+    """Return the light of a flat, and the name of its scale: photons, exposure times radiance, or exposure alone."""
     if flat.photons_per_pixel is not None:
         at = "" if flat.wavelength_nm is None else f" at {flat.wavelength_nm:g} nm"
         return flat.photons_per_pixel, f"{PHOTONS}{at}"
@@ -90,7 +90,7 @@ def _light(recordings: RecordingSet, flat: FlatCapture) -> tuple[float, str]:
 
 
 def flat_level(recordings: RecordingSet, flat: FlatCapture, frame: Frame, clipped: dict[str, float]) -> ClippedLevel:
-    """The level of one flat. Raises InputError where its spectrum can't be used."""
+    """Return the level of one flat. Raises InputError where its spectrum can't be used."""
     light, scale = _light(recordings, flat)
     planes = channel_planes(frame, recordings.camera(flat.side))
     mean_dn = {name: float(np.mean([plane.mean() for plane in planes[name]])) for name in planes}

@@ -21,7 +21,8 @@ RAWS = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", 
 
 
 def locate(root: Path, path: str) -> Path:
-    """The file at a manifest's `path`. Raises InputError for a path that is absolute, missing, or outside `root`."""
+    """Return the file at a manifest's `path`. Raises InputError for a path that is absolute, missing, or outside
+    `root`."""
     pure = PurePosixPath(path)
     if not path or "\\" in path or pure.is_absolute() or (len(path) > 1 and path[1] == ":"):
         raise InputError("not a path relative to the folder with '/'; move the file into the folder and name it so")
@@ -44,7 +45,7 @@ def locate(root: Path, path: str) -> Path:
 
 
 def _load_npy(file: Path, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
-    """A two-dimensional .npy of `dtype` in either byte order."""
+    """Return a two-dimensional .npy of `dtype` in either byte order."""
     try:
         # Mapped: a damaged header may announce terabytes, which must not be allocated.
         mapped = np.load(file, mmap_mode="r", allow_pickle=False)
@@ -61,8 +62,8 @@ def _load_npy(file: Path, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
 
 
 def _load_tif(file: Path, wanted: tuple[int, int] | None = None) -> NDArray[Any]:
-    """A TIFF of one page, 16 bit, one sample a pixel. One of another shape than `wanted` isn't decoded: it may be far
-    larger than its file."""
+    """Return a TIFF of one page, 16 bit, one sample a pixel. One of another shape than `wanted` isn't decoded: it may
+    be far larger than its file."""
     frame = None
     try:
         with tifffile.TiffFile(file) as tif:
@@ -87,7 +88,7 @@ def _load_tif(file: Path, wanted: tuple[int, int] | None = None) -> NDArray[Any]
 
 
 def _load_raw(file: Path, shape: tuple[int, int] | None = None) -> NDArray[Any]:
-    """The mosaic of a camera raw: its visible area, or the whole sensor where only that has `shape`."""
+    """Return the mosaic of a camera raw: its visible area, or the whole sensor where only that has `shape`."""
     try:
         with rawpy.imread(str(file)) as raw:
             visible, whole = raw.raw_image_visible, raw.raw_image
@@ -114,7 +115,7 @@ def load_frame(file: Path, shape: tuple[int, int] | None = None) -> Frame:
 
 
 def load_target(file: Path) -> Target:
-    """A screen's pattern from an .npy file: uint8 (rows, cols) of 0 and 1. Its InputError leaves the path to the
+    """Return a screen's pattern from an .npy file: uint8 (rows, cols) of 0 and 1. Its InputError leaves the path to the
     caller."""
     if file.suffix.lower() != ".npy":
         raise InputError(f"a target can't be {file.suffix or 'without an ending'}; give .npy (uint8)")
@@ -122,7 +123,7 @@ def load_target(file: Path) -> Target:
 
 
 def checked_target(target: Target) -> Target:
-    """The target itself. Raises InputError where it holds other numbers than 0 and 1."""
+    """Return the target itself. Raises InputError where it holds other numbers than 0 and 1."""
     if target.size == 0 or int(target.max()) > 1:
         raise InputError("holds other numbers than 0 and 1; save what was shown as 0 (dark) and 1 (lit)")
     return target

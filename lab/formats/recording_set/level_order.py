@@ -86,7 +86,7 @@ def exchanged_kinds(levels: Sequence[FrameLevel], camera: DataSheet) -> tuple[li
 
 
 def _comparable(dark: FrameLevel, flat: FrameLevel) -> bool:
-    """Whether the flat has to be as bright as the dark: as long an exposure at about the same temperature."""
+    """Return whether the flat has to be as bright as the dark: as long an exposure at about the same temperature."""
     warmer = (dark.temperature_c is not None and flat.temperature_c is not None) and abs(
         dark.temperature_c - flat.temperature_c
     ) > ALIKE_C

@@ -96,7 +96,7 @@ class Findings:
 
 
 def manifest_json(manifest: Manifest) -> str:
-    """A manifest as JSON text, with the keys that were given, unknown ones included."""
+    """Return a manifest as JSON text, with the keys that were given, unknown ones included."""
     kept = manifest.model_dump(mode="json", exclude_unset=True)
     head = {key: getattr(manifest, key) for key in ("format", "version", "name", "notes")}
     return json.dumps(head | kept, indent=1, ensure_ascii=False) + "\n"
@@ -143,7 +143,7 @@ def _usable_captures(listed: list[Any], where: str, sides: Container[str], found
 
 
 def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
-    """The manifest in JSON `text`, and warnings for what was skipped. Raises RecordingError, one line for each
+    """Return the manifest in JSON `text`, and warnings for what was skipped. Raises RecordingError, one line for each
     problem."""
     try:
         raw = json.loads(text)

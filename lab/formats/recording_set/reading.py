@@ -15,7 +15,7 @@ from lab.formats.recording_set.recordings import RecordingSet
 
 
 def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None = None) -> RecordingSet:
-    """The recording set in the folder `path`, completely checked.
+    """Return the recording set in the folder `path`, completely checked.
 
     Raises RecordingError (an InputError) with one line for everything that can't be used. Unknown keys, skipped kinds
     and the like stand in `.warnings`.

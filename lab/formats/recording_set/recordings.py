@@ -62,7 +62,7 @@ class RecordingSet:
         return tuple(side for side in get_args(Side) if side in self.manifest.cameras)
 
     def camera(self, side: Side) -> DataSheet:
-        """The data sheet of the camera of `side`. Raises InputError where there is none."""
+        """Return the data sheet of the camera of `side`. Raises InputError where there is none."""
         if side not in self.manifest.cameras:
             raise InputError(f"{self.source}: no camera '{side}', only {', '.join(self.sides)}; ask for one of these")
         return self.manifest.cameras[side]
@@ -84,7 +84,7 @@ class RecordingSet:
         ]
 
     def with_frames(self, frames: Mapping[str, NDArray[Any]]) -> RecordingSet:
-        """The same set with other frames (uint16) at some of its paths."""
+        """Return the same set with other frames (uint16) at some of its paths."""
         return self._copy(files=OverlaidFiles(self._files, frames))
 
     def joined(self, later: RecordingSet, folder: str) -> RecordingSet:
@@ -98,16 +98,16 @@ class RecordingSet:
         )
 
     def without(self, ids: Container[str]) -> RecordingSet:
-        """The same set less the captures of these ids; frames, spectra and targets are shared."""
+        """Return the same set less the captures of these ids; frames, spectra and targets are shared."""
         kept = tuple(c for c in self.manifest.captures if c.id not in ids)
         return self.under(self.manifest.model_copy(update={"captures": kept}))
 
     def under(self, manifest: Manifest) -> RecordingSet:
-        """The same frames, spectra and targets as `manifest` describes them."""
+        """Return the same frames, spectra and targets as `manifest` describes them."""
         return self._copy(manifest=manifest)
 
     def for_one_of(self, processes: int) -> RecordingSet:
-        """The same set for one of several processes, which together keep as many frames as this set would."""
+        """Return the same set for one of several processes, which together keep as many frames as this set would."""
         return self._copy(cache_bytes=self.cache_bytes // processes)
 
     def _copy(
@@ -117,7 +117,7 @@ class RecordingSet:
         files: RecordingFiles | None = None,
         cache_bytes: int | None = None,
     ) -> RecordingSet:
-        """A set with an empty cache of frames; what isn't given is this set's."""
+        """Return a set with an empty cache of frames; what isn't given is this set's."""
         return RecordingSet(
             self.manifest if manifest is None else manifest,
             source=self.source,
@@ -127,7 +127,7 @@ class RecordingSet:
         )
 
     def capture(self, id: str) -> Capture:
-        """The capture called `id`; InputError where there is none."""
+        """Return the capture called `id`; InputError where there is none."""
         for capture in self.manifest.captures:
             if capture.id == id:
                 return capture
@@ -163,25 +163,25 @@ class RecordingSet:
             self._held = 0
 
     def spectrum(self, path: str) -> Spectrum:
-        """The spectrum that the manifest calls `path`."""
+        """Return the spectrum that the manifest calls `path`."""
         try:
             return self._files.spectrum(path)
         except InputError as error:
             raise InputError(f"{self.where(path)}: {error}") from error
 
     def target(self, path: str) -> Target:
-        """What was shown on the screen: uint8 (rows, cols) of 0 and 1."""
+        """Return what was shown on the screen: uint8 (rows, cols) of 0 and 1."""
         try:
             return self._files.target(path)
         except InputError as error:
             raise InputError(f"{self.where(path)}: {error}") from error
 
     def file(self, path: str) -> Path | None:
-        """The file behind a path of the manifest, or None for a set in memory."""
+        """Return the file behind a path of the manifest, or None for a set in memory."""
         return self._files.file(path)
 
     def where(self, path: str) -> str:
-        """How messages call the file that the manifest names `path`."""
+        """Return how messages call the file that the manifest names `path`."""
         return self._files.where(path)
 
 

@@ -43,7 +43,7 @@ Snapshots = Mapping[str, InstrumentSnapshot]
 
 
 def differences(before: Snapshots, now: Snapshots) -> tuple[str, ...]:
-    """What differs between two sets of instruments, by their names in messages (`camera left`): a line each.
+    """Return what differs between two sets of instruments, by their names in messages (`camera left`): a line each.
 
     Nothing where one of them isn't known. Settings of `OF_A_CAPTURE`, and a camera's `Device...`, which says its
     identity again or its temperature, are left out.
@@ -79,5 +79,5 @@ def _same(was: Value | None, is_now: Value | None) -> bool:
 
 
 def told(value: Value | None) -> str:
-    """A setting's value in words."""
+    """Return a setting's value in words."""
     return "not there" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

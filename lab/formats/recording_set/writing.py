@@ -24,7 +24,7 @@ MANIFEST = "manifest.json"
 
 
 def _place(recordings: RecordingSet, root: Path, path: str) -> Path:
-    """The file below `root` that the manifest calls `path`; its folder is made."""
+    """Return the file below `root` that the manifest calls `path`; its folder is made."""
     pure = PurePosixPath(path)
     if "\\" in path or pure.is_absolute() or ".." in pure.parts or path == MANIFEST:
         raise InputError(f"{recordings.source}: the path '{path}' leaves the folder; name it frames/..., spectra/...")
@@ -34,7 +34,7 @@ def _place(recordings: RecordingSet, root: Path, path: str) -> Path:
 
 
 def _frame_content(recordings: RecordingSet, path: str, frame: Frame) -> bytes:
-    """A frame as a file of the format that its name says: the set's own file, byte by byte, where it has one."""
+    """Return a frame as a file of the format that its name says: the set's own file, byte by byte, where it has one."""
     if (there := recordings.file(path)) is not None:
         return there.read_bytes()
     buffer, suffix = io.BytesIO(), PurePosixPath(path).suffix

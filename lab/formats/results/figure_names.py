@@ -80,8 +80,8 @@ _SECTIONS = {"noise", "spectral", "mtf", "psf", "geometry", "stereo", "channels"
 
 
 def _parts(figure: str) -> tuple[str, list[str]]:
-    """The field of a figure (empty where its path has none that is declared), and what tells it from others of that
-    field."""
+    """Return the field of a figure (empty where its path has none that is declared), and what tells it from others of
+    that field."""
     words = figure.split()
     at = max((k for k, word in enumerate(words) if word in NAMES), default=-1)
     if at < 0:
@@ -91,7 +91,8 @@ def _parts(figure: str) -> tuple[str, list[str]]:
 
 
 def plain_name(figure: str, place: str = "") -> str:
-    """The plain name of a figure: `MTF50, edge-1 G`, `focal length x`. A path without a declared field is its own name.
+    """Return the plain name of a figure: `MTF50, edge-1 G`, `focal length x`. A path without a declared field is its
+    own name.
 
     `place`: which number, of a figure of several.
     """
@@ -105,6 +106,6 @@ def plain_name(figure: str, place: str = "") -> str:
 
 
 def unit_of(figure: str) -> str:
-    """The unit of a figure, "1" for a ratio."""
+    """Return the unit of a figure, "1" for a ratio."""
     field = _parts(figure)[0]
     return next((unit for end, unit in _UNITS.items() if field.endswith(end)), "1")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, ncx2
 
-from lab.challenge.fair_strength import (
+from lab.challenge.noncentrality import (
     FALSE_ALARMS,
     Directions,
     beyond,

@@ -15,8 +15,7 @@ from lab.formats.provenance import provenance_of
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
 from lab.report import render_report
-from lab.report.emva import data_sheets
-from lab.report.emva_spatial import spectrogram
+from lab.report.emva import data_sheets, spectrogram
 
 SHAPE = (64, 96)
 

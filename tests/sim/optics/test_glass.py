@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sim.optics.glass import model_index, refractive_index
 from sim.optics.prescription import GlassName, PrescriptionError
+from sim.optics.system import model_index, refractive_index
 
 D, F, C, G = 587.5618, 486.1327, 656.2725, 435.8343
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lab.diagnose.inference.families import tied_family
+from lab.diagnose.inference.decide import tied_family
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.charge_diffusion import ChargeDiffusion

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from lab.diagnose.inference.decide import _with_equal_choices, _with_every_mode, decide
+from lab.diagnose.inference.decide import _still_certain, _with_equal_choices, _with_every_mode, decide, named_members
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.naming import _still_certain, named_members
 from lab.diagnose.inference.score import prototype_changes, signatures_of
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate

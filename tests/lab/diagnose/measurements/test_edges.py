@@ -11,9 +11,16 @@ import pytest
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.edge_estimator import REAL_AT, profile_interpolation, spread_operator
-from lab.diagnose.measurements.edge_profiles import measured_edges
-from lab.diagnose.measurements.slanted_edge import ASIDE, _Edges, edge_block, stopped_edge_block
+from lab.diagnose.measurements.slanted_edge import (
+    ASIDE,
+    REAL_AT,
+    _Edges,
+    edge_block,
+    measured_edges,
+    profile_interpolation,
+    spread_operator,
+    stopped_edge_block,
+)
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lab.capture_kinds.flat import FlatCapture
-from lab.measure.repeatability import RepeatedMeans, level_repeatability, steady
+from lab.measure.noise_figures import RepeatedMeans, level_repeatability, steady
 
 SCATTER, NOISE = 3e-4, 1e-4
 

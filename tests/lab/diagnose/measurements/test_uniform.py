@@ -26,9 +26,10 @@ from lab.measure.noise_figures import (
     NARROW_WINDOW_PX,
     WIDE_PLANE_PX,
     WIDE_WINDOW_PX,
+    level_repeatability,
+    repeated_levels,
     variance_between_pixels,
 )
-from lab.measure.repeatability import level_repeatability, repeated_levels
 from lab.measure.rounding import rounding_std_dn
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (

@@ -9,7 +9,7 @@ from scipy import ndimage
 from lab.diagnose.measurements.chart import chart_block
 from lab.diagnose.measurements.dark_squares import screen_block
 from lab.diagnose.measurements.slanted_edge import edge_block
-from lab.measure.halo_light import Surroundings, harmonics
+from lab.measure.patches import Surroundings, harmonics
 from mocks.former import laws as concealed
 from sim.point import halos
 from tests.lab.diagnose.on_blocks import former, names, verdict
