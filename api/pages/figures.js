@@ -4,7 +4,13 @@ import { $, element } from "./page.js";
 import { number } from "./charts.js";
 
 export const unitText = (unit) => (unit === "1" ? "" : ` ${unit}`);
-export const measured = (value, std) => (value == null ? "" : std ? `${number(value, 6)} ± ${number(std, 2)}` : number(value, 6));
+// A value to the digit that two digits of its uncertainty reach.
+export function measured(value, std) {
+  if (value == null) return "";
+  if (!std) return number(value, 6);
+  const decimals = Math.min(20, Math.max(0, 1 - Math.floor(Math.log10(std))));
+  return `${value.toFixed(decimals)} ± ${std.toFixed(decimals)}`;
+}
 
 export function bandText([low, high]) {
   if (low == null) return `≤ ${number(high)}`;
@@ -30,9 +36,24 @@ export function isLike(one, text) {
   return text.toLowerCase().split(/\s+/).every((word) => names.includes(word));
 }
 
-// Draws those of `items()` that the search field of the form `id` asks for, now and whenever it is changed.
+const FIRST = 40; // figures that stand there until all are asked for
+
+// Draws those of `items()` that the search field of the form `id` asks for, now and whenever it is changed: the first
+// of many, until all are asked for.
 export function searchIn(id, items, draw) {
-  const again = () => draw(items().filter((one) => isLike(one, $(id).elements.search.value)));
+  const all = element("button", { type: "button", hidden: true });
+  let whole = false;
+  const again = () => {
+    const found = items().filter((one) => isLike(one, $(id).elements.search.value));
+    all.hidden = whole || found.length <= FIRST;
+    all.textContent = `Show all ${found.length}`;
+    draw(whole ? found : found.slice(0, FIRST));
+  };
+  all.addEventListener("click", () => {
+    whole = true;
+    again();
+  });
+  $(id).append(all);
   $(id).addEventListener("input", again);
   $(id).addEventListener("submit", (event) => event.preventDefault());
   return again;
