@@ -74,6 +74,7 @@ INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
     "pr670": _mock("pr655", "PhotoResearch", "PR-670", "67001234"),
     "cr250": _mock("cr300", "ColorimetryResearch", "CR-250"),
     "cr300": _mock("cr300", "ColorimetryResearch", "CR-300"),
+    "cs2000": _mock("cs2000", "MockCs2000"),
     "scpi-meter": _mock("scpi_meter", "MockScpiMeter"),
     "stage": _mock("stage", "MockStage"),
 }

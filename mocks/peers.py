@@ -27,6 +27,7 @@ from mocks.bench import Bench
 from mocks.cornerstone260 import MockCornerstone260
 from mocks.cornerstone260b import MockCornerstone260B
 from mocks.cr300 import ColorimetryResearch
+from mocks.cs2000 import MockCs2000
 from mocks.display import Page, browse
 from mocks.lamp import Lamp, LampClock
 from mocks.pr655 import PhotoResearch
@@ -584,6 +585,10 @@ def pr655() -> Peer:
 
 def cr300() -> Peer:
     return LinePeer(ColorimetryResearch, slowness=5.0, timeout_s=0.5, measure_timeout_s=2.0)
+
+
+def cs2000() -> Peer:
+    return LinePeer(MockCs2000, slowness=2.0, timeout_s=0.5, measure_timeout_s=5.0)
 
 
 def ocean_optics() -> Peer:
