@@ -67,20 +67,24 @@ class MockCs2000(Grammar):
     def _obey(self, command: str) -> Reply:
         code = self._failure()
         if command in {"MEAS,0", "MEAS,1"} and self._remote:
-            if command == "MEAS,0":
-                self._done_at = None
-                return _ok()
-            if self._done_at is not None:
-                return _error(INVALID)
-            self._failing, self._values = code, []
-            luminance = tristimulus(self._light.radiance())[1]
-            seconds = round(float(np.clip(40.0 / max(luminance, 1e-9), 2.0, 240.0)))
-            self._done_at = self.clock.now() + seconds
-            return _ok(str(seconds))
-        if code is not None:
-            return _error(code)
+            return self._measure(command == "MEAS,1", code)
+        if code is None and self._done_at is not None:
+            code = INVALID
+        return self._tell(command) if code is None else _error(code)
+
+    def _measure(self, begin: bool, code: int | None) -> Reply:
+        if not begin:
+            self._done_at = None
+            return _ok()
         if self._done_at is not None:
             return _error(INVALID)
+        self._failing, self._values = code, []
+        luminance = tristimulus(self._light.radiance())[1]
+        seconds = round(float(np.clip(40.0 / max(luminance, 1e-9), 2.0, 240.0)))
+        self._done_at = self.clock.now() + seconds
+        return _ok(str(seconds))
+
+    def _tell(self, command: str) -> Reply:
         if command == "IDDR":
             return _ok("CS-2000", "0", self._serial_number)
         if found := re.fullmatch(r"RMTS,([01])", command):

@@ -33,6 +33,7 @@ from mocks.lamp import Lamp, LampClock
 from mocks.pr655 import PhotoResearch
 from mocks.scpi_meter import AREA_M2, MockScpiMeter
 from mocks.scpi_meter import calibration_csv as diode_calibration
+from mocks.sp2150 import MockSp2150
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.stage import MockStage
 from mocks.tethered import TetheredCamera, write_dng
@@ -573,6 +574,10 @@ def cornerstone260() -> Peer:
 def cornerstone260b() -> Peer:
     bench = Bench()
     return UsbPeer((MockCornerstone260B(bench),), bench.clock, timeout_s=0.5, move_timeout_s=20.0)
+
+
+def sp2150() -> Peer:
+    return LinePeer(MockSp2150, light=Bench(), slit_um=500.0, dark_place=6, timeout_s=1.0, move_timeout_s=20.0)
 
 
 def specbos1211() -> Peer:

@@ -1,4 +1,4 @@
-"""Konica Minolta CS-2000 and CS-2000A on USB's virtual serial port: commands and answers are lines, 380..780 nm by 1 nm.
+"""Konica Minolta CS-2000 and CS-2000A on USB's virtual serial port: commands and answers are lines; 380..780 nm, 1 nm.
 
 An answer begins with `OK00`, or is an error code `ERnn`. MEAS,1 answers twice: with the seconds that the measurement
 takes, and once it is done. Sources: public clients (TU Berlin's MATLAB toolbox: commands, error codes, the four pieces
