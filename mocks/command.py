@@ -67,6 +67,7 @@ def _mock(module: str, name: str, *identity: Any) -> Callable[[Place], Grammar]:
 INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
     "cornerstone260": _mock("cornerstone260", "MockCornerstone260"),
     "cornerstone260b-serial": _mock("cornerstone260b_serial", "MockCornerstone260BSerial"),
+    "cm110": _mock("cm110", "MockCm110"),
     "sp2150": _mock("sp2150", "MockSp2150"),
     "specbos1211": _mock("specbos1211", "MockSpecbos1211"),
     "specbos1201": _mock("specbos1211", "MockSpecbos1211", "1201427", "specbos 1201", (380.0, 780.0)),

@@ -24,6 +24,7 @@ from drivers.camera.basler import pylon_library
 from drivers.contract.peer import Peer, RealInstrument
 from drivers.errors import InstrumentError
 from mocks.bench import Bench
+from mocks.cm110 import MockCm110
 from mocks.cornerstone260 import MockCornerstone260
 from mocks.cornerstone260b import MockCornerstone260B
 from mocks.cr300 import ColorimetryResearch
@@ -574,6 +575,18 @@ def cornerstone260() -> Peer:
 def cornerstone260b() -> Peer:
     bench = Bench()
     return UsbPeer((MockCornerstone260B(bench),), bench.clock, timeout_s=0.5, move_timeout_s=20.0)
+
+
+def cm110() -> Peer:
+    return LinePeer(
+        MockCm110,
+        light=Bench(),
+        dark_nm=200.0,
+        dispersion_nm_per_mm=7.0,
+        slit_um=500.0,
+        timeout_s=0.5,
+        move_timeout_s=20.0,
+    )
 
 
 def sp2150() -> Peer:

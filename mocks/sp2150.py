@@ -70,11 +70,11 @@ class MockSp2150(Grammar):
             if told is not None:
                 out.append(self._said(command, told))
             elif self._busy_until is None:
-                out.append(Reply(f"{command if self._echo else ''}  ? \r\n".encode("latin-1")))
+                out.append(Reply(f"{command if self._echo else ''}  ? \r\n".encode("latin-1", "replace")))
         return out
 
     def _said(self, command: str, told: str) -> Reply:
-        return Reply(f"{command if self._echo else ''} {told} ok\r\n".encode("latin-1"))
+        return Reply(f"{command if self._echo else ''} {told} ok\r\n".encode("latin-1", "replace"))
 
     def _told(self, command: str) -> str | None:
         """Return the answer; None where there is none yet (a motion), or none at all."""

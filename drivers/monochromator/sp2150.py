@@ -1,4 +1,4 @@
-"""Acton / Princeton Instruments SP2150 (SP-2150i) on RS-232 or its USB port: 9600 8N1, commands end CR, parameters first.
+"""Acton / Princeton Instruments SP2150 (SP-2150i) on RS-232 or its USB port: 9600 8N1, commands end CR, numbers first.
 
 The instrument echoes a command, and ends its answer with ` ok` CR LF once it is done: `500.00 GOTO` when the grating
 stands, `?NM` after ` 500.000 nm `. It has no shutter: a blank in its filter wheel stands for one. `dark_place` says
@@ -62,7 +62,7 @@ class Sp2150(WireInstrument, Monochromator):
         self.dark_place = dark_place
         if dark_place in {row.place for row in self.filters}:
             raise InstrumentError(
-                f"monochromator: dark_place {dark_place} is an order-sorting filter's place, too; correct one of the two"
+                f"monochromator: dark_place {dark_place} is an order-sorting filter's place, too; correct one of them"
             )
         self.dispersion_nm_per_mm = dispersion_nm_per_mm
         self._slits = HandSlits(None if slit_um is None else checked_slit_um(slit_um))

@@ -60,7 +60,7 @@ class Cs2000(WireInstrument, Spectroradiometer):
     def measure(self) -> RadianceMeasurement:
         with self._conversation():
             seconds = self._ask("MEAS,1")
-            if not seconds.strip().isdigit():  # the late end of an earlier one has none
+            if not seconds.strip().isdecimal():  # the late end of an earlier one has none
                 raise self._strange("MEAS,1", f"OK00,{seconds}")
             if float(seconds) > self.measure_timeout_s:
                 self._cancel()
@@ -125,7 +125,7 @@ class Cs2000(WireInstrument, Spectroradiometer):
         code, _, rest = answer.partition(",")
         if code == "OK00":
             return rest
-        if len(code) == 4 and code.startswith("ER") and code[2:].isdigit():
+        if len(code) == 4 and code.startswith("ER") and code[2:].isdecimal():
             meaning = ERRORS.get(int(code[2:]), "look it up in its manual")
             raise Refused(f"{self._transport.name}: {asked!r} failed: {code}, {meaning}", int(code[2:]))
         raise self._strange(asked, answer)
