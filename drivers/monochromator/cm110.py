@@ -17,7 +17,6 @@ what tells a CM112."""
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 
 from drivers.errors import Garbled, InstrumentError, NoAnswer, Refused
 from drivers.found_settings import FoundSettings
@@ -72,7 +71,7 @@ class Cm110(WireInstrument, Monochromator):
         with self._conversation():
             return self._identity
 
-    def settings(self) -> Mapping[str, Setting]:
+    def settings(self) -> dict[str, Setting]:
         with self._conversation():
             return {
                 "bandwidth_nm": self.bandwidth_nm(),

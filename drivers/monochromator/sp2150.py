@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from drivers.errors import Garbled, InstrumentError, Refused
 from drivers.instrument import Identity, Recorder, Setting
@@ -77,7 +77,7 @@ class Sp2150(WireInstrument, Monochromator):
         with self._conversation():
             return self._identity
 
-    def settings(self) -> Mapping[str, Setting]:
+    def settings(self) -> dict[str, Setting]:
         return {**super().settings(), "grating": self._grating()[0]}
 
     def departures(self) -> tuple[str, ...]:
