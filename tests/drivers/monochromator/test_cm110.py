@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Refused
 from drivers.monochromator.cm110 import Cm110
 from mocks.cm110 import MockCm110
-from mocks.lamp import Lamp
+from mocks.lamp import Lamp, LampClock
 from mocks.wire import Pty
 
 
@@ -114,4 +115,30 @@ def test_a_lost_echo_is_asked_for_again(served: Callable[..., str]) -> None:
     assert mono.wavelength_nm() == 0.0
     mono.move_nm(500.0)
     assert mono.wavelength_nm() == 500.0
+    mono.close()
+
+
+@pytest.mark.parametrize("late_status", [False, True])
+def test_a_motion_longer_than_an_answer_is_waited_for_and_ends_before_a_stop_parks(
+    served: Callable[..., str], late_status: bool
+) -> None:
+    mock = MockCm110(Lamp(20.0, LampClock(1.0)), late_status=late_status)
+    mono = Cm110(served(mock, Pty()), dark_nm=200.0, timeout_s=0.3)
+    mono.move_nm(390.0)  # 2.3 s from 0
+    assert mono.wavelength_nm() == 390.0
+    ended: list[str] = []
+
+    def move() -> None:
+        try:
+            mono.move_nm(700.0)
+        except InstrumentError as error:
+            ended.append(str(error))
+
+    worker = threading.Thread(target=move)
+    worker.start()
+    worker.join(0.5)
+    mono.stop()
+    worker.join(30)
+    assert "stopped while waiting for" in ended[0]
+    assert not mono.shutter_is_open()
     mono.close()
