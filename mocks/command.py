@@ -67,6 +67,8 @@ def _mock(module: str, name: str, *identity: Any) -> Callable[[Place], Grammar]:
 INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
     "cornerstone260": _mock("cornerstone260", "MockCornerstone260"),
     "cornerstone260b-serial": _mock("cornerstone260b_serial", "MockCornerstone260BSerial"),
+    "cm110": _mock("cm110", "MockCm110"),
+    "sp2150": _mock("sp2150", "MockSp2150"),
     "specbos1211": _mock("specbos1211", "MockSpecbos1211"),
     "specbos1201": _mock("specbos1211", "MockSpecbos1211", "1201427", "specbos 1201", (380.0, 780.0)),
     "spectraval1501": _mock("specbos1211", "MockSpecbos1211", "1501427", "spectraval 1501", (380.0, 780.0)),
@@ -74,6 +76,7 @@ INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
     "pr670": _mock("pr655", "PhotoResearch", "PR-670", "67001234"),
     "cr250": _mock("cr300", "ColorimetryResearch", "CR-250"),
     "cr300": _mock("cr300", "ColorimetryResearch", "CR-300"),
+    "cs2000": _mock("cs2000", "MockCs2000"),
     "scpi-meter": _mock("scpi_meter", "MockScpiMeter"),
     "stage": _mock("stage", "MockStage"),
 }

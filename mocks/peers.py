@@ -24,14 +24,17 @@ from drivers.camera.basler import pylon_library
 from drivers.contract.peer import Peer, RealInstrument
 from drivers.errors import InstrumentError
 from mocks.bench import Bench
+from mocks.cm110 import MockCm110
 from mocks.cornerstone260 import MockCornerstone260
 from mocks.cornerstone260b import MockCornerstone260B
 from mocks.cr300 import ColorimetryResearch
+from mocks.cs2000 import MockCs2000
 from mocks.display import Page, browse
 from mocks.lamp import Lamp, LampClock
 from mocks.pr655 import PhotoResearch
 from mocks.scpi_meter import AREA_M2, MockScpiMeter
 from mocks.scpi_meter import calibration_csv as diode_calibration
+from mocks.sp2150 import MockSp2150
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.stage import MockStage
 from mocks.tethered import TetheredCamera, write_dng
@@ -574,6 +577,22 @@ def cornerstone260b() -> Peer:
     return UsbPeer((MockCornerstone260B(bench),), bench.clock, timeout_s=0.5, move_timeout_s=20.0)
 
 
+def cm110() -> Peer:
+    return LinePeer(
+        MockCm110,
+        light=Bench(),
+        dark_nm=200.0,
+        dispersion_nm_per_mm=7.0,
+        slit_um=500.0,
+        timeout_s=0.5,
+        move_timeout_s=20.0,
+    )
+
+
+def sp2150() -> Peer:
+    return LinePeer(MockSp2150, light=Bench(), slit_um=500.0, dark_place=6, timeout_s=1.0, move_timeout_s=20.0)
+
+
 def specbos1211() -> Peer:
     return LinePeer(MockSpecbos1211, slowness=5.0, timeout_s=0.5, fetch_timeout_s=0.5, measure_timeout_s=2.0)
 
@@ -584,6 +603,10 @@ def pr655() -> Peer:
 
 def cr300() -> Peer:
     return LinePeer(ColorimetryResearch, slowness=5.0, timeout_s=0.5, measure_timeout_s=2.0)
+
+
+def cs2000() -> Peer:
+    return LinePeer(MockCs2000, slowness=2.0, timeout_s=0.5, measure_timeout_s=5.0)
 
 
 def ocean_optics() -> Peer:

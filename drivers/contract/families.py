@@ -73,14 +73,20 @@ class MonochromatorContract(FamilyContract):
 
     def takes_long(self, driver: Monochromator) -> None:
         driver.move_nm(400.0 if driver.wavelength_nm() > 550.0 else 700.0)
+        driver.open_shutter()  # one that is parked in place of a shutter moves now
 
     def settings(self, driver: Monochromator) -> None:
+        driver.move_nm(500.0)
+        driver.open_shutter()
         for wavelength_nm in (450.0, 632.8, 0.0):
             driver.check_nm(wavelength_nm)  # refuses nothing that it can do
             driver.move_nm(wavelength_nm)
             found = driver.wavelength_nm()
             require(abs(found - wavelength_nm) <= 0.5, f"told to go to {wavelength_nm} nm it stands at {found} nm")
-        for opened in (True, False):
+        for wrong_nm in (-1.0, 1e6, math.nan, math.inf):
+            require_refused(lambda wrong_nm=wrong_nm: driver.move_nm(wrong_nm), f"{wrong_nm} nm")  # type: ignore[misc]
+        require(driver.wavelength_nm() <= 0.5, "a refused wavelength moved it")
+        for opened in (False, True, False):
             (driver.open_shutter if opened else driver.close_shutter)()
             require(driver.shutter_is_open() is opened, f"the shutter told to be open = {opened} isn't")
         before = driver.slit_um()
@@ -89,11 +95,8 @@ class MonochromatorContract(FamilyContract):
         require(abs(driver.slit_um() - 500.0) <= 5.0, f"told a slit of 500 um it has {driver.slit_um()} um")
         require(driver.bandwidth_nm() > 0.0, "its bandwidth isn't above 0")
         driver.set_slit_um(before)
-        for wrong_nm in (-1.0, 1e6, math.nan, math.inf):
-            require_refused(lambda wrong_nm=wrong_nm: driver.move_nm(wrong_nm), f"{wrong_nm} nm")  # type: ignore[misc]
         for wrong_um in (-1.0, 1e9):
             require_refused(lambda wrong_um=wrong_um: driver.set_slit_um(wrong_um), f"a slit of {wrong_um} um")  # type: ignore[misc]
-        require(driver.wavelength_nm() <= 0.5, "a refused wavelength moved it")
 
     def is_safe(self, driver: Monochromator) -> None:
         require(not driver.shutter_is_open(), "its shutter is open")

@@ -85,7 +85,11 @@ def filter_place(filters: Sequence[OrderSortingFilter], wavelength_nm: float) ->
 
 
 class Monochromator(Instrument):
-    """A monochromator behind a light source. `stop` and `close` leave the shutter closed."""
+    """A monochromator behind a light source. `stop` and `close` leave the shutter closed.
+
+    One without a shutter has something in its place: a blank in the filter wheel, or a wavelength at which its lamp
+    gives no light. There it is parked, and goes to the wavelength that it was told when it is opened.
+    """
 
     #: Whether light may get out, as far as this driver's own commands and the instrument's answers say.
     _may_shine = False

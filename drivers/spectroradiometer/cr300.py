@@ -120,7 +120,7 @@ class Cr300(WireInstrument, Spectroradiometer):
         code, _, rest = rest.partition(":")
         if kind == "OK" and rest.startswith(f"{asked}:"):
             return rest.removeprefix(f"{asked}:").strip()
-        if kind == "ER" and code.lstrip("-").isdigit():
+        if kind == "ER" and code.lstrip("-").isdecimal():
             remedy = REMEDIES.get(int(code), "look it up in its manual")
             meaning = rest.partition(":")[0]
             raise Refused(f"{self._transport.name}: {asked!r} failed: error {code}, {meaning}; {remedy}", int(code))

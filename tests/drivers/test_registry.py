@@ -21,7 +21,7 @@ def test_every_built_in_driver_can_be_loaded() -> None:
 
 
 def test_an_unknown_driver_is_refused_with_what_there_is() -> None:
-    with pytest.raises(InstrumentError, match=r"no driver 'cs999'; installed are cornerstone260"):
+    with pytest.raises(InstrumentError, match=r"no driver 'cs999'; installed are .*cornerstone260"):
         registry.driver("monochromator", "cs999")
 
 

@@ -36,7 +36,7 @@ GOLDEN = Path(__file__).parent.parent / "wire"
 
 
 def conversations() -> Iterator[tuple[str, int]]:
-    for name in ("cornerstone260", "specbos1211", "pr655", "cr300", "stage"):
+    for name in ("cornerstone260", "specbos1211", "pr655", "cr300", "cs2000", "sp2150", "cm110", "stage"):
         for number, _ in enumerate(parse((GOLDEN / f"{name}.txt").read_text(encoding="ascii"))):
             yield name, number
 
@@ -102,6 +102,9 @@ def test_no_input_upsets_a_mock(name: str, talk: Callable[[Grammar, bytes], byte
         "pr670": (b"\rQPHOTO\r", b"D111\r", b"00000,PR-670\r\n"),
         "cr250": (b"\n", b"RC Model\n", b"OK:0:RC Model:CR-250\r\n"),
         "cr300": (b"\n", b"RC Model\n", b"OK:0:RC Model:CR-300\r\n"),
+        "cs2000": (b"\n", b"IDDR\n", b"OK00,CS-2000,0,10004711\r\n"),
+        "cm110": (b"\x1b" * 5, b"8\x0d", b"\x18"),
+        "sp2150": (b"\r", b"SERIAL\r", b"SERIAL 21500427  ok\r\n"),
         "stage": (b"\n", b"LIST?\n", b"cap,sphere,colorchecker,screen\r\n"),
     }[name]
     talk(mock, start_over)
