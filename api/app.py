@@ -86,6 +86,7 @@ TAGS = [
         "description": "Candidate, certified, superseded, expired; figures and their history; camera models; "
         "comparisons.",
     },
+    {"name": "twin", "description": "Predictions before the capture, sealed; their scores, and budgets."},
     {"name": "challenges", "description": "Concealed-effect data with sealed truths, and its scoring."},
     {"name": "knowledge", "description": "What the models know."},
 ]

@@ -31,6 +31,7 @@ from lab.effect_titles import effect_title
 from lab.errors import InputError
 from lab.formats.results import DiagnosisResult, NamedEffect, ResolveEnd
 from sim.camera import Side
+from sim.effects.families import Family
 from sim.effects.library import effects as library
 from sim.effects.library import typical
 from sim.parameters import Frozen
@@ -272,6 +273,8 @@ NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
 
 #: Effects that the mock bench can't show, and refuses to conceal.
 NOT_SHOWN_BY_BENCH = frozenset({"second_order_light", "stereo_time_offset"})
+#: They hold what a diagnosis found, and name no cause.
+NO_CAUSES = frozenset(name for name, kind in library().items() if kind.family is Family.DISCREPANCY)
 
 #: Effects that one session can't show: distortion is fitted to its boards, so that only an earlier calibration shows a
 #: change.
@@ -347,6 +350,12 @@ def typical_spec(effect: str) -> str:
     of_rig = "light" in kind.stages()
     one = typical(kind)
     values = ",".join(f"{name}={getattr(one, name):g}" for name in kind.quantities())
+    # choices that aren't those of an effect that nothing is said of
+    values += "".join(
+        f",{name}={getattr(one, name)}"
+        for name in kind.told_choices()
+        if getattr(one, name) != kind.choices()[name].default
+    )
     return f"{'both' if of_rig else 'left'}:{effect}:{values}"
 
 
@@ -364,7 +373,7 @@ def _of(name: str, *effects: str) -> LiveCase:
 
 def every_case() -> dict[str, LiveCase]:
     """Name -> case: singles, pairs, healthy cameras, and benches to resolve."""
-    cases = [_of(effect, effect) for effect in library() if effect not in NOT_SHOWN_BY_BENCH]
+    cases = [_of(effect, effect) for effect in library() if effect not in NOT_SHOWN_BY_BENCH | NO_CAUSES]
     cases += [_of("+".join(pair), *pair) for pair in PAIRS]
     cases += [LiveCase(name=f"healthy-{seed}", seed=seed) for seed in HEALTHY_SEEDS]
     cases += [

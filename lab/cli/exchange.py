@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
-from lab.capture_kinds.base import Names, names_in
 from lab.cli.console import out, warn
 from lab.cli.progress import progress_bar
 from lab.cli.sources import recordings_of, store_to_read
@@ -86,6 +85,7 @@ def export_spectra(source: str, to: Path, quantity: str, data: Path | None) -> N
 
 
 def _spectra(source: str, quantity: str, data: Path | None) -> CgatsSpectra:
+    from lab.capture_kinds.base import Names, names_in
     from lab.formats.cgats import CgatsSpectra, Quantity, get_quantity
     from lab.formats.spectrum_csv import parse_spectrum
 

@@ -44,7 +44,8 @@ SPREADING = [
     _one_deviation(kind)
     for kind in library.effects().values()
     if TRANSFER & library.may_change(kind)
-    and kind.name not in {"veiling_glare", "field_curvature"}  # on axis what grows with the field does nothing
+    # on axis what grows with the field does nothing; a discovered law acts where its table is
+    and kind.name not in {"veiling_glare", "field_curvature", "empirical_law"}
 ]
 
 

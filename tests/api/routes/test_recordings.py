@@ -550,10 +550,10 @@ def test_the_captures_of_a_set_are_looked_at(running: Running, folder: Path, lit
         assert channel["mean_dn"] == pytest.approx(little_set.frame(little_set.captures()[1]).mean())
         assert client.get(f"{here}/captures/1/preview.webp").content[8:12] == b"WEBP"
         assert client.get(f"{here}/captures/3").status_code == 404
+        assert client.get(f"{here}/figures").status_code == 409
         job = client.post(f"{here}/jobs", json={"kind": "fit"}).json()
         id = here.rpartition("/")[2]
         assert [one["id"] for one in client.get("/api/v1/jobs", params={"recordings_id": id}).json()] == [job["id"]]
         assert client.get("/api/v1/jobs", params={"session_id": "nothing"}).json() == []
         assert client.get("/api/v1/jobs", params={"session_id": "x", "recordings_id": id}).status_code == 422
-        assert client.get(f"{here}/figures").status_code == 409
         until(client, f"/api/v1/jobs/{job['id']}", lambda one: one["state"] in ("done", "failed"), 60.0)
