@@ -604,20 +604,35 @@ def test_the_help_waits_for_no_numerics(arguments: list[str]) -> None:
 
 
 @pytest.mark.parametrize("verb", [["capture"], ["run"], ["run", "--resolve"]])
+@pytest.mark.parametrize("during", ["capture", "fit", "resolve"])
 def test_an_interrupted_session_is_told_with_the_whole_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: list[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    verb: list[str],
+    during: str,
 ) -> None:
-    def interrupted(store: object, station: object, request: object, tell: Callable[[object], None]) -> str:
-        tell(SimpleNamespace(session="session-1"))
+    """While its sequences are taken, while it is fitted, and while a further session settles its doubts."""
+    sessions = iter(["session-1", "session-2"])
+
+    def captured(store: object, station: object, request: object, tell: Callable[[object], None]) -> str:
+        tell(SimpleNamespace(session=(session := next(sessions))))
+        if (session, during) in {("session-1", "capture"), ("session-2", "resolve")}:
+            raise KeyboardInterrupt
+        return session
+
+    def carried_out(request: PipelineRequest, store: object, capturer: Callable[..., str]) -> None:
+        for _ in range(1 if during == "fit" else 2):
+            capturer(request.capture, lambda progress: None)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(capturing, "capture_here", interrupted)
+    monkeypatch.setattr(capturing, "capture_here", captured)
+    monkeypatch.setattr(capturing, "run_here", carried_out)
     monkeypatch.setattr("lab.capture.station.read_station", lambda file: None)
-    store = open_store(tmp_path / "data folder")
-    with pytest.raises(KeyboardInterrupt):
-        capturing._capturer(store, Path("lab.toml"), None, verb)(CaptureRequest(), lambda progress: None)
-    command = f"calibench {' '.join(verb)} --resume session-1 --out '{store.root}' --station lab.toml"
-    assert capsys.readouterr().err == f"calibench: go on with `{command}`\n"
+    data = tmp_path / "data [of] a folder"
+    assert cli.main([*verb, "--out", str(data), "--station", "lab.toml"]) == 130
+    command = f"calibench {' '.join(verb)} --resume session-1 --out '{data}' --station lab.toml"
+    assert capsys.readouterr().err.splitlines()[0] == f"calibench: go on with `{command}`"
 
 
 @pytest.mark.parametrize(
