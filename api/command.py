@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
+from lab.cli.exit_codes import Terminated
 from lab.cli.sources import open_store, store_to_read
 from lab.errors import InputError
 
@@ -135,7 +136,7 @@ def serve(
         shown = "127.0.0.1" if host in _ANY else f"[{host}]" if ":" in host else host
         url = f"{'http' if tls_certificate is None else 'https'}://{shown}:{line.getsockname()[1]}"
         typer.echo(f"operator's page: {url}/    REST: {url}/docs")
-        with contextlib.suppress(KeyboardInterrupt):  # raised again by uvicorn, once it has ended in good order
+        with contextlib.suppress(Terminated):  # uvicorn raises the signal again, once it has ended in good order
             server.run(sockets=[line])
 
 

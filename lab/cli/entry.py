@@ -9,7 +9,7 @@ import threading
 import traceback
 from collections.abc import Iterator
 from importlib import metadata
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -17,7 +17,7 @@ from rich.markup import escape
 from lab.cli import calibrations, capturing, devices, diagnosis, effects, fitting, kinds, recordings, simulation
 from lab.cli.challenge import commands as challenge
 from lab.cli.console import err, out
-from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
+from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated
 from lab.cli.twin import commands as twin
 from lab.errors import DeviceError, InputError, failure_of_environment
 
@@ -75,7 +75,11 @@ def _ended_as_by_ctrl_c() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+    def end(number: int, frame: Any) -> None:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, end)
     try:
         yield
     finally:
