@@ -726,6 +726,24 @@ def test_a_frame_that_may_not_be_read_is_not_damaged(
     assert "can't be read (Permission denied)" in told and "damaged" not in told
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_said_with_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`/dev/full` refuses what is written as a full disk does: without the name of the file."""
+
+    def write(path: Path, text: str, **_: object) -> None:
+        with Path("/dev/full").open("w") as full:
+            full.write(text)
+
+    monkeypatch.setattr(Path, "write_text", write)
+    file = tmp_path / "effects.json"
+    assert cli.main(["effects", "--json", str(file)]) == 2
+    told = capsys.readouterr().err
+    assert told == f"calibench: {file}: No space left on device; make room on that disk, then do it again\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def _commands(command: Any, *path: str) -> Iterator[tuple[str, Any]]:
     yield " ".join(path), command
     for name, below in getattr(command, "commands", {}).items():
