@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
+from lab.cli.exit_codes import Terminated
 from lab.cli.sources import open_store, store_to_read
 from lab.errors import InputError
 
@@ -69,7 +70,7 @@ def serve(
     host: Annotated[
         str, typer.Option(help="where to listen; others than this computer need a key first")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 8000,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="where to listen; 0: a free one")] = 8000,
     allow_host: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="a name under which others reach it; may be repeated")
     ] = None,
@@ -135,7 +136,8 @@ def serve(
         shown = "127.0.0.1" if host in _ANY else f"[{host}]" if ":" in host else host
         url = f"{'http' if tls_certificate is None else 'https'}://{shown}:{line.getsockname()[1]}"
         typer.echo(f"operator's page: {url}/    REST: {url}/docs")
-        server.run(sockets=[line])
+        with contextlib.suppress(Terminated):  # uvicorn raises the signal again, once it has ended in good order
+            server.run(sockets=[line])
 
 
 @key.command("create")
@@ -156,7 +158,7 @@ def list_keys(data: Folder = None) -> None:
 
 
 @key.command("remove")
-def remove(name: str, data: Folder = None) -> None:
+def remove(name: Annotated[str, typer.Argument(help="name of the key's owner")], data: Folder = None) -> None:
     """Remove a key and the logins of the operator's page that were made with it."""
     store_to_read(data).remove_key(name)
     typer.echo(f"removed: {name}")

@@ -8,6 +8,7 @@ process.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
@@ -35,6 +36,15 @@ def dask_client(scheduler: str, timeout_s: float) -> Any:
         ) from error
 
 
+@contextlib.contextmanager
+def _cluster(scheduler: str) -> Iterator[Any]:
+    """Connect to a scheduler and yield the client. Raises InputError where none answers, or it has no workers."""
+    with dask_client(scheduler, CONNECT_TIMEOUT_S) as client:
+        if not client.scheduler_info(n_workers=-1)["workers"]:
+            raise InputError(f"Dask scheduler {scheduler}: has no workers; start some with `dask worker {scheduler}`")
+        yield client
+
+
 @dataclass(frozen=True)
 class Workers:
     """`jobs` processes of this computer, 1: this one unless it is to be `apart`; or with `scheduler` the workers of a
@@ -58,6 +68,12 @@ class Workers:
                 yield number, work(item, *shared)
         else:
             yield from self._here(work, items, shared)
+
+    def check(self) -> None:
+        """Raise InputError where the cluster's scheduler doesn't answer or has no workers: before the work."""
+        if self.scheduler is not None:
+            with _cluster(self.scheduler):
+                pass
 
     def in_order(self, work: Callable[..., R], items: Sequence[Any], *shared: Any) -> list[R]:
         """Return the results of `done`, in the order of the items."""
@@ -89,11 +105,7 @@ class Workers:
     ) -> Iterator[tuple[int, R]]:
         from distributed import as_completed as as_completed_there
 
-        with dask_client(scheduler, CONNECT_TIMEOUT_S) as client:
-            if not client.scheduler_info(n_workers=-1)["workers"]:
-                raise InputError(
-                    f"Dask scheduler {scheduler}: has no workers; start some with `dask worker {scheduler}`"
-                )
+        with _cluster(scheduler) as client:
             there = [client.scatter(part, broadcast=True, hash=False) for part in shared]
             running = {client.submit(work, item, *there, pure=False): number for number, item in enumerate(items)}
             for ready in as_completed_there(running, loop=client.loop):

@@ -94,37 +94,37 @@ class _Unusable(Exception):
 
 @commands.command()
 def mock(
-    name: Annotated[str, typer.Argument(help=f"Instrument: {', '.join(EVERY_INSTRUMENT)}.")],
-    link: Annotated[Path | None, typer.Option(help="Make this path a link to the pseudo-terminal.")] = None,
+    name: Annotated[str, typer.Argument(help=f"instrument: {', '.join(EVERY_INSTRUMENT)}")],
+    link: Annotated[Path | None, typer.Option(help="make this path a link to the pseudo-terminal")] = None,
     tcp: Annotated[
-        str, typer.Option(help="HOST:PORT to listen at instead (display: to connect to; USB instruments: for USB/IP).")
+        str, typer.Option(help="HOST:PORT to listen at instead (display: to connect to; USB instruments: for USB/IP)")
     ] = "",
     fault: Annotated[
         str,
         typer.Option(
-            help="How to fail: KIND[=VALUE][@N[+]], as in half@3; late never half wrong error drop unplug, "
-            "a camera's frames also torn repeated missed."
+            help="how to fail: KIND[=VALUE][@N[+]], as in half@3; late never half wrong error drop unplug, "
+            "a camera's frames also torn repeated missed"
         ),
     ] = "",
     real_time: Annotated[
-        float, typer.Option(min=0.0, help="Real seconds for each second of the instrument (0: no waiting).")
+        float, typer.Option(min=0.0, help="real seconds for each second of the instrument (0: no waiting)")
     ] = 0.0,
     dialect: Annotated[
         str,
-        typer.Option(help="Which of an instrument's public dialects it speaks (pr655, pr670: two-lines, one-line)."),
+        typer.Option(help="which of an instrument's public dialects it speaks (pr655, pr670: two-lines, one-line)"),
     ] = "",
     calibration: Annotated[
         Path | None,
-        typer.Option(help="Write the calibration file that came with the instrument here (usb2000plus, scpi-meter)."),
+        typer.Option(help="write the calibration file that came with the instrument here (usb2000plus, scpi-meter)"),
     ] = None,
     frames: Annotated[
         Path | None,
         typer.Option(
-            help="Replay the frames *-left.npy and *-right.npy of this folder, in real time (u3v, u3v-stereo)."
+            help="replay the frames *-left.npy and *-right.npy of this folder, in real time (u3v, u3v-stereo)"
         ),
     ] = None,
     folder: Annotated[
-        Path | None, typer.Option(help="The folder that the camera's software writes raw files into (tethered).")
+        Path | None, typer.Option(help="the folder that the camera's software writes raw files into (tethered)")
     ] = None,
 ) -> None:
     """Serve one mock instrument on a pseudo-terminal, a TCP port or USB/IP; prints `ready ADDRESS` when it listens."""
@@ -270,34 +270,34 @@ def _serve_usb(
 
 @commands.command()
 def bench(
-    station: Annotated[Path | None, typer.Option(help="Write the station file of this bench here.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the hidden truth and of the noise.")] = 1,
+    station: Annotated[Path | None, typer.Option(help="write the station file of this bench here")] = None,
+    seed: Annotated[int, typer.Option(help="seed of the hidden truth and of the noise")] = 1,
     real_time: Annotated[
-        float, typer.Option(min=0.0, help="Real seconds for each second of the bench (0: no waiting).")
+        float, typer.Option(min=0.0, help="real seconds for each second of the bench (0: no waiting)")
     ] = 0.0,
     fault: Annotated[
-        list[str] | None, typer.Option(help="INSTRUMENT:SPEC, as in spectroradiometer:half@3; may be repeated.")
+        list[str] | None, typer.Option(help="INSTRUMENT:SPEC, as in spectroradiometer:half@3; may be repeated")
     ] = None,
-    host: Annotated[str, typer.Option(help="Where the stage and the cameras listen.")] = "127.0.0.1",
-    advertise: Annotated[str, typer.Option(help="Name of this computer for others; as --host if not given.")] = "",
+    host: Annotated[str, typer.Option(help="where the stage and the cameras listen")] = "127.0.0.1",
+    advertise: Annotated[str, typer.Option(help="name of this computer for others; as --host if not given")] = "",
     serial_over_tcp: Annotated[
-        bool, typer.Option("--serial-over-tcp", help="The serial instruments listen at --host, too.")
+        bool, typer.Option("--serial-over-tcp", help="the serial instruments listen at --host, too")
     ] = False,
-    display: Annotated[str, typer.Option(help="HOST:PORT at which the display driver will listen.")] = "",
-    with_parent: Annotated[bool, typer.Option("--with-parent", help="End when standard input is closed.")] = False,
+    display: Annotated[str, typer.Option(help="HOST:PORT at which the display driver will listen")] = "",
+    with_parent: Annotated[bool, typer.Option("--with-parent", help="end when standard input is closed")] = False,
     conceal: Annotated[
         list[str] | None,
         typer.Option(
             help="SIDE:EFFECT:PARAMETER=VALUE[,...], as in left:nonlinearity:quadratic_percent=2, in place of the "
             "bench's "
-            "default effects; may be repeated (or CALIBENCH_CONCEAL, with a ; between)."
+            "default effects; may be repeated (or CALIBENCH_CONCEAL, with a ; between)"
         ),
     ] = None,
     healthy: Annotated[
-        bool, typer.Option("--healthy", help="Conceal nothing: cameras that do what their data sheet says.")
+        bool, typer.Option("--healthy", help="conceal nothing: cameras that do what their data sheet says")
     ] = False,
     warm_up: Annotated[
-        float, typer.Option(help="Degrees by which the sensors get warmer during the first virtual minutes.")
+        float, typer.Option(help="degrees by which the sensors get warmer during the first virtual minutes")
     ] = 0.0,
 ) -> None:
     """Run the whole mock bench: prints one line an instrument, then `ready`."""

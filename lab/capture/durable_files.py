@@ -23,10 +23,13 @@ def write_durably(path: Path, content: bytes) -> None:
     folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
-    with partial.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:  # of a full disk, the system names no file
+        raise OSError(error.errno, error.strerror, error.filename or str(path)) from error
     partial.rename(path)
     folder = os.open(path.parent, os.O_RDONLY)
     try:

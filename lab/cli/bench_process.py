@@ -38,7 +38,11 @@ def mock_bench(conceal: Sequence[str], options: Sequence[str] = ()) -> Iterator[
             start_new_session=True,
         )
         try:
-            _await_ready(bench)
+            try:
+                _await_ready(bench)
+            except BaseException:  # it holds nothing yet, and looks at standard input only once it is ready
+                bench.kill()
+                raise
             yield file
         finally:
             assert bench.stdin is not None

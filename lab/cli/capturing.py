@@ -16,7 +16,7 @@ from lab.cli.console import check_writable, err, out, write_json
 from lab.cli.sources import Json, StoreFolder, open_store, run_here
 from lab.cli.tables import print_fit, print_resolving, print_sequences
 from lab.errors import InputError
-from lab.pipeline import Capturer, CaptureRequest, PipelineRequest, capture_here
+from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult, capture_here
 
 if TYPE_CHECKING:
     from lab.capture.session import Progress as CaptureProgress
@@ -85,7 +85,7 @@ def capture(
             demands_certified=certified,
         ),
     )
-    out.print(f"session: {run_here(request, store, _capturer(store, station, conceal, ['capture'])).session}")
+    out.print(f"session: {_carried_out(request, store, station, conceal, ['capture']).session}")
 
 
 @commands.command()
@@ -135,7 +135,7 @@ def run(
     verb += ["--resolve"] if resolve else []
     verb += [] if resolve_minutes is None else [f"--resolve-minutes={resolve_minutes:g}"]
     verb += [] if resolve_rounds is None else [f"--resolve-rounds={resolve_rounds}"]
-    found = run_here(request, store, _capturer(store, station, conceal, verb))
+    found = _carried_out(request, store, station, conceal, verb)
     assert found.fit is not None
     assert found.validation is not None
     assert found.diagnosis is not None
@@ -183,31 +183,34 @@ def sequences(
         print_sequences(catalogue(), found)
 
 
-def _capturer(store: Store, station_file: Path | None, conceal: list[str] | None, verb: list[str]) -> Capturer:
-    """Captures in this thread: on the station of a file, or on a mock bench that is started for each session. `verb`:
-    the words of the command that does, which goes on with an interrupted session."""
+def _carried_out(
+    request: PipelineRequest, store: Store, station_file: Path | None, conceal: list[str] | None, verb: list[str]
+) -> PipelineResult:
+    """Carry out a request in this thread, with captures on the station of a file, or on a mock bench that is started
+    for each session. Where it is interrupted, tells the command that goes on; `verb`: its first words."""
     if station_file is not None and conceal:
         raise InputError("--conceal: only the mock bench conceals effects; leave --station out")
+    assert request.capture is not None
+    session = request.capture.session
 
-    def captured(request: CaptureRequest, tell: Callable[[CaptureProgress], None]) -> str:
+    def captured(wanted: CaptureRequest, tell: Callable[[CaptureProgress], None]) -> str:
         from lab.capture.station import read_station
-
-        session = ""
 
         def told(progress: CaptureProgress) -> None:
             nonlocal session
-            session = progress.session
+            session = session or progress.session  # the first: later ones resolve its doubts
             tell(progress)
 
         with contextlib.nullcontext(station_file) if station_file else mock_bench(conceal or []) as file:
-            try:
-                return capture_here(store, read_station(file), request, told)
-            except KeyboardInterrupt:
-                if session:
-                    err.print(f"calibench: go on with `{_resuming(verb, session, store, station_file, conceal or [])}`")
-                raise
+            return capture_here(store, read_station(file), wanted, told)
 
-    return captured
+    try:
+        return run_here(request, store, captured)
+    except KeyboardInterrupt:
+        if session:
+            command = _resuming(verb, session, store, station_file, conceal or [])
+            err.print(f"calibench: go on with `{escape(command)}`")
+        raise
 
 
 def _resuming(verb: list[str], session: str, store: Store, station_file: Path | None, conceal: list[str]) -> str:

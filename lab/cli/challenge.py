@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lab.cli.console import check_folder, check_writable
 from lab.cli.exit_codes import EXIT_CHECK
 from lab.cli.sources import Scheduler
 from lab.errors import InputError
@@ -38,9 +39,12 @@ def _say(text: str, share: float) -> None:
 
 
 def _workers(jobs: int | None, scheduler: str | None) -> Workers:
+    """Return the workers. Raises InputError where they are a cluster's that isn't there."""
     from lab.workers import Workers
 
-    return Workers(jobs or os.cpu_count() or 1, scheduler)
+    workers = Workers(jobs or os.cpu_count() or 1, scheduler)
+    workers.check()
+    return workers
 
 
 @commands.command("make")
@@ -91,6 +95,8 @@ def make_command(
     if proof:
         refuse_scored(seed, UNLISTED_PAGE if unlisted else PROOF_PAGE)
     file = truths if truths is not None else out.parent / f"{out.resolve().name}.truths.json"
+    check_folder(out)
+    check_writable(file)
     laws: Laws = "unlisted" if unlisted else "listed"
     made = make(out, cases, seed, file, size, _workers(jobs, scheduler), cfa=cfa, laws=laws, progress=_say)
     print(f"{out}: {len(made.truths)} cases, sealed in seals.json; the truths, seed among them, are in {file}")
@@ -114,6 +120,8 @@ def score_command(
     from lab.challenge.run import run_all
     from lab.challenge.truth import Seals, Truths, load, store
 
+    check_writable(json)
+    check_writable(page)
     seals = load(Seals, folder / "seals.json")
     cases = tuple(case for case in sorted(seals.seals) if (folder / case).is_dir())
     runs = run_all(folder, cases, _workers(jobs, scheduler), _say)

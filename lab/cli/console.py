@@ -43,6 +43,15 @@ def check_folder(folder: Path | None) -> None:
         raise InputError(f"{folder}: can't be written into; name a folder that is yours")
 
 
+def check_output(path: Path) -> None:
+    """Refuse a file or folder of results that can't be made with the folders above it, before the work. Raises
+    InputError."""
+    above = path.absolute() if path.is_dir() else path.absolute().parent
+    there = next(one for one in (above, *above.parents) if one.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise InputError(f"{path}: can't be written; name a place that is yours")
+
+
 def write_json(result: BaseModel, file: Path | None) -> None:
     """Write a result as JSON, completely or not at all: to a file, to stdout ("-"), or nowhere (None)."""
     if file is None:

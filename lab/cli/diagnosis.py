@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from lab.cli.console import check_folder, check_writable, err, make_folder, out, write_json
+from lab.cli.console import check_output, check_writable, err, make_folder, out, write_json
 from lab.cli.exit_codes import EXIT_CHECK, EXIT_INPUT
 from lab.cli.sources import (
     FitFile,
@@ -57,6 +57,7 @@ def validate(
 
 @commands.command()
 def diagnose(
+    context: typer.Context,
     source: Source,
     json: Json = None,
     fit_file: FitFile = None,
@@ -83,16 +84,22 @@ def diagnose(
             f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, "
             "or 0"
         )
+    stated = context.get_parameter_source("scheduler")
+    if not bootstrap and stated is not None and stated.name == "ENVIRONMENT":
+        scheduler = None  # CALIBENCH_SCHEDULER is for every command: one that has nothing to spread leaves it
     if scheduler is not None and not bootstrap:
         raise InputError(f"--scheduler {scheduler}: only the draws of --bootstrap are spread; give both, or neither")
     from lab.formats.results import FitResult
     from lab.workers import Workers
 
     check_writable(json)
+    if save is not None:
+        check_output(save)
+    workers = Workers(scheduler=scheduler)
+    workers.check()
     recordings = recordings_of(source, data)
     if save is not None:
-        camera_path(recordings, recordings.sides[0], save)
-        check_folder(save.parent if save.suffix == ".toml" else save)
+        camera_path(recordings, recordings.sides[0], save)  # one file is of one camera
     request = PipelineRequest(
         "diagnose",
         recordings=recordings,
@@ -100,7 +107,7 @@ def diagnose(
         models=read_models(recordings, model),
         pictures=False,
         bootstrap=bootstrap,
-        workers=Workers(scheduler=scheduler),
+        workers=workers,
     )
     found = run_here(request)
     assert found.diagnosis is not None

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
+import threading
 import traceback
+from collections.abc import Iterator
+from importlib import metadata
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from lab.cli import calibrations, capturing, devices, diagnosis, effects, fitting, kinds, recordings, simulation
 from lab.cli.challenge import commands as challenge
-from lab.cli.console import err
-from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
+from lab.cli.console import err, out
+from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated
 from lab.cli.twin import commands as twin
 from lab.errors import DeviceError, InputError, failure_of_environment
 
 app = typer.Typer(
     name="calibench",
-    help="Captures with, calibrates and explains cameras.",
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -35,6 +40,21 @@ app.add_typer(devices.devices)
 app.add_typer(devices.station)
 
 
+def _tell_version(asked: bool) -> None:
+    if asked:
+        out.print(f"calibench {metadata.version('calibench')}")
+        raise typer.Exit
+
+
+@app.callback()
+def everywhere(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_tell_version, help="print the version and end")
+    ] = False,
+) -> None:
+    """Captures with, calibrates and explains cameras."""
+
+
 def attach_service_and_mocks() -> None:
     """Add the commands of `api` and `mocks`. Only this function imports them, and only when a command line is
     parsed."""
@@ -49,11 +69,29 @@ def attach_service_and_mocks() -> None:
         app.registered_groups += others.registered_groups
 
 
+@contextlib.contextmanager
+def _ended_as_by_ctrl_c() -> Iterator[None]:
+    """Within it, SIGTERM interrupts as Ctrl-C does: a command ends the processes that it started."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, frame: Any) -> None:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     try:
         attach_service_and_mocks()
-        code = app(arguments, standalone_mode=False)
+        with _ended_as_by_ctrl_c():
+            code = app(arguments, standalone_mode=False)
     except (InputError, DeviceError) as error:
         if os.environ.get("CALIBENCH_DEBUG"):
             traceback.print_exc()

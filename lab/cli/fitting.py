@@ -115,6 +115,7 @@ def compare(
     from lab.formats.recording_set import differences
 
     check_writable(json)
+    check_folder(report_folder)
     rules = [FailRule.parse(text) for text in fail_on or ()]
     (before, then), (after, now) = _calibration(a, data), _calibration(b, data)
     result = compared(before, after).model_copy(update={"instruments": differences(then, now)})

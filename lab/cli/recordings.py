@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import check_writable, out, warn, write_json
+from lab.cli.console import check_output, check_writable, out, warn, write_json
 from lab.cli.exchange import (
     LENSFUN,
     OF_A_CAMERA,
@@ -121,6 +121,7 @@ def import_(
     )
     if lens and kind != LENSFUN:
         raise InputError(f"--from {kind} doesn't take --lens")
+    check_output(out_folder)
     if kind in (SPECTRA, TILED):
         if options.stated():
             raise InputError(f"--from {kind} doesn't take {', '.join(options.stated())}; it takes none")
@@ -219,6 +220,8 @@ def export(
     """Write a stored session as a recording set; spectra and cameras in the formats of other programs."""
     from lab.formats import recording_set
 
+    if kind != TILED:  # a catalogue may be a server's
+        check_output(Path(to))
     if kind == SPECTRA:
         export_spectra(source, Path(to), quantity, data)
         return

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import check_writable, out, warn, write_json
+from lab.cli.console import check_folder, check_writable, out, warn, write_json
 from lab.cli.progress import progress_bar
 from lab.cli.sources import Json, Scheduler
 from lab.errors import InputError
@@ -43,8 +43,11 @@ def lens(
     from lab.workers import Workers
 
     check_writable(json)
+    check_folder(report_folder)
     if focus not in ("file", "best"):
         raise InputError(f"--focus {focus}: give file or best")
+    workers = Workers(scheduler=scheduler)
+    workers.check()
     with progress_bar(file.name) as advance:
         traced = trace_prescription(
             file,
@@ -52,7 +55,7 @@ def lens(
             maximum_field_deg=field_deg,
             glasses=parse_glasses(glass or []),
             progress=advance,
-            workers=Workers(scheduler=scheduler),
+            workers=workers,
         )
     warn(traced.result.warnings)
     write_json(traced.result, json)
@@ -145,6 +148,7 @@ def simulate(
         raise InputError("simulate: no SCENE; `calibench simulate list` shows them")
     if out_file is not None:
         simulation.check_out(out_file)
+    check_writable(write_camera_file)
     options = simulation.options_of(
         {
             "scene": scene,

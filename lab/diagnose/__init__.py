@@ -84,10 +84,13 @@ def examine(
     """
     policy = policy or DecisionPolicy()
     shares = dict.fromkeys(recordings.sides, 0.0)
+    steps = dict.fromkeys(recordings.sides, "")
     cameras = baseline or {}
 
     def report(side: Side, text: str) -> None:
-        shares[side] = 1.0 - 0.8 * (1.0 - shares[side])
+        step = text.partition(":")[0]
+        if step != steps[side]:  # else it counts on within its step: "STEP: 3 done"
+            steps[side], shares[side] = step, 1.0 - 0.8 * (1.0 - shares[side])
         if progress is not None:
             progress(f"{text} ({side})", sum(shares.values()) / len(shares))
 

@@ -116,8 +116,12 @@ def diagnose_side(
     rng = np.random.default_rng(SEED)
     least = 0.0
     if bootstrap:
-        report(f"drawing {bootstrap} healthy cameras")
-        draws = healthy_draws(recordings, side, model, bootstrap, rng, fit, baseline, workers)
+        drawing = f"drawing {bootstrap} healthy cameras"
+        report(drawing)
+        draws = healthy_draws(
+            recordings, side, model, bootstrap, rng, fit, baseline, workers,
+            lambda done: report(f"{drawing}: {done} done"),
+        )  # fmt: skip
         least = image_threshold(draws, policy.false_alarm_rate)
     report("scoring the effects")
     verdict = decide(model, rng, policy, report, least_threshold=least)

@@ -69,8 +69,10 @@ def replacing(file: Path) -> Iterator[Path]:
         with partial.open("rb") as stream:
             os.fsync(stream.fileno())
         partial.replace(file)
-    except BaseException:
+    except BaseException as error:
         partial.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # of a full disk, the system names no file
+            raise OSError(error.errno, error.strerror, str(file)) from error
         raise
 
 

@@ -8,7 +8,7 @@ edge's tail, rounding.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,16 +50,20 @@ def healthy_draws(
     fit: FitResult | None = None,
     baseline: CameraFile | None = None,
     workers: Workers | None = None,
+    report: Callable[[int], None] = lambda done: None,
 ) -> list[HealthyDraw]:
     """`count` draws of the recordings by the baseline of `model`; measurements of captures that can't be replayed are
     left out. Each draw has a generator of its own, so that they are the same wherever `workers` do them (None: in this
-    process)."""
+    process). `report` is called with the number of draws that are done, after each."""
     workers = workers or Workers()
     camera = _at_recorded_levels(recordings, side, model.camera)
     if workers.scheduler is not None:
         recordings.let_go()  # every worker reads its own frames
-    draws = workers.in_order(_healthy_draw, rng.spawn(count), recordings, side, camera, fit, baseline)
-    return [draw for draw in draws if draw is not None]
+    draws: dict[int, HealthyDraw | None] = {}
+    for number, draw in workers.done(_healthy_draw, rng.spawn(count), recordings, side, camera, fit, baseline):
+        draws[number] = draw
+        report(len(draws))
+    return [draw for _, draw in sorted(draws.items()) if draw is not None]
 
 
 @one_blas_thread

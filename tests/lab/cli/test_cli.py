@@ -7,14 +7,18 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from importlib import metadata
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import sqlalchemy as sa
+import typer
 
 import lab.diagnose
 import lab.fit
@@ -22,7 +26,7 @@ from lab import cli
 from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession
 from lab.capture_kinds.dark import DarkSequence
-from lab.cli import bench_process, capturing, diagnosis, fitting
+from lab.cli import bench_process, capturing, diagnosis, entry, fitting
 from lab.cli.exit_codes import EXIT_INPUT
 from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
@@ -604,20 +608,35 @@ def test_the_help_waits_for_no_numerics(arguments: list[str]) -> None:
 
 
 @pytest.mark.parametrize("verb", [["capture"], ["run"], ["run", "--resolve"]])
+@pytest.mark.parametrize("during", ["capture", "fit", "resolve"])
 def test_an_interrupted_session_is_told_with_the_whole_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: list[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    verb: list[str],
+    during: str,
 ) -> None:
-    def interrupted(store: object, station: object, request: object, tell: Callable[[object], None]) -> str:
-        tell(SimpleNamespace(session="session-1"))
+    """While its sequences are taken, while it is fitted, and while a further session settles its doubts."""
+    sessions = iter(["session-1", "session-2"])
+
+    def captured(store: object, station: object, request: object, tell: Callable[[object], None]) -> str:
+        tell(SimpleNamespace(session=(session := next(sessions))))
+        if (session, during) in {("session-1", "capture"), ("session-2", "resolve")}:
+            raise KeyboardInterrupt
+        return session
+
+    def carried_out(request: PipelineRequest, store: object, capturer: Callable[..., str]) -> None:
+        for _ in range(1 if during == "fit" else 2):
+            capturer(request.capture, lambda progress: None)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(capturing, "capture_here", interrupted)
+    monkeypatch.setattr(capturing, "capture_here", captured)
+    monkeypatch.setattr(capturing, "run_here", carried_out)
     monkeypatch.setattr("lab.capture.station.read_station", lambda file: None)
-    store = open_store(tmp_path / "data folder")
-    with pytest.raises(KeyboardInterrupt):
-        capturing._capturer(store, Path("lab.toml"), None, verb)(CaptureRequest(), lambda progress: None)
-    command = f"calibench {' '.join(verb)} --resume session-1 --out '{store.root}' --station lab.toml"
-    assert capsys.readouterr().err == f"calibench: go on with `{command}`\n"
+    data = tmp_path / "data [of] a folder"
+    assert cli.main([*verb, "--out", str(data), "--station", "lab.toml"]) == 130
+    command = f"calibench {' '.join(verb)} --resume session-1 --out '{data}' --station lab.toml"
+    assert capsys.readouterr().err.splitlines()[0] == f"calibench: go on with `{command}`"
 
 
 @pytest.mark.parametrize(
@@ -705,3 +724,141 @@ def test_a_frame_that_may_not_be_read_is_not_damaged(
     assert cli.main(["fit", str(folder)]) == 2
     told = capsys.readouterr().err
     assert "can't be read (Permission denied)" in told and "damaged" not in told
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_said_with_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`/dev/full` refuses what is written as a full disk does: without the name of the file."""
+
+    def write(path: Path, text: str, **_: object) -> None:
+        with Path("/dev/full").open("w") as full:
+            full.write(text)
+
+    monkeypatch.setattr(Path, "write_text", write)
+    file = tmp_path / "effects.json"
+    assert cli.main(["effects", "--json", str(file)]) == 2
+    told = capsys.readouterr().err
+    assert told == f"calibench: {file}: No space left on device; make room on that disk, then do it again\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def _commands(command: Any, *path: str) -> Iterator[tuple[str, Any]]:
+    yield " ".join(path), command
+    for name, below in getattr(command, "commands", {}).items():
+        yield from _commands(below, *path, name)
+
+
+def test_every_help_is_of_one_style() -> None:
+    """A command's is a sentence; an option's or argument's a phrase without a capital or a full stop."""
+    entry.attach_service_and_mocks()
+    found = dict(_commands(typer.main.get_command(entry.app), "calibench"))
+    assert len(found) > 40
+    for path, command in found.items():
+        assert (command.help or "").rstrip().endswith("."), path
+        for parameter in command.params:
+            told = getattr(parameter, "help", None)
+            assert told, (path, parameter.name)
+            word = told.split()[0]
+            assert not told.endswith(".") or told.endswith("..."), (path, parameter.name)
+            assert word[0].islower() or not word[1:].islower() or word.startswith("Dask"), (path, parameter.name)
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"calibench {metadata.version('calibench')}\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["fit", "SET", "--json", "OUT"],
+        ["validate", "SET", "--json", "OUT"],
+        ["compare", "SET", "SET", "--report", "OUT"],
+        ["diagnose", "SET", "--json", "OUT"],
+        ["diagnose", "SET", "--save", "OUT"],
+        ["report", "SET", "--out", "OUT"],
+        ["import", "SET", "--from", "raw-folder", "--out", "OUT"],
+        ["import", "SET", "--from", "tiled", "--out", "OUT"],
+        ["export", "SET", "--to", "OUT"],
+        ["export", "camera.toml", "--as", "dcp", "--to", "OUT"],
+        ["lens", "lens.zmx", "--json", "OUT"],
+        ["lens", "lens.zmx", "--report", "OUT"],
+        ["simulate", "colorchecker", "--out", "OUT.npy"],
+        ["simulate", "--write-camera", "OUT"],
+        ["challenge", "make", "--seed", "1", "--out", "OUT"],
+        ["challenge", "make", "--seed", "1", "--out", "DIR", "--truths", "OUT"],
+        ["challenge", "score", "SET", "--truths", "FILE", "--json", "OUT"],
+        ["challenge", "score", "SET", "--truths", "FILE", "--page", "OUT"],
+        ["twin", "predict", "MODEL", "--plan", "SET", "--out", "OUT"],
+        ["twin", "score", "SEALED", "SET", "--json", "OUT"],
+        ["twin", "budget", "MODEL", "--use", "variance", "--json", "OUT"],
+        ["effects", "draft", "SET", "--law", "1", "--out", "OUT"],
+        ["effects", "--json", "OUT"],
+        ["sequences", "--json", "OUT"],
+        ["calibrations", "show", "ID", "--json", "OUT"],
+        ["calibrations", "history", "--json", "OUT"],
+        ["devices", "transcript", "lab.toml", "display", "--out", "OUT"],
+        ["station", "init", "OUT"],
+        ["bench", "--station", "OUT"],
+    ],
+)
+def test_an_output_that_cannot_be_written_is_refused_first(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No input is there, either: the line is of the output where that is looked at first."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    place = str(tmp_path / "file" / "of")
+    assert cli.main([word.replace("OUT", place) for word in arguments]) == 2
+    told = capsys.readouterr().err
+    assert place in told and told.count("\n") == 1, told
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["diagnose", "SET", "--bootstrap", "10"],
+        ["lens", "FILE.zmx"],
+        ["challenge", "make", "--seed", "1", "--out", "DIR"],
+    ],
+)
+def test_a_cluster_that_is_not_there_is_said_before_the_work(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The inputs aren't there: they would be said if they were read first."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lab.workers.CONNECT_TIMEOUT_S", 0.3)
+    assert cli.main([*arguments, "--scheduler", "tcp://127.0.0.1:9"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("calibench: Dask scheduler tcp://127.0.0.1:9: not reached") and told.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cluster_of_the_environment_is_left_where_nothing_is_spread(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """CALIBENCH_SCHEDULER is set for every command; an option that can't act is refused."""
+    healthy = DiagnosisResult(source="x", verdict="no_mismatch")
+    monkeypatch.setattr(lab.diagnose, "examine", lambda *_, **__: Diagnosis(healthy, {}))
+    assert cli.main(["diagnose", str(folder), "--scheduler", "tcp://127.0.0.1:9"]) == 2
+    assert "only the draws of --bootstrap" in capsys.readouterr().err
+    monkeypatch.setenv("CALIBENCH_SCHEDULER", "tcp://127.0.0.1:9")
+    assert cli.main(["diagnose", str(folder)]) == 0
+
+
+def test_sigterm_ends_a_command_and_the_bench_that_it_starts(tmp_path: Path) -> None:
+    """The bench is being started: it would be there for half a minute where its loops are compiled. `--with-parent`
+    tells whose it is."""
+    command = [sys.executable, "-m", "lab.cli", "run", "--quick", "--out", str(tmp_path / "data")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    children: list[psutil.Process] = []
+    while not children and process.poll() is None:
+        children = psutil.Process(process.pid).children(recursive=True)
+        time.sleep(0.05)
+    process.terminate()
+    told = process.communicate(timeout=60)[1]
+    assert process.returncode == 130 and told.splitlines()[-1] == "calibench: interrupted"
+    assert children and psutil.wait_procs(children, timeout=30)[1] == []

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lab.challenge.recordings import recordings_of
+from lab.diagnose import examine
 from lab.diagnose.inference.bootstrap import HealthyDraw, image_threshold
 from lab.diagnose.side import diagnose_side
 from mocks.former import ConcealedCamera, Plan
@@ -29,3 +30,15 @@ def test_a_threshold_is_never_below_that_of_drawn_cameras(monkeypatch: pytest.Mo
     assert plain.threshold is not None
     assert drawn.threshold == pytest.approx(image_threshold([HealthyDraw(t, {}) for t in tops], 0.01))
     assert drawn.threshold > plain.threshold
+
+
+def test_each_draw_is_told_and_moves_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hours on a cluster are seen to go on; a hundred draws aren't a hundred steps of the bar."""
+    recordings = recordings_of(ConcealedCamera(9, cfa="MONO", rows=64, cols=96), Plan(kinds=("dark", "flat")))
+    tops = iter(30.0 + t for t in range(10))
+    monkeypatch.setattr("lab.diagnose.inference.bootstrap._healthy_draw", lambda *_: HealthyDraw(next(tops), {}))
+    told: list[tuple[str, float]] = []
+    examine(recordings, progress=lambda what, share: told.append((what, share)), at_once=False, bootstrap=10)
+    drawing = [(what, share) for what, share in told if what.startswith("drawing")]
+    assert [what for what, _ in drawing][1:] == [f"drawing 10 healthy cameras: {n} done (left)" for n in range(1, 11)]
+    assert len({share for _, share in drawing}) == 1
