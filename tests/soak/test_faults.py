@@ -187,6 +187,7 @@ def _usb_fault(peer: UsbPeer, rng: random.Random, timeout_s: float) -> Broken:
 
     def mend() -> None:
         device.fail(())
+        time.sleep(value or 0.0)  # it hears nothing meanwhile
         if kind == "unplug":
             device.plug()
 
@@ -293,7 +294,15 @@ class Subject:
         rng = random.Random(seed)
         label, call = rng.choice(CALLS[self.family] * 2 + EVERY)
         driver = self.made()
-        driver.connect()
+        seen.cases[self.driver_name] += 1
+        try:
+            driver.connect()
+        except InstrumentError as error:
+            seen.wrong.append(
+                f"{self.driver_name}: can't connect before the fault: {error} ({self.driver_name}:{seed})"
+            )
+            driver.close()
+            return
         if self.family == "camera":
             CALLS["camera"][0][1](driver)
         model = driver.identity().model
@@ -302,7 +311,6 @@ class Subject:
             driver.open_shutter()
         broken = break_something(self.peer, rng, self.timeout_s)
         what = f"{self.driver_name} {label} with {broken.kind}"
-        seen.cases[self.driver_name] += 1
 
         def complain(why: str) -> None:
             seen.wrong.append(f"{what}: {why} (FAULTS_ONLY={self.driver_name}:{seed})")
@@ -341,7 +349,7 @@ class Subject:
         if (unclosed := timed("close", driver.close)) is not None and label != "close":
             complain(f"close afterwards: {unclosed}")
         if self.family == "monochromator":
-            self.check_shutter(failed if label == "close" else None, complain, seen)
+            self.check_shutter(failed if label == "close" else unclosed, complain, seen)
 
     def check_shutter(self, of_close: InstrumentError | None, complain: Callable[[str], None], seen: Seen) -> None:
         """Read the shutter back: by the mock itself after a close that said nothing, and by a new driver."""

@@ -171,9 +171,11 @@ class Desk:
         in the halt's answer or at the station, and what the station's state reads at the end."""
         answered: list[StationSafety] = []
 
+        page = ServiceClient(self.wire.url, self.key)
+
         def ask() -> None:
-            with ServiceClient(self.wire.url, self.key) as one:
-                told = Halted.model_validate_json(one.request("POST", "/halt", json={}).content)
+            with page:
+                told = Halted.model_validate_json(page.request("POST", "/halt", json={}).content)
             answered.extend(station.safety for station in told.stations)
 
         asking = threading.Thread(target=ask)
@@ -190,7 +192,7 @@ class Desk:
             settled = safety is not None and safety.state != "halting"
             if last and settled and (closed_s < PATIENCE_S or time.monotonic() > began_s + 20.0):
                 break
-            time.sleep(0.01)
+            time.sleep(0.1)  # more would be a load of its own
         asking.join(PATIENCE_S)
         return closed_s, self.safety()
 
