@@ -137,7 +137,9 @@ class Desk:
     def under_way(self, what: str) -> str:
         """Id of a session that runs from now on: a new one, or that which was halted before."""
         found = self.sessions.get(what)
-        if found is None or self.state(found) == "finished":
+        session = None if found is None else self.client.session(found)
+        captured = session is not None and session.steps_done == session.steps  # packing is left
+        if found is None or self.state(found) == "finished" or (captured and what == "capturing"):
             start = SessionStart(station="bench", quick=True, sequences=("dark", "flat"))
             found = self.sessions[what] = self.client.start_session(start).id
         else:
