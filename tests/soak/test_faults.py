@@ -358,6 +358,8 @@ class Subject:
         again = self.made()
         try:
             again.connect()
+            if of_close is not None:  # it said that light may get out: the next user stops it first, as a session does
+                again.stop()
             if again.shutter_is_open():
                 complain("a new driver reads the shutter open")
             else:
