@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium peers names soak kills setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
+.PHONY: aravis chromium peers names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
 
 setup: $(STAMP)
 
@@ -29,6 +29,17 @@ soak: $(STAMP)
 KILLS ?= 20
 kills: $(STAMP)
 	KILLS=$(KILLS) $(BIN)/python -m pytest tests/soak/test_kills.py -m slow -s $(ARGS)
+
+# Halts of a session at random moments, packing included, HALTS of them; about five seconds each. HALTS_SEED=N draws others.
+HALTS ?= 20
+halts: $(STAMP)
+	HALTS=$(HALTS) $(BIN)/python -m pytest tests/soak/test_halts.py -m slow -s $(ARGS)
+
+# Random faults over every driver that has a mock, FAULTS of them; about three seconds each. FAULTS_SEED=N draws others,
+# FAULTS_ONLY=DRIVER:SEED repeats one that failed, FAULTS_ONLY=DRIVER takes one driver.
+FAULTS ?= 100
+faults: $(STAMP)
+	FAULTS=$(FAULTS) $(BIN)/python -m pytest tests/soak/test_faults.py -m slow $(ARGS)
 
 # The library for GigE cameras of any maker, from the distribution; tests that need it skip without it.
 aravis:

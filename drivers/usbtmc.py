@@ -62,12 +62,16 @@ class UsbTmc:
 
     def clear(self) -> None:
         """Discard what a host before left half said, on both sides."""
-        self._device.ctrl_transfer(0xA1, _INITIATE_CLEAR, 0, self._number, 1, round(self.timeout_s * 1000))
-        for _ in range(100):
-            state = self._device.ctrl_transfer(0xA1, _CHECK_CLEAR, 0, self._number, 2, round(self.timeout_s * 1000))
-            if len(state) < 1 or state[0] != 2:  # pending
-                break
-        self._device.clear_halt(self._out)
+        wait_ms = round(self.timeout_s * 1000)
+        try:
+            self._device.ctrl_transfer(0xA1, _INITIATE_CLEAR, 0, self._number, 1, wait_ms)
+            for _ in range(100):
+                state = self._device.ctrl_transfer(0xA1, _CHECK_CLEAR, 0, self._number, 2, wait_ms)
+                if len(state) < 1 or state[0] != 2:  # pending
+                    break
+            self._device.clear_halt(self._out)
+        except usb.core.USBError as error:
+            raise translate(error, self.who, "clearing its line") from error
 
     def write(self, text: str) -> None:
         """Send one message."""

@@ -42,7 +42,7 @@ from mocks.usb import UsbIpServer, stereo_pair
 from mocks.usb2000plus import MockUsb2000Plus
 from mocks.usb2000plus import calibration_csv as spectrometer_calibration
 from mocks.usb_device import UsbDevice
-from mocks.wire import Endpoint, Fault, Grammar, Pty, Tcp, serve
+from mocks.wire import Endpoint, Fault, FaultyLine, Grammar, Pty, Tcp, serve
 
 
 class _Plug(Endpoint):
@@ -87,7 +87,8 @@ class _Plug(Endpoint):
 
 
 class LinePeer(Peer):
-    """A mock on a serial line or TCP. `slowness`: real seconds for each of its own where it is slow."""
+    """A mock on a serial line or TCP. `slowness`: real seconds for each of its own where it is slow; `line` can be told
+    to fail."""
 
     def __init__(
         self,
@@ -103,11 +104,12 @@ class LinePeer(Peer):
         self.folder = Path(self._folder.name)
         self._light = light if light is not None else Lamp(20.0)
         self._slowness = slowness
+        self.line = FaultyLine(make(self._light))
         self._plug = _Plug(Tcp("127.0.0.1", 0) if tcp else Pty(self.folder / "line"))
         self._stop, ready = threading.Event(), threading.Event()
         self._thread = threading.Thread(
             target=serve,
-            args=(make(self._light), self._plug, self._stop),
+            args=(self.line, self._plug, self._stop),
             kwargs={"announce": lambda address: ready.set()},
             daemon=True,
         )
@@ -142,7 +144,7 @@ class UsbPeer(Peer):
     """Mock USB devices, exported over USB/IP; the driver has the first."""
 
     def __init__(self, devices: Sequence[UsbDevice], clock: Any, *, slowness: float = 1.0, **settings: Any) -> None:
-        self._devices, self._clock, self._slowness = devices, clock, slowness
+        self.device, self._clock, self._slowness = devices[0], clock, slowness
         self._server = UsbIpServer(devices)
         self.address = self._server.url(devices[0].identity.serial_number)
         self.settings = settings
@@ -157,13 +159,13 @@ class UsbPeer(Peer):
         return self
 
     def mute(self, silent: bool) -> None:
-        self._devices[0].mute(silent)
+        self.device.mute(silent)
 
     def unplug(self) -> None:
-        self._devices[0].unplug()
+        self.device.unplug()
 
     def plug(self) -> None:
-        self._devices[0].plug()
+        self.device.plug()
 
     def slow(self, slowly: bool) -> bool:
         self._clock.real_time_factor = self._slowness if slowly else 0.0
@@ -184,13 +186,13 @@ class TetheredPeer(Peer):
         self._folder = Path(self._parent.name) / "tethered"
         self._folder.mkdir()
         self._bench = lit_bench()
-        self._camera = TetheredCamera(self._folder, self._bench)
-        self._camera.start()
+        self.camera = TetheredCamera(self._folder, self._bench)
+        self.camera.start()
         self.address = str(self._folder)
-        self.settings = {"settle_s": 0.1, "timeout_s": 2.0, **self._camera.settings}
+        self.settings = {"settle_s": 0.1, "timeout_s": 2.0, **self.camera.settings}
 
     def mute(self, silent: bool) -> None:
-        self._camera.fail((Fault("never", onwards=True),) if silent else ())
+        self.camera.fail((Fault("never", onwards=True),) if silent else ())
 
     def unplug(self) -> None:
         self._folder.rename(self._folder.with_suffix(".gone"))
@@ -204,7 +206,7 @@ class TetheredPeer(Peer):
 
     def close(self) -> None:
         self._bench.clock.real_time_factor = 0.0
-        self._camera.close()
+        self.camera.close()
         self._parent.cleanup()
 
 
@@ -223,15 +225,15 @@ class DisplayPeer(Peer):
         with socket.create_server(("127.0.0.1", 0)) as probe:
             self.address = f"127.0.0.1:{probe.getsockname()[1]}"
         self.settings = {"timeout_s": 1.0, "connect_timeout_s": 2.0}
-        self._page = _SilentPage(Lamp())
+        self.page = _SilentPage(Lamp())
         self.plug()
 
     def mute(self, silent: bool) -> None:
-        self._page.silent = silent
+        self.page.silent = silent
 
     def plug(self) -> None:
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=browse, args=(self._page, self.address, self._stop), daemon=True)
+        self._thread = threading.Thread(target=browse, args=(self.page, self.address, self._stop), daemon=True)
         self._thread.start()
 
     def unplug(self) -> None:

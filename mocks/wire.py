@@ -191,6 +191,10 @@ class FaultyLine:
 
     def __init__(self, grammar: Grammar, faults: Iterable[Fault] = ()) -> None:
         self.grammar = grammar
+        self.fail(faults)
+
+    def fail(self, faults: Iterable[Fault]) -> None:
+        """Break the answers to come, which count from 1."""
         self.faults = FaultPlan(faults)
         self.answers = 0
         self._arm()
@@ -398,15 +402,17 @@ class Tcp(Endpoint):
 
 
 def serve(
-    grammar: Grammar,
+    grammar: Grammar | FaultyLine,
     endpoint: Endpoint,
     stop: threading.Event,
     *,
     faults: Iterable[Fault] = (),
     announce: Callable[[str], None] = lambda address: None,
 ) -> None:
-    """Serve a grammar on an endpoint until `stop` is set; `announce` is told the address each time it can be opened."""
-    line = FaultyLine(grammar, faults)
+    """Serve a grammar on an endpoint until `stop` is set; `announce` is told the address each time it can be opened. A
+    `FaultyLine` has faults of its own."""
+    line = grammar if isinstance(grammar, FaultyLine) else FaultyLine(grammar, faults)
+    grammar = line.grammar
     held: deque[tuple[float, Output]] = deque()
     quiet_since: float | None = None
     endpoint.open()

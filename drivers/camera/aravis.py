@@ -169,8 +169,7 @@ class AravisDevice:
                 "cable, the power and the network"
             ) from error
         nodes = _AravisFeatures(self._camera, f"camera {self.address}")
-        device = self._camera.get_device()
-        if hasattr(device, "is_controller") and not device.is_controller():
+        if not self._controls():
             raise InUse(f"camera {self.address}: another program controls it; close that one")
         self._nodes = nodes
         with suppress(_glib_error()):
@@ -198,9 +197,17 @@ class AravisDevice:
         self._nodes.do("starting", self._camera.start_acquisition)
 
     def halt(self) -> None:
-        """Stop acquisition, discard what is queued."""
+        """Stop acquisition, discard what is queued. Raises `Disconnected` where the camera has lost us meanwhile: one
+        that was switched off and on hears no trigger of ours."""
         self._stream = None
         self._nodes.do("stopping", self._camera.stop_acquisition)
+        if not self._controls():
+            raise Disconnected(f"camera {self.address}: it has forgotten who controls it; the next call reconnects")
+
+    def _controls(self) -> bool:
+        """Return whether we control the camera; a USB camera's others can't."""
+        device = self._camera.get_device()
+        return not hasattr(device, "is_controller") or bool(device.is_controller())
 
     def grab(self, timeout_s: float) -> dict[str, Any] | None:
         """Return the fields of a `Grabbed`; None if nothing came in time."""

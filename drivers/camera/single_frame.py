@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from drivers.camera.base import Camera, Frame, SensorInfo, Trigger
 from drivers.camera.found_features import RememberedFeatures
 from drivers.camera.genicam_settings import CameraFeatures
-from drivers.errors import Disconnected, InstrumentError, Interrupted, NoAnswer
+from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer
 from drivers.found_settings import FoundSettings, Hold
 from drivers.instrument import Identity, Recorder, Setting
 
@@ -213,6 +213,11 @@ class SingleFrameCamera(Camera):
                 self._await_exposed(self._exposure_s)
                 raw = self._read()
             except (Disconnected, NoAnswer):
+                raise
+            except Garbled:  # its settings may be lost: a server that was started again has others
+                with contextlib.suppress(InstrumentError):
+                    self._end_exposure()
+                self._drop()
                 raise
             except InstrumentError:
                 self._end_exposure()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -39,6 +40,10 @@ from lab.errors import DeviceError
 from lab.formats.recording_set import DataSheet, InstrumentSnapshot
 from sim.camera import Side
 from sim.parameters import Frozen
+
+#: How long (s) the other instruments of a station wait for the shutter's answer before they are stopped: to reach all
+#: of them at once takes seconds where the cores are busy.
+HEAD_START_S = 0.5
 
 
 class BenchState(Frozen):
@@ -229,16 +234,26 @@ def _snapshot(driver: Instrument) -> InstrumentSnapshot:
 def made_safe(
     drivers: Drivers, first: Callable[[Instrument], None], on_shut: Callable[[], None] = lambda: None
 ) -> SafeState:
-    """Stop every instrument of a station, all at once, within `STOP_S`, after `first` was called with it. `on_shut` is
-    called as soon as the monochromator has answered that its shutter is closed."""
+    """Stop every instrument of a station within `STOP_S`, after `first` was called with it: the monochromator, and all
+    others at once when it has answered, `HEAD_START_S` later at most. `on_shut` is called as soon as it has answered
+    that its shutter is closed."""
+    answered = threading.Event()
 
     def stopped(driver: Instrument) -> None:
-        first(driver)
-        if isinstance(driver, Monochromator):
+        if not isinstance(driver, Monochromator):
+            answered.wait(HEAD_START_S)
+            first(driver)
+            driver.stop()
+            return
+        try:
+            first(driver)
             shut(driver)
             on_shut()
-        else:
-            driver.stop()
+        finally:
+            answered.set()
+
+    if drivers.monochromator is None:
+        answered.set()
 
     complaints = _complaints({name: in_thread(partial(stopped, driver)) for name, driver in drivers.all.items()})
     shutter: Shutter = "unknown" if "monochromator" in complaints else "closed"

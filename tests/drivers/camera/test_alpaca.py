@@ -72,6 +72,16 @@ def test_it_is_left_as_it_was_found(peer: AlpacaSimulator, stranger: AlpacaDevic
     assert {name: stranger.get(name) for name in FOUND} == FOUND
 
 
+def test_it_goes_on_with_a_server_that_was_started_again(peer: AlpacaSimulator) -> None:
+    with AlpacaCamera(peer.address, **peer.settings) as camera:
+        camera.configure(0.01)
+        peer.unplug()
+        peer.plug()  # binned again, as it starts
+        with pytest.raises(Garbled, match=r"a frame has \(100, 200\) pixels"):
+            camera.capture()
+        assert camera.capture().raw.shape == (480, 640)
+
+
 def test_a_server_that_another_uses_stays_connected(peer: AlpacaSimulator, stranger: AlpacaDevice) -> None:
     stranger.put("connected", Connected=True)
     with AlpacaCamera(peer.address, **peer.settings):
@@ -94,7 +104,8 @@ def test_two_drivers_are_not_one_cameras(peer: AlpacaSimulator) -> None:
             AlpacaCamera(peer.address, **peer.settings).connect()
         camera.configure(0.01)
         assert camera.capture().raw.shape == (480, 640)
-    AlpacaCamera(peer.address, **peer.settings).connect()
+    with AlpacaCamera(peer.address, **peer.settings):
+        pass
 
 
 def test_what_it_lacks_is_named(peer: AlpacaSimulator) -> None:

@@ -140,6 +140,17 @@ def test_a_frozen_camera_is_given_up_and_controlled_again(fake: AravisFakeCamera
         _used_again(camera)
 
 
+def test_a_camera_that_forgot_its_controller_is_controlled_again_by_the_next_call(fake: AravisFakeCamera) -> None:
+    with AravisCamera(fake.address, timeout_s=2.0) as camera:
+        camera.configure(0.002)
+        camera.capture()
+        fake.unplug()
+        fake.plug()  # switched off and on: it hears no trigger
+        with pytest.raises(InstrumentError, match="no frame within 2 s"):
+            camera.capture()
+        assert camera.capture().raw.shape == (512, 512)
+
+
 def test_a_camera_that_died_is_controlled_again_by_the_same_driver(fake: AravisFakeCamera) -> None:
     with AravisCamera(fake.address, timeout_s=2.0) as camera:
         camera.configure(0.002)

@@ -155,6 +155,16 @@ def test_a_fault_is_one_error_and_then_it_works_again(
     assert opened
 
 
+def test_a_silent_instrument_that_is_asked_for_its_slits_is_one_error(mono: Cornerstone260B, device: Mock) -> None:
+    """No answer may mean slits that a micrometer sets: it is cleared then, which nobody answers either."""
+    mono.connect()
+    device.mute(True)
+    with pytest.raises(NoAnswer, match="no answer while clearing its line"):
+        mono.slit_um()
+    device.mute(False)
+    assert mono.slit_um() > 0.0
+
+
 def test_stop_ends_a_motion_and_closes_the_shutter() -> None:
     bench = Bench(real_time_factor=1.0)
     begun = threading.Event()

@@ -3,6 +3,14 @@ allowed."""
 
 from __future__ import annotations
 
+import time
+
+import pytest
+
+from drivers.instrument import Instrument
+from drivers.monochromator.base import Monochromator
+from lab.capture import instruments
+from lab.capture.instruments import made_safe
 from lab.capture.plan import CapturePlan
 from lab.capture.records import RunRecord, now
 from lab.capture.recovery import Recovery, make_station_safe
@@ -79,6 +87,20 @@ def test_a_session_whose_process_lives_is_left_alone(store: Store) -> None:
     lock.release()
     assert bench.opened and bench.log == []
     assert store.session(session_id).error is None
+
+
+def test_the_shutter_answers_before_the_others_are_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(instruments, "HEAD_START_S", 30.0)
+    reached: list[str] = []
+
+    def reach(driver: Instrument) -> None:
+        if isinstance(driver, Monochromator):
+            time.sleep(0.1)  # it takes its time
+        reached.append(type(driver).__name__)
+
+    found = made_safe(Bench().drivers(), reach, lambda: reached.append("shut"))
+    assert found.complaints == () and found.shutter == "closed"
+    assert reached[:2] == ["FakeMonochromator", "shut"] and len(reached) > 3
 
 
 def test_a_station_whose_drivers_cannot_be_made_is_a_complaint() -> None:
