@@ -31,7 +31,6 @@ from lab.effect_titles import effect_title
 from lab.errors import InputError
 from lab.formats.results import DiagnosisResult, NamedEffect, ResolveEnd
 from sim.camera import Side
-from sim.effects.families import Family
 from sim.effects.library import effects as library
 from sim.effects.library import typical
 from sim.parameters import Frozen
@@ -184,7 +183,7 @@ SIZES: dict[str, str] = {
     "decentre": "left:shift_x_um=3",
     "defocus": "left:defocus_um=22",
     "distortion": "left:corner_percent=1.5",
-    "empirical_law": "left:strength=1",
+    "empirical_law": "both:strength=1",
     "exposure_offset": "left:offset_us=25",
     "field_curvature": "left:curvature_um=25",
     "ghost": "left:share_percent=2",
@@ -273,8 +272,6 @@ NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
 
 #: Effects that the mock bench can't show, and refuses to conceal.
 NOT_SHOWN_BY_BENCH = frozenset({"second_order_light", "stereo_time_offset"})
-#: They hold what a diagnosis found, and name no cause.
-NO_CAUSES = frozenset(name for name, kind in library().items() if kind.family is Family.DISCREPANCY)
 
 #: Effects that one session can't show: distortion is fitted to its boards, so that only an earlier calibration shows a
 #: change.
@@ -373,7 +370,7 @@ def _of(name: str, *effects: str) -> LiveCase:
 
 def every_case() -> dict[str, LiveCase]:
     """Name -> case: singles, pairs, healthy cameras, and benches to resolve."""
-    cases = [_of(effect, effect) for effect in library() if effect not in NOT_SHOWN_BY_BENCH | NO_CAUSES]
+    cases = [_of(effect, effect) for effect in library() if effect not in NOT_SHOWN_BY_BENCH]
     cases += [_of("+".join(pair), *pair) for pair in PAIRS]
     cases += [LiveCase(name=f"healthy-{seed}", seed=seed) for seed in HEALTHY_SEEDS]
     cases += [
