@@ -151,11 +151,11 @@ class Cornerstone260(WireInstrument, Monochromator):
     def open_shutter(self) -> None:
         with self._conversation():
             self._may_shine = True
-            self._do("SHUTTER O")
+            self._move_shutter("O")
 
     def close_shutter(self) -> None:
         with self._conversation():
-            self._do("SHUTTER C")
+            self._move_shutter("C")
 
     def shutter_is_open(self) -> bool:
         with self._conversation():
@@ -278,7 +278,7 @@ class Cornerstone260(WireInstrument, Monochromator):
             found.forget("HANDSHAKE")
 
     def _make_safe(self) -> None:
-        self._do("SHUTTER C")
+        self._move_shutter("C")
 
     def _gets_in_step(self) -> bool:
         """End the motion and ask INFO?: answers come in the order of the statements, so what comes before its reply is
@@ -292,10 +292,15 @@ class Cornerstone260(WireInstrument, Monochromator):
     def _make_safe_for_good(self) -> InstrumentError | None:
         return self._shut_for_good()
 
-    def _do(self, statement: str) -> None:
-        """A command: its echo, its status byte, and the end of its motion."""
+    def _move_shutter(self, to: str) -> None:
+        """Open (O) or close (C) the shutter, which takes no longer than a query: a lost answer isn't waited for as that
+        of a grating is."""
+        self._do(f"SHUTTER {to}", self._transport.timeout_s)
+
+    def _do(self, statement: str, timeout_s: float | None = None) -> None:
+        """Do a command: its echo, its status byte within `timeout_s` (None: that of motions), the end of its motion."""
         self._say(statement)
-        status = self._line(statement, self.move_timeout_s)
+        status = self._line(statement, self.move_timeout_s if timeout_s is None else timeout_s)
         if self._tells_idle and status in _DONE:
             self._await_idle(statement)
         if status in _FAILED:
