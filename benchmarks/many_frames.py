@@ -98,7 +98,7 @@ def diagnose(folder: Path) -> None:
     recordings = recording.read(folder)
     found = diagnose_side(recordings, "left", None, None, report)
     named = ", ".join(one.candidate.name for one in found.named)
-    report(f"done: {named or 'no effect'} named, {len(found.mismatches)} mismatches")
+    report(f"done: {named or 'no effect'} named, {len(found.lists.mismatches)} mismatches")
 
 
 if __name__ == "__main__":
