@@ -26,13 +26,18 @@ _PIECE = 1 << 20
 
 @dataclass
 class _Vector:
-    """A property as it was told last: its kind (`Switch`, `Number`, `Text`, `Light`, `BLOB`), state, and values."""
+    """A property as it was told last: its kind (`Switch`, `Number`, `Text`, `Light`, `BLOB`), state, and values.
+
+    `updates`: how often it was told; `changes`: of these, as a new value. A server tells definitions to all clients
+    when one of them asks.
+    """
 
     kind: str
     state: str = "Idle"
     values: dict[str, str] = field(default_factory=dict)
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     updates: int = 0
+    changes: int = 0
     blob: bytes | None = None
 
 
@@ -156,6 +161,7 @@ class IndiDevice:
         vector = self._vectors.setdefault(name, _Vector(tag[3:-6]))
         vector.state = told.get("state", vector.state)
         vector.updates += 1
+        vector.changes += tag.startswith("set")
         for one in told:
             element, text = one.get("name", ""), (one.text or "").strip()
             if tag == "setBLOBVector":
@@ -246,7 +252,10 @@ class IndiDevice:
         self._refuse_alert(name)
 
     def begin(self, name: str, value: Setting) -> None:
-        """Set a property and wait until the device has heard it."""
+        """Set a property and wait until the device has heard it: until it tells the property's new value."""
+        until = time.monotonic() + self._left_s()
+        while self._pump(0.0) and time.monotonic() < until:
+            continue  # what was told before isn't the answer
         vector = self._vector(name)
         if vector.kind == "Switch":
             if value not in vector.values:
@@ -257,10 +266,10 @@ class IndiDevice:
             given = {str(value): "On"}
         else:
             given = dict(part.partition("=")[::2] for part in str(value).split(";"))
-        before, kind = vector.updates, vector.kind
+        before, kind = vector.changes, vector.kind
         parts = "".join(f"<one{kind} name={quoteattr(one)}>{text}</one{kind}>" for one, text in given.items())
         self._send(f"<new{kind}Vector device={quoteattr(self.name)} name={quoteattr(name)}>{parts}</new{kind}Vector>")
-        self._await(name, lambda: name not in self._vectors or self._vectors[name].updates > before)
+        self._await(name, lambda: name not in self._vectors or self._vectors[name].changes > before)
         if name in self._vectors:
             self._refuse_alert(name)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
@@ -157,6 +158,41 @@ def answering() -> Iterator[Callable[[bytes], IndiDevice]]:
     yield start
     for one in sockets:
         one.close()
+
+
+def test_a_definition_for_another_client_is_no_answer() -> None:
+    """A server tells definitions to all clients when one of them asks: one with the old value comes before the new
+    one."""
+    both = "<{kind}Switch name='CONNECT'>{on}</{kind}Switch><{kind}Switch name='DISCONNECT'>{off}</{kind}Switch>"
+    old = (
+        f"<defSwitchVector device='C' name='CONNECTION'>{both.format(kind='def', on='On', off='Off')}</defSwitchVector>"
+    )
+    new = (
+        f"<setSwitchVector device='C' name='CONNECTION'>{both.format(kind='one', on='Off', off='On')}</setSwitchVector>"
+    )
+
+    def serve() -> None:
+        with server, server.accept()[0] as line:
+            line.recv(1 << 16)
+            line.sendall(old.encode())
+            asked = b""
+            while b"newSwitchVector" not in asked:
+                asked += line.recv(1 << 16)
+            line.sendall(old.encode())
+            time.sleep(0.2)
+            line.sendall(new.encode())
+            line.recv(1 << 16)
+
+    server = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=serve)
+    thread.start()
+    device = IndiDevice(f"127.0.0.1:{server.getsockname()[1]}/C", lambda: 5.0, lambda direction, data: None)
+    device.open()
+    device.set("CONNECTION", "DISCONNECT")
+    told = device.get("CONNECTION")
+    device.close()
+    thread.join(5.0)
+    assert told == "DISCONNECT"
 
 
 DEFINED = b"<defSwitchVector device='C' name='CONNECTION'><defSwitch name='CONNECT'>On</defSwitch></defSwitchVector>"
