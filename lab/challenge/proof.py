@@ -145,13 +145,11 @@ def _share(share: float | None) -> str:
 
 def table(found: ChallengeScore) -> str:
     """Return the scores as Markdown tables, with 95 % intervals (Clopper-Pearson)."""
-    verdict = {True: "met", False: "missed", None: "no case"}
     lines = ["| goal | wanted | reached | oracle | |", "| --- | --- | --- | --- | --- |"]
-    for goal in found.goals:
-        doubt = "" if goal.sure or goal.sure is None or goal.met is None else ", too few cases to be sure"
-        lines.append(
-            f"| {goal.name} | {goal.wanted} | {goal.reached} | {_share(goal.oracle)} | {verdict[goal.met]}{doubt} |"
-        )
+    lines += [
+        f"| {goal.name} | {goal.wanted} | {goal.reached} | {_share(goal.oracle)} | {goal.verdict} |"
+        for goal in found.goals
+    ]
     lines += [
         "",
         "| single effects of non-centrality | first name right | it alone | nothing named |",

@@ -62,6 +62,13 @@ class Goal(Frozen):
     sure: bool | None = None  # whether the 95 % interval lies entirely on one side of the limit
     oracle: float | None = None  # mean share of the oracle on the same cases; None where it wasn't computed
 
+    @property
+    def verdict(self) -> str:
+        """Whether it was met, in words, and whether the cases are enough to be sure."""
+        if self.met is None:
+            return "no case"
+        return ("met" if self.met else "missed") + (", too few cases to be sure" if self.sure is False else "")
+
 
 class CaseScore(Frozen):
     """One case: the concealed truth, and the diagnosis."""
@@ -132,11 +139,9 @@ class EffectScore(Frozen):
     instead: dict[str, int]
 
 
-class ChallengeScore(Frozen):
-    """All scores of a challenge: what `calibench challenge score --json FILE` writes."""
+class SealedScore(Frozen):
+    """What the scores of every sealed challenge begin with. `failed`: the error of each case that didn't end."""
 
-    format: Literal["calibench-challenge-score"] = "calibench-challenge-score"
-    version: Literal[1] = 1
     purpose: Purpose
     seed: int
     size: str
@@ -144,6 +149,19 @@ class ChallengeScore(Frozen):
     seals_sha256: str
     broken_seals: tuple[str, ...]
     failed: dict[str, str]
+    goals: tuple[Goal, ...]
+
+    @property
+    def reached(self) -> bool:
+        """Whether no goal was missed."""
+        return all(goal.met is not False for goal in self.goals)
+
+
+class ChallengeScore(SealedScore):
+    """All scores of a challenge: what `calibench challenge score --json FILE` writes."""
+
+    format: Literal["calibench-challenge-score"] = "calibench-challenge-score"
+    version: Literal[1] = 1
     singles: tuple[SinglesScore, ...]
     fair: tuple[FairScore, ...]
     families: FamiliesScore
@@ -167,13 +185,18 @@ class ChallengeScore(Frozen):
     cpu_median_s: float | None
     cpu_max_s: float | None
     memory_max_mib: float | None
-    goals: tuple[Goal, ...]
     case_scores: tuple[CaseScore, ...]
 
-    @property
-    def reached(self) -> bool:
-        """Whether no goal was missed."""
-        return all(goal.met is not False for goal in self.goals)
+
+def goals_of_run(seals: Seals, broken: Sequence[str], ran: int, cases: int) -> tuple[Goal, Goal]:
+    """Return the goals of every sealed challenge: that its seals hold, and that each of its `cases` ran."""
+    whole = len(seals.seals)
+    return (
+        Goal(
+            name="seals that hold", wanted="all", reached=f"{whole - len(broken)} of {whole}", met=not broken, sure=True
+        ),
+        Goal(name="cases that ran", wanted="all", reached=f"{ran} of {cases}", met=ran == cases, sure=True),
+    )
 
 
 def broken_seals(folder: Path, seals: Seals, truths: Truths) -> tuple[str, ...]:
@@ -248,20 +271,7 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
         for what, above, most in CLASSES
     )
     goals = (
-        Goal(
-            name="seals that hold",
-            wanted="all",
-            reached=f"{len(seals.seals) - len(broken)} of {len(seals.seals)}",
-            met=not broken,
-            sure=True,
-        ),
-        Goal(
-            name="cases that ran",
-            wanted="all",
-            reached=f"{len(ran)} of {len(cases)}",
-            met=len(ran) == len(cases),
-            sure=True,
-        ),
+        *goals_of_run(seals, broken, len(ran), len(cases)),
         at_least("top-1 of single effects above 50", classes[0].top_1, 0.95).model_copy(
             update={"oracle": _oracle(s for s in singles if s.noncentrality[0] > STRONG)}
         ),

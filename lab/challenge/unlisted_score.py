@@ -19,8 +19,19 @@ import numpy as np
 
 from lab.challenge.proof import ABSTAINED, RIGHT, WRONG, placed, rate_words, with_seed
 from lab.challenge.run import CaseRun
-from lab.challenge.score import CLASSES, EXCESS_SIGMAS, STRONG, Goal, Rate, at_least, at_most, seals_sha256
-from lab.challenge.truth import CaseTruth, Purpose, Seals, Truths
+from lab.challenge.score import (
+    CLASSES,
+    EXCESS_SIGMAS,
+    STRONG,
+    Goal,
+    Rate,
+    SealedScore,
+    at_least,
+    at_most,
+    goals_of_run,
+    seals_sha256,
+)
+from lab.challenge.truth import CaseTruth, Seals, Truths
 from lab.effect_titles import effect_title
 from lab.formats.results import DiagnosisResult, DiscoveredLaw
 from mocks.former import UNLISTED, UnlistedLaw
@@ -99,31 +110,18 @@ class SeparabilityScore(Frozen):
     right: Rate
 
 
-class UnlistedScore(Frozen):
+class UnlistedScore(SealedScore):
     """All scores of a proof of discovery."""
 
     format: Literal["calibench-unlisted-score"] = "calibench-unlisted-score"
     version: Literal[1] = 1
-    purpose: Purpose
-    seed: int
-    size: str
-    cases: int
-    seals_sha256: str
-    broken_seals: tuple[str, ...]
-    failed: dict[str, str]
     classes: tuple[SeparabilityScore, ...]
     laws: tuple[LawScore, ...]
     periods: Rate
     beside_named: Rate
     excess_removed: float | None
     cpu_median_s: float | None
-    goals: tuple[Goal, ...]
     case_scores: tuple[UnlistedCase, ...]
-
-    @property
-    def reached(self) -> bool:
-        """Whether no goal was missed."""
-        return all(goal.met is not False for goal in self.goals)
 
 
 # --- one law, one case ------------------------------------------------------------------------------------------------
@@ -225,20 +223,7 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
     ran = [case for case in cases if runs[case].error is None]
     whole = _mean(strong)
     goals = (
-        Goal(
-            name="seals that hold",
-            wanted="all",
-            reached=f"{len(seals.seals) - len(broken)} of {len(seals.seals)}",
-            met=not broken,
-            sure=True,
-        ),
-        Goal(
-            name="cases that ran",
-            wanted="all",
-            reached=f"{len(ran)} of {len(cases)}",
-            met=len(ran) == len(cases),
-            sure=True,
-        ),
+        *goals_of_run(seals, broken, len(ran), len(cases)),
         at_least("axis and stage right above a separability of 50", Rate.over(s.right for s in strong), 0.90),
         Goal(
             name="held-out excess chi2 removed above 50, mean",
@@ -308,11 +293,8 @@ def _instead(case: UnlistedCase) -> str:
 
 def table(found: UnlistedScore) -> str:
     """Return the scores as Markdown tables, with 95 % intervals (Clopper-Pearson)."""
-    verdict = {True: "met", False: "missed", None: "no case"}
     lines = ["| goal | wanted | reached | |", "| --- | --- | --- | --- |"]
-    for goal in found.goals:
-        doubt = "" if goal.sure or goal.sure is None or goal.met is None else ", too few cases to be sure"
-        lines.append(f"| {goal.name} | {goal.wanted} | {goal.reached} | {verdict[goal.met]}{doubt} |")
+    lines += [f"| {goal.name} | {goal.wanted} | {goal.reached} | {goal.verdict} |" for goal in found.goals]
     lines += ["", "| separability | axis right | axis and stage right |", "| --- | --- | --- |"]
     lines += [f"| {c.separability} | {rate_words(c.axis_right)} | {rate_words(c.right)} |" for c in found.classes]
     lines += ["", "| also | |", "| --- | --- |"]
