@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from drivers.camera.base import SensorInfo
 from drivers.camera.genicam_settings import CameraFeatures
 from drivers.camera.single_frame import SingleFrameCamera
 from drivers.errors import Garbled, InstrumentError, NoAnswer, Refused
-from drivers.instrument import Identity, Recorder, Setting
+from drivers.instrument import Identity, Setting
 
 #: CameraState: it can begin an exposure; it has failed.
 _IDLE, _ERROR = 0, 5
@@ -30,6 +31,7 @@ class AlpacaCamera(SingleFrameCamera):
     """The camera `host:port/NUMBER` of an Alpaca server.
 
     `readout_mode`: one of the camera's own names, None: as it is. `gain_db_per_unit` is of the property Gain.
+    `settings`: those of `SingleFrameCamera`.
     """
 
     def __init__(
@@ -37,20 +39,9 @@ class AlpacaCamera(SingleFrameCamera):
         address: str,
         *,
         readout_mode: str | None = None,
-        timeout_s: float = 5.0,
-        trigger_line: str | None = None,
-        gain_db_per_unit: float | None = None,
-        gain_at_0_db: float = 0.0,
-        recorder: Recorder | None = None,
+        **settings: Any,
     ) -> None:
-        super().__init__(
-            address,
-            timeout_s=timeout_s,
-            trigger_line=trigger_line,
-            gain_db_per_unit=gain_db_per_unit,
-            gain_at_0_db=gain_at_0_db,
-            recorder=recorder,
-        )
+        super().__init__(address, **settings)
         self._readout_mode = readout_mode
         self._device = AlpacaDevice(address, "camera", self._left_s, self._record)
         self._info: SensorInfo | None = None

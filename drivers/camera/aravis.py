@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from drivers.apart import Apart
 from drivers.camera.buffers import Grabbed
 from drivers.camera.genicam import GenicamCamera
+from drivers.camera.genicam_settings import AskedFeatures
 from drivers.errors import Disconnected, InstrumentError, InUse, NoAnswer
 from drivers.instrument import Identity, Setting
 
@@ -238,34 +239,6 @@ class AravisDevice:
             leave()
 
 
-class _Apart:
-    """The features of a camera that another process has."""
-
-    def __init__(self, ask: Callable[..., Any]) -> None:
-        self._ask = ask
-
-    def has(self, name: str) -> bool:
-        return bool(self._ask("has", name))
-
-    def get(self, name: str) -> Setting:
-        found: Setting = self._ask("get", name)
-        return found
-
-    def set(self, name: str, value: Setting) -> None:
-        self._ask("set", name, value)
-
-    def entries(self, name: str) -> Collection[str]:
-        found: Collection[str] = self._ask("entries", name)
-        return found
-
-    def limits(self, name: str) -> tuple[float, float]:
-        found: tuple[float, float] = self._ask("limits", name)
-        return found
-
-    def execute(self, name: str) -> None:
-        self._ask("execute", name)
-
-
 class AravisCamera(GenicamCamera):
     """The camera that Aravis knows as `address`: its identifier, or its IP address."""
 
@@ -294,11 +267,11 @@ class AravisCamera(GenicamCamera):
     def _call(self, method: str, *arguments: Any, longer_s: float = 0.0) -> Any:
         return self._device.call(method, *arguments, timeout_s=self._timeout_s + longer_s)
 
-    def _open(self) -> tuple[_Apart, Identity]:
+    def _open(self) -> tuple[AskedFeatures, Identity]:
         self._device.start()
         self._device.call("load", timeout_s=_LOADING_S)
         identity = Identity(*self._call("open", longer_s=self._timeout_s))
-        return _Apart(lambda *asked: self._call("feature", *asked)), identity
+        return AskedFeatures(lambda *asked: self._call("feature", *asked)), identity
 
     def _start(self) -> None:
         self._call("start")

@@ -8,9 +8,9 @@ same settings serve every library that reaches such cameras: `drivers.camera.gen
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from drivers.errors import Disconnected, InstrumentError, NoAnswer
 from drivers.instrument import Setting
@@ -40,6 +40,34 @@ class CameraFeatures(Features, Protocol):
 
     def execute(self, name: str) -> None:
         """Run a command."""
+
+
+class AskedFeatures:
+    """A camera's features in another process: `ask(method, *arguments)` answers for each method."""
+
+    def __init__(self, ask: Callable[..., Any]) -> None:
+        self._ask = ask
+
+    def has(self, name: str) -> bool:
+        return bool(self._ask("has", name))
+
+    def get(self, name: str) -> Setting:
+        found: Setting = self._ask("get", name)
+        return found
+
+    def set(self, name: str, value: Setting) -> None:
+        self._ask("set", name, value)
+
+    def entries(self, name: str) -> Collection[str]:
+        found: Collection[str] = self._ask("entries", name)
+        return found
+
+    def limits(self, name: str) -> tuple[float, float]:
+        found: tuple[float, float] = self._ask("limits", name)
+        return found
+
+    def execute(self, name: str) -> None:
+        self._ask("execute", name)
 
 
 @dataclass(frozen=True)

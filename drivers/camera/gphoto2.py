@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from fractions import Fraction
 from io import BytesIO
@@ -21,9 +21,9 @@ from drivers.apart import Apart
 from drivers.camera.base import SensorInfo
 from drivers.camera.genicam_settings import CameraFeatures
 from drivers.camera.raw_folder import TOLERANCE, RawPicture, read_raw
-from drivers.camera.single_frame import SingleFrameCamera
+from drivers.camera.single_frame import LibraryCamera
 from drivers.errors import Disconnected, Garbled, InstrumentError
-from drivers.instrument import Identity, Recorder, Setting
+from drivers.instrument import Recorder, Setting
 
 #: Names of one setting on cameras of different makers; the first that a camera has is meant.
 _EXPOSURES = ("shutterspeed", "shutterspeed2", "exptime")
@@ -110,6 +110,12 @@ class Library:
         widget = self._widget(name)
         return tuple(widget.get_choice(index) for index in range(widget.count_choices()))
 
+    def limits(self, name: str) -> tuple[float, float]:
+        raise InstrumentError(f"gphoto2: {name} has choices, no limits")
+
+    def execute(self, name: str) -> None:
+        raise InstrumentError(f"gphoto2: {name} is no command")
+
     def settings(self) -> dict[str, Setting]:
         """All settings, by name."""
         found: dict[str, Setting] = {}
@@ -155,34 +161,7 @@ class Library:
         self._camera.exit()
 
 
-class _Settings:
-    """The camera's settings, from the process apart."""
-
-    def __init__(self, camera: Gphoto2Camera) -> None:
-        self._ask = camera.ask
-
-    def has(self, name: str) -> bool:
-        return bool(self._ask("has", name))
-
-    def get(self, name: str) -> Setting:
-        found: Setting = self._ask("get", name)
-        return found
-
-    def set(self, name: str, value: Setting) -> None:
-        self._ask("set", name, value)
-
-    def entries(self, name: str) -> Collection[str]:
-        found: tuple[str, ...] = self._ask("entries", name)
-        return found
-
-    def limits(self, name: str) -> tuple[float, float]:
-        raise InstrumentError(f"gphoto2: {name} has choices, no limits")
-
-    def execute(self, name: str) -> None:
-        raise InstrumentError(f"gphoto2: {name} is no command")
-
-
-class Gphoto2Camera(SingleFrameCamera):
+class Gphoto2Camera(LibraryCamera):
     """A camera that libgphoto2 knows, by its port (`usb:001,005`, `ptpip:ADDRESS`) or its serial number; an empty
     address: the only one.
 
@@ -213,19 +192,6 @@ class Gphoto2Camera(SingleFrameCamera):
         self._library = Apart(
             "drivers.camera.gphoto2:Library", address, who=f"camera {address}", start_timeout_s=connect_timeout_s
         )
-
-    def ask(self, method: str, *arguments: Any) -> Any:
-        """Ask the library, within what is left of the time of the call under way."""
-        if method in ("set", "expose"):
-            self._record("sent", " ".join([method, *map(str, arguments)]).encode())
-        answer = self._library.call(method, *arguments, timeout_s=self._left_s())
-        if method == "get":
-            self._record("received", f"{arguments[0]} = {answer}".encode())
-        return answer
-
-    def _open(self) -> tuple[_Settings, Identity]:
-        self._library.start()
-        return _Settings(self), Identity(*self.ask("identity"))
 
     def _prepare(self, features: CameraFeatures) -> None:
         for name, value in NEUTRAL.items():
@@ -357,6 +323,3 @@ class Gphoto2Camera(SingleFrameCamera):
 
     def _abort(self) -> None:
         """It can't be told to: what still comes is dropped before the next exposure."""
-
-    def _release(self) -> None:
-        self._library.end()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from drivers.camera.genicam_settings import CameraFeatures
 from drivers.camera.single_frame import SingleFrameCamera
 from drivers.errors import Garbled, InstrumentError
 from drivers.indi import IndiDevice
-from drivers.instrument import Identity, Recorder, Setting
+from drivers.instrument import Identity, Setting
 
 _EXPOSURE, _PICTURE, _ABORT = "CCD_EXPOSURE", "CCD1", "CCD_ABORT_EXPOSURE"
 #: Properties that change the codes, their places or where they go, and what they have to be.
@@ -32,6 +33,7 @@ class IndiCamera(SingleFrameCamera):
     """The camera `host:port/NAME` of an INDI server.
 
     `capture_format`: one of the camera's own names, None: as it is. `gain_db_per_unit` is of CCD_GAIN.
+    `settings`: those of `SingleFrameCamera`.
     """
 
     def __init__(
@@ -39,20 +41,9 @@ class IndiCamera(SingleFrameCamera):
         address: str,
         *,
         capture_format: str | None = None,
-        timeout_s: float = 5.0,
-        trigger_line: str | None = None,
-        gain_db_per_unit: float | None = None,
-        gain_at_0_db: float = 0.0,
-        recorder: Recorder | None = None,
+        **settings: Any,
     ) -> None:
-        super().__init__(
-            address,
-            timeout_s=timeout_s,
-            trigger_line=trigger_line,
-            gain_db_per_unit=gain_db_per_unit,
-            gain_at_0_db=gain_at_0_db,
-            recorder=recorder,
-        )
+        super().__init__(address, **settings)
         self._capture_format = capture_format
         self._device = IndiDevice(address, self._left_s, self._record)
         self._info: SensorInfo | None = None

@@ -6,7 +6,7 @@ Adapters run in a process of their own (`drivers.apart`): one that hangs or cras
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from drivers.apart import Apart
 from drivers.camera.base import SensorInfo
-from drivers.camera.genicam_settings import CameraFeatures
-from drivers.camera.single_frame import SingleFrameCamera
+from drivers.camera.genicam_settings import AskedFeatures, CameraFeatures
+from drivers.camera.single_frame import LibraryCamera
 from drivers.errors import Disconnected, Garbled, InstrumentError
-from drivers.instrument import Identity, Recorder, Setting
+from drivers.instrument import Identity, Setting
 
 #: Standard properties (MMDeviceConstants.h) that change the codes or their places, and where they don't.
 NEUTRAL = {
@@ -114,14 +114,17 @@ class Core:
     def entries(self, name: str) -> tuple[str, ...]:
         return tuple(self._core.getAllowedPropertyValues(self._camera, name))
 
-    def limits(self, name: str) -> tuple[float, float] | None:
-        """Least and greatest value; None where it has none."""
+    def limits(self, name: str) -> tuple[float, float]:
+        """Return the least and the greatest value; infinite where it has none."""
         if not self._core.hasProperty(self._camera, name) or not self._core.hasPropertyLimits(self._camera, name):
-            return None
+            return -math.inf, math.inf
         return (
             float(self._core.getPropertyLowerLimit(self._camera, name)),
             float(self._core.getPropertyUpperLimit(self._camera, name)),
         )
+
+    def execute(self, name: str) -> None:
+        raise InstrumentError(f"Micro-Manager: {name} is no command; it has none")
 
     def size(self) -> tuple[int, int, int, int, int]:
         """Rows, columns, bits of a code, bytes of a pixel, colours of a pixel."""
@@ -159,42 +162,14 @@ class Core:
         self._core.unloadAllDevices()
 
 
-class _Properties:
-    """The camera's properties, from the process apart."""
-
-    def __init__(self, camera: MicroManagerCamera) -> None:
-        self._ask = camera.ask
-
-    def has(self, name: str) -> bool:
-        return bool(self._ask("has", name))
-
-    def get(self, name: str) -> Setting:
-        found: Setting = self._ask("get", name)
-        return found
-
-    def set(self, name: str, value: Setting) -> None:
-        self._ask("set", name, value)
-
-    def entries(self, name: str) -> Collection[str]:
-        found: tuple[str, ...] = self._ask("entries", name)
-        return found
-
-    def limits(self, name: str) -> tuple[float, float]:
-        found: tuple[float, float] | None = self._ask("limits", name)
-        return found or (-math.inf, math.inf)
-
-    def execute(self, name: str) -> None:
-        raise InstrumentError(f"Micro-Manager: {name} is no command; it has none")
-
-
-class MicroManagerCamera(SingleFrameCamera):
+class MicroManagerCamera(LibraryCamera):
     """The camera of a configuration, `FILE.cfg` or `FILE.cfg#LABEL`; without a label the one that the file names.
 
     `adapters`: the folder of the device adapters; None: where pymmcore-plus finds Micro-Manager. `shutter`: label of
     the shutter that is open during an exposure alone; None: the one that the file names. `pixel_type`: the property's
     value, None: as it is. `properties`: others to be set, by name. `cfa`: the colour filters, as no adapter tells them.
     `gain_property`: the gain that `gain_db_per_unit` is of. `connect_timeout_s`: longest time until all devices of the
-    configuration are loaded.
+    configuration are loaded. `settings`: those of `SingleFrameCamera`.
     """
 
     def __init__(
@@ -208,20 +183,9 @@ class MicroManagerCamera(SingleFrameCamera):
         cfa: str | None = None,
         gain_property: str = "Gain",
         connect_timeout_s: float = 60.0,
-        timeout_s: float = 5.0,
-        trigger_line: str | None = None,
-        gain_db_per_unit: float | None = None,
-        gain_at_0_db: float = 0.0,
-        recorder: Recorder | None = None,
+        **settings: Any,
     ) -> None:
-        super().__init__(
-            address,
-            timeout_s=timeout_s,
-            trigger_line=trigger_line,
-            gain_db_per_unit=gain_db_per_unit,
-            gain_at_0_db=gain_at_0_db,
-            recorder=recorder,
-        )
+        super().__init__(address, **settings)
         self._loading_s = connect_timeout_s
         self._wanted = dict(properties or {}) | ({} if pixel_type is None else {"PixelType": pixel_type})
         self._cfa, self._gain_property = cfa, gain_property
@@ -229,33 +193,23 @@ class MicroManagerCamera(SingleFrameCamera):
         self._limits: tuple[float, float] | None = None
         file, _, label = address.partition("#")
         self._file = Path(file)
-        self._core = Apart(
+        self._library = Apart(
             "drivers.camera.micromanager:Core",
             file,
             label,
             shutter or "",
             adapters or "",
-            str(timeout_s),
+            str(self._timeout_s),
             who=f"camera {address}",
             start_timeout_s=connect_timeout_s,
         )
 
-    def ask(self, method: str, *arguments: Any) -> Any:
-        """Ask the core, within what is left of the time of the call under way."""
-        if method in ("set", "expose", "abort"):
-            self._record("sent", " ".join([method, *map(str, arguments)]).encode())
-        answer = self._core.call(method, *arguments, timeout_s=self._left_s())
-        if method == "get":
-            self._record("received", f"{arguments[0]} = {answer}".encode())
-        return answer
-
-    def _open(self) -> tuple[_Properties, Identity]:
+    def _open(self) -> tuple[AskedFeatures, Identity]:
         if not self._file.is_file():
             raise Disconnected(
                 f"{self._who}: no configuration file {self._file}; save one in Micro-Manager, or correct the address"
             )
-        self._core.start()
-        return _Properties(self), Identity(*self.ask("identity"))
+        return super()._open()
 
     def _prepare(self, features: CameraFeatures) -> None:
         self.ask("abort")
@@ -289,7 +243,7 @@ class MicroManagerCamera(SingleFrameCamera):
         return SensorInfo(rows, cols, f"{8 * in_bytes} bits", self._cfa, bits, exposure_s=self._limits)
 
     def _check_gain(self, unit: float) -> None:
-        low, high = self.ask("limits", self._gain_property) or (-math.inf, math.inf)
+        low, high = self.ask("limits", self._gain_property)
         if not low <= unit <= high:
             raise InstrumentError(
                 f"{self._who}: {self._gain_property} {unit:g} is outside {low:g}..{high:g}; ask for another gain"
@@ -334,9 +288,6 @@ class MicroManagerCamera(SingleFrameCamera):
     def _abort(self) -> None:
         if self.ask("abort"):
             raise InstrumentError(f"{self._who}: its shutter stays open; close it by hand")
-
-    def _release(self) -> None:
-        self._core.end()
 
 
 def _same(found: Setting, wanted: str) -> bool:

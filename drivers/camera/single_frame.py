@@ -13,13 +13,15 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.apart import Apart
 from drivers.camera.base import Camera, Frame, SensorInfo, Trigger
 from drivers.camera.found_features import RememberedFeatures
-from drivers.camera.genicam_settings import CameraFeatures
+from drivers.camera.genicam_settings import AskedFeatures, CameraFeatures
 from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer
 from drivers.found_settings import FoundSettings, Hold
 from drivers.instrument import Identity, Recorder, Setting
@@ -32,8 +34,8 @@ class SingleFrameCamera(Camera):
     """A camera at an `address` of whatever reaches it.
 
     `timeout_s`: longest time for an answer, beyond the exposure; a call that asks many things ends within twice that.
-    `trigger_line`: `Software` where the computer triggers
-    it right after the camera that leads, milliseconds later; no other line can be waited for.
+    `trigger_line`: `Software` where the computer triggers it right after the camera that leads, milliseconds later; no
+    other line can be waited for.
     `gain_db_per_unit`, `gain_at_0_db`: the gain's own unit, as these cameras' makers each have another; without it the
     gain stays as it was found, and is called 0 dB.
     """
@@ -323,3 +325,25 @@ class SingleFrameCamera(Camera):
         self._features, self._armed, self._fired = None, None, None
         with contextlib.suppress(Exception):  # the camera may be gone
             self._release()
+
+
+class LibraryCamera(SingleFrameCamera):
+    """A camera behind a maker's library, which runs in a process of its own: `_library`."""
+
+    _library: Apart
+
+    def ask(self, method: str, *arguments: Any) -> Any:
+        """Ask the library, within what is left of the time of the call under way."""
+        if method in ("set", "expose", "abort"):
+            self._record("sent", " ".join([method, *map(str, arguments)]).encode())
+        answer = self._library.call(method, *arguments, timeout_s=self._left_s())
+        if method == "get":
+            self._record("received", f"{arguments[0]} = {answer}".encode())
+        return answer
+
+    def _open(self) -> tuple[AskedFeatures, Identity]:
+        self._library.start()
+        return AskedFeatures(self.ask), Identity(*self.ask("identity"))
+
+    def _release(self) -> None:
+        self._library.end()
