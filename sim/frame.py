@@ -422,8 +422,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
 
 def _scatter_light(image: FloatArray, state: Image, shade: FloatArray) -> FloatArray:
     """Return a channel's irradiance with its reflections, the fall-off, and what is scattered evenly. A traced lens's
-    image is
-    a mosaic already: colour by colour.
+    image is a mosaic already: colour by colour.
     """
     traced = isinstance(state.camera.lens.imaging, TracedLens)
 

@@ -45,8 +45,8 @@ class Specbos1211(WireInstrument, Spectroradiometer):
     """A specbos or spectraval. Rates in `baudrates` are tried in turn; a TCP connection has none.
 
     `from_nm`, `to_nm`: range asked for, in steps of 1 nm; None: as far as the unit is calibrated, by its own word, or
-    less where it then refuses to measure that (error 141). `max_integration_s`: longest
-    integration time that the instrument may choose; one measurement ends within 5 times that and 10 s.
+    less where it then refuses to measure that (error 141). `max_integration_s`: longest integration time that the
+    instrument may choose; one measurement ends within 5 times that and 10 s.
     """
 
     def __init__(

@@ -477,10 +477,9 @@ def history(
     once: by its newest fit, or by that which was certified.
 
     Each is compared with its reference as `compare` does, by the standard deviation of the difference, dark currents at
-    the sensor temperature of the reference. The threshold is that at which
-    an unchanged camera has any drift called in its whole history with the probability `false_alarm_rate` (Sidak).
-    `limits`: by default those of the camera's newest certificate. Raises InputError where the camera or the figure
-    isn't known."""
+    the sensor temperature of the reference. The threshold is that at which an unchanged camera has any drift called in
+    its whole history with the probability `false_alarm_rate` (Sidak). `limits`: by default those of the camera's newest
+    certificate. Raises InputError where the camera or the figure isn't known."""
     register(store)
     of_figure = (FigureRow.camera == camera, FigureRow.name == figure, FigureRow.place == place)
     columns = (*FigureRow.__table__.columns, CalibrationRow.session_id, *_LIFE)

@@ -4,15 +4,13 @@ Each Bayer plane is analysed on its own grid; nothing is demosaiced.
 
 - `lab.measure.edge_finding`: where the edge lies, a cubic polynomial in the frame, found by iterated least squares;
 - `lab.measure.edge_spread`: the edge-spread function (ESF) is a cubic spline of the distance from the edge. Its knots
-  are even
-  near the edge and ever wider apart in the tails. A spline is used because a basis of hat functions leaves a ripple of
-  h^2 E'' / 12, which samples at uneven distances turn into a bias of 0.1 % of MTF50. A prior of the line-spread
-  function (LSF), the derivative of the ESF, decides what the samples leave open: a Gaussian, a Gaussian process about
-  it, and the 1 / distance^2 tail of diffraction, which holds 1 % of the contrast beyond any region;
+  are even near the edge and ever wider apart in the tails. A spline is used because a basis of hat functions leaves a
+  ripple of h^2 E'' / 12, which samples at uneven distances turn into a bias of 0.1 % of MTF50. A prior of the
+  line-spread function (LSF), the derivative of the ESF, decides what the samples leave open: a Gaussian, a Gaussian
+  process about it, and the 1 / distance^2 tail of diffraction, which holds 1 % of the contrast beyond any region;
 - `lab.measure.edge_mtf`: the ESF is fitted by weighted least squares together with the gradient of the illumination.
-  The
-  MTF is the Fourier transform of the derivative of the spline, in closed form, with its covariance. `edge_mtf` is the
-  whole estimator, on a region;
+  The MTF is the Fourier transform of the derivative of the spline, in closed form, with its covariance. `edge_mtf` is
+  the whole estimator, on a region;
 - `lab.measure.edges`: the edges of a frame that are usable, and the MTF of one edge of a recording set;
 - here, the step on all captures of a side.
 

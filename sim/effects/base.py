@@ -33,9 +33,9 @@ def _is_told(field: FieldInfo) -> bool:
 
 
 class Effect(Frozen):
-    """Base of all effects. Parameters are fields annotated with `sim.parameters.Quantity`
-    (unit, bounds, prior, `absent`, `linear_power`), each with its `absent` value as default, so that `TheEffect()` is
-    the baseline. Other fields are choices, which no fit changes; each has a pydantic `Field` with a description.
+    """Base of all effects. Parameters are fields annotated with `sim.parameters.Quantity` (unit, bounds, prior,
+    `absent`, `linear_power`), each with its `absent` value as default, so that `TheEffect()` is the baseline. Other
+    fields are choices, which no fit changes; each has a pydantic `Field` with a description.
 
     The methods that an effect may write; each default changes nothing:
 

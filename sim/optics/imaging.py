@@ -66,9 +66,9 @@ class ZernikePupil(Frozen):
     wavelengths.
 
     W(rho, phi) = sum_j c_j Z_j(rho, phi), Z_j of rms 1 over the pupil, phi from the columns' direction towards the
-    rows'; the phase is 2 pi W / wavelength. `coefficients` begin with the index scheme's first
-    (`noll`: j = 1; `osa`, that is ANSI Z80.28: j = 0; both piston) and are in um, or in waves at
-    `reference_wavelength_nm`. A W that rises along x moves the image along +x.
+    rows'; the phase is 2 pi W / wavelength. `coefficients` begin with the index scheme's first (`noll`: j = 1; `osa`,
+    that is ANSI Z80.28: j = 0; both piston) and are in um, or in waves at `reference_wavelength_nm`. A W that rises
+    along x moves the image along +x.
 
     Colours may differ: at `colour_wavelength_nm` (linear between, held beyond) the sensor lies `focus_shift_um` dz from
     the focus (axial colour, W = dz / (8 N^2) rho^2 on top), and the image is moved by `image_shift_um` (x, y)

@@ -419,9 +419,8 @@ def _covariance(
 
 def displaced(model: MeasurementModel, effects: Effects, index: int) -> list[tuple[Effect, ...]]:
     """Return the effects with member `index` moved by one standard deviation along each principal direction of its
-    parameters'
-    posterior, within bounds: a set for each direction. Predictions by these, less that by `effects`, are a square root
-    of the covariance that the member's parameters give to a prediction."""
+    parameters' posterior, within bounds: a set for each direction. Predictions by these, less that by `effects`, are a
+    square root of the covariance that the member's parameters give to a prediction."""
     coords = coordinates(effects, model.camera)
     own = [k for k, c in enumerate(coords) if c.index == index]
     if not own:

@@ -62,9 +62,8 @@ class Search:
     """The sets that were fitted so far, by their effects' names, and the search over further ones.
 
     `threshold` is that of the scores, which one healthy camera in a hundred reaches; `above_noise`: by how much drawn
-    healthy cameras have raised it. `changes`: of the candidates' prototypes, beside
-    no effect. `clock` gives the CPU time (s) that the budget is counted in, from the search's beginning. `not_weighed`:
-    what the budget left.
+    healthy cameras have raised it. `changes`: of the candidates' prototypes, beside no effect. `clock` gives the CPU
+    time (s) that the budget is counted in, from the search's beginning. `not_weighed`: what the budget left.
     """
 
     model: MeasurementModel

@@ -61,8 +61,7 @@ class NamedEffect(Frozen):
     where the family is named, its effects, likeliest first; `name` is then the family's identifier, and `parameters`
     are those of the first member. `choices`: which of its alternatives the law is, by field: the corner of a glow.
     `modes`: other values of the parameters, in their units, that fit as well. `shown_in`: measurements in which it
-    stands out of the noise,
-    strongest first.
+    stands out of the noise, strongest first.
     """
 
     name: str
