@@ -115,17 +115,6 @@ def collect_rows(camera: CameraModel, effects: Effects) -> FloatArray:
     return np.stack([tile[:, first::step].mean(axis=1) for first in range(step)], axis=1)
 
 
-def differing_light(camera: CameraModel, effects: Effects) -> FloatArray | None:
-    """Return what effects leave of even light (rows, cols), each colour's plane over its mean; None for even light."""
-    differing = acting(effects, COLLECTED | GAINS)
-    if not differing:
-        return None
-    rows = collect_rows(camera, acting(differing, COLLECTED))
-    light = np.tile(rows, -(-camera.cols // rows.shape[1]))[:, : camera.cols]
-    gains = Uniform(camera, differing).gain_map()
-    return light if gains is None else light * gains
-
-
 def without_dark(
     study: Study, dark: DarkReadOut, levels: Sequence[FlatLevel], image: FloatArray
 ) -> tuple[FloatArray, float]:
