@@ -141,13 +141,18 @@ def collected_electrons(
             camera.lens.f_number
         )
     mean: FloatArray = light.scene * source  # an array of its own: what follows writes into it
+    if before_lens.level_by_channel:
+        for channel, places in mosaic.phases(camera.cfa).items():
+            for row, col in places:
+                step = mosaic.step(camera.cfa)
+                mean[row::step, col::step] *= before_lens.colour(channel, exposure.elapsed_s)
     rows = before_lens.row_factors(camera.rows, exposure.exposure_s, exposure.elapsed_s)
     if rows is not None:
         mean *= rows[:, None]
     if isinstance(light.room, np.ndarray) or light.room:
         mean += light.room
-    down = np.linspace(0.0, 1.0, camera.rows)[:, None]
-    mean *= charge.collected_s(exposure.exposure_s) + charge.leaked_s(down)
+    down, across = np.linspace(0.0, 1.0, camera.rows)[:, None], np.linspace(0.0, 1.0, camera.cols)[None, :]
+    mean *= charge.collected_s(exposure.exposure_s) + charge.leaked_s(down, across)
     np.add(charge.collect_light(mean), dark_electrons(camera, exposure, effects), out=mean)
     return charge.overflow_wells(charge.move_charge(mean))
 
@@ -172,7 +177,7 @@ def read_electrons(
 def is_steady(camera: CameraModel, effects: Sequence[Effect]) -> bool:
     """Return whether the light is the same in all frames of one setting, whenever they are taken."""
     light = light_of(camera, effects)
-    return not light.level and not light.rows
+    return not light.level and not light.level_by_channel and not light.rows
 
 
 def grows_with_exposure(camera: CameraModel, effects: Sequence[Effect]) -> bool:
@@ -398,7 +403,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
     if not effects:
         return sensor.LINEAR
     charge, signal, codes = charge_of(camera, effects), signal_of(camera, effects), codes_of(camera, effects)
-    disturbances = signal.random
+    disturbances = signal.random_at(exposure.elapsed_s)
 
     def draw_disturbances(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         return sum((one.draw(shape, rng) for one in disturbances), np.zeros((1, 1)))
@@ -409,7 +414,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
     return ReadOut(
         signal.read if signal.response else None,
         charge.shot_e2 if charge.variance_e2 else None,
-        signal.shift_dn(exposure.elapsed_s, exposure.temperature_c),
+        signal.shift_dn(exposure.elapsed_s, exposure.temperature_c, exposure.exposure_s),
         draw_disturbances if disturbances else None,
         sum((one.mean_e(shape) for one in disturbances), 0.0),
         sum((one.variance_e2(shape) for one in disturbances), 0.0),

@@ -81,7 +81,8 @@ class RowLight:
 class Light(State):
     """State of the light that reaches the lens, given what the radiometer measured and the screen was asked to show.
 
-    `spectrum`: (wavelength_nm, radiance, kind of capture) -> radiance. `level`: elapsed_s -> factor on the source.
+    `spectrum`: (wavelength_nm, radiance, kind of capture) -> radiance. `level`: elapsed_s -> factor on the source;
+    `level_by_channel`: (channel, elapsed_s) -> the same of what one channel sees of it.
     `rows`: factors on the source's light by row of one frame. `shading`: (x_um, y_um) -> factor by place on the sensor.
     `ambient_e_per_s`: channel -> electrons a second of light beside the source. `screen`: (share asked for, x_um, y_um)
     -> share of the lit state that is shown. `pair_gain`: factors on the right camera's signal over the left one's in
@@ -91,6 +92,7 @@ class Light(State):
 
     spectrum: tuple[Callable[[FloatArray, FloatArray, str], FloatArray], ...] = ()
     level: tuple[Callable[[float], float], ...] = ()
+    level_by_channel: tuple[Callable[[str, float], float], ...] = ()
     rows: tuple[RowLight, ...] = ()
     shading: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     ambient_e_per_s: tuple[Callable[[str], float], ...] = ()
@@ -106,6 +108,10 @@ class Light(State):
     def source(self, elapsed_s: float) -> float:
         """Factor on the source's radiance at a time after the first capture; of an unsteady source the mean."""
         return reduce(lambda value, law: value * max(law(elapsed_s), 0.0), self.level, 1.0)
+
+    def colour(self, channel: str, elapsed_s: float) -> float:
+        """Return the factor on what one channel sees of the source, beside `source`."""
+        return reduce(lambda value, law: value * max(law(channel, elapsed_s), 0.0), self.level_by_channel, 1.0)
 
     def unsteady(self, elapsed_s: float) -> float:
         """Random factor besides, of mean 1, in the one frame that is taken at that time."""
@@ -251,8 +257,8 @@ class Image(State):
 class Charge(State):
     """Electrons in the pixels: where they come from and where they end up.
 
-    `exposure_s`: time asked for -> time in which light is collected. `leak_s`: place down the frame, 0 first row .. 1
-    last -> time in which light is collected besides, whatever is asked for. `collected`: electrons of light (rows,
+    `exposure_s`: time asked for -> time in which light is collected. `leak_s`: places down and across
+    the frame, 0 first line .. 1 last -> time in which light is collected besides, whatever is asked for. `collected`: electrons of light (rows,
     cols) -> electrons, pixel by pixel and in proportion; it depends on the place by a short period alone, a part of
     `mosaic.PERIOD_PX`, as measurements ask it on small tiles, and keeps each colour's mean, as levels don't ask it at
     all. `dark_current`: (e/s, sensor temperature) -> e/s, of all pixels or of each (rows, cols). `defects`: pixels with
@@ -268,7 +274,7 @@ class Charge(State):
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
-    leak_s: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    leak_s: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     collected: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     dark_current: tuple[Callable[[FloatArray | float, float | None], FloatArray | float], ...] = ()
     defects: tuple[Defects, ...] = ()
@@ -284,9 +290,10 @@ class Charge(State):
         """Return the time in which light is collected, given the time that was asked for."""
         return reduce(lambda value, law: law(value), self.exposure_s, exposure_s)
 
-    def leaked_s(self, down: FloatArray) -> FloatArray | float:
-        """Return the time in which light is collected beside the exposure, at places down the frame, 0..1."""
-        return sum((law(down) for law in self.leak_s), 0.0)
+    def leaked_s(self, down: FloatArray, across: FloatArray) -> FloatArray | float:
+        """Return the time in which light is collected beside the exposure, at places down and across the frame, 0..1,
+        which broadcast."""
+        return sum((law(down, across) for law in self.leak_s), 0.0)
 
     def collect_light(self, electrons: FloatArray) -> FloatArray:
         """Mean electrons of light (rows, cols) as the pixels collect them."""
@@ -354,12 +361,64 @@ class Disturbance(Protocol):
 
 
 @dataclass(frozen=True)
+class PatternNoise:
+    """Offsets that stand in every frame, and noise beside them, of rows (rows, 1), of columns (1, cols) or of pixels: a
+    `Disturbance`.
+    """
+
+    offset_e: FloatArray | float
+    added_e2: FloatArray | float
+
+    def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+        """Draw the offsets of one frame, in electrons."""
+        if not np.any(self.added_e2):
+            return np.asarray(self.offset_e)
+        return np.asarray(self.offset_e + np.sqrt(self.added_e2) * rng.standard_normal(shape))
+
+    def mean_e(self, shape: tuple[int, ...]) -> FloatArray:
+        """Return the offsets of every pixel."""
+        return np.broadcast_to(self.offset_e, shape)
+
+    def variance_e2(self, shape: tuple[int, ...]) -> FloatArray:
+        """Return the variance of every pixel beside the read noise's."""
+        return np.broadcast_to(self.added_e2, shape)
+
+
+@dataclass(frozen=True)
+class SharedNoise:
+    """Noise that pixels of a line share with those of the next one: a `Disturbance`. `shared_e2` (lines,): the
+    covariance of each line with the next; `axis`: 0 of rows, 1 of columns.
+    """
+
+    shared_e2: FloatArray
+    axis: int
+
+    def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+        """Draw the noise of one frame, in electrons."""
+        scale = np.sqrt(self.shared_e2)
+        own = np.moveaxis(rng.standard_normal(shape), self.axis, 0) * scale[:, None]
+        own[-1] = 0.0  # no line follows the last one
+        return np.moveaxis(own + np.roll(own, 1, axis=0), 0, self.axis)
+
+    def mean_e(self, shape: tuple[int, ...]) -> float:
+        """None."""
+        return 0.0
+
+    def variance_e2(self, shape: tuple[int, ...]) -> FloatArray:
+        """Return what both neighbours share with each line."""
+        own = np.append(self.shared_e2[:-1], 0.0)
+        line = own + np.roll(own, 1)
+        return np.broadcast_to(line[:, None] if self.axis == 0 else line[None, :], shape)
+
+
+@dataclass(frozen=True)
 class Signal(State):
     """State of the electrons' read-out, up to the converter.
 
     `response`: electrons -> electrons, point by point; none stay none. `gains`: (row, col in px, which broadcast) ->
     factor on what is read, noise alike, of mean 1 over the frame, as levels don't ask it. `offset_dn`: (elapsed_s,
-    sensor temperature) -> DN added to the black level. `lines`: noise that rows or columns share. `telegraph`: pixels
+    sensor temperature) -> DN added to the black level; `exposure_offset_dn`: exposure_s -> the same. `noise_e2`:
+    elapsed_s -> variance of every pixel beside the read noise's. `lines`: noise that rows or columns share. `telegraph`: pixels
     that jump between two levels. `disturbances`: signals that are added at random. `filters`: kernels (odd, odd) of sum
     1 that the chip runs over each colour's plane, signal and noise alike, before rounding.
     """
@@ -367,6 +426,8 @@ class Signal(State):
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     gains: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     offset_dn: tuple[Callable[[float, float | None], float], ...] = ()
+    exposure_offset_dn: tuple[Callable[[float], float], ...] = ()
+    noise_e2: tuple[Callable[[float], float], ...] = ()
     lines: tuple[LineNoise, ...] = ()
     telegraph: tuple[Jumps, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
@@ -383,14 +444,23 @@ class Signal(State):
         row, col = np.arange(float(shape[0]))[:, None], np.arange(float(shape[1]))[None, :]
         return reduce(lambda value, law: value * law(row, col), self.gains, np.ones(shape))
 
-    def shift_dn(self, elapsed_s: float, temperature_c: float | None) -> float:
+    def shift_dn(self, elapsed_s: float, temperature_c: float | None, exposure_s: float) -> float:
         """DN added to the black level."""
-        return sum((law(elapsed_s, temperature_c) for law in self.offset_dn), 0.0)
+        by_exposure = sum((law(exposure_s) for law in self.exposure_offset_dn), 0.0)
+        return by_exposure + sum((law(elapsed_s, temperature_c) for law in self.offset_dn), 0.0)
+
+    def changing_e2(self, elapsed_s: float) -> float:
+        """Variance of every pixel beside the read noise's at a time after the first capture, e^2."""
+        return sum((law(elapsed_s) for law in self.noise_e2), 0.0)
 
     @property
     def random(self) -> tuple[Disturbance, ...]:
-        """Everything that is drawn anew in each frame."""
+        """Everything that is drawn anew in each frame, but for `noise_e2`."""
         return (*self.lines, *(Telegraph(jumps) for jumps in self.telegraph), *self.disturbances)
+
+    def random_at(self, elapsed_s: float) -> tuple[Disturbance, ...]:
+        """Everything that is drawn anew in the frame taken at a time after the first capture."""
+        return (*self.random, PatternNoise(0.0, self.changing_e2(elapsed_s))) if self.noise_e2 else self.random
 
     def filter_kernel(self) -> FloatArray | None:
         """Kernel of all filters, one after the other; None for none."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, reduce
+from functools import cache, cached_property, partial, reduce
 
 import numpy as np
 from scipy.special import ndtri
@@ -27,6 +27,7 @@ SHADING = frozenset({"light.shading", "image.shading"})
 #: Those that levels of uniform light depend on, at given rates.
 LEVEL = SHADING | {
     "light.level",
+    "light.level_by_channel",
     "charge.exposure_s",
     "charge.leak_s",
     "light.ambient_e_per_s",
@@ -34,6 +35,7 @@ LEVEL = SHADING | {
     "charge.exchange",
     "signal.response",
     "signal.offset_dn",
+    "signal.exposure_offset_dn",
     "codes.codes",
 }
 
@@ -184,8 +186,10 @@ class Uniform:
 
     def leaked_s(self, points: FieldPoints) -> FloatArray:
         """Return the time (points,) in which light is collected beside the exposure."""
-        row = points.y_um / self.camera.pixel_pitch_um + optical_axis_px(self.camera)[0]
-        return np.asarray(self._charge.leaked_s(row / (self.camera.rows - 1.0)) * np.ones(row.shape))
+        row0, col0 = optical_axis_px(self.camera)
+        row, col = points.y_um / self.camera.pixel_pitch_um + row0, points.x_um / self.camera.pixel_pitch_um + col0
+        leaked = self._charge.leaked_s(row / (self.camera.rows - 1.0), col / (self.camera.cols - 1.0))
+        return np.asarray(leaked * np.ones(row.shape))
 
     def ambient_e(self, channel: str, exposure_s: float) -> float:
         """Electrons that light beside the source makes while the shutter is open, which is the time that light is
@@ -228,10 +232,11 @@ class Uniform:
         found = {}
         for channel, rate in rates.items():
             ambient = (self._light.ambient(channel) * collected_s)[..., None]
-            light = (rate * source_s)[..., None] * field.light
+            seen = rate * _of_each(partial(self._light.colour, channel), elapsed_s)
+            light = (seen * source_s)[..., None] * field.light
             if self.leaks:
                 leaked = self.leaked_s(field) * field.light
-                light = light + (rate * _of_each(self._light.source, elapsed_s))[..., None] * leaked
+                light = light + (seen * _of_each(self._light.source, elapsed_s))[..., None] * leaked
             found[channel] = (light + ambient) * mixed.get(channel, np.ones(()))[..., None] + dark
         return found
 
@@ -329,9 +334,9 @@ class Uniform:
         """Factor (rows, cols) on what is read of every pixel; None where it is the same for all."""
         return self._signal.gain_map((self.camera.rows, self.camera.cols))
 
-    def offset_dn(self, elapsed_s: float, temperature_c: float | None) -> float:
+    def offset_dn(self, elapsed_s: float, temperature_c: float | None, exposure_s: float) -> float:
         """DN added to the black level, beside the mean of `added_e`."""
-        return self._signal.shift_dn(elapsed_s, temperature_c)
+        return self._signal.shift_dn(elapsed_s, temperature_c, exposure_s)
 
     @property
     def adds_signal(self) -> bool:

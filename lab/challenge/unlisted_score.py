@@ -158,14 +158,16 @@ def removed(found: DiagnosisResult | None, told: Sequence[DiscoveredLaw], strong
     """Share of the held-out excess chi2 that the improved model removes, (before - after) / (before - n), limited to
     -1..1.
 
-    chi2 is that of all held-out numbers where they have an excess of 3 standard deviations, else that along the axes of
-    the rightly `told` laws. 0 where neither has one and the law is `strong`: what is there wasn't found. Else None."""
+    chi2 is that of all held-out numbers where they have an excess of 3 standard deviations, else that of the rightly
+    `told` laws' own numbers, the means of their classes. 0 where neither has one and the law is `strong`: what is there wasn't found. Else None."""
     pairs = []
     if found is not None and found.held_out is not None:
         held = found.held_out
         after = held.chi2_after if held.chi2_discovered is None else held.chi2_discovered
         pairs.append((held.chi2_before, after, held.n))
-    pairs.append((sum(t.chi2_before for t in told), sum(t.chi2_after for t in told), sum(t.n for t in told)))
+    own = [(t.own_chi2_before, t.own_chi2_after, t.own_n) for t in told]
+    kept = [(a, b, n) for a, b, n in own if a is not None and b is not None and n is not None]
+    pairs.append((sum(a for a, _, _ in kept), sum(b for _, b, _ in kept), sum(n for _, _, n in kept)))
     for before, after, n in pairs:
         if n and before - n > EXCESS_SIGMAS * (2.0 * n) ** 0.5:
             return max(-1.0, min(1.0, (before - after) / (before - n)))

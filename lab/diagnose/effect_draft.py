@@ -83,7 +83,7 @@ ASKED: dict[tuple[Stage, Along, Of], tuple[str, str]] = {
         "CAMERA.full_well_e * np.multiply({module}.AT, {module}.TABLE)",
     ),
     ("signal", "time", "mean"): (
-        "[signal_of(CAMERA, LAW).shift_dn(time, None) for time in {module}.AT]",
+        "[signal_of(CAMERA, LAW).shift_dn(time, None, 0.01) for time in {module}.AT]",
         "CAMERA.conversion_gain_dn_per_e * np.array({module}.TABLE)",
     ),
     ("codes", "code", "mean"): (

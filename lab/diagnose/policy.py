@@ -93,6 +93,25 @@ class DecisionPolicy(Frozen):
             "chosen: below, most of what is seen along that index is something else",
         ),
     ] = 0.1
+    superseding_chi2: Annotated[
+        float,
+        Rule(
+            "significance",
+            "1",
+            "by how much more than a named effect a law that no effect has must take off chi2, beyond two for each of "
+            "its numbers, to be told in its place",
+            "chosen: twice ln 1000, a thousand to one",
+        ),
+    ] = 14.0
+    unrivalled_probability: Annotated[
+        float,
+        Rule(
+            "significance",
+            "1",
+            "probability of a name from which on no law without a name is tried in its place",
+            "chosen: a search along all coordinates for each name takes a second",
+        ),
+    ] = 0.999999
     held_out_veto_sigma: Annotated[
         float,
         Rule(

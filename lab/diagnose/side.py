@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lab.capture_kinds.base import Equipment
-from lab.diagnose.discovery import discover, law_of, told
+from lab.diagnose.discovery import discover, law_of, superseded, told
 from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.weigh import Candidate
@@ -48,6 +48,7 @@ from sim.camera import Side
 Report = Callable[[str], None]
 #: Seed of the draws behind the threshold: the same recordings give the same diagnosis.
 SEED = 1288
+MOST_WITHDRAWN = 2  # rounds in which laws that no effect has may take the place of names
 
 
 @dataclass(frozen=True)
@@ -124,10 +125,16 @@ def diagnose_side(
         )  # fmt: skip
         least = image_threshold(draws, policy.false_alarm_rate)
     report("scoring the effects")
-    verdict = decide(model, rng, policy, report, least_threshold=least)
+    verdict, withdrawn = decide(model, rng, policy, report, least_threshold=least), {}
     report("looking for laws that no effect has")
-    left_over = verdict if verdict.after or verdict.held_out else None
-    discovered = discover(study, (*model.always, *verdict.effects), policy, left_over)
+    discovered = discover(study, (*model.always, *verdict.effects), policy, verdict)
+    for _ in range(MOST_WITHDRAWN):
+        lost = superseded(study, verdict, discovered, policy)
+        if not lost:
+            break
+        withdrawn |= lost
+        verdict = decide(model, rng, policy, report, least_threshold=least, without=tuple(withdrawn))
+        discovered = discover(study, (*model.always, *verdict.effects), policy, verdict)
     report("looking for the next capture")
     laws = tuple(law_of(one, study) for one in discovered)
     by_laws = described(verdict, discovered, laws)

@@ -216,7 +216,7 @@ class Study:
     def offset(self, effects: Effects) -> Callable[[Capture], float]:
         """Function of a capture: change of its black level by effects, DN."""
         model = Uniform(self.camera, effects)
-        return lambda capture: model.offset_dn(self.elapsed_s(capture), capture.temperature_c)
+        return lambda capture: model.offset_dn(self.elapsed_s(capture), capture.temperature_c, capture.exposure_s)
 
     def free_offsets(self, exposures: FloatArray) -> dict[str, FloatArray]:
         """Jacobian by black level and dark current, for n exposures: name -> (n,), DN per standard deviation of the

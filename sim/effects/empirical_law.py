@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -14,67 +13,65 @@ from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.stages import Charge, Codes, Image, Light, Signal
+from sim.stages import Charge, Codes, Image, Light, PatternNoise, SharedNoise, Signal
 
 Stage = Literal["light", "image", "charge", "signal", "codes"]
 Along = Literal[
-    "code", "row", "column", "row and column", "radius", "level", "time", "exposure", "wavelength", "frequency"
-]
-Of = Literal["mean", "variance"]
+    "code", "row", "column", "row and column", "radius", "angle", "level", "time", "exposure", "wavelength", "frequency",
+    "row x level", "column x level", "radius x exposure", "plane x time",
+]  # fmt: skip
+Of = Literal["mean", "variance", "covariance"]
 
 #: What the numbers are by stage, index, and mean or variance; the values that change nothing; and the coordinate of a
 #: curve's points.
 PLACES: dict[tuple[Stage, Along, Of], tuple[str, float, str]] = {
     ("light", "time", "mean"): ("factor on the source", 1.0, "s after the first capture"),
+    ("light", "plane x time", "mean"): ("factor on the source by channel", 1.0, "s after the first capture"),
+    ("light", "wavelength", "mean"): ("displacement of the monochromator's line, nm", 0.0, "nm"),
     ("image", "radius", "mean"): ("factor on the light", 1.0, "um from the sensor's centre"),
+    ("image", "angle", "mean"): ("factor on the light in the corners, else by r^2 less", 1.0, "deg"),
     ("image", "wavelength", "mean"): ("transmittance", 1.0, "nm"),
     ("image", "frequency", "mean"): ("factor on the transfer function", 1.0, "cycles per um"),
     ("charge", "row", "mean"): ("factor on the electrons of light", 1.0, "share of the rows"),
     ("charge", "column", "mean"): ("factor on the electrons of light", 1.0, "share of the columns"),
     ("charge", "row and column", "mean"): ("factor on the electrons of light", 1.0, ""),
     ("charge", "exposure", "mean"): ("factor on the time in which light is collected", 1.0, "s"),
+    ("charge", "radius", "mean"): ("dark current, e/s", 0.0, "um from the sensor's centre"),
+    ("charge", "radius x exposure", "mean"): (
+        "time in which light is collected besides, s",
+        0.0,
+        "um from the sensor's centre",
+    ),
     ("charge", "level", "variance"): ("factor on the shot noise's variance", 1.0, "e"),
     ("signal", "row", "mean"): ("offset, e", 0.0, "share of the rows"),
     ("signal", "column", "mean"): ("offset, e", 0.0, "share of the columns"),
     ("signal", "row and column", "mean"): ("offset, e", 0.0, ""),
     ("signal", "row", "variance"): ("variance beside the read noise's, e^2", 0.0, "share of the rows"),
     ("signal", "column", "variance"): ("variance beside the read noise's, e^2", 0.0, "share of the columns"),
+    ("signal", "row", "covariance"): ("covariance with the next row, e^2", 0.0, "share of the rows"),
+    ("signal", "column", "covariance"): ("covariance with the next column, e^2", 0.0, "share of the columns"),
+    ("signal", "radius", "mean"): ("offset, e", 0.0, "um from the sensor's centre"),
+    ("signal", "row x level", "mean"): ("change of the response, at full well", 0.0, "share of the rows"),
+    ("signal", "column x level", "mean"): ("change of the response at full well", 0.0, "share of the columns"),
     ("signal", "level", "mean"): ("factor on the response", 1.0, "e"),
     ("signal", "time", "mean"): ("offset, e", 0.0, "s after the first capture"),
+    ("signal", "time", "variance"): ("variance beside the read noise's, e^2", 0.0, "s after the first capture"),
+    ("signal", "exposure", "mean"): ("offset, e", 0.0, "s"),
     ("codes", "code", "mean"): ("width of a code", 1.0, ""),
 }
 
 
-@dataclass(frozen=True)
-class PatternNoise:
-    """Offsets that stand in every frame, and noise beside them, of rows (rows, 1), of columns (1, cols) or of pixels: a
-    `Disturbance`.
-    """
-
-    offset_e: FloatArray
-    added_e2: FloatArray
-
-    def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
-        """Draw the offsets of one frame, in electrons."""
-        if not self.added_e2.any():
-            return self.offset_e
-        return np.asarray(self.offset_e + np.sqrt(self.added_e2) * rng.standard_normal(shape))
-
-    def mean_e(self, shape: tuple[int, ...]) -> FloatArray:
-        """Return the offsets of every pixel."""
-        return np.broadcast_to(self.offset_e, shape)
-
-    def variance_e2(self, shape: tuple[int, ...]) -> FloatArray:
-        """Return the variance of every pixel beside the read noise's."""
-        return np.broadcast_to(self.added_e2, shape)
+#: Those of which a table has entries.
+INDICES = frozenset({"code", "row", "column", "row and column", "row x level", "column x level"})
 
 
 class EmpiricalLaw(Effect):
     """A table by index, or a curve, that changes one quantity of one stage (`PLACES`).
 
     A table: the entry of index i is that of i - `first`, or of i mod `period`; along "row and column" the entry of
-    (row mod `period`, column mod `columns`), rows first. Where a table ends nothing changes. A curve, where `at` has
-    points: linear between them, and held beyond them. It describes and predicts; it names no cause, so that a diagnosis
+    (row mod `period`, column mod `columns`), rows first. Where a table ends nothing changes, and below `first`. A curve,
+    where `at` has points: linear between them, and held beyond them; along "plane x time" the curves of the channels,
+    one after the other. It describes and predicts; it names no cause, so that a diagnosis
     never looks for it.
     """
 
@@ -111,7 +108,7 @@ class EmpiricalLaw(Effect):
             raise ValueError(f"no law of stage {self.stage!r} along {self.along!r} ({self.of}); there are: {known}")
         if self.at:
             self._check_curve()
-        elif self.along not in {"code", "row", "column", "row and column"}:
+        elif self.along not in INDICES:
             raise ValueError(f"along {self.along!r}: has no index; give the curve's points `at`")
         elif self.period and len(self.table) != self.period * (self.columns or 1):
             entries = f"{self.period * (self.columns or 1)}"
@@ -123,8 +120,8 @@ class EmpiricalLaw(Effect):
         least = min(self.table)
         if self._none == 1.0 and least <= 0.0:
             raise ValueError(f"table: {least:g} is the least entry: widths and factors are above 0")
-        if self.of == "variance" and least < 0.0:
-            raise ValueError(f"table: {least:g} is the least entry: a variance is 0 or more")
+        if self.of != "mean" and least < 0.0:
+            raise ValueError(f"table: {least:g} is the least entry: a {self.of} is 0 or more")
         if self.stage == "codes" and self.period and abs(float(np.mean(self.table)) - 1.0) > 1e-6:
             raise ValueError(f"table: the mean width is {np.mean(self.table):.7g}: divide by it, so that it is 1")
         return self
@@ -132,7 +129,8 @@ class EmpiricalLaw(Effect):
     def _check_curve(self) -> None:
         if self.along in {"code", "row and column"}:
             raise ValueError(f"at: {len(self.at)} points along {self.along!r}, which has indices: give a table")
-        if len(self.at) != len(self.table) or list(self.at) != sorted(set(self.at)):
+        curves = len(self.table) // len(self.at) if self.along == "plane x time" else 1
+        if curves * len(self.at) != len(self.table) or list(self.at) != sorted(set(self.at)):
             raise ValueError(f"at: {len(self.at)} points for {len(self.table)} values: give one each, ascending")
         if self.along == "frequency" and (self.at[0] != 0.0 or self.table[0] != 1.0):
             raise ValueError("at: a transfer function is 1 at frequency 0: begin with that point")
@@ -148,9 +146,12 @@ class EmpiricalLaw(Effect):
                 table = (none + 0.3, *[none] * 14, none - 0.3)
                 law = cls(stage=stage, along=along, period=4, columns=4, table=table, strength=0.3)
             else:
-                reach = {"wavelength": 1000.0, "level": camera.full_well_e, "radius": 1e4}.get(along, 1.0)
+                reach = {"wavelength": 1000.0, "level": camera.full_well_e, "radius": 1e4, "radius x exposure": 1e4,
+                         "angle": 360.0}.get(along, 1.0)  # fmt: skip
                 at = np.linspace(0.0, reach, 5)
-                table = tuple((none + np.array([0.0, 0.1, 0.3, 0.1, 0.2])).tolist())
+                curves = len(camera.channels) if along == "plane x time" else 1
+                size = 1e-3 if along == "radius x exposure" else 1.0
+                table = tuple(np.tile(none + size * np.array([0.0, 0.1, 0.3, 0.1, 0.2]), curves).tolist())
                 law = cls(stage=stage, along=along, of=of, at=tuple(at.tolist()), table=table, strength=0.3)
             others.append((law,))
         return ((cls(strength=0.3),), *others)
@@ -177,7 +178,7 @@ class EmpiricalLaw(Effect):
             return self._at((np.arange(count) + 0.5) / count)
         change = self._change
         if self.period:
-            return np.asarray(np.resize(change, count))
+            return np.concatenate([np.zeros(min(self.first, count)), np.resize(change, max(count - self.first, 0))])
         found = np.zeros(max(count, self.first + len(change)))
         found[self.first : self.first + len(change)] = change
         return found[:count]
@@ -187,7 +188,13 @@ class EmpiricalLaw(Effect):
         if self.along == "row and column":
             cell = self._change.reshape(self.period, self.columns)
             return cell[np.ix_(np.arange(shape[0]) % self.period, np.arange(shape[1]) % self.columns)]
-        return self._by_line(shape[0])[:, None] if self.along == "row" else self._by_line(shape[1])[None, :]
+        by_row = self.along.startswith("row")
+        return self._by_line(shape[0])[:, None] if by_row else self._by_line(shape[1])[None, :]
+
+    def _by_radius(self, camera: CameraModel) -> FloatArray:
+        """Return the departure from no change of every pixel (rows, cols), by its distance from the sensor's centre."""
+        y, x = (camera.pixel_pitch_um * (np.arange(n) - 0.5 * (n - 1)) for n in (camera.rows, camera.cols))
+        return self._at(np.hypot(y[:, None], x[None, :]))
 
     def _even(self, shape: tuple[int, ...], camera: CameraModel) -> FloatArray:
         """Return factors over a frame whose mean over the pixels of each colour is 1."""
@@ -202,13 +209,39 @@ class EmpiricalLaw(Effect):
     def on_light(self, light: Light) -> Light:
         if not self._acts("light"):
             return light
+        if self.along == "plane x time":
+            change = self._change.reshape(-1, len(self.at))
+            of_channel = dict(zip(light.camera.channels, np.resize(change, (len(light.camera.channels), len(self.at))),
+                                  strict=True))  # fmt: skip
+            return light.add_laws(
+                level_by_channel=lambda channel, elapsed_s: 1.0
+                + float(np.interp(elapsed_s, self.at, of_channel[channel]))
+            )
+        if self.along == "wavelength":
+            return light.add_laws(spectrum=self._displace)
         return light.add_laws(level=lambda elapsed_s: 1.0 + float(self._at(np.asarray(elapsed_s))))
+
+    def _displace(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+        """Return the spectrum of narrowband light at its true wavelengths, given the stated one."""
+        total = float(np.sum(radiance))
+        if kind != "narrowband" or total <= 0.0:
+            return radiance
+        away_nm = float(self._at(np.sum(radiance * wavelength_nm) / total))
+        return np.asarray(np.interp(wavelength_nm - away_nm, wavelength_nm, radiance))
 
     def on_image(self, image: Image) -> Image:
         if not self._acts("image"):
             return image
         if self.along == "radius":
             return image.add_laws(shading=lambda x_um, y_um: 1.0 + self._at(np.hypot(x_um, y_um)))
+        if self.along == "angle":
+            most = 0.5 * image.camera.pixel_pitch_um * float(np.hypot(image.camera.rows, image.camera.cols))
+
+            def shading(x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+                share = (np.square(x_um) + np.square(y_um)) / most**2
+                return 1.0 + share * self._at(np.degrees(np.arctan2(y_um, x_um)) % 360.0)
+
+            return image.add_laws(shading=shading)
         if self.along == "wavelength":
             return image.add_laws(transmittance=lambda wavelength_nm, sine: 1.0 + self._at(wavelength_nm))
         return image.add_laws(transfer=lambda fx, fy, wavelength_nm: 1.0 + self._at(np.hypot(fx, fy)))
@@ -216,6 +249,17 @@ class EmpiricalLaw(Effect):
     def on_charge(self, charge: Charge) -> Charge:
         if not self._acts("charge"):
             return charge
+        if self.along == "radius":
+            added = self._by_radius(charge.camera)
+            return charge.add_laws(dark_current=lambda e_per_s, _: np.maximum(e_per_s + added, 0.0))
+        if self.along == "radius x exposure":
+            rows, cols, pitch_um = charge.camera.rows, charge.camera.cols, charge.camera.pixel_pitch_um
+
+            def leak(down: FloatArray, across: FloatArray) -> FloatArray:
+                y, x = (down - 0.5) * (rows - 1) * pitch_um, (across - 0.5) * (cols - 1) * pitch_um
+                return self._at(np.hypot(y, x))
+
+            return charge.add_laws(leak_s=leak)
         if self.along == "exposure":
             return charge.add_laws(exposure_s=lambda asked_s: asked_s * (1.0 + float(self._at(np.asarray(asked_s)))))
         if self.along == "level":
@@ -241,8 +285,26 @@ class EmpiricalLaw(Effect):
             return signal.add_laws(response=lambda electrons: electrons * (1.0 + self._at(electrons)))
         if self.along == "time":
             gain = signal.camera.conversion_gain_dn_per_e
+            if self.of == "variance":
+                return signal.add_laws(noise_e2=lambda elapsed_s: max(float(self._at(np.asarray(elapsed_s))), 0.0))
             return signal.add_laws(offset_dn=lambda elapsed_s, _: gain * float(self._at(np.asarray(elapsed_s))))
-        change = self._over((signal.camera.rows, signal.camera.cols))
+        if self.along == "exposure":
+            gain = signal.camera.conversion_gain_dn_per_e
+            return signal.add_laws(exposure_offset_dn=lambda t: gain * float(self._at(np.asarray(t))))
+        shape = signal.camera.rows, signal.camera.cols
+        if self.along in {"row x level", "column x level"}:
+            bend, full_e = self._over(shape), signal.camera.full_well_e
+
+            def response(electrons: FloatArray) -> FloatArray:
+                # levels of a few points don't ask where they lie: its mean over the lines is 0
+                return electrons * (1.0 + bend * electrons / full_e) if np.shape(electrons) == shape else electrons
+
+            return signal.add_laws(response=response)
+        if self.of == "covariance":
+            by_row = self.along == "row"
+            shared = self._by_line(shape[0] if by_row else shape[1])
+            return signal.add_laws(disturbances=SharedNoise(np.maximum(shared, 0.0), 0 if by_row else 1))
+        change = self._by_radius(signal.camera) if self.along == "radius" else self._over(shape)
         none = np.zeros_like(change)
         pattern = PatternNoise(change, none) if self.of == "mean" else PatternNoise(none, change)
         return signal.add_laws(disturbances=pattern)
@@ -260,7 +322,7 @@ class EmpiricalLaw(Effect):
             whole = np.floor(above / self.period) * self.period if self.period else np.zeros_like(above)
             within = above - whole
             inside = np.interp(within, border, ideal)
-            moved = inside if self.period else np.where((within >= 0) & (within <= ideal[-1]), inside, within)
+            moved = np.where(above >= 0.0, inside, within) if self.period else np.where((within >= 0) & (within <= ideal[-1]), inside, within)
             return np.asarray(whole + moved - 0.5 + self.first)
 
         return codes.add_laws(codes=convert)

@@ -55,8 +55,8 @@ class ShutterLeakage(Effect):
         if self.last_row_us == 0.0 or charge.camera.shutter == "rolling":
             return charge
 
-        def leak(down: FloatArray) -> FloatArray:
+        def leak(down: FloatArray, across: FloatArray) -> FloatArray:
             waits = down if self.read_last == "bottom" else 1.0 - down
-            return np.asarray(1e-6 * self.last_row_us * waits)
+            return np.asarray(1e-6 * self.last_row_us * waits * np.ones_like(across))
 
         return charge.add_laws(leak_s=leak)

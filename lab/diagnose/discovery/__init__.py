@@ -12,7 +12,7 @@ the table is one by code.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,14 +29,20 @@ from lab.diagnose.discovery.profile import (
     PredictiveTable,
     Profile,
     Table,
+    angle_forms,
+    chi2_within,
     curve_forms,
     description_length,
+    end_forms,
     fitted,
     formulas,
     periodic_forms,
+    plane_forms,
     tap_forms,
+    upper_forms,
+    wave_forms,
 )
-from lab.diagnose.discovery.words import BEYOND_TABLE, entry, place_in_words, statement, suspects_of, unit_of
+from lab.diagnose.discovery.words import BEYOND_TABLE, entry, entry_unit, place_in_words, statement, suspects_of, unit_of
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
@@ -48,6 +54,7 @@ from lab.measure.study import Study
 from sim.camera import Side
 from sim.effects.base import Effects
 from sim.effects.empirical_law import PLACES, EmpiricalLaw
+from sim.effects.library import list_changes
 from sim.spectrum import FloatArray
 
 LEAST_WIDTH = 0.02  # of a code: a missing code's
@@ -57,6 +64,8 @@ SHORTER_SHARE = 0.9
 NEARLY_ALL = 0.95
 #: Lines by which steps are moved to see whether they are sharp, and the most that these may gain, over the gain.
 BESIDE_LINES, SHARP_SHARE = 2, 0.75
+#: Least gain in chi2, and share of what a law says of captures that it wasn't taken from.
+LEAST_GAIN, PREDICTED_SHARE = 4.0, 0.5
 MOST_BY_CODE = 4096  # entries of a table by code
 MOST_CURVES = 2  # laws along coordinates, one after the other
 #: Description length by which another place in the chain may be longer and is told beside.
@@ -68,12 +77,12 @@ def discover(
 ) -> tuple[PredictiveTable, ...]:
     """Find laws that hold in what they weren't taken from, the most significant first; see the package.
 
-    `effects`: those of the baseline, and the named ones. `left`: the verdict, where it leaves a mismatch: it is looked
-    at along coordinates. Without, only indices are looked at.
+    `effects`: those of the baseline, and the named ones. `left`: the verdict, whose measurements are looked at along
+    coordinates: those that are mismatched, or all where none is. Without, only indices are looked at.
     """
     looks = list(index_looks(study, effects))
-    tables = [[fitted(look.seen, form) for form in _index_forms(look)] for look in looks]
-    every = [table.log_probability for own in tables for table in own]
+    tables = [_fitted(look, _index_forms(look)) for look in looks]
+    every = [_likeliest(own) for own in tables]
     limit = _limit(every, policy)
     found = []
     for look, own in zip(looks, tables, strict=True):
@@ -82,7 +91,7 @@ def discover(
             one = _by_code(look, one, policy)
         if one is not None:
             found.append(one)
-    found = [one for one in found if not one.look.columns] + _smallest_cells(found)
+    found = _of_each_place([one for one in found if not one.look.columns], _smallest_cells(found))
     if left is not None:
         found += _curves(study, left, found, every, policy)
     return tuple(sorted(found, key=lambda one: one.log_probability))
@@ -96,10 +105,38 @@ def _limit(log_probabilities: Sequence[float], policy: DecisionPolicy) -> float:
     return float(order[below[-1]]) if len(below) else -np.inf
 
 
+def _fitted(look: Look, forms: Iterable[Form]) -> list[Table]:
+    """Return the forms fitted that have fewer numbers than a third of what they describe."""
+    most = len(look.seen.residual) / 3.0
+    return [fitted(look.seen, form) for form in forms if form.numbers <= most]
+
+
+def _likeliest(tables: Sequence[Table]) -> float:
+    return min((table.log_probability for table in tables), default=0.0)
+
+
 def _index_forms(look: Look) -> Iterator[Form]:
-    yield from periodic_forms(look)
-    if look.along in {"row", "column"} and look.of == "mean":
-        yield from tap_forms(look, entry(look))
+    if look.at:
+        yield from _place_forms(look)
+    elif look.is_whole:
+        yield from end_forms(look, entry(look))
+    else:
+        yield from periodic_forms(look)
+        if look.stage == "codes":
+            yield from upper_forms(look)
+        elif not look.columns:
+            yield from wave_forms(look, entry(look))
+        if look.along in {"row", "column"} and look.of == "mean":
+            yield from tap_forms(look, entry(look))
+
+
+def _place_forms(look: Look) -> Iterator[Form]:
+    x = np.array(look.at)
+    if look.along == "angle":
+        yield from angle_forms(x, entry(look))
+    else:
+        yield from curve_forms(look.seen, x, x, unit_of(look), entry(look))
+        yield from formulas(look.seen, x, unit_of(look), by_inverse=False)
 
 
 def _predictive(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> PredictiveTable | None:
@@ -107,8 +144,11 @@ def _predictive(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> Pr
     if not kept:
         return None
     best = min(kept, key=lambda table: description_length(look.seen, table))
+    if best.form.name == "lines":  # what rows and columns do by themselves
+        return None
     judged = _judged(look, best)
-    if not _takes_enough(judged, policy) or not _predicts_other_half(look.seen, best.form):
+    is_judged_apart = look.is_whole and look.held_out is not None
+    if not _takes_enough(judged, policy) or not (is_judged_apart or _predicts_other_half(look.seen, best.form)):
         return None
     if best.form.name == "step" and not look.at and not _is_sharp(look, best):
         return None
@@ -124,10 +164,11 @@ def _gain(one: PredictiveTable) -> float:
 
 
 def _takes_enough(one: PredictiveTable, policy: DecisionPolicy) -> bool:
-    """Return whether it takes `least_discovery_share` off chi2, a curve twice the standard deviation of chi2 at
-    least."""
-    least = 2.0 * np.sqrt(2.0 * one.chi2[2]) if one.look.at else 0.0
-    return _gain(one) >= max(policy.least_discovery_share * one.chi2[0], float(least))
+    """Return whether it takes at least `least_discovery_share` of what isn't noise off chi2, and half of what it says
+    of the captures that judge it."""
+    judge = one.look.held_out or one.look.seen
+    said = judge.said_by(one.over(judge.count))
+    return _gain(one) >= max(policy.least_discovery_share * judge.excess, PREDICTED_SHARE * said, LEAST_GAIN)
 
 
 def _smallest_cells(found: Sequence[PredictiveTable]) -> list[PredictiveTable]:
@@ -155,8 +196,10 @@ def _smallest_cells(found: Sequence[PredictiveTable]) -> list[PredictiveTable]:
 def _predicts_other_half(profile: Profile, form: Form) -> bool:
     """Return whether a form fitted to each half of the index lowers chi2 of the other half: a few outlying lines
     don't."""
+    if form.first:
+        profile = profile.part(profile.index >= form.first)
     for one, other in ((profile.low, ~profile.low), (~profile.low, profile.low)):
-        table, judge = fitted(profile.part(one), form).departure, profile.part(other)
+        table, judge = fitted(profile.part(one), form).over(profile.count), profile.part(other)
         if judge.chi2(table) >= judge.chi2(np.zeros(1)):
             return form.name == "step" and not form.period and _lies_in_one_half(profile, form)
     return True
@@ -181,10 +224,13 @@ def _lies_in_one_half(profile: Profile, form: Form) -> bool:
 
 
 def _judged(look: Look, table: Table) -> PredictiveTable:
-    """Return the table with chi2 of the captures held out; of the seen ones where none are."""
+    """Return the table with chi2 of the captures held out; of the seen ones where none are. Of images, whose patterns
+    stand for the noise, it is that of the table's own numbers."""
     judge = look.held_out or look.seen
-    chi2 = judge.chi2(np.zeros(1)), judge.chi2(table.departure), len(judge.residual)
-    return PredictiveTable(look, table.form, table.departure, table.std, table.log_probability, chi2, table.said)
+    chi2 = own = chi2_within(judge, table)
+    if look.stage == "codes" or look.is_of_measurements:
+        chi2 = judge.chi2(np.zeros(1)), judge.chi2(table.over(judge.count)), len(judge.residual)
+    return PredictiveTable(look, table.form, table.departure, table.std, table.log_probability, chi2, own, table.said)
 
 
 def _by_code(look: Look, periodic: PredictiveTable | None, policy: DecisionPolicy) -> PredictiveTable | None:
@@ -197,7 +243,8 @@ def _by_code(look: Look, periodic: PredictiveTable | None, policy: DecisionPolic
     """
     if look.held_out is None:
         return periodic
-    seen, base = look.seen, np.zeros(1) if periodic is None else periodic.departure
+    seen = look.seen
+    base = np.zeros(seen.count) if periodic is None else periodic.over(seen.count)
     if int(np.ptp(seen.index)) + 1 > MOST_BY_CODE:
         return None if periodic is None else replace(periodic, remark=BEYOND_TABLE.format(most=MOST_BY_CODE))
     own = np.asarray(seen.matrix[np.arange(len(seen.index)), seen.index]).ravel()  # change by the code's own width
@@ -207,7 +254,7 @@ def _by_code(look: Look, periodic: PredictiveTable | None, policy: DecisionPolic
         return periodic
     weighted = sparse.csr_array(seen.matrix / seen.variance[:, None])
     normal = sparse.csc_array(seen.matrix.T @ weighted + sparse.eye_array(seen.count) / excess)
-    every = np.resize(base, seen.count) + spsolve(normal, weighted.T @ left)
+    every = base + spsolve(normal, weighted.T @ left)
     std = 1.0 / np.sqrt(normal.diagonal())
     n = len(look.held_out.residual)
     first, before, after = (look.held_out.chi2(table) for table in (np.zeros(1), base, every))
@@ -215,9 +262,22 @@ def _by_code(look: Look, periodic: PredictiveTable | None, policy: DecisionPolic
         return periodic
     # chi2 of what the table takes off, as of one number
     log_p = float(chi_squared.logsf(before - after, 1)) if periodic is None else periodic.log_probability
-    form = Form("by index", np.zeros((0, 0)), seen.count)
+    form, chi2 = Form("by index", np.zeros((0, 0)), seen.count), (first, after, n)
     shorter = () if periodic is None else (*periodic.shorter, periodic)
-    return PredictiveTable(look, form, every, std, log_p, (first, after, n), shorter=shorter)
+    return PredictiveTable(look, form, every, std, log_p, chi2, chi2, shorter=shorter)
+
+
+def _of_each_place(found: Sequence[PredictiveTable], cells: Sequence[PredictiveTable]) -> list[PredictiveTable]:
+    """Return of each place in the chain the likeliest law, and cells in the place of what rows and columns do in
+    them."""
+    kept: dict[tuple[str, str, str], PredictiveTable] = {}
+    for one in sorted(found, key=lambda one: one.log_probability):
+        look = one.look
+        whole = [c for c in cells if c.look.stage == look.stage and look.of == "mean" and one.period]
+        periods = [c.period // c.look.columns if look.along == "row" else c.look.columns for c in whole]
+        if not (look.along in {"row", "column"} and any(period % one.period == 0 for period in periods)):
+            kept.setdefault((look.stage, look.along, look.of), one)
+    return [*kept.values(), *cells]
 
 
 # --- along coordinates -----------------------------------------------------------------------------------------------
@@ -229,16 +289,17 @@ def _curves(
     found: Sequence[PredictiveTable],
     tried: Sequence[float],
     policy: DecisionPolicy,
+    most: int = MOST_CURVES,
 ) -> list[PredictiveTable]:
     """Find laws along coordinates of what is mismatched, the one that describes most first, and others beside it."""
     laws: list[PredictiveTable] = []
-    while len(laws) < MOST_CURVES:
+    while len(laws) < most:
         acting = (*left.effects, *(law_of(one, study) for one in (*found, *laws)))
         located = _located(left.model, acting, policy)
-        looks = list(curve_looks(left.model, study, acting, located)) if located else []
-        tables = [[fitted(look.seen, form) for form in _curve_forms(look)] for look in looks]
-        every = [*tried, *(table.log_probability for own in tables for table in own)]
-        limit = _limit(every, policy) if looks else 0.0
+        looks = list(curve_looks(left.model, study, acting, located, every=not located))
+        tables = [_fitted(look, _curve_forms(look)) for look in looks]
+        every = [*tried, *(_likeliest(own) for own in tables)]
+        limit = _limit(every, policy)
         likeliest = [
             _predictive_curve(look, [table for table in own if table.log_probability <= limit], policy)
             for look, own in zip(looks, tables, strict=True)
@@ -288,8 +349,61 @@ def _located(model: MeasurementModel, effects: Effects, policy: DecisionPolicy) 
 
 def _curve_forms(look: Look) -> Iterator[Form]:
     x = np.array(look.at)
+    if look.along == "plane x time":
+        yield from plane_forms(x, look.channels, entry(look))
+        return
     yield from curve_forms(look.seen, x, np.array(look.known), unit_of(look), entry(look))
     yield from formulas(look.seen, x, unit_of(look), by_inverse=look.along == "wavelength")
+
+
+# --- names in whose place a law stands --------------------------------------------------------------------------------
+
+
+def superseded(
+    study: Study, verdict: Verdict, found: Sequence[PredictiveTable], policy: DecisionPolicy
+) -> dict[str, PredictiveTable]:
+    """Return the named effects in whose place a discovered law predicts more, each with the law.
+
+    A law of another quantity of the chain supersedes a name where, in its place, chi2 of all captures is lower by
+    `superseding_chi2` and twice its numbers, and that of the held-out ones isn't higher. A law of the same quantity is
+    no rival of a listed one, but where it was found beside it, too, and makes it needless.
+    """
+    model, effects = verdict.model, verdict.effects
+    lost = {}
+    for candidate in verdict.named:
+        if candidate.members:
+            continue
+        name, others = candidate.effect.name, tuple(e for e in effects if e is not candidate.effect)
+        changed = list_changes(candidate.effect)
+        rivals = [one for one in found if changed & list_changes(law_of(one, study))]
+        if not rivals and candidate.probability > policy.unrivalled_probability:
+            continue
+        left = replace(verdict, named=tuple(c for c in verdict.named if c is not candidate), after=(), held_out=())
+        again = discover(study, (*model.always, *others), policy)
+        beside = [one for one in again if any(_is_of_one_place(one, rival) for rival in rivals)]
+        elsewhere = [] if rivals else [*again, *_curves(study, left, (), (), policy, most=1)]
+        elsewhere = [
+            one
+            for one in elsewhere
+            if not any(_is_of_one_place(one, other) for other in found) and not changed & list_changes(law_of(one, study))
+        ]
+        for law in (*beside, *elsewhere):
+            with_law = (*others, law_of(law, study))
+            least = policy.superseding_chi2 + 2.0 * law.form.numbers if law in elsewhere else 0.0
+            named, instead = (_chi2_of(model, one) for one in (effects, with_law))
+            if instead[1] <= named[1] and sum(instead) <= sum(named) - least:
+                lost[name] = law
+                break
+    return lost
+
+
+def _is_of_one_place(one: PredictiveTable, other: PredictiveTable) -> bool:
+    return (one.look.stage, one.look.along, one.look.of) == (other.look.stage, other.look.along, other.look.of)
+
+
+def _chi2_of(model: MeasurementModel, effects: Effects) -> tuple[float, float]:
+    """Return chi2 of the seen numbers, and of those held out given them."""
+    return model.seen_gaussian(effects).chi2(model.value[model.seen]), model.held_out(effects)[0]
 
 
 # --- as a result, and as an effect ---
@@ -320,6 +434,9 @@ def told(side: Side, study: Study, found: Sequence[PredictiveTable]) -> tuple[Di
                 chi2_before=one.chi2[0],
                 chi2_after=one.chi2[1],
                 n=one.chi2[2],
+                own_chi2_before=one.own[0],
+                own_chi2_after=one.own[1],
+                own_n=one.own[2],
                 measurements=tuple(sorted(one.look.shown_in)),
                 suspects=suspects_of(one),
                 statement=statement(side, one),
@@ -331,20 +448,23 @@ def told(side: Side, study: Study, found: Sequence[PredictiveTable]) -> tuple[Di
 def law_of(found: PredictiveTable, study: Study) -> EmpiricalLaw:
     """Return the law as an effect that acts on its stage, in its units."""
     look, none = found.look, PLACES[found.look.stage, found.look.along, found.look.of][1]
-    first, at, table = 0, np.array(look.at), np.array(found.departure)
-    if look.of == "variance" and none == 0.0:  # added to the read noise, of which the least entry has none
-        table = (table - table.min()) * study.camera.read_noise_e**2
-    elif none == 0.0 and not look.at:
+    first, at, table = found.form.first, np.array(look.at), np.array(found.departure)
+    if look.of != "mean" and none == 0.0:  # added to the read noise, of which the least entry has none
+        scale = 1.0 / study.noise.gain**2 if look.along == "time" else study.camera.read_noise_e**2
+        table = (table - table.min()) * scale
+    elif none == 0.0 and not look.along.endswith("level") and (not look.at or entry_unit(look).startswith("DN")):
         table = table / study.noise.gain
     elif none == 1.0:
         table = np.maximum(1.0 + table, LEAST_WIDTH)
         if not look.at:
             table = table / table.mean()
+    if look.stage == "charge" and not (look.at or found.period or found.form.name == "step"):
+        at = (np.arange(len(table)) + 0.5) / len(table)
     if look.along == "frequency":
         table[0] = 1.0
     if found.form.name == "step" and not look.at:
         at, table = _corners(table)
-    if found.form.name == "by index":
+    if found.form.name == "by index" and look.stage == "codes":
         counted = look.seen.index
         first = int(counted.min())
         moved = np.cumsum(found.departure[first : int(counted.max()) + 1])

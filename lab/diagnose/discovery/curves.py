@@ -22,22 +22,43 @@ from sim.effects.library import list_changes
 from sim.spectrum import FloatArray
 
 MOST_POINTS, LEAST_POINTS = 16, 4
+#: Where curves are looked for: what levels, spectra and transfer functions feel of a law.
+CURVES: tuple[tuple[Stage, Along, Of], ...] = (
+    ("light", "time", "mean"),
+    ("light", "plane x time", "mean"),
+    ("light", "wavelength", "mean"),
+    ("image", "radius", "mean"),
+    ("image", "wavelength", "mean"),
+    ("image", "frequency", "mean"),
+    ("charge", "exposure", "mean"),
+    ("charge", "level", "variance"),
+    ("signal", "level", "mean"),
+    ("signal", "time", "mean"),
+    ("signal", "exposure", "mean"),
+)
+BANDS = CURVES[4]
+MOST_PLANE_TIMES = 8
 MOST_TIMES = 48  # points of time, at any of which something may happen at once
 FINE_NM = 2.5  # from one wavelength to the next: a band is narrower than the steps of most sweeps
 SMALL = 0.01  # change of a factor by which its slope is found
-SMALL_E = 1.0  # the same of an offset, e
+SMALL_E, SMALL_NM = 1.0, 0.1  # the same of an offset, e, and of a displacement, nm
 #: Axis of the measurements whose numbers lie along a coordinate.
 AXES: dict[Along, str] = {"level": "level", "wavelength": "wavelength", "frequency": "spatial_frequency"}
 
 
-def curve_looks(model: MeasurementModel, study: Study, effects: Effects, located: Sequence[int]) -> Iterator[Look]:
-    """Yield a look for every coordinate along which a law could change the `located` blocks, beside `effects`.
+def curve_looks(
+    model: MeasurementModel, study: Study, effects: Effects, located: Sequence[int], *, every: bool = False
+) -> Iterator[Look]:
+    """Yield a look for every coordinate along which a law could change the `located` blocks, beside `effects`. `every`:
+    look at all blocks, but not for narrow bands of transmittance.
 
     The residuals are whitened, those of held-out captures given the seen ones: n numbers of variance 1.
     """
-    points_of = {place: _points(model, study, place, located) for place in PLACES}
-    places = {place: points for place, points in points_of.items() if len(points[1]) >= LEAST_POINTS}
-    if not places or model.seen.all() or not model.seen.any():
+    places = tuple(place for place in CURVES if not (every and place == BANDS))
+    at = range(len(model.blocks)) if every else located
+    points_of = {place: _points(model, study, place, at) for place in places}
+    points = {place: found for place, found in points_of.items() if len(found[1]) >= LEAST_POINTS}
+    if not points or model.seen.all() or not model.seen.any():
         return
     gaussian = model.gaussian(effects)
     residual, covariance, seen = model.value - gaussian.mean, gaussian.covariance, model.seen
@@ -45,9 +66,9 @@ def curve_looks(model: MeasurementModel, study: Study, effects: Effects, located
     shared = solve_triangular(lower, covariance[np.ix_(seen, ~seen)], lower=True)
     given = covariance[np.ix_(~seen, ~seen)] - shared.T @ shared
     given = 0.5 * (given + given.T) + _rounding(covariance, ~seen)
-    own_axes = {model.blocks[i].measurement.axis for i in located}
-    for place, (points, known) in places.items():
-        slopes, shown = _slopes(model, effects, place, points)
+    own_axes = {model.blocks[i].measurement.axis for i in at}
+    for place, (x, known) in points.items():
+        slopes, shown = _slopes(model, effects, place, x)
         if not slopes[seen].any():
             continue
         white = solve_triangular(lower, np.column_stack([residual[seen], slopes[seen]]), lower=True)
@@ -59,8 +80,8 @@ def curve_looks(model: MeasurementModel, study: Study, effects: Effects, located
             held_out = _profile(solve_triangular(own, out[judged], lower=True))
         stage, along, of = place
         yield Look(
-            stage, along, _profile(white), held_out, of=of, at=tuple(points.tolist()), known=tuple(known.tolist()),
-            shown_in=shown, is_own_axis=AXES.get(along) in own_axes,
+            stage, along, _profile(white), held_out, of=of, at=tuple(x.tolist()), known=tuple(known.tolist()),
+            shown_in=shown, channels=tuple(model.camera.channels), is_of_measurements=True, is_own_axis=AXES.get(along) in own_axes,
         )  # fmt: skip
 
 
@@ -81,8 +102,6 @@ def _points(
     blocks that a law there could change.
     """
     along, none = place[1], np.zeros(0)
-    if along in {"code", "row", "column", "row and column"}:
-        return none, none
     changed = list_changes(_law(place, np.array([0.0, 1.0]), np.array([0.0, 0.1])))
     every, seen = [none], [none]
     for i in located:
@@ -96,11 +115,11 @@ def _points(
     points = np.unique(np.concatenate(every).round(9))
     if along == "frequency":
         points = np.append(0.0, points[points > 0.0])
-    most = MOST_TIMES if along in {"time", "wavelength"} else MOST_POINTS
+    most = MOST_TIMES if along in {"time", "wavelength"} else MOST_PLANE_TIMES if "plane" in along else MOST_POINTS
     if len(points) > most:
         points = points[np.unique(np.linspace(0, len(points) - 1, most).round().astype(int))]
     known = points[np.isin(points, np.concatenate(seen).round(9))]
-    if along == "wavelength" and len(points):
+    if place == ("image", "wavelength", "mean") and len(points):
         points = np.union1d(points, np.arange(points[0], points[-1], FINE_NM))
     return points, known
 
@@ -123,7 +142,7 @@ def _coordinate(block: Block, study: Study, along: Along) -> FloatArray:
     for k, label in enumerate(block.labels):
         if len(label.captures) == 1:
             capture = captures[label.captures[0]]
-            none[k] = study.elapsed_s(capture) if along == "time" else capture.exposure_s
+            none[k] = capture.exposure_s if along == "exposure" else study.elapsed_s(capture)
     return none
 
 
@@ -143,9 +162,10 @@ def _slopes(
 ) -> tuple[FloatArray, frozenset[str]]:
     """Return the slopes (n, N) of all numbers by the curve's N points, and the measurements that it changes."""
     acting = (*model.always, *effects)
-    small = SMALL if PLACES[place][1] == 1.0 else SMALL_E
-    laws = [_law(place, points, small * one) for one in np.eye(len(points))]
-    changed, slopes = list_changes(laws[-1]), np.zeros((len(model.value), len(points)))
+    small = SMALL if PLACES[place][1] == 1.0 else SMALL_NM if place[0] == "light" else SMALL_E
+    count = len(points) * (len(model.camera.channels) if "plane" in place[1] else 1)
+    laws = [_law(place, points, small * one) for one in np.eye(count)]
+    changed, slopes = list_changes(laws[-1]), np.zeros((len(model.value), count))
     shown = set()
     for block, at in zip(model.blocks, model.slices, strict=True):
         if not block.reads & changed:

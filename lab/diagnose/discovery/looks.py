@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Literal, cast
 
 import numpy as np
 from scipy import ndimage, sparse
 from scipy.linalg import helmert
 from scipy.signal import savgol_coeffs
 
+from lab.diagnose.discovery.images import DarkImages, dark_images, flat_images, noise_by_time
 from lab.diagnose.discovery.profile import Look, Profile
-from lab.diagnose.measurements.code_density import CodeCounts, counted, prepared, widths
-from lab.diagnose.measurements.dark_frames import dark_frames
+from lab.diagnose.measurements.code_density import CodeCounts, counted_in_all, prepared, widths
 from lab.diagnose.measurements.dark_readout import dark_readout
 from lab.diagnose.measurements.even_flats import FlatLevel, flats
 from lab.diagnose.measurements.flat_lines import without_dark
 from lab.errors import NotDetermined
 from lab.measure.reads import COLLECTED, GAINS, acting
 from lab.measure.study import Study
+from sim.camera import Cfa
 from sim.effects.base import Effects
 from sim.effects.empirical_law import Along, Of, Stage
 from sim.frame import collected_mosaic
@@ -31,10 +33,14 @@ REACH, DEGREE = 24, 2
 ROBUST = 1.4826  # median absolute departure -> standard deviation of a normal distribution
 LINES: tuple[Along, ...] = ("row", "column")
 #: Cells of a plane of the mosaic, rows and columns, in which pixels may differ by their place.
-CELLS = ((2, 2), (2, 4), (4, 2), (4, 4))
+CELLS = ((1, 2), (2, 1), (1, 4), (4, 1), (2, 2), (2, 4), (4, 2), (4, 4))
 STRIPS = 16  # of a frame, each a repeat of the cell's means
 SMOOTHED_CELLS = 4  # cells a side of the box whose mean is taken out
 LEAST_STRIPS = 4
+PLACES_A_SIDE, RADII, ANGLES = 16, 12, 24  # parts of a side whose means are looked at; points of their curves
+LEAST_TIMES, MOST_TIMES = 8, 24  # from which on noise is looked at by time; points of its curve
+NOISE_FLOOR = 1e-3  # relative standard deviation of a variance beside that of its pixels
+MOST_LINES = 512  # groups of lines whose whole course is looked at
 #: Measurements that the quantities are part of, by stage.
 SHOWN_IN = {
     "codes": frozenset({"code_density"}),
@@ -44,17 +50,32 @@ SHOWN_IN = {
 
 
 def index_looks(study: Study, effects: Effects) -> Iterator[Look]:
-    """Yield what the effects leave along codes, rows and columns."""
+    """Yield what the effects leave along codes, rows, columns and places of the sensor."""
     yield from _codes(study, effects)
-    yield from _of_images(study, "charge", "mean", _lit_images(study, effects))
-    yield from _of_images(study, "signal", "mean", _dark_images(study, effects))
-    yield from _of_images(study, "signal", "variance", _dark_variances(study), cells=False)
+    step, even = mosaic.step(study.camera.cfa), _lit_images(study, effects)
+    yield from _lines_of(study, "charge", "mean", even, step)
+    yield from _cells_of(study, "charge", even)
+    yield from _places_of(study, "image", "angle", even, field=True)
+    dark, mean = study.once(dark_images), _offsets(study, effects, "mean")
+    yield from _lines_of(study, "signal", "mean", mean, 1)
+    yield from _cells_of(study, "signal", mean)
+    yield from _places_of(study, "signal", "radius", _offsets(study, effects, "offset"))
+    yield from _places_of(study, "charge", "radius", _per_second(study, dark, effects))
+    yield from _lines_of(study, "signal", "variance", _part(dark, "variance"), 1)
+    yield from _lines_of(study, "signal", "covariance", _part(dark, "below"), 1, lines=("row",))
+    yield from _lines_of(study, "signal", "covariance", _part(dark, "right"), 1, lines=("column",))
+    yield from _noise_times(study)
+    lit = study.once(flat_images)
+    bend = {out: one.bend for out, one in lit.items()}
+    yield from _lines_of(study, "signal", "mean", bend, step, times=" x level")
+    fixed_s = {out: one.fixed_s for out, one in lit.items() if one.fixed_s is not None}
+    yield from _places_of(study, "charge", "radius x exposure", fixed_s)
 
 
 def _codes(study: Study, effects: Effects) -> Iterator[Look]:
-    """Yield the counts of codes in uniform light, seen and held out, less those that the effects' converter gives."""
+    """Yield the counts of codes in light, seen and held out, less those that the effects' converter gives."""
     try:
-        counts = study.once(counted)
+        counts = study.once(counted_in_all)
     except NotDetermined:
         return
     found = {}
@@ -68,7 +89,7 @@ def _codes(study: Study, effects: Effects) -> Iterator[Look]:
 
 def _code_profile(codes: CodeCounts, effects: Effects, study: Study) -> Profile:
     used, rough = np.flatnonzero(codes.used), codes.rough
-    known = rough @ (codes.expected * (widths(codes, effects, study) - 1.0)) if effects else 0.0
+    known = rough @ (codes.smooth * (widths(codes, effects, study) - 1.0)) if effects else 0.0
     of_widths = sparse.coo_array((rough @ sparse.diags_array(codes.smooth))[used])
     at = of_widths.coords[0], of_widths.coords[1] + codes.first
     matrix = sparse.csr_array((of_widths.data, at), shape=(len(used), int(study.camera.white_level_dn) + 1))
@@ -112,76 +133,209 @@ def _pattern(study: Study, levels: Sequence[FlatLevel], effects: Effects) -> Flo
     return pattern if gains is None else pattern * gains
 
 
-def _dark_images(study: Study, effects: Effects) -> dict[bool, FloatArray]:
-    """Return the mean dark frame, DN, less the offsets that the effects add."""
-    dark = study.once(dark_readout)
-    if dark is None:
-        return {}
-    added = Uniform(study.camera, effects)
-    image = np.asarray(dark.offsets_dn, float).copy()
-    if added.adds_signal:
-        image -= study.noise.gain * added.added_e
-    for one in added.lines:  # of fixed offsets only their spread is known, but for the step from even to odd lines
-        image -= study.noise.gain * replace(one, fixed_e=0.0).mean_e(image.shape)
-    return {False: image}
+def _offsets(study: Study, effects: Effects, name: Literal["mean", "offset"]) -> dict[bool, FloatArray]:
+    """Return the mean dark frame, of all exposures or at none, DN, less the offsets that the effects add."""
+    added, found = Uniform(study.camera, effects), {}
+    for out, dark in study.once(dark_images).items():
+        image = np.array(getattr(dark, name), float)
+        if added.adds_signal:
+            image -= study.noise.gain * added.added_e
+        for one in added.lines:  # of fixed offsets only their spread is known, but for the step from even to odd lines
+            image -= study.noise.gain * replace(one, fixed_e=0.0).mean_e(image.shape)
+        found[out] = image
+    return found
 
 
-def _dark_variances(study: Study) -> dict[bool, FloatArray]:
-    """Return the temporal variance of dark frames over that of their surroundings, without noise of lines, of the
-    condition with most repeats.
-    """
-    try:
-        most = max(study.once(dark_frames), key=lambda one: len(one.condition.captures))
-    except NotDetermined:
-        return {}
-    return {out: np.asarray(part.squares, float) / part.contrasts for out, part in most.changing.items()}
+def _per_second(study: Study, dark: dict[bool, DarkImages], effects: Effects) -> dict[bool, FloatArray]:
+    """Return the dark current by pixel, DN/s, less that of the effects."""
+    model = Uniform(study.camera, effects)
+    own = study.noise.gain * model.dark_e_per_s(study.temperature_c) if model.changes_dark_current else 0.0
+    return {out: np.asarray(one.per_second - own, float) for out, one in dark.items() if one.per_second is not None}
 
 
-def _of_images(
-    study: Study, stage: Stage, of: Of, images: dict[bool, FloatArray], *, cells: bool = True
+def _part(dark: dict[bool, DarkImages], name: str) -> dict[bool, FloatArray]:
+    """Return the variances or covariances of dark frames, over the variance of most pixels."""
+    found = {}
+    for out, one in dark.items():
+        image = getattr(one, name)
+        if image is not None:
+            found[out] = np.asarray(image / np.mean(one.variance), float)
+    return found
+
+
+def _lines_of(
+    study: Study,
+    stage: Stage,
+    of: Of,
+    images: dict[bool, FloatArray],
+    step: int,
+    *,
+    times: str = "",
+    lines: Sequence[str] = LINES,
 ) -> Iterator[Look]:
-    """Yield the looks at images along rows, along columns, and within cells of both."""
+    """Yield the looks at images along rows and columns: at what is rough, and at the whole course.
+
+    step : period of the mosaic where its planes are looked at apart, else 1
+    times : the rest of the index's name, of a product
+    """
     if False not in images:
         return
-    step, shown = mosaic.step(study.camera.cfa), SHOWN_IN[stage] if of == "mean" else frozenset({"dark_noise"})
-    for along in LINES:
-        lines = {out: _lines(study, image, along) for out, image in images.items()}
-        seen = lines[False]
+    shown = frozenset({"dark_noise"}) if of != "mean" else frozenset() if times else SHOWN_IN[stage]
+    cfa: Cfa = study.camera.cfa if step > 1 else "MONO"
+    for line in lines:
+        along = cast(Along, f"{line}{times}")
+        rough = {out: _rough_lines(image, line, cfa) for out, image in images.items()}
+        seen = rough[False]
         if seen is not None:
-            yield Look(stage, along, seen, lines.get(True), of=of, step=step, shown_in=shown)
-    for cell in CELLS if cells else ():
+            yield Look(stage, along, seen, rough.get(True), of=of, step=step, shown_in=shown)
+        if not times:
+            whole = {out: _whole_lines(image, line, bent=stage == "charge") for out, image in images.items()}
+            yield Look(stage, along, whole[False], whole.get(True), of=of, step=step, shown_in=shown, is_whole=True)
+
+
+def _cells_of(study: Study, stage: Stage, images: dict[bool, FloatArray]) -> Iterator[Look]:
+    """Yield the looks within cells of rows and columns."""
+    step = mosaic.step(study.camera.cfa)
+    for cell in CELLS if False in images else ():
+        if min(cell) * step < 2:
+            continue
         within = {out: _within_cells(study, image, cell) for out, image in images.items()}
         seen = within[False]
         if seen is not None:
             yield Look(
-                stage, "row and column", seen, within.get(True), columns=cell[1] * step, step=step, shown_in=shown
-            )
+                stage, "row and column", seen, within.get(True), columns=cell[1] * step, step=step,
+                shown_in=SHOWN_IN[stage],
+            )  # fmt: skip
 
 
-def _lines(study: Study, image: FloatArray, along: Along) -> Profile | None:
+def _places_of(
+    study: Study, stage: Stage, along: Along, images: dict[bool, FloatArray], *, field: bool = False
+) -> Iterator[Look]:
+    """Yield the look at images along the radius, or along the angle about the sensor's centre.
+
+    field : whether light and lens may change the image: beside it may stand x, y, r^2 and r^4
+    """
+    rows, cols = study.camera.rows, study.camera.cols
+    if False not in images or min(rows, cols) < 4 * PLACES_A_SIDE:
+        return
+    pitch_um, middle = study.camera.pixel_pitch_um, (np.arange(PLACES_A_SIDE) + 0.5) / PLACES_A_SIDE - 0.5
+    y, x = (one.ravel() for one in np.meshgrid(rows * middle * pitch_um, cols * middle * pitch_um, indexing="ij"))
+    radius, most = np.hypot(x, y), 0.5 * pitch_um * float(np.hypot(rows, cols))
+    beside = [np.ones(x.size), x / most, y / most]
+    if field:
+        beside += [(radius / most) ** 2, (radius / most) ** 4]
+    if along == "angle":
+        at = np.linspace(0.0, 360.0, ANGLES + 1)
+        turn = np.degrees(np.arctan2(y, x)) % 360.0
+        matrix = np.stack([np.interp(turn, at, one) for one in np.eye(len(at))], axis=1)
+        matrix *= ((radius / most) ** 2)[:, None]
+    else:
+        at = np.linspace(0.0, most, RADII)
+        matrix = np.stack([np.interp(radius, at, one) for one in np.eye(len(at))], axis=1)
+    half = np.indices((PLACES_A_SIDE, PLACES_A_SIDE)).sum(axis=0).ravel() % 2
+    found = {}
+    for out, image in images.items():
+        cells = _place_means(image)
+        bends = np.concatenate([np.diff(cells, 2, axis=axis).ravel() for axis in (0, 1)])
+        variance = (ROBUST * float(np.median(np.abs(bends)))) ** 2 / 6.0
+        if variance == 0.0:
+            return
+        every = Profile(half, cells.ravel(), np.full(cells.size, variance), matrix)
+        found[out] = every.beside(np.stack(beside, axis=1))
+    points = tuple(at.tolist())
+    yield Look(stage, along, found[False], found.get(True), at=points, known=points, is_whole=True)
+
+
+def _noise_times(study: Study) -> Iterator[Look]:
+    """Yield the look at the variance of repeats by time, DN^2. Beside it may stand variance in proportion to the
+    signal and to its square, and of each longer dark exposure.
+    """
+    noise = study.once(noise_by_time)
+    if noise is None or len(np.unique(noise.elapsed_s)) < LEAST_TIMES:
+        return
+    at = np.unique(noise.elapsed_s)
+    at = at[np.unique(np.linspace(0, len(at) - 1, MOST_TIMES).round().astype(int))]
+    hats = np.stack([np.interp(noise.elapsed_s, at, one) for one in np.eye(len(at))], axis=1)
+    matrix = noise.shares @ hats
+    terms = [np.ones(len(noise.signal_dn)), noise.signal_dn, noise.square_dn2]
+    terms += [(noise.dark_s == t).astype(float) for t in np.unique(noise.dark_s[noise.dark_s > 0.0])]
+    beside = np.stack([one / max(float(np.max(one)), 1e-9) for one in terms], axis=1)
+    variance = 2.0 * np.square(noise.variance_dn2) / noise.pixels + np.square(NOISE_FLOOR * noise.variance_dn2)
+    found = {}
+    for out in (False, True):
+        own = noise.held_out == out
+        if own.sum() > 2 * beside.shape[1]:
+            half = np.arange(int(own.sum())) % 2
+            profile = Profile(half, noise.variance_dn2[own], variance[own], matrix[own])
+            found[out] = profile.beside(beside[own])
+    if False in found:
+        points = tuple(at.tolist())
+        yield Look(
+            "signal", "time", found[False], found.get(True), of="variance", at=points, known=points, is_whole=True,
+            shown_in=frozenset({"dark_noise", "temporal_noise"}),
+        )  # fmt: skip
+
+
+def _place_means(image: FloatArray) -> FloatArray:
+    """Return the means over `PLACES_A_SIDE` x `PLACES_A_SIDE` parts of an image."""
+    row, col = (np.linspace(0, n, PLACES_A_SIDE + 1).astype(int) for n in image.shape)
+    total = np.add.reduceat(np.add.reduceat(image.astype(float), row[:-1], 0), col[:-1], 1)
+    return np.asarray(total / np.outer(np.diff(row), np.diff(col)))
+
+
+def _rough_lines(image: FloatArray, along: str, cfa: Cfa) -> Profile | None:
     """Return the profile of an image (rows, cols) along its rows or columns, each plane of the mosaic by itself.
 
     The filter takes a running polynomial out. The variance is the square of the residuals' robust spread.
     """
-    axis, period = 0 if along == "row" else 1, mosaic.step(study.camera.cfa)
+    axis, period = 0 if along == "row" else 1, mosaic.step(cfa)
     count = image.shape[axis]
-    index, residual, matrix = [], [], []
-    for phases in mosaic.phases(study.camera.cfa).values():
+    index, residual, matrix, noise = [], [], [], []
+    for phases in mosaic.phases(cfa).values():
         for phase in phases:
-            mean = image[phase[0] :: period, phase[1] :: period].mean(axis=1 - axis)
+            plane = image[phase[0] :: period, phase[1] :: period]
+            mean = plane.mean(axis=1 - axis)
             taken = _polynomial_filter(len(mean))
             if taken is None:
                 return None
-            own = np.arange(phase[axis], count, period)
+            own = np.arange(phase[axis], count, period)[: len(mean)]
             index.append(own)
             residual.append(taken @ mean)
+            noise.append(np.full(len(mean), _pixel_variance(plane) / plane.shape[1 - axis]))
             at = sparse.coo_array(taken)
             matrix.append(sparse.csr_array((at.data, (at.coords[0], own[at.coords[1]])), shape=(len(own), count)))
     left = np.concatenate(residual)
     spread = ROBUST * float(np.median(np.abs(left - np.median(left))))
     if spread == 0.0:
         return None
-    return Profile(np.concatenate(index), left, np.full(len(left), spread**2), sparse.csr_array(sparse.vstack(matrix)))
+    every, variance = sparse.csr_array(sparse.vstack(matrix)), np.full(len(left), spread**2)
+    return Profile(np.concatenate(index), left, variance, every, np.concatenate(noise))
+
+
+def _pixel_variance(plane: FloatArray) -> float:
+    """Return the variance of single pixels beside what their rows and columns share."""
+    twice = plane[:-1, :-1] - plane[1:, :-1] - plane[:-1, 1:] + plane[1:, 1:]
+    return float(np.mean(np.square(twice))) / 4.0
+
+
+def _whole_lines(image: FloatArray, along: str, *, bent: bool) -> Profile:
+    """Return the profile of the means of rows or columns less their mean, in at most `MOST_LINES` groups.
+
+    bent : whether light may change them along the frame: beside the lines may stand a curve of fourth degree
+    """
+    axis = 0 if along == "row" else 1
+    line = np.asarray(image.mean(axis=1 - axis), float)
+    count = len(line)
+    group = np.arange(count) * min(count, MOST_LINES) // count
+    share = np.zeros((int(group[-1]) + 1, count))
+    share[group, np.arange(count)] = 1.0
+    share /= share.sum(axis=1, keepdims=True)
+    mean, place = share @ line, np.linspace(-1.0, 1.0, len(share))
+    spread = ROBUST * float(np.median(np.abs(np.diff(mean, 2)))) / np.sqrt(6.0)
+    variance = np.full(len(mean), max(spread**2, 1e-300))
+    beside = np.stack([place**k for k in range(5 if bent else 1)], axis=1)
+    noise = np.full(len(mean), _pixel_variance(image) / image.shape[1 - axis] / (count / len(share)))
+    return Profile(np.arange(len(mean)) % 2, mean, variance, share, noise).beside(beside)
 
 
 def _polynomial_filter(count: int) -> sparse.csr_array | None:
@@ -199,14 +353,13 @@ def _polynomial_filter(count: int) -> sparse.csr_array | None:
 
 
 def _within_cells(study: Study, image: FloatArray, cell: tuple[int, int]) -> Profile | None:
-    """Return how pixels differ by their place in a cell (rows, columns) of a plane of the mosaic, beyond what whole
-    rows and columns do.
+    """Return how pixels differ by their place in a cell (rows, columns) of a plane of the mosaic.
 
-    The means of the cell's pixels over each of `STRIPS` strips of the frame, in the orthogonal contrasts of Helmert
-    along rows times those along columns: these are independent of each other, and free of rows and columns.
+    The means of the cell's pixels over each of `STRIPS` strips of the frame, in Helmert's contrasts, which are
+    independent of each other.
     """
     (rows, cols), step = cell, mosaic.step(study.camera.cfa)
-    contrasts = np.kron(helmert(rows), helmert(cols))
+    contrasts = helmert(rows * cols)
     residual, matrix, spread = [], [], []
     for phases in mosaic.phases(study.camera.cfa).values():
         for phase in phases:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from math import comb
 
 import numpy as np
 from scipy import sparse
@@ -15,8 +16,14 @@ from scipy.stats import f as f_distribution
 from sim.effects.empirical_law import Along, Of, Stage
 from sim.spectrum import FloatArray
 
-PERIODS = (*range(2, 17), 20, 24, 32, 64)
+PERIODS = tuple(range(2, 65))
+#: Classes of a table, at most, that differ from all others where a table of few numbers is told.
+FEW_CLASSES, FEW_FROM = 2, 8
+UPPER_PERIODS = (2, 4, 8, 16)  # of tables that begin within the index
 LEAST_REPEATS = 6  # of a period over the index
+LEAST_WAVES, LEAST_PERIOD = 5.0, 3  # waves over the index, and lines of a wave
+MOST_ORDERS = 4  # waves about the sensor's centre
+END_LENGTHS = 24  # lengths of a decay that are tried
 #: Eigenvalues of a form's normal equations, over the largest, below which its numbers aren't determined.
 DETERMINED = 1e-12
 #: Decay lengths of the symbolic terms and widths of bumps, over the range of the coordinate; and the waves' cycles over
@@ -39,12 +46,20 @@ class Profile:
     residual  (n,) departure, filtered
     variance  (n,) of the residuals
     matrix    (n, N): departures by every index -> the residuals that they leave after the filter
+    noise     (n,) of it, the variance by noise of independent pixels; None: all of it
     """
 
     index: np.ndarray
     residual: FloatArray
     variance: FloatArray
     matrix: sparse.csr_array | FloatArray
+    noise: FloatArray | None = None
+
+    @property
+    def excess(self) -> float:
+        """Return chi2 beyond what noise of independent pixels gives."""
+        noise = float(len(self.residual)) if self.noise is None else float(np.sum(self.noise / self.variance))
+        return max(self.chi2(np.zeros(1)) - noise, 0.0)
 
     @property
     def count(self) -> int:
@@ -64,9 +79,25 @@ class Profile:
         """Return chi2 of the residuals less a table of departures, repeated over the index."""
         return float(np.sum(np.square(self.left_by(table)) / self.variance))
 
+    def said_by(self, table: FloatArray) -> float:
+        """Return by how much chi2 is expected to fall by a table of departures that is right."""
+        return float(np.sum(np.square(self.matrix @ np.resize(table, self.count)) / self.variance))
+
     def part(self, used: np.ndarray) -> Profile:
         """Return the profile of some (n,) of its numbers."""
-        return Profile(self.index[used], self.residual[used], self.variance[used], self.matrix[np.flatnonzero(used)])
+        noise = None if self.noise is None else self.noise[used]
+        matrix = self.matrix[np.flatnonzero(used)]
+        return Profile(self.index[used], self.residual[used], self.variance[used], matrix, noise)
+
+    def beside(self, nuisance: FloatArray) -> Profile:
+        """Return the profile without what columns (n, k) add, of variance 1."""
+        weight = 1.0 / np.sqrt(self.variance)
+        free, size, _ = np.linalg.svd(nuisance * weight[:, None], full_matrices=False)
+        free = free[:, size > DETERMINED * size.max()]
+        value, matrix = self.residual * weight, np.asarray(self.matrix * weight[:, None])
+        noise = None if self.noise is None else self.noise / self.variance
+        value, matrix = (one - free @ (free.T @ one) for one in (value, matrix))
+        return Profile(self.index, value, np.ones(len(value)), matrix, noise)
 
 
 @dataclass(frozen=True)
@@ -74,9 +105,10 @@ class Look:
     """The profiles of one quantity along one index: of the captures that the search may use, and of those held out.
 
     `at`: the points of a curve, in the coordinate's unit; none along an index. `known`: those at which there are seen
-    numbers. `columns`: of a table by row and column, the period of the columns. `step`: lines of a period of the
+    numbers. `channels`: of curves by channel. `columns`: of a table by row and column, the period of the columns. `step`: lines of a period of the
     mosaic. `shown_in`: measurements that the quantity is part of. `is_own_axis`: whether a mismatched one of them is
-    stated along it.
+    stated along it. `is_whole`: whether it is the whole course, not what a filter leaves of it.
+    `is_of_measurements`: whether the numbers are those of the measurements, with their covariance.
     """
 
     stage: Stage
@@ -89,17 +121,22 @@ class Look:
     columns: int = 0
     step: int = 1
     shown_in: frozenset[str] = frozenset()
+    channels: tuple[str, ...] = ()
     is_own_axis: bool = False
+    is_whole: bool = False
+    is_of_measurements: bool = False
 
 
 @dataclass(frozen=True)
 class Form:
     """A way to write the departures by index with few numbers.
 
-    name     "periodic", "by index", "step", "line", "knee", "bump", "formula", "curve"
+    name     "periodic", "by index", "wave", "decay", "step", "line", "knee", "bump", "formula", "curve"
     basis    (N, k), or (period, k) of a table that repeats
     numbers  that it has, those beside its k coefficients too
     tried    alternatives of the same form, the best of which counts
+    share    of the chance of a false law that the form may take of its look
+    period   of a table that repeats, from the index `first` on; 0: it doesn't
     say      its k coefficients in words
     centred  whether the departures have the mean 0
     """
@@ -108,15 +145,36 @@ class Form:
     basis: FloatArray
     numbers: int
     tried: int = 1
+    share: float = 0.1
     period: int = 0
+    first: int = 0
     say: Say | None = None
     centred: bool = False
+
+    @property
+    def change(self) -> FloatArray:
+        """Return the departures by each coefficient, (N, k) or (period, k)."""
+        return self.basis - self.basis.mean(axis=0) if self.centred else self.basis
+
+    def columns(self, profile: Profile) -> FloatArray:
+        """Return what the coefficients do to a profile's residuals, in its standard deviations, (n, k)."""
+        every = self.change
+        if self.period:
+            every = np.stack([self.over(profile.count, one) for one in every.T], axis=1)
+        return np.asarray(np.asarray(profile.matrix @ every) / np.sqrt(profile.variance)[:, None])
+
+    def over(self, count: int, departure: FloatArray) -> FloatArray:
+        """Return departures as of a table (period,) or (N,), for every one of `count` indices."""
+        every = np.array(np.resize(departure, count))
+        if self.first:
+            every = np.concatenate([np.zeros(self.first), np.resize(departure, max(count - self.first, 0))])
+        return every
 
 
 @dataclass(frozen=True)
 class Table:
     """A form fitted: departures (period,) or (N,), their standard deviations, and ln of the probability that chance
-    gains as much.
+    gains as much in any form of the look.
     """
 
     form: Form
@@ -130,19 +188,21 @@ class Table:
         """Indices after which it repeats; 0: it doesn't."""
         return self.form.period
 
+    def over(self, count: int) -> FloatArray:
+        """Return the departures of every one of `count` indices."""
+        return self.form.over(count, self.departure)
+
 
 def fitted(profile: Profile, form: Form) -> Table:
     """Fit a form.
 
     Weighted least squares of least norm, as a filter takes out what all classes of a table share. F test of the gain:
     the scatter that the form leaves stands for the noise, so that a variance that is too small gains nothing. The
-    probability is multiplied by the number of alternatives (Bonferroni).
+    probability is multiplied by the number of alternatives, and divided by the form's share (weighted Bonferroni).
     """
     weight = 1.0 / np.sqrt(profile.variance)
-    basis = form.basis
-    if form.period:
-        basis = basis[np.arange(profile.count) % form.period]
-    columns = np.asarray(profile.matrix @ basis) * weight[:, None]
+    change = form.change
+    columns = form.columns(profile)
     value = profile.residual * weight
     size, vectors = np.linalg.eigh(columns.T @ columns)
     kept = size > DETERMINED * max(float(size[-1]), 1e-300)
@@ -152,21 +212,33 @@ def fitted(profile: Profile, form: Form) -> Table:
     before = float(value @ value)
     after = float(np.sum(np.square(value - columns @ coefficients)))
     freedom = max(len(value) - rank, 1)
-    change = form.basis - form.basis.mean(axis=0) if form.centred else form.basis
     departure = change @ coefficients
     std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", change, inverse, change) * after / freedom, 0.0))
     said = form.say(coefficients) if form.say is not None else ""
     if rank == 0 or len(value) <= rank or after >= before:
         return Table(form, departure, std, 0.0, said)
     ratio = (before - after) / rank / (after / freedom)
-    log_p = float(f_distribution.logsf(ratio, rank, freedom)) + np.log(form.tried)
+    log_p = float(f_distribution.logsf(ratio, rank, freedom)) + np.log(form.tried / form.share)
     return Table(form, departure, std, min(log_p, 0.0), said)
+
+
+def chi2_within(profile: Profile, table: Table) -> tuple[float, float, int]:
+    """Return chi2 of a profile in the directions of a form, before and after its table, and their number."""
+    columns = table.form.columns(profile)
+    free, size, _ = np.linalg.svd(columns, full_matrices=False)
+    free = free[:, size > np.sqrt(DETERMINED) * max(float(size.max()), 1e-300)]
+    weight = 1.0 / np.sqrt(profile.variance)
+    before, after = (
+        float(np.sum(np.square(free.T @ (profile.left_by(one) * weight))))
+        for one in (np.zeros(profile.count), table.over(profile.count))
+    )
+    return before, after, free.shape[1]
 
 
 def description_length(profile: Profile, table: Table | PredictiveTable) -> float:
     """Return n ln chi2 + k ln n + 2 ln(alternatives) of a table with k numbers."""
     n, form = len(profile.residual), table.form
-    return float(n * np.log(profile.chi2(table.departure)) + form.numbers * np.log(n) + 2.0 * np.log(form.tried))
+    return float(n * np.log(profile.chi2(table.over(profile.count))) + form.numbers * np.log(n) + 2.0 * np.log(form.tried))
 
 
 # --- forms along an index --------------------------------------------------------------------------------------------
@@ -176,12 +248,76 @@ def periodic_forms(look: Look) -> Iterator[Form]:
     """Yield tables that repeat, those of the whole cell along rows and columns."""
     if look.columns:
         count = look.seen.count
-        yield Form("periodic", np.eye(count), count - 1, period=count, centred=True)
+        row, column = np.divmod(np.arange(count), look.columns)
+        lines = np.hstack([np.eye(count // look.columns)[row], np.eye(look.columns)[column]])
+        yield Form("lines", lines, lines.shape[1] - 2, share=0.5, period=count, centred=True)
+        yield Form("periodic", np.eye(count), count - 1, share=0.5, period=count, centred=True)
         return
     span = int(np.ptp(look.seen.index)) + 1
     for period in PERIODS:
-        if period * LEAST_REPEATS <= span:
-            yield Form("periodic", np.eye(period), period - 1, period=period, centred=True)
+        if period * LEAST_REPEATS > span:
+            break
+        share = 0.5 / (period * (period - 1))  # of all periods together a half
+        whole = Form("periodic", np.eye(period), period - 1, share=share, period=period, centred=True)
+        yield whole
+        if period >= FEW_FROM:
+            away = np.abs(fitted(look.seen, whole).departure)
+            for few in range(1, FEW_CLASSES + 1):
+                kept = np.sort(np.argsort(away)[-few:])
+                tried = comb(period, few)
+                few_of = np.eye(period)[:, kept]
+                yield Form("periodic", few_of, 2 * few, tried, 0.2 * share, period=period, centred=True)
+
+
+def upper_forms(look: Look) -> Iterator[Form]:
+    """Yield tables that repeat from a quarter, half or three quarters of the index on."""
+    for quarter in (1, 2, 3):
+        for period in UPPER_PERIODS:
+            first = look.seen.count * quarter // (4 * period) * period
+            if period * LEAST_REPEATS <= int(look.seen.index.max()) - max(first, int(look.seen.index.min())):
+                yield Form(
+                    "periodic", np.eye(period), period, 3, 0.1 / (period * (period - 1)), period, first, centred=True
+                )
+
+
+def wave_forms(look: Look, entry: Entry) -> Iterator[Form]:
+    """Yield the sine along an index, of any period, that takes most off chi2."""
+    count = look.seen.count
+    frequency = np.arange(LEAST_WAVES, count // LEAST_PERIOD, 0.5) / count
+    if not len(frequency):
+        return
+    turn = 2.0 * np.pi * np.arange(count)[:, None] * frequency
+    weight = 1.0 / np.sqrt(look.seen.variance)
+    waves = (np.asarray(look.seen.matrix @ np.cos(turn)), np.asarray(look.seen.matrix @ np.sin(turn)))
+    cos, sin = (one * weight[:, None] for one in waves)
+    value = look.seen.residual * weight
+    a, b, c = (np.einsum("ij,ij->j", x, y) for x, y in ((cos, cos), (cos, sin), (sin, sin)))
+    u, v = value @ cos, value @ sin
+    gain = (c * u * u - 2.0 * b * u * v + a * v * v) / np.maximum(a * c - b * b, DETERMINED * (a + c) ** 2 + 1e-300)
+    best = frequency[int(np.argmax(gain))]
+    angle = 2.0 * np.pi * best * np.arange(count)
+    basis = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def say(size: FloatArray) -> str:
+        return f"a wave of {entry(float(np.hypot(*size)))} with a period of {1.0 / best:.3g} {look.along}s"
+
+    yield Form("wave", basis, 3, len(frequency), centred=True, say=say)
+
+
+def end_forms(look: Look, entry: Entry) -> Iterator[Form]:
+    """Yield what decays from the first or from the last line on, of the length that takes most off chi2."""
+    count = look.seen.count
+    lengths = np.geomspace(2.0, count / 6.0, END_LENGTHS)
+    from_first = np.exp(-np.arange(count)[:, None] / lengths)
+    basis = np.hstack([from_first, from_first[::-1]])
+    best = _most_gaining(look.seen, basis)
+    end = "first" if best < len(lengths) else "last"
+    length = lengths[best % len(lengths)]
+
+    def say(size: FloatArray) -> str:
+        return f"{entry(size[0])} at the {end} {look.along}, which decays over {length:.3g} {look.along}s"
+
+    yield Form("decay", basis[:, [best]], 2, basis.shape[1], centred=True, say=say)
 
 
 def tap_forms(look: Look, entry: Entry) -> Iterator[Form]:
@@ -196,6 +332,19 @@ def tap_forms(look: Look, entry: Entry) -> Iterator[Form]:
             return f"{'a step' if len(edges) == 1 else 'steps'} of {', '.join(words)}"
 
         yield Form("step", basis, len(edges), centred=True, say=say)
+
+
+def angle_forms(at: FloatArray, entry: Entry) -> Iterator[Form]:
+    """Yield waves of one to four periods about the sensor's centre, and a curve. at : angles (N,), deg."""
+    turn = np.radians(at)
+    for order in range(1, MOST_ORDERS + 1):
+        basis = np.stack([np.cos(order * turn), np.sin(order * turn)], axis=1)
+
+        def say(c: FloatArray, order: int = order) -> str:
+            first = np.degrees(np.arctan2(c[1], c[0])) / order % (360.0 / order)
+            return f"{entry(float(np.hypot(*c)))} in the corners, times r^2 cos {order} (angle - {first:.0f} deg)"
+
+        yield Form("wave", basis, 2, MOST_ORDERS, say=say)
 
 
 # --- forms along a coordinate ----------------------------------------------------------------------------------------
@@ -247,6 +396,24 @@ def curve_forms(profile: Profile, x: FloatArray, known: FloatArray, unit: str, e
         through = known[np.unique(np.linspace(0, len(known) - 1, number).round().astype(int))]
         hats = np.array([np.interp(x, through, one) for one in np.eye(number)]).T
         yield Form("curve", hats, number, say=lambda c: f"a curve through {len(c)} points")
+
+
+def plane_forms(x: FloatArray, channels: Sequence[str], entry: Entry) -> Iterator[Form]:
+    """Yield straight lines, and curves through few points, of every channel by itself: columns of a table by channel
+    and place, channels first."""
+    line = ((x - x[0]) / np.ptp(x))[:, None]
+    few = np.unique(np.linspace(0, len(x) - 1, FEW_POINTS).round().astype(int))
+    hats = np.array([np.interp(x, x[few], one) for one in np.eye(len(few))]).T
+    for name, basis in (("line", line), ("curve", hats)):
+        count = basis.shape[1]
+
+        def say(c: FloatArray, name: str = name, count: int = count) -> str:
+            each = zip(channels, c.reshape(-1, count), strict=True)
+            if name == "line":
+                return ", ".join(f"{channel} {entry(float(own[0]))}" for channel, own in each) + " over the range"
+            return f"a curve through {count} points for each channel"
+
+        yield Form(name, np.kron(np.eye(len(channels)), basis), len(channels) * count, say=say)
 
 
 def _bumps(x: FloatArray, centre: FloatArray, width: FloatArray) -> FloatArray:
@@ -333,6 +500,7 @@ class PredictiveTable:
     """A form that predicts: departures from no change by class (period,) or by index (N,).
 
     chi2 : of the held-out captures (of the seen ones without any), before, after, and the number of numbers
+    own : the same in the directions of the form
     shorter : forms of fewer numbers that it rests on, the shortest first
     equal : other places in the chain whose best form the captures can't tell from it, in words
     """
@@ -343,6 +511,7 @@ class PredictiveTable:
     std: FloatArray
     log_probability: float
     chi2: tuple[float, float, int]
+    own: tuple[float, float, int]
     said: str = ""
     shorter: tuple[PredictiveTable, ...] = ()
     equal: tuple[str, ...] = field(default=())
@@ -352,3 +521,7 @@ class PredictiveTable:
     def period(self) -> int:
         """Indices after which it repeats; 0: it doesn't."""
         return self.form.period
+
+    def over(self, count: int) -> FloatArray:
+        """Return the departures of every one of `count` indices."""
+        return self.form.over(count, self.departure)

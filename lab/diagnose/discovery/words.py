@@ -33,6 +33,26 @@ SUSPECTS: dict[tuple[str, str, str], str] = {
     ("signal", "row", ""): "shared read-out of neighbouring rows does that, or pick-up at a fraction of the line rate",
     ("signal", "column", ""): "interleaved column converters with offsets of their own do that",
     ("signal", "row and column", ""): "pixels that share a floating diffusion, with offsets of their own, do that",
+    ("signal", "row", "covariance"): "rows that are read in pairs do that, or charge that is binned in part",
+    ("signal", "column", "covariance"): "columns that share a converter do that, or an amplifier that settles slowly",
+    ("signal", "row", "decay"): "a read-out that settles after the frame's beginning does that, or a frame's last rows",
+    ("signal", "column", "decay"): "a read-out that settles after a line's beginning does that",
+    ("charge", "row", "decay"): "rows that are exposed longer at the frame's end do that, or a mask's shadow",
+    ("charge", "column", "decay"): "a mask's shadow does that, or charge that is lost at the array's end",
+    ("signal", "radius", ""): "an amplifier's or a processor's light does that, or stress of the package",
+    ("charge", "radius", ""): "a part below or beside the sensor that warms its middle or its corners does that",
+    (
+        "charge",
+        "radius x exposure",
+        "",
+    ): "a leaf shutter that opens from the middle does that, or an iris that closes with it",
+    ("image", "angle", ""): "a rectangular port of the sphere does that, a tilted mask, or a stop that isn't round",
+    ("signal", "row x level", ""): "row drivers whose supply sags with the signal do that",
+    ("signal", "column x level", ""): "column amplifiers that each bend in their own way do that",
+    ("signal", "time", "variance"): "amplifiers that warm up do that, or pick-up that comes and goes",
+    ("signal", "exposure", ""): "a reset that settles during the exposure does that, or a clamp that follows it",
+    ("light", "plane x time", ""): "a lamp whose colour changes as it warms or ages does that",
+    ("light", "wavelength", ""): "an uneven screw or a worn grating drive of the monochromator does that",
     ("signal", "level", "step"): "a change of gain within the range (dual gain) does that",
     ("signal", "level", "knee"): "companding, dual gain, or a well that begins to fill up do that",
     (
@@ -64,9 +84,26 @@ QUANTITIES: dict[tuple[str, str], str] = {
     ("signal", "level"): "response",
     ("signal", "time"): "black level",
     ("light", "time"): "source",
+    ("light", "plane x time"): "colour of the source",
+    ("light", "wavelength"): "wavelength of narrowband light",
+    ("charge", "radius"): "dark current",
+    ("charge", "radius x exposure"): "time in which light is collected",
+    ("signal", "radius"): "dark offset",
+    ("signal", "row x level"): "bend of the response",
+    ("signal", "column x level"): "bend of the response",
+    ("signal", "exposure"): "black level",
+    ("image", "angle"): "light on the sensor",
     ("image", "radius"): "light on the sensor",
     ("image", "wavelength"): "transmittance",
     ("image", "frequency"): "transfer function",
+}
+#: Units of departures that aren't shares, nor offsets.
+UNITS: dict[tuple[str, str, str], str] = {
+    ("charge", "radius", "mean"): "DN/s",
+    ("charge", "radius x exposure", "mean"): "s",
+    ("signal", "radius", "mean"): "DN",
+    ("signal", "time", "variance"): "DN^2",
+    ("light", "wavelength", "mean"): "nm",
 }
 BY_LINES = {"charge": "sensitivities", "signal": "dark offsets"}
 #: Remark where a table by code isn't made.
@@ -78,10 +115,18 @@ BEYOND_TABLE = (
 
 def entry(look: Look) -> Entry:
     """Return how a departure is written, with its unit."""
-    if look.stage == "signal" and look.of == "mean" and look.along != "level":
+    unit = entry_unit(look)
+    if unit == "%":
+        return lambda value: f"{100.0 * value:+.2g} %"
+    return lambda value: f"{value:+.2g} {unit}"
+
+
+def entry_unit(look: Look) -> str:
+    """Return the unit of a look's departures."""
+    unit = UNITS.get((look.stage, look.along, look.of))
+    if unit is None and look.stage == "signal" and look.of == "mean" and not look.along.endswith("level"):
         unit = "e" if look.at else "DN"
-        return lambda value: f"{value:+.2g} {unit}"
-    return lambda value: f"{100.0 * value:+.2g} %"
+    return unit or "%"
 
 
 def unit_of(look: Look) -> str:
@@ -92,8 +137,9 @@ def unit_of(look: Look) -> str:
 def place_in_words(look: Look) -> str:
     """Return the quantity and the index of a look."""
     quantity = QUANTITIES.get((look.stage, look.along)) or BY_LINES[look.stage]
-    if look.of == "variance" and look.stage == "signal":
-        quantity = "variances of the dark noise"
+    if look.of != "mean" and look.stage == "signal":
+        quantity = "variance of the noise" if look.along == "time" else "variances of the dark noise"
+        quantity = quantity if look.of == "variance" else f"covariances of the dark noise with the next {look.along}"
     return f"{quantity} by {look.along}"
 
 
@@ -103,7 +149,7 @@ def suspects_of(found: PredictiveTable) -> str:
     period = (*found.shorter, found)[0].period
     if look.along == "code" and period & (period - 1):
         name = "no power of two"
-    kinds = (name, "variance", "") if look.of == "variance" else (name, "")
+    kinds = (look.of, name, "") if look.of != "mean" else (name, "")
     return next(SUSPECTS[look.stage, look.along, k] for k in kinds if (look.stage, look.along, k) in SUSPECTS)
 
 

@@ -294,11 +294,12 @@ def decide(
     report: Callable[[str], None] = lambda _: None,
     *,
     least_threshold: float = 0.0,
+    without: Collection[str] = (),
 ) -> Verdict:
     """Return the whole chain on one side's measurement model; deterministic for a given generator. `least_threshold` of
-    the
-    scores: from drawn healthy cameras, where there are any (`bootstrap.py`)."""
-    known = candidates()
+    the scores: from drawn healthy cameras, where there are any (`bootstrap.py`). `without`: names that aren't
+    considered."""
+    known = tuple(kind for kind in candidates() if kind.name not in without)
     changes = prototype_changes(model, model.camera, (), known)
     first = signatures_of(model, (), changes)
     drawn = first.threshold(rng, 1.0 - policy.false_alarm_rate, policy.threshold_draws)

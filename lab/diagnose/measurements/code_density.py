@@ -204,6 +204,26 @@ def counted(study: Study) -> dict[bool, _Counts]:
     return counts
 
 
+def counted_in_all(study: Study) -> dict[bool, _Counts]:
+    """Counts of `counted`, and of all other frames with light, without what their light gives an ideal converter.
+
+    Their histogram is as smooth by the noise of the light as that of even light. Of each kind every third capture is
+    held out.
+    """
+    found = {}
+    for out, even in study.once(counted).items():
+        found[out] = _Counts(even.count.copy(), np.zeros(len(even.count)), list(even.captures), [])
+    number: dict[str, int] = {}
+    for capture in study.recordings.captures(side=study.side):
+        if capture.kind in {"dark", "flat", "narrowband"} or getattr(capture, "gain_db", None):
+            continue
+        number[capture.kind] = number.get(capture.kind, -1) + 1
+        own, frame = found[number[capture.kind] % 3 == 1], study.recordings.frame(capture)
+        own.count[:] += np.bincount(frame.ravel(), minlength=len(own.count))[: len(own.count)]
+        own.captures.append(capture.id)
+    return found
+
+
 def prepared(study: Study, counts: _Counts) -> CodeCounts | None:
     """Return the histogram over the usable codes, None where they are too few."""
     level = np.arange(len(counts.count), dtype=float)

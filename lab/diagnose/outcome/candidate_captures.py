@@ -315,7 +315,7 @@ def _darks(camera: CameraModel) -> Iterator[CandidateCapture]:
             for seconds, elapsed, temperature in steps:
                 model = Uniform(h.camera, h.effects)
                 dark = float(np.mean(model.dark_e_per_s(temperature))) + model.mean_hot_e_per_s
-                found.append(dark * seconds * gain + model.offset_dn(elapsed, temperature))
+                found.append(dark * seconds * gain + model.offset_dn(elapsed, temperature, seconds))
             return np.array(found)
 
         seconds = np.array([s for s, _, _ in steps])

@@ -1,0 +1,299 @@
+"""Images of what changes from pixel to pixel in dark frames and in flats: of the offset, of the dark current, of the
+temporal variance and of the covariance of neighbours; of the response, of its square term, and of light that is
+collected in a fixed time. Each is that of seen (False) and of held-out captures (True).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.diagnose.measurements.dark_frames import DarkCondition, conditions
+from lab.diagnose.measurements.dark_readout import MOST_FRAMES, dark_readout
+from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, dark_level_dn, flats
+from lab.errors import NotDetermined
+from lab.measure.noise_figures import CLIP, robust_std
+from lab.measure.study import Study, held_out_flats, held_out_of
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+
+Image = NDArray[np.floating]
+LEAST_NOISE_DN2 = 1.0 / 12.0  # of a frame: that of rounding
+NO_SETTING = {"id", "frame", "time", "temperature_c", "dummy_frames"}  # what repeats differ by
+LEAST_LEVELS = 2  # from which on the response's change by level is determined
+
+
+@dataclass(frozen=True)
+class DarkImages:
+    """Images (rows, cols) of dark frames, DN, DN/s and DN^2; None where the captures don't determine one.
+
+    mean        of all exposures, less the frame's mean
+    offset      the same at exposure 0
+    per_second  its change by exposure
+    variance    of a pixel from frame to frame, without noise that rows or columns share
+    below       covariance of a pixel with the one below, (rows - 1, cols)
+    right       the same with the one to the right, (rows, cols - 1)
+    """
+
+    mean: Image
+    offset: Image
+    per_second: Image | None = None
+    variance: Image | None = None
+    below: Image | None = None
+    right: Image | None = None
+
+
+@dataclass
+class _Sums:
+    """Sums over the captures of one condition, seen or held out."""
+
+    frames: int
+    mean: Image
+    contrasts: int
+    squares: Image
+    below: Image
+    right: Image
+
+    @classmethod
+    def empty(cls, shape: tuple[int, int]) -> _Sums:
+        """Return sums over no frames of a shape."""
+        rows, cols = shape
+        every = (np.zeros((rows - i, cols - j), np.float32) for i, j in ((0, 0), (0, 0), (1, 0), (0, 1)))
+        mean, squares, below, right = every
+        return cls(0, mean, 0, squares, below, right)
+
+    def add_contrast(self, away: Image) -> None:
+        """Add a difference of frames with the variance of one; what rows and columns share is no part of it."""
+        std = robust_std(away)
+        away = np.clip(away, -CLIP * std, CLIP * std)
+        away -= away.mean(axis=1, keepdims=True)
+        away -= away.mean(axis=0, keepdims=True)
+        self.contrasts += 1
+        self.squares += np.square(away)
+        self.below += away[:-1] * away[1:]
+        self.right += away[:, :-1] * away[:, 1:]
+
+
+def dark_images(study: Study) -> dict[bool, DarkImages]:
+    """Return the images of dark frames at the usual temperature; none without dark captures."""
+    try:
+        every = conditions(study)
+    except NotDetermined:
+        return {}
+    usual = [c for c in every if _is_usual(study, c)] or every
+    sums = [(condition.exposure_s, _summed(study, condition)) for condition in usual]
+    found = {}
+    for out in (False, True):
+        mine = [(exposure_s, own[out]) for exposure_s, own in sums if own[out].frames]
+        if mine:
+            found[out] = _joined(study, mine)
+    return found
+
+
+def _is_usual(study: Study, condition: DarkCondition) -> bool:
+    warm = condition.temperature_c
+    return study.temperature_c is None or warm is None or abs(warm - study.temperature_c) < 2.0
+
+
+def _summed(study: Study, condition: DarkCondition) -> dict[bool, _Sums]:
+    """Return the sums over a condition's frames. Contrasts are Helmert's: frame k less the mean of those before, times
+    sqrt(k / (k + 1)); pixels beyond `CLIP` standard deviations count as such."""
+    shape = study.camera.rows, study.camera.cols
+    mean, own = np.zeros(shape, np.float32), {out: _Sums.empty(shape) for out in (False, True)}
+    seen, held_out = condition.seen[:MOST_FRAMES], condition.held_out[: MOST_FRAMES // 2]
+    for k, capture in enumerate((*seen, *held_out)):
+        frame = study.recordings.frame(capture).astype(np.float32)
+        frame -= np.float32(frame.mean(dtype=float))
+        sums, away = own[k >= len(seen)], frame - mean
+        mean += away / np.float32(k + 1)
+        sums.frames += 1
+        sums.mean += (frame - sums.mean) / np.float32(sums.frames)
+        if k:
+            sums.add_contrast(away * np.float32(np.sqrt(k / (k + 1.0))))
+    return own
+
+
+def _joined(study: Study, sums: Sequence[tuple[float, _Sums]]) -> DarkImages:
+    """Return the images of all exposures, weighted by their noise."""
+    exposure_s = np.array([t for t, _ in sums])
+    read_dn2 = max(study.noise.read_dn**2, LEAST_NOISE_DN2)
+    shot_dn2 = study.noise.gain * max(study.noise.dark_dn_per_s, 0.0) * exposure_s
+    weight = np.array([one.frames for _, one in sums]) / (read_dn2 + shot_dn2)
+    weight /= weight.sum()
+    middle = float(weight @ exposure_s)
+    spread = float(weight @ np.square(exposure_s - middle))
+    mean = sum(np.float32(w) * one.mean for w, (_, one) in zip(weight, sums, strict=True))
+    offset, slope = mean, None
+    if spread > 0.0:
+        by_time = weight * (exposure_s - middle) / spread
+        slope = _clipped(sum(np.float32(w) * one.mean for w, (_, one) in zip(by_time, sums, strict=True)))
+        offset = mean - np.float32(middle) * slope
+    images = DarkImages(_clipped(mean), _clipped(offset), slope)
+    paired = [one for _, one in sums if one.contrasts]
+    if not paired:
+        return images
+    by_noise = np.array([one.contrasts**2 / float(np.mean(one.squares)) ** 2 for one in paired])
+    by_noise /= sum(w * one.contrasts for w, one in zip(by_noise, paired, strict=True))
+    squares, below, right = (
+        sum(np.float32(w) * getattr(one, name) for w, one in zip(by_noise, paired, strict=True))
+        for name in ("squares", "below", "right")
+    )
+    return replace(images, variance=squares, below=below, right=right)
+
+
+def _clipped(image: Image) -> Image:
+    """Return an image with outlying pixels at `CLIP` standard deviations from its median."""
+    middle, std = float(np.median(image)), robust_std(image)
+    return np.clip(image, middle - CLIP * std, middle + CLIP * std)
+
+
+@dataclass(frozen=True)
+class FlatImages:
+    """Images (rows, cols) of flats, each plane of the mosaic by itself. A frame over its plane's mean, with the signal
+    s and the exposure t, is taken as
+
+    bend     1 + a + b s / s_full: b, of the square of the signal, at full well
+    fixed_s  1 + a + c / t: c, s, the time in which light is collected besides, whatever is asked for
+    """
+
+    bend: Image
+    fixed_s: Image | None
+
+
+def flat_images(study: Study) -> dict[bool, FlatImages]:
+    """Return the images of unclipped flats of the most frequent lamp; none where they don't determine them."""
+    try:
+        levels, _ = study.once(flats)
+    except NotDetermined:
+        return {}
+
+    def lamp_of(capture: Any) -> tuple[int, bool]:
+        return study.lamps.get(capture.radiance, -1), (capture.gain_db or 0.0) == study.usual_gain_db
+
+    lamps = [lamp_of(c) for u in levels for c in u.captures]
+    usual = max(dict.fromkeys(lamps), key=lamps.count)
+    dark = study.once(dark_readout)
+    full_dn = study.saturation_dn - study.noise.black
+    found = {}
+    for held_out in (False, True):
+        captures = [
+            (float(np.mean(list(u.mean.values()))) / full_dn, c)
+            for u in levels
+            if u.held_out == held_out and min(u.mean.values()) > LEAST_SIGNAL * study.noise.read_dn
+            for c in u.captures[:MOST_FRAMES]
+            if lamp_of(c) == usual
+        ]
+        if len({s for s, _ in captures}) >= LEAST_LEVELS:
+            found[held_out] = _regressed(study, captures, full_dn, None if dark is None else dark.offsets_dn)
+    return found
+
+
+def _regressed(
+    study: Study, captures: Sequence[tuple[float, Any]], full_dn: float, offsets_dn: Image | None
+) -> FlatImages:
+    """Return the terms by least squares, weighted by shot and read noise, pixel by pixel."""
+    signal = np.array([s for s, _ in captures])
+    inverse = np.array([1.0 / max(float(c.exposure_s), 1e-9) for _, c in captures])
+    noise = (study.noise.gain * signal * full_dn + study.noise.read_dn**2) / np.square(signal * full_dn)
+    weights = [_slope(x, 1.0 / noise) for x in (signal, inverse)]
+    total = np.zeros((2, study.camera.rows, study.camera.cols), np.float32)
+    for k, (_, capture) in enumerate(captures):
+        frame = np.asarray(study.recordings.frame(capture), np.float32) - np.float32(dark_level_dn(study, capture))
+        if offsets_dn is not None:
+            frame -= offsets_dn
+        for plane in mosaic.planes(frame, study.camera.cfa).values():
+            plane /= np.float32(plane.mean(dtype=float))
+        for term, weight in zip(total, weights, strict=True):
+            term += np.float32(weight[k]) * frame
+    for term in total:
+        for plane in mosaic.planes(term, study.camera.cfa).values():
+            plane[...] = _clipped(plane)
+    return FlatImages(total[0], total[1] if np.ptp(inverse) > 0.0 else None)
+
+
+def _slope(x: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the weights by which values (n,) give their slope by x."""
+    away = weight * (x - np.average(x, weights=weight))
+    return np.asarray(away / max(float(away @ x), 1e-300))
+
+
+# --- noise by time ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class NoiseByTime:
+    """The variance of differences of repeats, dark and lit: Helmert's contrasts, frame k less the mean of those before.
+
+    variance_dn2  (n,) of a pixel
+    pixels        of each
+    shares        (n, captures): how much of the variance is that of each capture's frame
+    elapsed_s     (captures,)
+    signal_dn     (n,) mean signal above black, and
+    square_dn2    (n,) mean of its square
+    dark_s        (n,) exposure of dark frames but the shortest, else 0: hot pixels add noise of their own
+    held_out      (n,)
+    """
+
+    variance_dn2: FloatArray
+    pixels: float
+    shares: FloatArray
+    elapsed_s: FloatArray
+    signal_dn: FloatArray
+    square_dn2: FloatArray
+    dark_s: FloatArray
+    held_out: NDArray[np.bool_]
+
+
+def noise_by_time(study: Study) -> NoiseByTime | None:
+    """Return the variance of repeats by time; None where no time is stated, or nothing is repeated."""
+    captures = study.recordings.captures(side=study.side)
+    if not captures or any(c.time is None for c in captures):
+        return None
+    by_setting: dict[str, list[Any]] = {}
+    for c in sorted(captures, key=study.elapsed_s):
+        by_setting.setdefault(c.model_dump_json(exclude=NO_SETTING), []).append(c)
+    groups = [group[:MOST_FRAMES] for group in by_setting.values() if len(group) > 1]
+    every = [c for group in groups for c in group]
+    place = {c.id: i for i, c in enumerate(every)}
+    shortest_s = min((c.exposure_s for c in every if c.kind == "dark"), default=0.0)
+    rows: list[tuple[float, FloatArray, float, float, float, bool]] = []
+    for number, group in enumerate(groups):
+        out = _held_out(study, group, number, len(groups))
+        mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
+        for k, capture in enumerate(group):
+            frame = study.recordings.frame(capture).astype(np.float32)
+            if k == 0:
+                signal = frame - np.float32(study.noise.black)
+                level, square = float(signal.mean(dtype=float)), float(np.mean(np.square(signal), dtype=float))
+            away = frame - mean
+            mean += away / np.float32(k + 1)
+            if k == 0 or any(v is None for v in study.levels(capture).mean.values()):
+                continue
+            share = np.zeros(len(every))
+            share[[place[c.id] for c in group[:k]]] = 1.0 / (k * (k + 1.0))
+            share[place[capture.id]] = k / (k + 1.0)
+            away *= np.float32(np.sqrt(k / (k + 1.0)))
+            for plane in mosaic.planes(away, study.camera.cfa).values():
+                std = robust_std(plane)
+                np.clip(plane, -CLIP * std, CLIP * std, out=plane)
+                plane -= plane.mean(axis=1, keepdims=True)
+                plane -= plane.mean(axis=0, keepdims=True)
+            own = capture.exposure_s if capture.kind == "dark" and capture.exposure_s > shortest_s else 0.0
+            rows.append((float(np.mean(np.square(away), dtype=float)), share, level, square, own, capture.id in out))
+    if not rows:
+        return None
+    variance, shares, level, square, dark, held_out = (np.array(column) for column in zip(*rows, strict=True))
+    elapsed_s = np.array([study.elapsed_s(c) for c in every])
+    pixels = float((study.camera.rows - 2) * (study.camera.cols - 2))
+    return NoiseByTime(variance, pixels, shares, elapsed_s, level, square, dark, held_out)
+
+
+def _held_out(study: Study, group: Sequence[Any], number: int, groups: int) -> set[str]:
+    """Return the ids of a setting's held-out captures."""
+    if group[0].kind == "dark":
+        return {c.id for condition in conditions(study) for c in condition.held_out}
+    return set(study.once(held_out_flats)) if group[0].kind == "flat" else held_out_of(group, number, groups)
