@@ -13,6 +13,8 @@ DARK_CURRENT = frozenset({"charge.dark_current"})
 COLLECTED = frozenset({"charge.collected"})
 #: What read-out adds to the pixels, lit or dark.
 ADDED = frozenset({"signal.disturbances"})
+#: What the converter makes of levels.
+CODES = frozenset({"codes.codes"})
 #: Light that is collected beside the exposure.
 LEAK = frozenset({"charge.leak_s"})
 #: Factors on what is read, by place.

@@ -67,8 +67,9 @@ BESIDE_LINES, SHARP_SHARE = 2, 0.75
 #: Least gain in chi2, and share of what a law says of captures that it wasn't taken from.
 LEAST_GAIN, PREDICTED_SHARE = 4.0, 0.5
 MOST_BY_CODE = 4096  # entries of a table by code
+MOST_LAWS = 6  # along indices, one after the other
 MOST_CURVES = 2  # laws along coordinates, one after the other
-#: Description length by which another place in the chain may be longer and is told beside.
+#: Description length by which a form of fewer numbers may be longer and is told, and another place in the chain, beside.
 EQUAL_LENGTH = 6.0
 
 
@@ -80,29 +81,58 @@ def discover(
     `effects`: those of the baseline, and the named ones. `left`: the verdict, whose measurements are looked at along
     coordinates: those that are mismatched, or all where none is. Without, only indices are looked at.
     """
-    looks = list(index_looks(study, effects))
-    tables = [_fitted(look, _index_forms(look)) for look in looks]
-    every = [_likeliest(own) for own in tables]
-    limit = _limit(every, policy)
-    found = []
-    for look, own in zip(looks, tables, strict=True):
-        one = _predictive(look, [table for table in own if table.log_probability <= limit], policy)
-        if look.stage == "codes":
-            one = _by_code(look, one, policy)
-        if one is not None:
-            found.append(one)
-    found = _of_each_place([one for one in found if not one.look.columns], _smallest_cells(found))
+    found: list[PredictiveTable] = []
+    every: list[float] = []
+    named = frozenset().union(*(list_changes(effect) for effect in effects))
+    while len(found) < MOST_LAWS:
+        acting = (*effects, *(law_of(one, study) for one in found))
+        looks = [look for look in index_looks(study, acting) if not any(_is_at(look, one.look) for one in found)]
+        tables = [_fitted(look, _index_forms(look)) for look in looks]
+        every = [_likeliest(own) for own in tables]
+        limit = _limit(every, policy)
+        beside = _of_each_place(
+            one
+            for one in _told(looks, tables, limit, policy)
+            if not named & list_changes(law_of(one, study)) or _exceeds_tolerance(one, policy)
+        )
+        if not beside:
+            break
+        found.append(min(beside, key=lambda one: one.log_probability))
     if left is not None:
         found += _curves(study, left, found, every, policy)
     return tuple(sorted(found, key=lambda one: one.log_probability))
 
 
+def _exceeds_tolerance(one: PredictiveTable, policy: DecisionPolicy) -> bool:
+    """Return whether a law takes `least_discovery_share` off chi2 where a named effect acts on the same quantity: less
+    may be what that effect's law lacks."""
+    judge = one.look.held_out or one.look.seen
+    before = judge.chi2(np.zeros(1))
+    return before - judge.chi2(one.over(judge.count)) >= policy.least_discovery_share * before
+
+
+def _is_at(look: Look, other: Look) -> bool:
+    return (look.stage, look.along, look.of) == (other.stage, other.along, other.of)
+
+
+def _told(
+    looks: Sequence[Look], tables: Sequence[Sequence[Table]], limit: float, policy: DecisionPolicy
+) -> Iterator[PredictiveTable]:
+    """Yield of each look the law that predicts, where there is one."""
+    for look, own in zip(looks, tables, strict=True):
+        one = _predictive(look, [table for table in own if table.log_probability <= limit], policy)
+        one = _by_code(look, one, policy) if look.stage == "codes" else one
+        if one is not None:
+            yield one
+
+
 def _limit(log_probabilities: Sequence[float], policy: DecisionPolicy) -> float:
-    """Return ln p of the largest k with p_(k) <= k q / (m (1 + 1/2 + ... + 1/m)) (Benjamini and Yekutieli)."""
+    """Return ln of k q / (m (1 + 1/2 + ... + 1/m)) for the largest k whose p_(k) is below (Benjamini and Yekutieli)."""
     order = np.sort(log_probabilities)
     rank = np.arange(1, len(order) + 1)
-    below = np.flatnonzero(order <= np.log(rank * policy.discovery_rate / (len(order) * np.sum(1.0 / rank))))
-    return float(order[below[-1]]) if len(below) else -np.inf
+    least = np.log(rank * policy.discovery_rate / (len(order) * np.sum(1.0 / rank)))
+    below = np.flatnonzero(order <= least)
+    return float(least[below[-1]]) if len(below) else -np.inf
 
 
 def _fitted(look: Look, forms: Iterable[Form]) -> list[Table]:
@@ -143,7 +173,9 @@ def _predictive(look: Look, kept: Sequence[Table], policy: DecisionPolicy) -> Pr
     """Return the form of the least description length that predicts what it wasn't taken from, with a shorter one."""
     if not kept:
         return None
-    best = min(kept, key=lambda table: description_length(look.seen, table))
+    length = [description_length(look.seen, table) for table in kept]
+    near = [table for table, own in zip(kept, length, strict=True) if own < min(length) + EQUAL_LENGTH]
+    best = min(near, key=lambda table: (table.form.numbers, description_length(look.seen, table)))
     if best.form.name == "lines":  # what rows and columns do by themselves
         return None
     judged = _judged(look, best)
@@ -267,15 +299,18 @@ def _by_code(look: Look, periodic: PredictiveTable | None, policy: DecisionPolic
     return PredictiveTable(look, form, every, std, log_p, chi2, chi2, shorter=shorter)
 
 
-def _of_each_place(found: Sequence[PredictiveTable], cells: Sequence[PredictiveTable]) -> list[PredictiveTable]:
+def _of_each_place(found: Iterable[PredictiveTable]) -> list[PredictiveTable]:
     """Return of each place in the chain the likeliest law, and cells in the place of what rows and columns do in
     them."""
+    every = sorted(found, key=lambda one: one.log_probability)
+    cells = _smallest_cells([one for one in every if one.look.columns])
     kept: dict[tuple[str, str, str], PredictiveTable] = {}
-    for one in sorted(found, key=lambda one: one.log_probability):
+    for one in every:
         look = one.look
         whole = [c for c in cells if c.look.stage == look.stage and look.of == "mean" and one.period]
         periods = [c.period // c.look.columns if look.along == "row" else c.look.columns for c in whole]
-        if not (look.along in {"row", "column"} and any(period % one.period == 0 for period in periods)):
+        is_in_cell = look.along in {"row", "column"} and any(period % one.period == 0 for period in periods)
+        if not look.columns and not is_in_cell:
             kept.setdefault((look.stage, look.along, look.of), one)
     return [*kept.values(), *cells]
 
@@ -308,7 +343,7 @@ def _curves(
         if not candidates:
             break
         length = [description_length(one.look.seen, one) for one in candidates]
-        near = [one for one, own in zip(candidates, length, strict=True) if own < min(length) + EQUAL_LENGTH]
+        near = [one for one, size in zip(candidates, length, strict=True) if size < min(length) + EQUAL_LENGTH]
         best = next((one for one in near if one.look.is_own_axis), candidates[int(np.argmin(length))])
         laws.append(replace(best, equal=tuple(place_in_words(one.look) for one in near if one is not best)))
     return laws
@@ -380,12 +415,12 @@ def superseded(
             continue
         left = replace(verdict, named=tuple(c for c in verdict.named if c is not candidate), after=(), held_out=())
         again = discover(study, (*model.always, *others), policy)
-        beside = [one for one in again if any(_is_of_one_place(one, rival) for rival in rivals)]
+        beside = [one for one in again if any(_is_at(one.look, rival.look) for rival in rivals)]
         elsewhere = [] if rivals else [*again, *_curves(study, left, (), (), policy, most=1)]
         elsewhere = [
             one
             for one in elsewhere
-            if not any(_is_of_one_place(one, other) for other in found) and not changed & list_changes(law_of(one, study))
+            if not any(_is_at(one.look, other.look) for other in found) and not changed & list_changes(law_of(one, study))
         ]
         for law in (*beside, *elsewhere):
             with_law = (*others, law_of(law, study))
@@ -395,10 +430,6 @@ def superseded(
                 lost[name] = law
                 break
     return lost
-
-
-def _is_of_one_place(one: PredictiveTable, other: PredictiveTable) -> bool:
-    return (one.look.stage, one.look.along, one.look.of) == (other.look.stage, other.look.along, other.look.of)
 
 
 def _chi2_of(model: MeasurementModel, effects: Effects) -> tuple[float, float]:

@@ -22,13 +22,15 @@ from sim.effects.library import list_changes
 from sim.spectrum import FloatArray
 
 MOST_POINTS, LEAST_POINTS = 16, 4
-#: Where curves are looked for: what levels, spectra and transfer functions feel of a law.
+BANDS: tuple[Stage, Along, Of] = ("image", "wavelength", "mean")
+#: Where curves are looked for: what levels, spectra and transfer functions feel of a law. Of those that describe as
+#: much, the first is told.
 CURVES: tuple[tuple[Stage, Along, Of], ...] = (
     ("light", "time", "mean"),
     ("light", "plane x time", "mean"),
-    ("light", "wavelength", "mean"),
     ("image", "radius", "mean"),
-    ("image", "wavelength", "mean"),
+    BANDS,
+    ("light", "wavelength", "mean"),
     ("image", "frequency", "mean"),
     ("charge", "exposure", "mean"),
     ("charge", "level", "variance"),
@@ -36,7 +38,6 @@ CURVES: tuple[tuple[Stage, Along, Of], ...] = (
     ("signal", "time", "mean"),
     ("signal", "exposure", "mean"),
 )
-BANDS = CURVES[4]
 MOST_PLANE_TIMES = 8
 MOST_TIMES = 48  # points of time, at any of which something may happen at once
 FINE_NM = 2.5  # from one wavelength to the next: a band is narrower than the steps of most sweeps

@@ -13,12 +13,12 @@ from scipy.signal import savgol_coeffs
 
 from lab.diagnose.discovery.images import DarkImages, dark_images, flat_images, noise_by_time
 from lab.diagnose.discovery.profile import Look, Profile
-from lab.diagnose.measurements.code_density import CodeCounts, counted_in_all, prepared, widths
+from lab.diagnose.measurements.code_density import CodeCounts, counted, counted_in_all, prepared, widths
 from lab.diagnose.measurements.dark_readout import dark_readout
 from lab.diagnose.measurements.even_flats import FlatLevel, flats
 from lab.diagnose.measurements.flat_lines import without_dark
 from lab.errors import NotDetermined
-from lab.measure.reads import COLLECTED, GAINS, acting
+from lab.measure.reads import CODES, COLLECTED, GAINS, acting
 from lab.measure.study import Study
 from sim.camera import Cfa
 from sim.effects.base import Effects
@@ -73,9 +73,13 @@ def index_looks(study: Study, effects: Effects) -> Iterator[Look]:
 
 
 def _codes(study: Study, effects: Effects) -> Iterator[Look]:
-    """Yield the counts of codes in light, seen and held out, less those that the effects' converter gives."""
+    """Yield the counts of codes in light, seen and held out, less those that the effects' converter gives.
+
+    Beside a converter's effect, in even light: there its counts are known best.
+    """
+    even_only = bool(acting(effects, CODES))
     try:
-        counts = study.once(counted_in_all)
+        counts = study.once(counted if even_only else counted_in_all)
     except NotDetermined:
         return
     found = {}
@@ -89,7 +93,7 @@ def _codes(study: Study, effects: Effects) -> Iterator[Look]:
 
 def _code_profile(codes: CodeCounts, effects: Effects, study: Study) -> Profile:
     used, rough = np.flatnonzero(codes.used), codes.rough
-    known = rough @ (codes.smooth * (widths(codes, effects, study) - 1.0)) if effects else 0.0
+    known = rough @ (codes.expected * (widths(codes, effects, study) - 1.0)) if acting(effects, CODES) else 0.0
     of_widths = sparse.coo_array((rough @ sparse.diags_array(codes.smooth))[used])
     at = of_widths.coords[0], of_widths.coords[1] + codes.first
     matrix = sparse.csr_array((of_widths.data, at), shape=(len(used), int(study.camera.white_level_dn) + 1))
