@@ -257,20 +257,19 @@ class Image(State):
 class Charge(State):
     """Electrons in the pixels: where they come from and where they end up.
 
-    `exposure_s`: time asked for -> time in which light is collected. `leak_s`: places down and across
-    the frame, 0 first line .. 1 last -> time in which light is collected besides, whatever is asked for. `collected`: electrons of light (rows,
-    cols) -> electrons, pixel by pixel and in proportion; it depends on the place by a short period alone, a part of
-    `mosaic.PERIOD_PX`, as measurements ask it on small tiles, and keeps each colour's mean, as levels don't ask it at
-    all. `dark_current`: (e/s, sensor temperature) -> e/s, of all pixels or of each (rows, cols). `defects`: pixels with
-    additional dark current.
-    `transfer`: (fx, fy in cy/um, wavelength_nm) -> factor on the transfer function, 1 at zero frequency, alike for all
-    colours. `kernels`: where the charge of a pixel ends up, (odd, odd) of sum 1, so that none is lost: they act on
-    whole frames, and on transfer functions (`sim.point.mix_channels` for a mosaic). `exchange`: mean electrons (rows,
-    cols) -> the same after neighbours have exchanged charge by how much they hold: their sum stays, and equal
-    neighbours exchange none. `overflow`: mean electrons (rows, cols) -> the same after full wells have run over. `lag`:
-    electrons collected -> electrons that stay for the next frame, from none to all. `variance_e2`: (mean electrons,
-    shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of the shot noise with each of the
-    four next pixels.
+    `exposure_s`: time asked for -> time in which light is collected. `leak_s`: places down and across the frame, 0
+    first line .. 1 last -> time in which light is collected besides, whatever is asked for. `collected`: electrons of
+    light (rows, cols) -> electrons, pixel by pixel and in proportion; it depends on the place by a short period alone,
+    a part of `mosaic.PERIOD_PX`, as measurements ask it on small tiles, and keeps each colour's mean, as levels don't
+    ask it at all. `dark_current`: (e/s, sensor temperature) -> e/s, of all pixels or of each (rows, cols). `defects`:
+    pixels with additional dark current. `transfer`: (fx, fy in cy/um, wavelength_nm) -> factor on the transfer
+    function, 1 at zero frequency, alike for all colours. `kernels`: where the charge of a pixel ends up, (odd, odd) of
+    sum 1, so that none is lost: they act on whole frames, and on transfer functions (`sim.point.mix_channels` for a
+    mosaic). `exchange`: mean electrons (rows, cols) -> the same after neighbours have exchanged charge by how much they
+    hold: their sum stays, and equal neighbours exchange none. `overflow`: mean electrons (rows, cols) -> the same after
+    full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame, from none to all.
+    `variance_e2`: (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of
+    the shot noise with each of the four next pixels.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
@@ -418,9 +417,9 @@ class Signal(State):
     `response`: electrons -> electrons, point by point; none stay none. `gains`: (row, col in px, which broadcast) ->
     factor on what is read, noise alike, of mean 1 over the frame, as levels don't ask it. `offset_dn`: (elapsed_s,
     sensor temperature) -> DN added to the black level; `exposure_offset_dn`: exposure_s -> the same. `noise_e2`:
-    elapsed_s -> variance of every pixel beside the read noise's. `lines`: noise that rows or columns share. `telegraph`: pixels
-    that jump between two levels. `disturbances`: signals that are added at random. `filters`: kernels (odd, odd) of sum
-    1 that the chip runs over each colour's plane, signal and noise alike, before rounding.
+    elapsed_s -> variance of every pixel beside the read noise's. `lines`: noise that rows or columns share.
+    `telegraph`: pixels that jump between two levels. `disturbances`: signals that are added at random. `filters`:
+    kernels (odd, odd) of sum 1 that the chip runs over each colour's plane, signal and noise alike, before rounding.
     """
 
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()

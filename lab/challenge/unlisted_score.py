@@ -159,7 +159,8 @@ def removed(found: DiagnosisResult | None, told: Sequence[DiscoveredLaw], strong
     -1..1.
 
     chi2 is that of all held-out numbers where they have an excess of 3 standard deviations, else that of the rightly
-    `told` laws' own numbers, the means of their classes. 0 where neither has one and the law is `strong`: what is there wasn't found. Else None."""
+    `told` laws' own numbers, the means of their classes. 0 where neither has one and the law is `strong`: what is there
+    wasn't found. Else None."""
     pairs = []
     if found is not None and found.held_out is not None:
         held = found.held_out

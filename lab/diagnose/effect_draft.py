@@ -24,20 +24,39 @@ WIDTH = 120
 #: Family of a drafted effect, by stage and index ("": any).
 FAMILIES: dict[tuple[str, str], Family] = {
     ("light", ""): Family.SOURCE_IN_TIME,
+    ("light", "wavelength"): Family.SOURCE_IN_WAVELENGTH,
     ("image", "radius"): Family.FIELD_OF_LIGHT,
+    ("image", "angle"): Family.FIELD_OF_LIGHT,
     ("image", "wavelength"): Family.SPECTRAL_FILTER,
     ("image", "frequency"): Family.ISOTROPIC_CONTRAST,
     ("charge", ""): Family.RESPONSE,
     ("charge", "level"): Family.CHARGE_BETWEEN_NEIGHBOURS,
+    ("charge", "radius"): Family.DARK_SIGNAL,
     ("signal", ""): Family.LINE_NOISE,
     ("signal", "level"): Family.RESPONSE,
     ("signal", "time"): Family.DARK_SIGNAL,
+    ("signal", "exposure"): Family.DARK_SIGNAL,
+    ("signal", "radius"): Family.DARK_SIGNAL,
+    ("signal", "row x level"): Family.RESPONSE,
+    ("signal", "column x level"): Family.RESPONSE,
     ("codes", ""): Family.CONVERTER,
 }
 
 #: What a test asks, by stage, index, and mean or variance: the expression that is found, and what is expected.
 ASKED: dict[tuple[Stage, Along, Of], tuple[str, str]] = {
     ("light", "time", "mean"): ("[light_of(CAMERA, LAW).source(time) for time in {module}.AT]", "{module}.TABLE"),
+    ("light", "plane x time", "mean"): (
+        "[light_of(CAMERA, LAW).colour('Y', time) for time in {module}.AT]",
+        "{module}.TABLE",
+    ),
+    ("light", "wavelength", "mean"): (
+        "[np.average(FINE_NM, weights=light_of(CAMERA, LAW).radiance(FINE_NM, one, 'narrowband')) for one in LIT]",
+        "np.add({module}.AT, {module}.TABLE)",
+    ),
+    ("image", "angle", "mean"): (
+        "Uniform(CAMERA, LAW).shade_light(np.ones(len({module}.AT)), *CORNERS_UM)",
+        "{module}.TABLE",
+    ),
     ("image", "radius", "mean"): (
         "Uniform(CAMERA, LAW).shade_light(np.ones(len({module}.AT)), np.array({module}.AT), np.zeros(1))",
         "{module}.TABLE",
@@ -66,6 +85,14 @@ ASKED: dict[tuple[Stage, Along, Of], tuple[str, str]] = {
         "[charge_of(CAMERA, LAW).collected_s(asked_s) for asked_s in {module}.AT]",
         "np.multiply({module}.AT, {module}.TABLE)",
     ),
+    ("charge", "radius", "mean"): (
+        "charge_of(CAMERA, LAW).even_dark_e_per_s(5.0, None)[LINES // 2 - 1, LINES // 2 - 1 :]",
+        "5.0 + np.interp(FROM_CENTRE_UM, {module}.AT, {module}.TABLE)",
+    ),
+    ("charge", "radius x exposure", "mean"): (
+        "charge_of(CAMERA, LAW).leaked_s(np.full(LINES, 0.5), np.linspace(0.0, 1.0, LINES))[LINES // 2 :]",
+        "np.interp(ACROSS_UM, {module}.AT, {module}.TABLE)",
+    ),
     ("charge", "level", "variance"): (
         "charge_of(CAMERA, LAW).shot_e2(CAMERA.full_well_e * np.array({module}.AT))",
         "CAMERA.full_well_e * np.multiply({module}.AT, {module}.TABLE)",
@@ -78,6 +105,34 @@ ASKED: dict[tuple[Stage, Along, Of], tuple[str, str]] = {
     ),
     ("signal", "row", "variance"): ("signal_of(CAMERA, LAW).random[0].variance_e2((LINES, LINES))[:, 0]", "BY_LINE"),
     ("signal", "column", "variance"): ("signal_of(CAMERA, LAW).random[0].variance_e2((LINES, LINES))[0]", "BY_LINE"),
+    ("signal", "row", "covariance"): (
+        "np.diff(signal_of(CAMERA, LAW).random[0].variance_e2((LINES, LINES))[::2, 0])",
+        "np.diff((BY_LINE + np.append(0.0, BY_LINE[:-1]))[::2])",
+    ),
+    ("signal", "column", "covariance"): (
+        "np.diff(signal_of(CAMERA, LAW).random[0].variance_e2((LINES, LINES))[0, ::2])",
+        "np.diff((BY_LINE + np.append(0.0, BY_LINE[:-1]))[::2])",
+    ),
+    ("signal", "radius", "mean"): (
+        "Uniform(CAMERA, LAW).added_e[LINES // 2 - 1, LINES // 2 - 1 :]",
+        "np.interp(FROM_CENTRE_UM, {module}.AT, {module}.TABLE)",
+    ),
+    ("signal", "row x level", "mean"): (
+        "signal_of(CAMERA, LAW).read(np.full((LINES, LINES), CAMERA.full_well_e))[:, 0] / CAMERA.full_well_e",
+        "1.0 + BY_LINE",
+    ),
+    ("signal", "column x level", "mean"): (
+        "signal_of(CAMERA, LAW).read(np.full((LINES, LINES), CAMERA.full_well_e))[0] / CAMERA.full_well_e",
+        "1.0 + BY_LINE",
+    ),
+    ("signal", "time", "variance"): (
+        "[signal_of(CAMERA, LAW).changing_e2(time) for time in {module}.AT]",
+        "{module}.TABLE",
+    ),
+    ("signal", "exposure", "mean"): (
+        "[signal_of(CAMERA, LAW).shift_dn(0.0, None, exposure_s) for exposure_s in {module}.AT]",
+        "CAMERA.conversion_gain_dn_per_e * np.array({module}.TABLE)",
+    ),
     ("signal", "level", "mean"): (
         "signal_of(CAMERA, LAW).read(CAMERA.full_well_e * np.array({module}.AT))",
         "CAMERA.full_well_e * np.multiply({module}.AT, {module}.TABLE)",
@@ -217,6 +272,8 @@ def _test(law: DiscoveredLaw, found: EmpiricalLaw, name: str) -> str:
     lines, tolerance = max(64, 2 * len(found.table)), "rtol=1e-6"
     if law.stage == "codes":
         tolerance = "atol=2.0"
+    if "FINE_NM" in asked:
+        tolerance = "atol=0.01"
     states = sorted({one for one in ("light_of", "image_of", "charge_of", "signal_of", "codes_of") if one in asked})
     imports = [f"from sim.stages import {', '.join(states)}"] if states else []
     imports += ["from sim.uniform import Uniform"] if "Uniform" in asked else []
@@ -224,6 +281,17 @@ def _test(law: DiscoveredLaw, found: EmpiricalLaw, name: str) -> str:
     after = []
     if "BY_LINE" in expected:
         after.append(f"BY_LINE = {by_line}")
+    if "CORNERS_UM" in asked:
+        after.append("HALF_UM = 0.5 * CAMERA.pixel_pitch_um * np.hypot(LINES, LINES)")
+        after.append(f"TURN = np.radians({name}.AT)")
+        after.append("CORNERS_UM = HALF_UM * np.cos(TURN), HALF_UM * np.sin(TURN)")
+    if "ACROSS_UM" in expected:
+        after.append("ACROSS_UM = CAMERA.pixel_pitch_um * (np.arange(LINES // 2) + 0.5)")
+    if "FINE_NM" in asked:
+        after.append("FINE_NM = np.arange(350.0, 1050.5, 0.5)")
+        after.append(f"LIT = np.exp(-0.5 * ((FINE_NM - np.reshape({name}.AT, (-1, 1))) / 5.0) ** 2)")
+    if "FROM_CENTRE_UM" in expected:
+        after.append("FROM_CENTRE_UM = CAMERA.pixel_pitch_um * np.hypot(0.5, np.arange(LINES // 2 + 1) - 0.5)")
     if law.stage == "codes":
         first, last = values["first"], (found.first or found.period) + len(found.table)
         after += ["FINE_STEPS = 200  # of a code", f"FINE = np.arange({first} - 0.5, {last} - 0.5, 1.0 / FINE_STEPS)"]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lab.capture_kinds.base import Equipment
-from lab.diagnose.discovery import discover, law_of, superseded, told
+from lab.diagnose.discovery import Superseded, discover, law_of, superseded, told
 from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.weigh import Candidate
@@ -125,7 +125,8 @@ def diagnose_side(
         )  # fmt: skip
         least = image_threshold(draws, policy.false_alarm_rate)
     report("scoring the effects")
-    verdict, withdrawn = decide(model, rng, policy, report, least_threshold=least), {}
+    verdict = decide(model, rng, policy, report, least_threshold=least)
+    withdrawn: dict[str, Superseded] = {}
     report("looking for laws that no effect has")
     discovered = discover(study, (*model.always, *verdict.effects), policy, verdict)
     for _ in range(MOST_WITHDRAWN):
@@ -170,7 +171,7 @@ def diagnose_side(
             skipped=skipped,
             mismatches=tuple(found),
             unexplained=left,
-            vetoed=tuple(vetoed_names(side, verdict)),
+            vetoed=(*vetoed_names(side, verdict), *(one.told(side, model) for one in withdrawn.values())),
             discovered=told(side, study, discovered),
             models=() if models is None else (models,),
             places=tuple(places(side, verdict, policy)),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from lab.diagnose.discovery.words import departure_unit
 from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.outcome.detectability import detectable
 from lab.diagnose.outcome.in_dn import told_as
@@ -21,7 +22,7 @@ from lab.formats.results import (
     Visibility,
 )
 from lab.formats.results.in_words import plain_number, shown_unit
-from lab.report.charts import AFTER, Figure, Trace, axis, band, layout
+from lab.report.charts import AFTER, CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.pictures import difference_picture
 from sim.camera import Side
 from sim.effects.empirical_law import PLACES as EMPIRICAL_PLACES
@@ -36,6 +37,12 @@ MARKED_QUANTILE = 0.999
 CURVES_A_SIDE = 8
 #: Share of the prior's standard deviation below which an entry of a table by code is determined.
 DETERMINED = 0.95
+#: What laws are of whose numbers are no factors, offsets or widths.
+QUANTITIES = {
+    ("charge", "radius"): "dark current",
+    ("charge", "radius x exposure"): "time collected besides",
+    ("light", "wavelength"): "displacement",
+}
 #: Range of the heat maps' colours.
 DEEPEST_SIGMA = 12.0
 
@@ -62,12 +69,15 @@ def _law_chart(law: DiscoveredLaw) -> Figure:
     """
     if law.columns:
         return _cell_map(law)
-    factor, unit = (1.0, "DN") if law.stage == "signal" and law.of == "mean" and law.along != "level" else (100.0, "%")
-    unit = "e" if unit == "DN" and law.at else unit
+    if law.along == "plane x time":
+        return _by_channel(law)
+    unit = departure_unit(law.stage, law.along, law.of, bool(law.at))
+    factor = 100.0 if unit == "%" else 1.0
     quantity = {"codes": "width less 1", "signal": "offset"}.get(
-        law.stage if unit != "%" or law.stage == "codes" else ""
+        law.stage if law.of == "mean" and (unit != "%" or law.stage == "codes") else ""
     )
-    quantity = quantity or ("variance less its mean" if law.of == "variance" else "factor less 1")
+    quantity = quantity or (f"{law.of} less its mean" if law.of != "mean" else "factor less 1")
+    quantity = QUANTITIES.get((law.stage, law.along), quantity)
     departure, half = factor * np.array(law.shown_departure), 2.0 * factor * np.array(law.shown_std)
     x: FloatArray = np.arange(len(departure)).astype(float)
     points: Trace = {"type": "scatter", "mode": "markers", "showlegend": False}
@@ -93,6 +103,18 @@ def _law_chart(law: DiscoveredLaw) -> Figure:
         points |= {"mode": "lines", "line": {"color": "@fg", "width": 2}}
     points |= {"x": x.tolist(), "y": departure.tolist()}
     return {"data": [*data, points], "layout": layout(220, xaxis=axis(along), yaxis=axis(f"{quantity}, {unit}"))}
+
+
+def _by_channel(law: DiscoveredLaw) -> Figure:
+    """Draw the curves of the channels over the time."""
+    curves = 100.0 * np.array(law.shown_departure).reshape(-1, len(law.at))
+    names = ("R", "G", "B") if len(curves) == 3 else ("Y",)
+    data: list[Trace] = [
+        {"type": "scatter", "mode": "lines", "x": list(law.at), "y": own.tolist(), "name": name,
+         "line": {"color": CHANNEL[name], "width": 2}}
+        for own, name in zip(curves, names, strict=True)
+    ]  # fmt: skip
+    return {"data": data, "layout": layout(220, xaxis=axis("time, s"), yaxis=axis("factor less 1, %"))}
 
 
 def _cell_map(law: DiscoveredLaw) -> Figure:

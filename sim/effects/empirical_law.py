@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Callable
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -13,12 +14,12 @@ from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.stages import Charge, Codes, Image, Light, PatternNoise, SharedNoise, Signal
+from sim.stages import Charge, Codes, Disturbance, Image, Light, PatternNoise, SharedNoise, Signal
 
 Stage = Literal["light", "image", "charge", "signal", "codes"]
 Along = Literal[
-    "code", "row", "column", "row and column", "radius", "angle", "level", "time", "exposure", "wavelength", "frequency",
-    "row x level", "column x level", "radius x exposure", "plane x time",
+    "code", "row", "column", "row and column", "radius", "angle", "level", "time", "exposure", "wavelength",
+    "frequency", "row x level", "column x level", "radius x exposure", "plane x time",
 ]  # fmt: skip
 Of = Literal["mean", "variance", "covariance"]
 
@@ -68,11 +69,10 @@ INDICES = frozenset({"code", "row", "column", "row and column", "row x level", "
 class EmpiricalLaw(Effect):
     """A table by index, or a curve, that changes one quantity of one stage (`PLACES`).
 
-    A table: the entry of index i is that of i - `first`, or of i mod `period`; along "row and column" the entry of
-    (row mod `period`, column mod `columns`), rows first. Where a table ends nothing changes, and below `first`. A curve,
+    A table: the entry of index i is that of i - `first`, or of i mod `period`; along "row and column" the entry of (row
+    mod `period`, column mod `columns`), rows first. Where a table ends nothing changes, and below `first`. A curve,
     where `at` has points: linear between them, and held beyond them; along "plane x time" the curves of the channels,
-    one after the other. It describes and predicts; it names no cause, so that a diagnosis
-    never looks for it.
+    one after the other. It describes and predicts; it names no cause, so that a diagnosis never looks for it.
     """
 
     name: ClassVar[str] = "empirical_law"
@@ -214,8 +214,9 @@ class EmpiricalLaw(Effect):
             of_channel = dict(zip(light.camera.channels, np.resize(change, (len(light.camera.channels), len(self.at))),
                                   strict=True))  # fmt: skip
             return light.add_laws(
-                level_by_channel=lambda channel, elapsed_s: 1.0
-                + float(np.interp(elapsed_s, self.at, of_channel[channel]))
+                level_by_channel=lambda channel, elapsed_s: (
+                    1.0 + float(np.interp(elapsed_s, self.at, of_channel[channel]))
+                )
             )
         if self.along == "wavelength":
             return light.add_laws(spectrum=self._displace)
@@ -226,7 +227,7 @@ class EmpiricalLaw(Effect):
         total = float(np.sum(radiance))
         if kind != "narrowband" or total <= 0.0:
             return radiance
-        away_nm = float(self._at(np.sum(radiance * wavelength_nm) / total))
+        away_nm = float(self._at(np.asarray(np.sum(radiance * wavelength_nm) / total)))
         return np.asarray(np.interp(wavelength_nm - away_nm, wavelength_nm, radiance))
 
     def on_image(self, image: Image) -> Image:
@@ -253,61 +254,61 @@ class EmpiricalLaw(Effect):
             added = self._by_radius(charge.camera)
             return charge.add_laws(dark_current=lambda e_per_s, _: np.maximum(e_per_s + added, 0.0))
         if self.along == "radius x exposure":
-            rows, cols, pitch_um = charge.camera.rows, charge.camera.cols, charge.camera.pixel_pitch_um
-
-            def leak(down: FloatArray, across: FloatArray) -> FloatArray:
-                y, x = (down - 0.5) * (rows - 1) * pitch_um, (across - 0.5) * (cols - 1) * pitch_um
-                return self._at(np.hypot(y, x))
-
-            return charge.add_laws(leak_s=leak)
+            return charge.add_laws(leak_s=self._leak(charge.camera))
         if self.along == "exposure":
             return charge.add_laws(exposure_s=lambda asked_s: asked_s * (1.0 + float(self._at(np.asarray(asked_s)))))
         if self.along == "level":
             return charge.add_laws(variance_e2=lambda mean_e, variance: variance * (1.0 + self._at(mean_e)))
-        if self.at:
-            return charge
-        return charge.add_laws(collected=lambda electrons: electrons * self._even(electrons.shape, charge.camera))
+        if not self.at:
+            charge = charge.add_laws(collected=lambda electrons: electrons * self._even(electrons.shape, charge.camera))
+        return charge
+
+    def _leak(self, camera: CameraModel) -> Callable[[FloatArray, FloatArray], FloatArray]:
+        """Return the time in which light is collected besides, by the place down and across the frame, 0..1."""
+        down_um, across_um = ((n - 1) * camera.pixel_pitch_um for n in (camera.rows, camera.cols))
+        return lambda down, across: self._at(np.hypot((down - 0.5) * down_um, (across - 0.5) * across_um))
 
     def on_signal(self, signal: Signal) -> Signal:
         if self._acts("charge") and self.at and self.along in {"row", "column"}:
             # what isn't periodic acts by place: small tiles don't tell where in the frame they are
-            by_row, camera = self.along == "row", signal.camera
-            count = camera.rows if by_row else camera.cols
-            mean = float(np.mean(1.0 + self._by_line(count)))  # of the frame's gain: the camera's own
-
-            def gains(row: FloatArray, col: FloatArray) -> FloatArray:
-                return (1.0 + self._at(((row if by_row else col) + 0.5) / count)) / mean
-
-            return signal.add_laws(gains=gains)
+            return signal.add_laws(gains=self._gains(signal.camera))
         if not self._acts("signal"):
             return signal
-        if self.along == "level":
-            return signal.add_laws(response=lambda electrons: electrons * (1.0 + self._at(electrons)))
-        if self.along == "time":
-            gain = signal.camera.conversion_gain_dn_per_e
-            if self.of == "variance":
-                return signal.add_laws(noise_e2=lambda elapsed_s: max(float(self._at(np.asarray(elapsed_s))), 0.0))
-            return signal.add_laws(offset_dn=lambda elapsed_s, _: gain * float(self._at(np.asarray(elapsed_s))))
-        if self.along == "exposure":
-            gain = signal.camera.conversion_gain_dn_per_e
-            return signal.add_laws(exposure_offset_dn=lambda t: gain * float(self._at(np.asarray(t))))
+        gain = signal.camera.conversion_gain_dn_per_e
+        laws: dict[tuple[Along, Of], dict[str, Any]] = {
+            ("level", "mean"): {"response": lambda electrons: electrons * (1.0 + self._at(electrons))},
+            ("time", "variance"): {"noise_e2": lambda elapsed_s: max(float(self._at(np.asarray(elapsed_s))), 0.0)},
+            ("time", "mean"): {"offset_dn": lambda elapsed_s, _: gain * float(self._at(np.asarray(elapsed_s)))},
+            ("exposure", "mean"): {"exposure_offset_dn": lambda t: gain * float(self._at(np.asarray(t)))},
+        }
+        if (self.along, self.of) in laws:
+            return signal.add_laws(**laws[self.along, self.of])
         shape = signal.camera.rows, signal.camera.cols
         if self.along in {"row x level", "column x level"}:
-            bend, full_e = self._over(shape), signal.camera.full_well_e
+            return signal.add_laws(response=self._bend(shape, signal.camera.full_well_e))
+        return signal.add_laws(disturbances=self._pattern(signal.camera, shape))
 
-            def response(electrons: FloatArray) -> FloatArray:
-                # levels of a few points don't ask where they lie: its mean over the lines is 0
-                return electrons * (1.0 + bend * electrons / full_e) if np.shape(electrons) == shape else electrons
+    def _gains(self, camera: CameraModel) -> Callable[[FloatArray, FloatArray], FloatArray]:
+        """Return the factor on what is read by row and column, over its mean: the frame's gain is the camera's own."""
+        by_row = self.along == "row"
+        count = camera.rows if by_row else camera.cols
+        mean = float(np.mean(1.0 + self._by_line(count)))
+        return lambda row, col: (1.0 + self._at(((row if by_row else col) + 0.5) / count)) / mean
 
-            return signal.add_laws(response=response)
+    def _bend(self, shape: tuple[int, int], full_well_e: float) -> Callable[[FloatArray], FloatArray]:
+        """Return the response of a whole frame. Levels of a few points don't ask where they lie: over the lines its
+        mean change is none."""
+        bend = self._over(shape)
+        return lambda e: e * (1.0 + bend * e / full_well_e) if np.shape(e) == shape else e
+
+    def _pattern(self, camera: CameraModel, shape: tuple[int, int]) -> Disturbance:
+        """Return offsets or noise of lines, of cells or by the radius."""
         if self.of == "covariance":
-            by_row = self.along == "row"
-            shared = self._by_line(shape[0] if by_row else shape[1])
-            return signal.add_laws(disturbances=SharedNoise(np.maximum(shared, 0.0), 0 if by_row else 1))
-        change = self._by_radius(signal.camera) if self.along == "radius" else self._over(shape)
+            axis = 0 if self.along == "row" else 1
+            return SharedNoise(np.maximum(self._by_line(shape[axis]), 0.0), axis)
+        change = self._by_radius(camera) if self.along == "radius" else self._over(shape)
         none = np.zeros_like(change)
-        pattern = PatternNoise(change, none) if self.of == "mean" else PatternNoise(none, change)
-        return signal.add_laws(disturbances=pattern)
+        return PatternNoise(change, none) if self.of == "mean" else PatternNoise(none, change)
 
     def on_codes(self, codes: Codes) -> Codes:
         if not self._acts("codes"):
@@ -321,8 +322,8 @@ class EmpiricalLaw(Effect):
             above = np.asarray(dn, float) + 0.5 - self.first
             whole = np.floor(above / self.period) * self.period if self.period else np.zeros_like(above)
             within = above - whole
-            inside = np.interp(within, border, ideal)
-            moved = np.where(above >= 0.0, inside, within) if self.period else np.where((within >= 0) & (within <= ideal[-1]), inside, within)
+            counts = above >= 0.0 if self.period else (within >= 0.0) & (within <= ideal[-1])
+            moved = np.where(counts, np.interp(within, border, ideal), within)
             return np.asarray(whole + moved - 0.5 + self.first)
 
         return codes.add_laws(codes=convert)

@@ -9,11 +9,10 @@ from pydantic import Field
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
-from sim.effects.empirical_law import PatternNoise
 from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
-from sim.stages import Signal
+from sim.stages import PatternNoise, Signal
 
 #: Where an area may end, as shares of the side.
 BORDERS = (0.25, 0.5, 0.75)

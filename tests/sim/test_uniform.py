@@ -110,9 +110,9 @@ def _means_dn(camera: CameraModel, lamp: Spectrum, exposure: Exposure, acting: t
     electrons = model.electrons(
         rates, exposure.exposure_s, field=model.field(_every_pixel(camera)), elapsed_s=exposure.elapsed_s
     )
-    offset_dn = model.offset_dn(exposure.elapsed_s, None) + camera.conversion_gain_dn_per_e * float(
-        model.added_e.mean()
-    )
+    offset_dn = model.offset_dn(
+        exposure.elapsed_s, None, exposure.exposure_s
+    ) + camera.conversion_gain_dn_per_e * float(model.added_e.mean())
     return {c: float(dn) + offset_dn for c, dn in model.mean_dn(electrons).items()}
 
 

@@ -13,7 +13,7 @@ the table is one by code.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -42,14 +42,23 @@ from lab.diagnose.discovery.profile import (
     upper_forms,
     wave_forms,
 )
-from lab.diagnose.discovery.words import BEYOND_TABLE, entry, entry_unit, place_in_words, statement, suspects_of, unit_of
+from lab.diagnose.discovery.words import (
+    BEYOND_TABLE,
+    entry,
+    entry_unit,
+    place_in_words,
+    statement,
+    suspects_of,
+    unit_of,
+)
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.code_density import WIDEST
 from lab.diagnose.policy import DecisionPolicy
-from lab.formats.results import DiscoveredLaw
+from lab.formats.results import DiscoveredLaw, VetoedName
 from lab.measure.study import Study
 from sim.camera import Side
 from sim.effects.base import Effects
@@ -69,7 +78,8 @@ LEAST_GAIN, PREDICTED_SHARE = 4.0, 0.5
 MOST_BY_CODE = 4096  # entries of a table by code
 MOST_LAWS = 6  # along indices, one after the other
 MOST_CURVES = 2  # laws along coordinates, one after the other
-#: Description length by which a form of fewer numbers may be longer and is told, and another place in the chain, beside.
+#: Description length by which a form of fewer numbers may be longer and is told, and another place in the chain told
+#: beside.
 EQUAL_LENGTH = 6.0
 
 
@@ -394,17 +404,44 @@ def _curve_forms(look: Look) -> Iterator[Form]:
 # --- names in whose place a law stands --------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Superseded:
+    """A name in whose place a law stands: chi2 of the seen and of the held-out numbers, with the name and with the
+    law."""
+
+    candidate: Candidate
+    law: PredictiveTable
+    with_name: tuple[float, float]
+    with_law: tuple[float, float]
+
+    def told(self, side: Side, model: MeasurementModel) -> VetoedName:
+        """Return it as a result."""
+        name, place = self.candidate.told_name, place_in_words(self.law.look)
+        return VetoedName(
+            side=side,
+            name=name,
+            probability=self.candidate.probability,
+            captures=model.captures(True),
+            chi2_before=self.with_law[1],
+            chi2_after=self.with_name[1],
+            n=int((~model.seen).sum()),
+            statement=f"{name} is not named for the {side} camera: a law of the {place} in its place takes chi2 of all "
+            f"{len(model.value)} numbers from {sum(self.with_name):.0f} to {sum(self.with_law):.0f}, and that of the "
+            f"held-out ones from {self.with_name[1]:.0f} to {self.with_law[1]:.0f}.",
+        )
+
+
 def superseded(
     study: Study, verdict: Verdict, found: Sequence[PredictiveTable], policy: DecisionPolicy
-) -> dict[str, PredictiveTable]:
-    """Return the named effects in whose place a discovered law predicts more, each with the law.
+) -> dict[str, Superseded]:
+    """Return the named effects in whose place a discovered law predicts more, by name.
 
     A law of another quantity of the chain supersedes a name where, in its place, chi2 of all captures is lower by
     `superseding_chi2` and twice its numbers, and that of the held-out ones isn't higher. A law of the same quantity is
     no rival of a listed one, but where it was found beside it, too, and makes it needless.
     """
     model, effects = verdict.model, verdict.effects
-    lost = {}
+    lost: dict[str, Superseded] = {}
     for candidate in verdict.named:
         if candidate.members:
             continue
@@ -420,14 +457,15 @@ def superseded(
         elsewhere = [
             one
             for one in elsewhere
-            if not any(_is_at(one.look, other.look) for other in found) and not changed & list_changes(law_of(one, study))
+            if not any(_is_at(one.look, other.look) for other in found)
+            and not changed & list_changes(law_of(one, study))
         ]
         for law in (*beside, *elsewhere):
             with_law = (*others, law_of(law, study))
             least = policy.superseding_chi2 + 2.0 * law.form.numbers if law in elsewhere else 0.0
             named, instead = (_chi2_of(model, one) for one in (effects, with_law))
             if instead[1] <= named[1] and sum(instead) <= sum(named) - least:
-                lost[name] = law
+                lost[name] = Superseded(candidate, law, named, instead)
                 break
     return lost
 

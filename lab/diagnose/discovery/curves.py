@@ -82,7 +82,8 @@ def curve_looks(
         stage, along, of = place
         yield Look(
             stage, along, _profile(white), held_out, of=of, at=tuple(x.tolist()), known=tuple(known.tolist()),
-            shown_in=shown, channels=tuple(model.camera.channels), is_of_measurements=True, is_own_axis=AXES.get(along) in own_axes,
+            shown_in=shown, channels=tuple(model.camera.channels), is_of_measurements=True,
+            is_own_axis=AXES.get(along) in own_axes,
         )  # fmt: skip
 
 

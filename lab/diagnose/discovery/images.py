@@ -68,14 +68,21 @@ class _Sums:
 
     def add_contrast(self, away: Image) -> None:
         """Add a difference of frames with the variance of one; what rows and columns share is no part of it."""
-        std = robust_std(away)
-        away = np.clip(away, -CLIP * std, CLIP * std)
-        away -= away.mean(axis=1, keepdims=True)
-        away -= away.mean(axis=0, keepdims=True)
+        away = _pixels_alone(away)
         self.contrasts += 1
         self.squares += np.square(away)
         self.below += away[:-1] * away[1:]
         self.right += away[:, :-1] * away[:, 1:]
+
+
+def _pixels_alone(away: Image) -> Image:
+    """Return a difference of frames with outlying pixels at `CLIP` standard deviations, less what rows and columns
+    share."""
+    std = robust_std(away)
+    clipped = np.clip(away, -CLIP * std, CLIP * std)
+    clipped -= clipped.mean(axis=1, keepdims=True)
+    clipped -= clipped.mean(axis=0, keepdims=True)
+    return clipped
 
 
 def dark_images(study: Study) -> dict[bool, DarkImages]:
@@ -126,11 +133,12 @@ def _joined(study: Study, sums: Sequence[tuple[float, _Sums]]) -> DarkImages:
     weight /= weight.sum()
     middle = float(weight @ exposure_s)
     spread = float(weight @ np.square(exposure_s - middle))
-    mean = sum(np.float32(w) * one.mean for w, (_, one) in zip(weight, sums, strict=True))
+    means = np.stack([one.mean for _, one in sums])
+    mean = np.tensordot(weight.astype(np.float32), means, 1)
     offset, slope = mean, None
     if spread > 0.0:
         by_time = weight * (exposure_s - middle) / spread
-        slope = _clipped(sum(np.float32(w) * one.mean for w, (_, one) in zip(by_time, sums, strict=True)))
+        slope = _clipped(np.tensordot(by_time.astype(np.float32), means, 1))
         offset = mean - np.float32(middle) * slope
     images = DarkImages(_clipped(mean), _clipped(offset), slope)
     paired = [one for _, one in sums if one.contrasts]
@@ -206,9 +214,8 @@ def _regressed(
         if offsets_dn is not None:
             frame -= offsets_dn
         for plane in mosaic.planes(frame, study.camera.cfa).values():
-            plane /= np.float32(plane.mean(dtype=float))
-        for term, weight in zip(total, weights, strict=True):
-            term += np.float32(weight[k]) * frame
+            np.divide(plane, np.float32(plane.mean(dtype=float)), out=plane)
+        total += np.array([weight[k] for weight in weights], np.float32)[:, None, None] * frame
     for term in total:
         for plane in mosaic.planes(term, study.camera.cfa).values():
             plane[...] = _clipped(plane)
@@ -278,18 +285,15 @@ def noise_by_time(study: Study) -> NoiseByTime | None:
             share[place[capture.id]] = k / (k + 1.0)
             away *= np.float32(np.sqrt(k / (k + 1.0)))
             for plane in mosaic.planes(away, study.camera.cfa).values():
-                std = robust_std(plane)
-                np.clip(plane, -CLIP * std, CLIP * std, out=plane)
-                plane -= plane.mean(axis=1, keepdims=True)
-                plane -= plane.mean(axis=0, keepdims=True)
+                plane[...] = _pixels_alone(plane)
             own = capture.exposure_s if capture.kind == "dark" and capture.exposure_s > shortest_s else 0.0
             rows.append((float(np.mean(np.square(away), dtype=float)), share, level, square, own, capture.id in out))
     if not rows:
         return None
-    variance, shares, level, square, dark, held_out = (np.array(column) for column in zip(*rows, strict=True))
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
     elapsed_s = np.array([study.elapsed_s(c) for c in every])
     pixels = float((study.camera.rows - 2) * (study.camera.cols - 2))
-    return NoiseByTime(variance, pixels, shares, elapsed_s, level, square, dark, held_out)
+    return NoiseByTime(columns[0], pixels, columns[1], elapsed_s, *columns[2:])
 
 
 def _held_out(study: Study, group: Sequence[Any], number: int, groups: int) -> set[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, cast
 
@@ -11,7 +11,7 @@ from scipy import ndimage, sparse
 from scipy.linalg import helmert
 from scipy.signal import savgol_coeffs
 
-from lab.diagnose.discovery.images import DarkImages, dark_images, flat_images, noise_by_time
+from lab.diagnose.discovery.images import DarkImages, Image, dark_images, flat_images, noise_by_time
 from lab.diagnose.discovery.profile import Look, Profile
 from lab.diagnose.measurements.code_density import CodeCounts, counted, counted_in_all, prepared, widths
 from lab.diagnose.measurements.dark_readout import dark_readout
@@ -157,13 +157,13 @@ def _per_second(study: Study, dark: dict[bool, DarkImages], effects: Effects) ->
     return {out: np.asarray(one.per_second - own, float) for out, one in dark.items() if one.per_second is not None}
 
 
-def _part(dark: dict[bool, DarkImages], name: str) -> dict[bool, FloatArray]:
+def _part(dark: dict[bool, DarkImages], name: Literal["variance", "below", "right"]) -> dict[bool, Image]:
     """Return the variances or covariances of dark frames, over the variance of most pixels."""
     found = {}
     for out, one in dark.items():
         image = getattr(one, name)
-        if image is not None:
-            found[out] = np.asarray(image / np.mean(one.variance), float)
+        if image is not None and one.variance is not None:
+            found[out] = image / float(np.mean(one.variance, dtype=float))
     return found
 
 
@@ -171,7 +171,7 @@ def _lines_of(
     study: Study,
     stage: Stage,
     of: Of,
-    images: dict[bool, FloatArray],
+    images: Mapping[bool, Image],
     step: int,
     *,
     times: str = "",
@@ -197,7 +197,7 @@ def _lines_of(
             yield Look(stage, along, whole[False], whole.get(True), of=of, step=step, shown_in=shown, is_whole=True)
 
 
-def _cells_of(study: Study, stage: Stage, images: dict[bool, FloatArray]) -> Iterator[Look]:
+def _cells_of(study: Study, stage: Stage, images: Mapping[bool, Image]) -> Iterator[Look]:
     """Yield the looks within cells of rows and columns."""
     step = mosaic.step(study.camera.cfa)
     for cell in CELLS if False in images else ():
@@ -213,7 +213,7 @@ def _cells_of(study: Study, stage: Stage, images: dict[bool, FloatArray]) -> Ite
 
 
 def _places_of(
-    study: Study, stage: Stage, along: Along, images: dict[bool, FloatArray], *, field: bool = False
+    study: Study, stage: Stage, along: Along, images: Mapping[bool, Image], *, field: bool = False
 ) -> Iterator[Look]:
     """Yield the look at images along the radius, or along the angle about the sensor's centre.
 
@@ -280,14 +280,14 @@ def _noise_times(study: Study) -> Iterator[Look]:
         )  # fmt: skip
 
 
-def _place_means(image: FloatArray) -> FloatArray:
+def _place_means(image: Image) -> FloatArray:
     """Return the means over `PLACES_A_SIDE` x `PLACES_A_SIDE` parts of an image."""
     row, col = (np.linspace(0, n, PLACES_A_SIDE + 1).astype(int) for n in image.shape)
     total = np.add.reduceat(np.add.reduceat(image.astype(float), row[:-1], 0), col[:-1], 1)
     return np.asarray(total / np.outer(np.diff(row), np.diff(col)))
 
 
-def _rough_lines(image: FloatArray, along: str, cfa: Cfa) -> Profile | None:
+def _rough_lines(image: Image, along: str, cfa: Cfa) -> Profile | None:
     """Return the profile of an image (rows, cols) along its rows or columns, each plane of the mosaic by itself.
 
     The filter takes a running polynomial out. The variance is the square of the residuals' robust spread.
@@ -316,13 +316,13 @@ def _rough_lines(image: FloatArray, along: str, cfa: Cfa) -> Profile | None:
     return Profile(np.concatenate(index), left, variance, every, np.concatenate(noise))
 
 
-def _pixel_variance(plane: FloatArray) -> float:
+def _pixel_variance(plane: Image) -> float:
     """Return the variance of single pixels beside what their rows and columns share."""
     twice = plane[:-1, :-1] - plane[1:, :-1] - plane[:-1, 1:] + plane[1:, 1:]
     return float(np.mean(np.square(twice))) / 4.0
 
 
-def _whole_lines(image: FloatArray, along: str, *, bent: bool) -> Profile:
+def _whole_lines(image: Image, along: str, *, bent: bool) -> Profile:
     """Return the profile of the means of rows or columns less their mean, in at most `MOST_LINES` groups.
 
     bent : whether light may change them along the frame: beside the lines may stand a curve of fourth degree
@@ -356,7 +356,7 @@ def _polynomial_filter(count: int) -> sparse.csr_array | None:
     return sparse.csr_array(sparse.eye_array(count) - smooth)
 
 
-def _within_cells(study: Study, image: FloatArray, cell: tuple[int, int]) -> Profile | None:
+def _within_cells(study: Study, image: Image, cell: tuple[int, int]) -> Profile | None:
     """Return how pixels differ by their place in a cell (rows, columns) of a plane of the mosaic.
 
     The means of the cell's pixels over each of `STRIPS` strips of the frame, in Helmert's contrasts, which are

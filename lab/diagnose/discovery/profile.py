@@ -105,10 +105,10 @@ class Look:
     """The profiles of one quantity along one index: of the captures that the search may use, and of those held out.
 
     `at`: the points of a curve, in the coordinate's unit; none along an index. `known`: those at which there are seen
-    numbers. `channels`: of curves by channel. `columns`: of a table by row and column, the period of the columns. `step`: lines of a period of the
-    mosaic. `shown_in`: measurements that the quantity is part of. `is_own_axis`: whether a mismatched one of them is
-    stated along it. `is_whole`: whether it is the whole course, not what a filter leaves of it.
-    `is_of_measurements`: whether the numbers are those of the measurements, with their covariance.
+    numbers. `channels`: of curves by channel. `columns`: of a table by row and column, the period of the columns.
+    `step`: lines of a period of the mosaic. `shown_in`: measurements that the quantity is part of. `is_own_axis`:
+    whether a mismatched one of them is stated along it. `is_whole`: whether it is the whole course, not what a filter
+    leaves of it. `is_of_measurements`: whether the numbers are those of the measurements, with their covariance.
     """
 
     stage: Stage
@@ -238,7 +238,9 @@ def chi2_within(profile: Profile, table: Table) -> tuple[float, float, int]:
 def description_length(profile: Profile, table: Table | PredictiveTable) -> float:
     """Return n ln chi2 + k ln n + 2 ln(alternatives) of a table with k numbers."""
     n, form = len(profile.residual), table.form
-    return float(n * np.log(profile.chi2(table.over(profile.count))) + form.numbers * np.log(n) + 2.0 * np.log(form.tried))
+    return float(
+        n * np.log(profile.chi2(table.over(profile.count))) + form.numbers * np.log(n) + 2.0 * np.log(form.tried)
+    )
 
 
 # --- forms along an index --------------------------------------------------------------------------------------------

@@ -123,9 +123,14 @@ def entry(look: Look) -> Entry:
 
 def entry_unit(look: Look) -> str:
     """Return the unit of a look's departures."""
-    unit = UNITS.get((look.stage, look.along, look.of))
-    if unit is None and look.stage == "signal" and look.of == "mean" and not look.along.endswith("level"):
-        unit = "e" if look.at else "DN"
+    return departure_unit(look.stage, look.along, look.of, bool(look.at))
+
+
+def departure_unit(stage: str, along: str, of: str, is_curve: bool) -> str:
+    """Return the unit of a law's departures from no change, "%" of shares."""
+    unit = UNITS.get((stage, along, of))
+    if unit is None and stage == "signal" and of == "mean" and not along.endswith("level"):
+        unit = "e" if is_curve else "DN"
     return unit or "%"
 
 

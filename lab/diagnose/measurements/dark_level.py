@@ -96,7 +96,8 @@ def dark_level_block(study: Study) -> Block:
         covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse,
         coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
-        reads=LAG | DARK_CURRENT | {"signal.offset_dn", "signal.exposure_offset_dn", "codes.codes"}, scattered_by=LINES, predict=predict,
+        reads=LAG | DARK_CURRENT | {"signal.offset_dn", "signal.exposure_offset_dn", "codes.codes"},
+        scattered_by=LINES, predict=predict,
         scale=np.ones(len(value)),
     )  # fmt: skip
 

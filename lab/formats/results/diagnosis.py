@@ -120,13 +120,14 @@ class DiscoveredLaw(Frozen):
     in the improved model as `empirical_law`.
 
     `stage`, `along`, `of`, `period`, `columns`, `first`, `at` and `table` are those of that effect. `form` is that in
-    which it was found (`periodic`, `by index`, `wave`, `decay`, `step`, `line`, `knee`, `bump`, `formula`, `curve`). `shown_departure`
-    is the shortest table that does nearly as well, by index mod `shown_period` (0: by index, or by `at`): departures
-    from no change, relative, or in DN or e (offsets of stage `signal`), with their standard deviations. chi2 is of the
-    `n` numbers along the index in held-out captures (in the captures themselves where none are held out), without and
-    with the law; of images (rows, columns, places, variances), whose patterns stand for the noise, of the table's own
-    numbers. `own_chi2_before`, `own_chi2_after` and `own_n` are those of the table's own numbers throughout: of the
-    means of its classes. `measurements`: those that it shows in. `suspects`: what physics may do it; none of them is a name.
+    which it was found (`periodic`, `by index`, `wave`, `decay`, `step`, `line`, `knee`, `bump`, `formula`, `curve`).
+    `shown_departure` is the shortest table that does nearly as well, by index mod `shown_period` (0: by index, or by
+    `at`): departures from no change, relative, or in DN or e (offsets of stage `signal`), with their standard
+    deviations. chi2 is of the `n` numbers along the index in held-out captures (in the captures themselves where none
+    are held out), without and with the law; of images (rows, columns, places, variances), whose patterns stand for the
+    noise, of the table's own numbers. `own_chi2_before`, `own_chi2_after` and `own_n` are those of the table's own
+    numbers throughout: of the means of its classes. `measurements`: those that it shows in. `suspects`: what physics
+    may do it; none of them is a name.
     """
 
     side: Side

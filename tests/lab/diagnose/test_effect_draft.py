@@ -61,14 +61,19 @@ def _law(stage: str, along: str, of: str) -> DiscoveredLaw:
     """A law of some per cent, or some electrons, at one place of the chain."""
     none, rng = PLACES[stage, along, of][1], np.random.default_rng(3)  # type: ignore[index]
     departure = np.append(0.0, 0.05 * rng.random(5)) if none else np.append(0.0, 3.0 * rng.random(5))
-    reach = {"level": 8000.0, "radius": 400.0, "time": 900.0, "frequency": 0.2}.get(along, 1.0)
+    reach = {"level": 8000.0, "radius": 400.0, "time": 900.0, "frequency": 0.2, "angle": 360.0, "plane x time": 900.0,
+             "radius x exposure": 400.0}.get(along, 1.0)  # fmt: skip
+    if along == "radius x exposure":
+        departure = 1e-5 * departure
+    if along == "angle":
+        departure[-1] = departure[0]
     at: tuple[float, ...] = tuple(np.linspace(0.0, reach, 6).tolist())
     period = columns = 0
     if along == "wavelength":
         at = tuple(np.linspace(400.0, 700.0, 6).tolist())
     if along == "row and column":
         period, columns, departure = 4, 4, np.tile(0.05 * rng.standard_normal(4), 4) * (1.0 if none else 50.0)
-    if along in {"code", "row", "column"}:
+    if along in {"code", "row", "column", "row x level", "column x level"}:
         period = 6
     if period:
         at = ()

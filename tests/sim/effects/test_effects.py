@@ -33,7 +33,7 @@ from sim.scene.scenes import Darkness, EdgeRegion, KnifeEdge, PlanarTarget, Poin
 from sim.sensor.mosaic import PERIOD_PX
 from sim.sensor.mosaic import phases as mosaic_phases
 from sim.spectrum import Spectrum
-from sim.stages import charge_of, signal_of
+from sim.stages import charge_of, light_of, signal_of
 from sim.uniform import Uniform, electron_rate
 
 ALL = list(effects().values())
@@ -89,9 +89,10 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     place = np.linspace(-40.0, 40.0, 5)
     one = Uniform(CAMERA, acting)
     moved = displaced_um(CAMERA, place, 0.5 * place, 620.0, acting)
-    rest = [one.source(600.0), one.collected_s(0.02), one.ambient_e("G", 1.0) / 1e3, one.offset_dn(600.0, 30.0),
+    rest = [one.source(600.0), one.collected_s(0.02), one.ambient_e("G", 1.0) / 1e3, one.offset_dn(600.0, 30.0, 0.02),
             float(one.shot_e2(np.array(9e3))), even_share(CAMERA, acting), sum(h[0] for h in halos(CAMERA, acting)),
-            1e3 * one.unsteadiness**2,
+            1e3 * one.unsteadiness**2, *(light_of(CAMERA, acting).colour(c, 600.0) for c in "RGB"),
+            signal_of(CAMERA, acting).changing_e2(600.0),
             *one.shade_light(np.ones(5), place, place),
             *np.ravel(np.zeros(10) if moved is None else moved)]  # fmt: skip
     # what acts on dark pixels, on the frame after, and on the read-out, in electrons or DN

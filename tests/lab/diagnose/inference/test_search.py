@@ -111,7 +111,7 @@ def _model(truth: Sequence[Effect], rng: np.random.Generator) -> MeasurementMode
     camera = _camera()
 
     def line(acting: Sequence[Effect]) -> FloatArray:
-        return np.array([Uniform(camera, acting).offset_dn(float(x), None) for x in X])
+        return np.array([Uniform(camera, acting).offset_dn(float(x), None, 0.01) for x in X])
 
     block = Block(
         measurement=declared("dark", "time", "s"), reach=0.2, value=line(truth) + NOISE * rng.standard_normal(X.size),
