@@ -75,6 +75,8 @@ NEARLY_ALL = 0.95
 BESIDE_LINES, SHARP_SHARE = 2, 0.75
 #: Least gain in chi2, and share of what a law says of captures that it wasn't taken from.
 LEAST_GAIN, PREDICTED_SHARE = 4.0, 0.5
+OTHER_HALF_SHARE = 0.15
+LEAST_SAID = 1.0  # expected fall of chi2 below which captures say nothing of a law
 MOST_BY_CODE = 4096  # entries of a table by code
 MOST_LAWS = 6  # along indices, one after the other
 MOST_CURVES = 2  # laws along coordinates, one after the other
@@ -116,7 +118,7 @@ def discover(
 def _exceeds_tolerance(one: PredictiveTable, policy: DecisionPolicy) -> bool:
     """Return whether a law takes `least_discovery_share` off chi2 where a named effect acts on the same quantity: less
     may be what that effect's law lacks."""
-    judge = one.look.held_out or one.look.seen
+    judge = _judge(one.look, one)
     before = judge.chi2(np.zeros(1))
     return before - judge.chi2(one.over(judge.count)) >= policy.least_discovery_share * before
 
@@ -208,7 +210,9 @@ def _gain(one: PredictiveTable) -> float:
 def _takes_enough(one: PredictiveTable, policy: DecisionPolicy) -> bool:
     """Return whether it takes at least `least_discovery_share` of what isn't noise off chi2, and half of what it says
     of the captures that judge it."""
-    judge = one.look.held_out or one.look.seen
+    if float(np.ptp(one.departure)) < one.look.least:
+        return False
+    judge = _judge(one.look, one)
     said = judge.said_by(one.over(judge.count))
     return _gain(one) >= max(policy.least_discovery_share * judge.excess, PREDICTED_SHARE * said, LEAST_GAIN)
 
@@ -236,13 +240,13 @@ def _smallest_cells(found: Sequence[PredictiveTable]) -> list[PredictiveTable]:
 
 
 def _predicts_other_half(profile: Profile, form: Form) -> bool:
-    """Return whether a form fitted to each half of the index lowers chi2 of the other half: a few outlying lines
-    don't."""
+    """Return whether a form fitted to each half of the index lowers chi2 of the other half by `OTHER_HALF_SHARE` of
+    what it says of it: a few outlying lines don't, nor what is alike over some lines alone."""
     if form.first:
         profile = profile.part(profile.index >= form.first)
     for one, other in ((profile.low, ~profile.low), (~profile.low, profile.low)):
         table, judge = fitted(profile.part(one), form).over(profile.count), profile.part(other)
-        if judge.chi2(table) >= judge.chi2(np.zeros(1)):
+        if judge.chi2(np.zeros(1)) - judge.chi2(table) < OTHER_HALF_SHARE * judge.said_by(table):
             return form.name == "step" and not form.period and _lies_in_one_half(profile, form)
     return True
 
@@ -268,11 +272,18 @@ def _lies_in_one_half(profile: Profile, form: Form) -> bool:
 def _judged(look: Look, table: Table) -> PredictiveTable:
     """Return the table with chi2 of the captures held out; of the seen ones where none are. Of images, whose patterns
     stand for the noise, it is that of the table's own numbers."""
-    judge = look.held_out or look.seen
+    judge = _judge(look, table)
     chi2 = own = chi2_within(judge, table)
     if look.stage == "codes" or look.is_of_measurements:
         chi2 = judge.chi2(np.zeros(1)), judge.chi2(table.over(judge.count)), len(judge.residual)
     return PredictiveTable(look, table.form, table.departure, table.std, table.log_probability, chi2, own, table.said)
+
+
+def _judge(look: Look, table: Table | PredictiveTable) -> Profile:
+    """Return the captures held out, or the seen ones where a table says nothing of those."""
+    held_out = look.held_out
+    is_silent = held_out is None or held_out.said_by(table.over(held_out.count)) < LEAST_SAID
+    return look.seen if held_out is None or is_silent else held_out
 
 
 def _by_code(look: Look, periodic: PredictiveTable | None, policy: DecisionPolicy) -> PredictiveTable | None:

@@ -141,7 +141,7 @@ def _joined(study: Study, sums: Sequence[tuple[float, _Sums]]) -> DarkImages:
         slope = _clipped(np.tensordot(by_time.astype(np.float32), means, 1))
         offset = mean - np.float32(middle) * slope
     images = DarkImages(_clipped(mean), _clipped(offset), slope)
-    paired = [one for _, one in sums if one.contrasts]
+    paired = [one for _, one in sums if one.contrasts and one.squares.any()]
     if not paired:
         return images
     by_noise = np.array([one.contrasts**2 / float(np.mean(one.squares)) ** 2 for one in paired])
@@ -166,10 +166,12 @@ class FlatImages:
 
     bend     1 + a + b s / s_full: b, of the square of the signal, at full well
     fixed_s  1 + a + c / t: c, s, the time in which light is collected besides, whatever is asked for
+    greatest_dn_per_s  signal over exposure
     """
 
     bend: Image
     fixed_s: Image | None
+    greatest_dn_per_s: float
 
 
 def flat_images(study: Study) -> dict[bool, FlatImages]:
@@ -183,6 +185,8 @@ def flat_images(study: Study) -> dict[bool, FlatImages]:
         return study.lamps.get(capture.radiance, -1), (capture.gain_db or 0.0) == study.usual_gain_db
 
     lamps = [lamp_of(c) for u in levels for c in u.captures]
+    if not lamps:
+        return {}
     usual = max(dict.fromkeys(lamps), key=lamps.count)
     dark = study.once(dark_readout)
     full_dn = study.saturation_dn - study.noise.black
@@ -219,7 +223,8 @@ def _regressed(
     for term in total:
         for plane in mosaic.planes(term, study.camera.cfa).values():
             plane[...] = _clipped(plane)
-    return FlatImages(total[0], total[1] if np.ptp(inverse) > 0.0 else None)
+    fixed_s = total[1] if np.ptp(inverse) > 0.0 else None
+    return FlatImages(total[0], fixed_s, float(np.max(signal * full_dn * inverse)))
 
 
 def _slope(x: FloatArray, weight: FloatArray) -> FloatArray:

@@ -39,6 +39,7 @@ SMOOTHED_CELLS = 4  # cells a side of the box whose mean is taken out
 LEAST_STRIPS = 4
 PLACES_A_SIDE, RADII, ANGLES = 16, 12, 24  # parts of a side whose means are looked at; points of their curves
 LEAST_TIMES, MOST_TIMES = 8, 24  # from which on noise is looked at by time; points of its curve
+LEAST_OFFSET_DN = 0.1  # of a flat, by which offsets in light may differ from those in the dark
 NOISE_FLOOR = 1e-3  # relative standard deviation of a variance beside that of its pixels
 MOST_LINES = 512  # groups of lines whose whole course is looked at
 #: Measurements that the quantities are part of, by stage.
@@ -69,7 +70,9 @@ def index_looks(study: Study, effects: Effects) -> Iterator[Look]:
     bend = {out: one.bend for out, one in lit.items()}
     yield from _lines_of(study, "signal", "mean", bend, step, times=" x level")
     fixed_s = {out: one.fixed_s for out, one in lit.items() if one.fixed_s is not None}
-    yield from _places_of(study, "charge", "radius x exposure", fixed_s)
+    # a pattern of offsets that is another in light is one of time where the signal goes by the exposure
+    least_s = LEAST_OFFSET_DN / lit[False].greatest_dn_per_s if False in lit else 0.0
+    yield from _places_of(study, "charge", "radius x exposure", fixed_s, least=least_s)
 
 
 def _codes(study: Study, effects: Effects) -> Iterator[Look]:
@@ -213,11 +216,18 @@ def _cells_of(study: Study, stage: Stage, images: Mapping[bool, Image]) -> Itera
 
 
 def _places_of(
-    study: Study, stage: Stage, along: Along, images: Mapping[bool, Image], *, field: bool = False
+    study: Study,
+    stage: Stage,
+    along: Along,
+    images: Mapping[bool, Image],
+    *,
+    field: bool = False,
+    least: float = 0.0,
 ) -> Iterator[Look]:
     """Yield the look at images along the radius, or along the angle about the sensor's centre.
 
     field : whether light and lens may change the image: beside it may stand x, y, r^2 and r^4
+    least : range of departures below which nothing is told
     """
     rows, cols = study.camera.rows, study.camera.cols
     if False not in images or min(rows, cols) < 4 * PLACES_A_SIDE:
@@ -247,7 +257,7 @@ def _places_of(
         every = Profile(half, cells.ravel(), np.full(cells.size, variance), matrix)
         found[out] = every.beside(np.stack(beside, axis=1))
     points = tuple(at.tolist())
-    yield Look(stage, along, found[False], found.get(True), at=points, known=points, is_whole=True)
+    yield Look(stage, along, found[False], found.get(True), at=points, known=points, least=least, is_whole=True)
 
 
 def _noise_times(study: Study) -> Iterator[Look]:

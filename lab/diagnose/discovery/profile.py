@@ -11,6 +11,7 @@ from math import comb
 import numpy as np
 from scipy import sparse
 from scipy.optimize import minimize
+from scipy.special import betaln
 from scipy.stats import f as f_distribution
 
 from sim.effects.empirical_law import Along, Of, Stage
@@ -21,7 +22,7 @@ PERIODS = tuple(range(2, 65))
 FEW_CLASSES, FEW_FROM = 2, 8
 UPPER_PERIODS = (2, 4, 8, 16)  # of tables that begin within the index
 LEAST_REPEATS = 6  # of a period over the index
-LEAST_WAVES, LEAST_PERIOD = 5.0, 3  # waves over the index, and lines of a wave
+LEAST_WAVES, LEAST_PERIOD = 3.0, 3  # waves over the index, and lines of a wave
 MOST_ORDERS = 4  # waves about the sensor's centre
 END_LENGTHS = 24  # lengths of a decay that are tried
 #: Eigenvalues of a form's normal equations, over the largest, below which its numbers aren't determined.
@@ -106,7 +107,7 @@ class Look:
 
     `at`: the points of a curve, in the coordinate's unit; none along an index. `known`: those at which there are seen
     numbers. `channels`: of curves by channel. `columns`: of a table by row and column, the period of the columns.
-    `step`: lines of a period of the mosaic. `shown_in`: measurements that the quantity is part of. `is_own_axis`:
+    `step`: lines of a period of the mosaic. `least`: range of departures below which nothing is told. `shown_in`: measurements that the quantity is part of. `is_own_axis`:
     whether a mismatched one of them is stated along it. `is_whole`: whether it is the whole course, not what a filter
     leaves of it. `is_of_measurements`: whether the numbers are those of the measurements, with their covariance.
     """
@@ -122,6 +123,7 @@ class Look:
     step: int = 1
     shown_in: frozenset[str] = frozenset()
     channels: tuple[str, ...] = ()
+    least: float = 0.0
     is_own_axis: bool = False
     is_whole: bool = False
     is_of_measurements: bool = False
@@ -217,9 +219,18 @@ def fitted(profile: Profile, form: Form) -> Table:
     said = form.say(coefficients) if form.say is not None else ""
     if rank == 0 or len(value) <= rank or after >= before:
         return Table(form, departure, std, 0.0, said)
-    ratio = (before - after) / rank / (after / freedom)
-    log_p = float(f_distribution.logsf(ratio, rank, freedom)) + np.log(form.tried / form.share)
+    log_p = _log_chance(before, after, rank, freedom) + np.log(form.tried / form.share)
     return Table(form, departure, std, min(log_p, 0.0), said)
+
+
+def _log_chance(before: float, after: float, rank: int, freedom: int) -> float:
+    """Return ln of the probability that chance takes as much off a sum of squares (F test)."""
+    log_p = float(f_distribution.logsf((before - after) / rank / (after / freedom), rank, freedom))
+    if np.isfinite(log_p):
+        return log_p
+    # the incomplete beta function's first term, for what is too small for a number
+    a, b, share = 0.5 * freedom, 0.5 * rank, after / before
+    return float(a * np.log(share) + b * np.log1p(-share) - np.log(a) - betaln(a, b))
 
 
 def chi2_within(profile: Profile, table: Table) -> tuple[float, float, int]:

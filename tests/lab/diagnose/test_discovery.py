@@ -28,6 +28,20 @@ from mocks.former.laws import (
     TapOffsetLaw,
     TreeRingsLaw,
 )
+from mocks.former.unlisted import (
+    BankNoiseLaw,
+    CoarseTopLaw,
+    FirstRowsLaw,
+    LeafShutterLaw,
+    RingCodesLaw,
+    RowBanksLaw,
+    SaddleShadingLaw,
+    SharedCellLaw,
+    SharedReadLaw,
+    WarmCentreLaw,
+    WarmingNoiseLaw,
+    WavyColumnsLaw,
+)
 from sim.effects.column_noise import ColumnNoise
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -315,3 +329,44 @@ def test_the_codes_of_a_real_ccd_repeat_every_four(tmp_path: Path) -> None:
     before, after, n = codes.chi2
     assert before / n > 20.0
     assert after / n < 3.0
+
+
+@pytest.mark.parametrize(
+    ("law", "place", "period"),
+    [
+        (WavyColumnsLaw(0.5), ("charge", "column", "mean"), None),
+        (SharedCellLaw(0.5), ("charge", "row and column", "mean"), None),
+        (RowBanksLaw(0.5), ("signal", "row", "mean"), 8),
+        (FirstRowsLaw(2.0), ("signal", "row", "mean"), None),
+        (BankNoiseLaw(3.0), ("signal", "column", "variance"), 2),
+        (SharedReadLaw(3.0), ("signal", "row", "covariance"), 2),
+        (WarmCentreLaw(20.0), ("charge", "radius", "mean"), None),
+        (SaddleShadingLaw(2.0), ("image", "angle", "mean"), None),
+        (LeafShutterLaw(20.0), ("charge", "radius x exposure", "mean"), None),
+        (RingCodesLaw(0.2), ("codes", "code", "mean"), 10),
+        (CoarseTopLaw(0.5), ("codes", "code", "mean"), 2),
+    ],
+    ids=lambda value: value.name if isinstance(value, Law) else None,
+)
+@pytest.mark.parametrize("cfa", ["MONO", "RGGB"])
+def test_a_law_of_the_former_is_found_at_its_place(
+    law: Law, place: tuple[str, str, str], period: int | None, cfa: str
+) -> None:
+    """Strong laws that no list has: each along its own index, first of all that is told."""
+    first = _found(recordings_of(ConcealedCamera(772302, (law,), cfa=cfa, rows=96, cols=128), LIT_AND_DARK))[0]
+    assert (first.look.stage, first.look.along, first.look.of) == place
+    assert period is None or (*first.shorter, first)[0].period == period
+    before, after, n = first.own
+    assert before - after > 0.8 * (before - n)
+
+
+def test_noise_that_grows_with_the_time_is_found() -> None:
+    """Read noise whose variance grows by 16 e^2 in ten minutes: within four standard deviations of the line."""
+    camera = ConcealedCamera(772302, (WarmingNoiseLaw(4.0),), cfa="MONO", rows=96, cols=128)
+    recordings = recordings_of(camera, Plan())
+    one = _found(recordings)[0]
+    assert (one.look.stage, one.look.along, one.look.of) == ("signal", "time", "variance")
+    law = law_of(one, study_of(recordings, "left"))
+    slope = (law.table[-1] - law.table[0]) / (law.at[-1] - law.at[0])
+    std = 4.0 * float(one.std.max()) / study_of(recordings, "left").noise.gain ** 2 / (law.at[-1] - law.at[0])
+    assert slope == pytest.approx(16.0 / 600.0, abs=max(std, 0.1 * 16.0 / 600.0))
