@@ -107,9 +107,10 @@ class Look:
 
     `at`: the points of a curve, in the coordinate's unit; none along an index. `known`: those at which there are seen
     numbers. `channels`: of curves by channel. `columns`: of a table by row and column, the period of the columns.
-    `step`: lines of a period of the mosaic. `least`: range of departures below which nothing is told. `shown_in`: measurements that the quantity is part of. `is_own_axis`:
-    whether a mismatched one of them is stated along it. `is_whole`: whether it is the whole course, not what a filter
-    leaves of it. `is_of_measurements`: whether the numbers are those of the measurements, with their covariance.
+    `step`: lines of a period of the mosaic. `least`: range of departures below which nothing is told. `shown_in`:
+    measurements that the quantity is part of. `is_own_axis`: whether a mismatched one of them is stated along it.
+    `is_whole`: whether it is the whole course, not what a filter leaves of it. `is_of_measurements`: whether the
+    numbers are those of the measurements, with their covariance.
     """
 
     stage: Stage
