@@ -39,6 +39,7 @@ SMOOTHED_CELLS = 4  # cells a side of the box whose mean is taken out
 LEAST_STRIPS = 4
 PLACES_A_SIDE, RADII, ANGLES = 16, 12, 24  # parts of a side whose means are looked at; points of their curves
 LEAST_TIMES, MOST_TIMES = 8, 24  # from which on noise is looked at by time; points of its curve
+LEAST_PATTERN_DN = 0.01  # range of offsets of lines in the dark, below which they are of no account
 LEAST_OFFSET_DN = 0.1  # of a flat, by which offsets in light may differ from those in the dark
 NOISE_FLOOR = 1e-3  # relative standard deviation of a variance beside that of its pixels
 MOST_LINES = 512  # groups of lines whose whole course is looked at
@@ -78,10 +79,13 @@ def index_looks(study: Study, effects: Effects) -> Iterator[Look]:
 def _codes(study: Study, effects: Effects) -> Iterator[Look]:
     """Yield the counts of codes in light, seen and held out, less those that the effects' converter gives.
 
-    Beside a converter's effect, in even light: there its counts are known best.
+    Even light has to show codes by itself. Beside a converter's effect it is all that counts: there its counts are
+    known best.
     """
     even_only = bool(acting(effects, CODES))
     try:
+        if prepared(study, study.once(counted)[False]) is None:
+            return
         counts = study.once(counted if even_only else counted_in_all)
     except NotDetermined:
         return
@@ -187,6 +191,7 @@ def _lines_of(
     """
     if False not in images:
         return
+    least = LEAST_PATTERN_DN if stage == "signal" and of == "mean" and not times else 0.0
     shown = frozenset({"dark_noise"}) if of != "mean" else frozenset() if times else SHOWN_IN[stage]
     cfa: Cfa = study.camera.cfa if step > 1 else "MONO"
     for line in lines:
@@ -194,10 +199,13 @@ def _lines_of(
         rough = {out: _rough_lines(image, line, cfa) for out, image in images.items()}
         seen = rough[False]
         if seen is not None:
-            yield Look(stage, along, seen, rough.get(True), of=of, step=step, shown_in=shown)
+            yield Look(stage, along, seen, rough.get(True), of=of, step=step, shown_in=shown, least=least)
         if not times:
             whole = {out: _whole_lines(image, line, bent=stage == "charge") for out, image in images.items()}
-            yield Look(stage, along, whole[False], whole.get(True), of=of, step=step, shown_in=shown, is_whole=True)
+            yield Look(
+                stage, along, whole[False], whole.get(True), of=of, step=step, shown_in=shown, least=least,
+                is_whole=True,
+            )  # fmt: skip
 
 
 def _cells_of(study: Study, stage: Stage, images: Mapping[bool, Image]) -> Iterator[Look]:
