@@ -199,6 +199,9 @@ def told(
         chi2_before=chi2[0],
         chi2_after=chi2[1],
         n=chi2[2],
+        own_chi2_before=chi2[0],
+        own_chi2_after=chi2[1],
+        own_n=chi2[2],
         suspects="",
         statement="",
     )
@@ -300,7 +303,7 @@ def test_broken_seals_are_left_out() -> None:
 def test_axes_by_the_words_of_a_result() -> None:
     """Every index that a discovered law may have is one word, or two of which both count."""
     for along in get_args(library()["empirical_law"].model_fields["along"].annotation):
-        assert axes_of(along) in ({along}, {"row", "column", "place"})
+        assert axes_of(along) in ({along}, {"row", "column", "place"}, set(along.split(" x ")))
     assert axes_of("column x level") == {"column", "level"}
 
 
