@@ -33,6 +33,11 @@ class CapturePlan:
         made = tuple(step for sequence in self.sequences for step in sequence.steps(station))
         times = Counter(name_of(step.id) for step in made)
         for step in made:
+            if step.setting.by_hand and station.lacks("stage"):
+                raise InputError(
+                    f"station: {step.setting.by_hand[0]!r} is set by hand and there is no [stage] to ask for it; add "
+                    "one (driver 'prompt' asks you)"
+                )
             if (there := times[name_of(step.id)]) > 1:
                 raise InputError(
                     f"sequences: the step {step.id} is there {there} times; take each sequence once, and give every "

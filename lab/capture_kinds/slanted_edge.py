@@ -80,11 +80,11 @@ def edge_steps(
     station: Equipment,
     stem: str,
     kind: type[EdgeCapture],
-    aperture: str | None = None,
+    by_hand: tuple[str, ...] = (),
     **keys: Any,
 ) -> tuple[Step, ...]:
     """Return the steps of a sequence's edges, whose ids begin with `stem`; `keys`: further ones of the captures,
-    `aperture`: the lenses' stop. Raises InputError where the station lacks one of the edges."""
+    `by_hand`: adjustments. Raises InputError where the station lacks one of the edges."""
     station.one(EdgeTarget)
     there = station.list_targets(EdgeTarget)
     if unknown := [name for name in sequence.edges if name not in there]:
@@ -96,7 +96,7 @@ def edge_steps(
     made: list[Step] = []
     for name in sequence.edges or there:
         edge = there[name]
-        lit = Setting(target=name, wavelength_nm=light_nm, slit_um=slit_um, aperture=aperture)
+        lit = Setting(target=name, wavelength_nm=light_nm, slit_um=slit_um, by_hand=by_hand)
         found = exposure_step(f"{stem}/{name}", f"slanted edge {name}", lit, sequence.level)
         light = spectrum_path(found.id)
         made.append(found)

@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from lab.cli.bench_process import mock_bench
 from lab.cli.console import check_writable, err, out, write_json
-from lab.cli.sources import Json, StoreFolder, open_store, run_here
+from lab.cli.sources import Json, StoreFolder, open_store, run_here, store_to_read
 from lab.cli.tables import print_fit, print_resolving, print_sequences
 from lab.errors import InputError
 from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult, capture_here
@@ -183,6 +183,31 @@ def sequences(
         print_sequences(catalogue(), found)
 
 
+@commands.command("put-back")
+def put_back(
+    session: Annotated[
+        str, typer.Argument(metavar="[SESSION]", help="say that what this session left changed is put back")
+    ] = "",
+    data: StoreFolder = None,
+) -> None:
+    """What sessions that ended early left changed by hand, and how to put it back; with SESSION: it is put back."""
+    from lab.capture.by_hand import left_by_hand, note_put_back
+
+    root = store_to_read(data).root
+    left = {one.session: one for one in left_by_hand(root)}
+    if session and session not in left:
+        known = f"; those are {', '.join(left)}" if left else "; nothing is"
+        raise InputError(f"session {session}: left nothing changed by hand{known}")
+    if session:
+        note_put_back(root, session)
+        out.print(f"session {escape(session)}: put back")
+        return
+    for one in left.values():
+        out.print(f"session {escape(one.session)}: {escape(one.words)}")
+    if not left:
+        out.print("nothing is left changed by hand")
+
+
 def _carried_out(
     request: PipelineRequest, store: Store, station_file: Path | None, conceal: list[str] | None, verb: list[str]
 ) -> PipelineResult:
@@ -190,6 +215,8 @@ def _carried_out(
     for each session. Where it is interrupted, tells the command that goes on; `verb`: its first words."""
     if station_file is not None and conceal:
         raise InputError("--conceal: only the mock bench conceals effects; leave --station out")
+    from lab.capture.by_hand import left_by_hand
+
     assert request.capture is not None
     session = request.capture.session
 
@@ -206,8 +233,10 @@ def _carried_out(
 
     try:
         return run_here(request, store, captured)
-    except KeyboardInterrupt:
-        if session:
+    except BaseException as error:
+        for left in left_by_hand(store.root):
+            err.print(f"calibench: {escape(left.session)}: {escape(left.words)}")
+        if session and isinstance(error, KeyboardInterrupt):
             command = _resuming(verb, session, store, station_file, conceal or [])
             err.print(f"calibench: go on with `{escape(command)}`")
         raise
