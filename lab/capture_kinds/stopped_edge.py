@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field
 
 from lab.capture_kinds.base import Adjustment, Equipment, Sequence, Step, Target, back_step
-from lab.capture_kinds.slanted_edge import EdgeCapture, EdgeSequence, EdgeTarget, edge_steps
+from lab.capture_kinds.slanted_edge import EdgeCapture, EdgeSequence, EdgeTarget, TurnTarget, edge_steps
 from lab.errors import InputError
 from sim.parameters import Quantity
 
@@ -39,6 +39,7 @@ class StoppedEdgeSequence(EdgeSequence):
     name: ClassVar[str] = "stopped_edge"
     purpose: ClassVar[str] = "MTF at another f-number: which part of a blur is the lens's"
     targets: ClassVar[tuple[type[Target], ...]] = (EdgeTarget, ApertureTarget)
+    adjustments: ClassVar[tuple[type[Adjustment], ...]] = (TurnTarget,)
 
     f_number: Annotated[float, Quantity("1", "f-number that the lenses are set to", lower=0.5, upper=64.0)]
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+from typer.testing import CliRunner
 
 from drivers.errors import Interrupted
 from drivers.stage.prompt import PromptStage
@@ -20,6 +21,7 @@ from lab.capture_kinds.base import Setting
 from lab.capture_kinds.dark import DarkSequence
 from lab.capture_kinds.slanted_edge import EdgeSequence
 from lab.capture_kinds.stopped_edge import StoppedEdgeSequence
+from lab.cli.entry import app
 from lab.errors import DeviceError, InputError
 from tests.lab import fake_bench
 
@@ -149,6 +151,19 @@ def test_the_recovery_after_a_kill_tells_it(store: Store) -> None:
     Recovery(store, fake_bench.Bench().drivers).look()
     told = store.session(id).error or ""
     assert "kill -9" in told and TURN_BACK in told
+
+
+def test_the_command_lists_it_and_takes_that_it_is_put_back(store: Store) -> None:
+    def told(*words: str) -> tuple[int, str]:
+        found = CliRunner().invoke(app, ["put-back", *words, "--data", str(store.root)])
+        return found.exit_code, " ".join(found.output.split()) or str(found.exception)
+
+    id = given_up(store)
+    assert TURN_BACK in told()[1]
+    code, said = told("20200101-000000-aaaaaa")
+    assert code != 0 and f"left nothing changed by hand; those are {id}" in said
+    assert told(id) == (0, f"session {id}: put back")
+    assert told() == (0, "nothing is left changed by hand")
 
 
 def test_deleting_the_session_does_not_forget_the_lens(store: Store) -> None:
