@@ -488,8 +488,8 @@ class JobStart(Asked):
     kind: JobKind
     resolve: bool = Field(
         default=False,
-        description="pipeline of a session: while rivals are left, take the capture that tells them apart and "
-        "diagnose again",
+        description="pipeline of a session, or of recordings with their `station`: while rivals are left, take the "
+        "capture that tells them apart and diagnose again",
     )
     resolve_minutes: float | None = RESOLVE_MINUTES
     resolve_rounds: int | None = RESOLVE_ROUNDS
@@ -504,7 +504,7 @@ class JobStart(Asked):
         default=None,
         max_length=100,
         description="pipeline of a session: a station with the same instruments at other addresses; null: as in its "
-        "last run",
+        "last run. Of recordings, with `resolve`: the station that made them",
     )
 
 

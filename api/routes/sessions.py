@@ -209,7 +209,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
         ),
         results=service.store.newest_results(session_id),
-        resolving=read_journal(service.store, session_id),
+        resolving=read_journal(service.store.folder(session_id)),
     )
 
 
