@@ -108,6 +108,11 @@ class Instruments:
             )
         return self._hands.setdefault(self.by_hand.kind_of(adjustment), HandDevice(self.drivers.stage, self.by_hand))
 
+    def questions(self, step: Step) -> tuple[str, ...]:
+        """Return what a step will ask of the operator's hand, a line each."""
+        asked = [name for name in step.setting.by_hand if self.hand(name).value != name]
+        return tuple(f"by hand: {self.station.targets[name].instruction} ({name})" for name in asked)
+
     @property
     def devices(self) -> tuple[Device, ...]:
         """All devices that the station has, the cameras last."""

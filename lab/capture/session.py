@@ -439,6 +439,8 @@ class CaptureSession:
                 if self._ended_by is not None:
                     break
                 self._tell("running", step.what, step.sequence, to_do)
+                for question in instruments.questions(step):
+                    self._tell("running", step.what, step.sequence, to_do, remark=question)
                 started, began_s = now(), time.monotonic()
                 taken: Taken = yield from take(step, instruments, results, following)
                 yield Msg("in_a_thread", None, call=lambda s=step, t=taken, b=started: self._keep(s, t, b))

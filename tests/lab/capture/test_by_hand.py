@@ -82,6 +82,17 @@ def test_a_whole_session_leaves_nothing(store: Store) -> None:
     assert left_by_hand(store.root) == ()
 
 
+def test_what_is_asked_stands_in_the_progress_too(store: Store) -> None:
+    """So that who follows on a page or over REST sees what the session waits for, once for each question."""
+    remarks: list[str] = []
+    CaptureSession.start(
+        store, station(), STOPPED, connect=Operator().connect,
+        on_progress=lambda told: remarks.extend(filter(None, [told.remark])),
+    ).run()  # fmt: skip
+    assert [line.rpartition(" ")[2] for line in remarks] == ["(f/8)", "(f/4)"]
+    assert f"by hand: {TURN_BACK}" in remarks[1]
+
+
 def test_a_session_that_is_given_up_says_what_is_changed_and_how_to_put_it_back(store: Store) -> None:
     id = given_up(store)
     told = store.session(id).error or ""
