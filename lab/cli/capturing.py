@@ -248,8 +248,9 @@ def _carried_out(
     for each session. Where it is interrupted, tells the command that goes on; `verb`: its first words."""
     if station_file is not None and conceal:
         raise InputError("--conceal: only the mock bench conceals effects; leave --station out")
-    from lab.capture.by_hand import left_by_hand
+    from lab.capture.by_hand import left_by_session
 
+    captured_here: dict[str, None] = {}
     session = "" if request.capture is None else request.capture.session
 
     def captured(wanted: CaptureRequest, tell: Callable[[CaptureProgress], None]) -> str:
@@ -257,6 +258,7 @@ def _carried_out(
 
         def told(progress: CaptureProgress) -> None:
             nonlocal session
+            captured_here[progress.session] = None
             session = session or progress.session  # the first: later ones resolve its doubts
             tell(progress)
 
@@ -268,8 +270,8 @@ def _carried_out(
     try:
         return run_here(request, store, captured)
     except BaseException as error:
-        for left in left_by_hand(store.root):
-            err.print(f"calibench: {escape(left.session)}: {escape(left.words)}")
+        for left in filter(None, (left_by_session(store.root, one) for one in captured_here)):
+            err.print(f"calibench: session {escape(left.session)}: {escape(left.words)}")
         if request.capture is None and isinstance(error, KeyboardInterrupt):
             err.print("calibench: the same command goes on where it was")
         elif session and isinstance(error, KeyboardInterrupt):
