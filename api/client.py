@@ -267,6 +267,10 @@ class ServiceClient:
             found = self.device(station, device)
         return found
 
+    def put_back(self, station: str) -> StationState:
+        """Say that what sessions left changed by hand on a station is put back."""
+        return StationState.model_validate_json(self.request("POST", f"/stations/{station}/put-back").content)
+
     def start_checks(self, station: str, *, transcript: bool = False) -> list[DeviceState]:
         """Let every instrument of a station work once, one after the other, in the background."""
         body = DeviceCheck(transcript=transcript).model_dump(mode="json")

@@ -170,6 +170,10 @@ class LiveSessions:
         self._asking = threading.Lock()
         self._asked: dict[str, Future[None]] = {}  # what was asked last at each shutter
 
+    def connect(self, station: Station) -> Drivers:
+        """Return the drivers of a station, not yet connected."""
+        return self._connect(station)
+
     def hold(self, station: Station, but: str = "") -> Callable[[], None]:
         """Keep sessions off a station's instruments until what is returned is called.
 

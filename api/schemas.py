@@ -102,6 +102,13 @@ class Login(Asked):
     key: str = Field(min_length=1, max_length=200)
 
 
+class LeftChanged(Schema):
+    """What a session changed by hand and didn't put back: it was killed, or given up."""
+
+    session: str = Field(description="its id; the session may be deleted")
+    words: str = Field(description="what stands otherwise, and how to put it back")
+
+
 class StationState(Schema):
     """A station file of the data folder; `problem` says why it can't be used."""
 
@@ -114,6 +121,10 @@ class StationState(Schema):
     busy_with: str | None = Field(default=None, description="id of a session that uses its instruments now")
     safety: StationSafety | None = Field(
         default=None, description="null: its instruments haven't answered since the service's start, or a run uses them"
+    )
+    left_by_hand: tuple[LeftChanged, ...] = Field(
+        default=(),
+        description="what was changed by hand and not put back; the next session asks for it before all else",
     )
     problem: str | None = None
 
@@ -477,8 +488,8 @@ class JobStart(Asked):
     kind: JobKind
     resolve: bool = Field(
         default=False,
-        description="pipeline of a session: while rivals are left, take the capture that tells them apart and "
-        "diagnose again",
+        description="pipeline of a session, or of recordings with their `station`: while rivals are left, take the "
+        "capture that tells them apart and diagnose again",
     )
     resolve_minutes: float | None = RESOLVE_MINUTES
     resolve_rounds: int | None = RESOLVE_ROUNDS
@@ -493,7 +504,7 @@ class JobStart(Asked):
         default=None,
         max_length=100,
         description="pipeline of a session: a station with the same instruments at other addresses; null: as in its "
-        "last run",
+        "last run. Of recordings, with `resolve`: the station that made them",
     )
 
 

@@ -43,6 +43,7 @@ from lab.workers import dask_client
 from sim.parameters import Frozen
 
 if TYPE_CHECKING:
+    from lab.capture.station import Station
     from lab.formats.camera_file import CameraFile
     from lab.resolve import ResolveLimits
     from sim.camera import Side
@@ -113,6 +114,7 @@ def run_job(
     resolve: ResolveLimits | None = None,
     capturer: Capturer | None = None,
     camera_model: str | None = None,
+    station: Station | None = None,
 ) -> None:
     """Carry out a job, in this process or on a worker; its result goes to the registry. Never raises."""
     store = Store(root, database_url)
@@ -131,7 +133,7 @@ def run_job(
             if kind in WORK:
                 carry_out(kind, Path(source), tell)
             else:
-                request = _request(store, cast(Goal, kind), source, job_id, resolve)
+                request = _request(store, cast(Goal, kind), source, job_id, resolve, station)
                 if camera_model is not None:
                     request = replace(request, models=_models(store, request, camera_model))
                 run_pipeline(request, tell.pipeline, store=store, capturer=capturer)
@@ -147,7 +149,9 @@ def run_job(
         store.close()
 
 
-def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: ResolveLimits | None) -> PipelineRequest:
+def _request(
+    store: Store, kind: Goal, source: str, job_id: str, resolve: ResolveLimits | None, station: Station | None
+) -> PipelineRequest:
     """Return what a job asks of the pipeline. A pipeline on a session captures what is left of it, and computes every
     step anew."""
     page = store.root / "reports" / f"{job_id}.html"
@@ -161,6 +165,8 @@ def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: Resolv
         job_id=job_id,
         reuse=kind != "pipeline",
         report_file=page,
+        resolve=None if station is None else resolve,
+        station=station,
     )
 
 
@@ -282,13 +288,15 @@ class JobRunner:
         resolve: ResolveLimits | None = None,
         capturer: Capturer | None = None,
         camera_model: str | None = None,
+        station: Station | None = None,
     ) -> str:
         """Queue a job on a session's id, a recording set's folder, or a challenge's; returns the job's id.
 
         `capturer`: how the job reaches the instruments; with one, the job runs in a thread of this process. `resolve`:
-        of a pipeline, take the captures that tell the remaining rivals apart, within these limits. `camera_model`: id
-        of one that stands in for the fitted cameras of a validation or a diagnosis. Raises InputError for an unknown
-        kind, and for `resolve` or `camera_model` where the job can't take it.
+        of a pipeline, take the captures that tell the remaining rivals apart, within these limits. `station`: the one
+        that made the recordings, for `resolve` on a set's folder (`lab.resolve.station_of`). `camera_model`: id of one
+        that stands in for the fitted cameras of a validation or a diagnosis. Raises InputError for an unknown kind,
+        and for `resolve` or `camera_model` where the job can't take it.
         """
         if kind not in KINDS:
             raise InputError(f"job {kind!r}: no such work; choose from {', '.join(KINDS)}")
@@ -314,7 +322,7 @@ class JobRunner:
         work = (str(self.store.root), self.store.settings.database_url, job_id)
         if client is None:
             thread = threading.Thread(
-                target=run_job, args=(*work, resolve, capturer), name=f"job {job_id}", daemon=True
+                target=run_job, args=(*work, resolve, capturer, None, station), name=f"job {job_id}", daemon=True
             )
             self._started[job_id] = thread
             thread.start()

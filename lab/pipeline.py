@@ -99,6 +99,7 @@ class PipelineRequest:
     improved : the cameras with the effects that `diagnosis` names, by side, for the report; where none are given, those
     that are kept with it models : camera files that replace the fitted cameras, by side, in validation and diagnosis
     resolve : after the diagnosis, take the captures that tell the remaining rivals apart, within these limits; None: no
+    station : the one that made `recordings` (`lab.resolve.station_of`), which takes these captures
     pictures : draw the residual pictures of the diagnosis
     bootstrap : healthy cameras that are drawn frame by frame for the threshold of the diagnosis
     workers : where they are drawn; None: in this computer's processes of the diagnosis
@@ -118,6 +119,7 @@ class PipelineRequest:
     improved: Mapping[Side, CameraFile] = field(default_factory=dict)
     models: Mapping[Side, CameraFile] = field(default_factory=dict)
     resolve: ResolveLimits | None = None
+    station: Station | None = None
     pictures: bool = True
     bootstrap: int = 0
     workers: Workers | None = None
@@ -126,11 +128,14 @@ class PipelineRequest:
     def __post_init__(self) -> None:
         if (self.recordings is None) == (self.capture is None):
             raise ValueError("PipelineRequest: give either recordings or capture")
+        if self.station is not None and (self.capture is not None or self.resolve is None):
+            raise ValueError("PipelineRequest: a station resolves recordings; a session has its own")
         if self.resolve is None:
             return
-        if "resolve" not in STEPS[self.goal] or self.capture is None:
+        if "resolve" not in STEPS[self.goal] or (self.capture is None and self.station is None):
             raise InputError(
-                f"resolve: {self.goal} makes no diagnosis on a station's session; run the whole pipeline on one"
+                f"resolve: {self.goal} makes no diagnosis on a station's session; run the whole pipeline on one, or on "
+                "recordings and the station that made them"
             )
         if self.diagnosis is not None:
             raise InputError(
@@ -459,8 +464,9 @@ class _Pipeline:
                 from lab.resolve import Resolver
 
                 assert self.store is not None
-                assert self._session is not None
-                self._resolver = Resolver(self.store, self._session, self.request.resolve)
+                station = self._station()
+                assert station is not None
+                self._resolver = Resolver(self.store, self._folder(), station, self.request.resolve)
             self._examined = self._diagnosed(self._with_resolved("diagnose"), "diagnose")
             self._diagnosis = self._examined.result
             self._keep("diagnose", self._diagnosis)
@@ -478,9 +484,25 @@ class _Pipeline:
             pictures=self.request.pictures,
             bootstrap=self.request.bootstrap,
             workers=self.request.workers,
-            station=self.store.station(self._session) if self.store is not None and self._session is not None else None,
+            station=self._station(),
         )
         return replace(found, result=found.result.model_copy(update={"baseline": self._baseline}))
+
+    def _station(self) -> Station | None:
+        """Return the station that can take further captures; None: there is none."""
+        if self.store is None or self._session is None:
+            return self.request.station
+        return self.store.station(self._session)
+
+    def _folder(self) -> Path:
+        """Return where the files of this pipeline lie: the session's folder, or that of resolved recordings."""
+        from lab.resolve import resolving_folder
+
+        assert self.store is not None
+        if self._session is not None:
+            return self.store.folder(self._session)
+        assert self.request.recordings is not None
+        return resolving_folder(self.store.root, self.request.recordings)
 
     @property
     def _baseline(self) -> str | None:
@@ -514,7 +536,12 @@ class _Pipeline:
             assert self.store is not None
             session = self._captured(step, CaptureRequest(session=taken.session))
             folder = "resolve" if number == 1 else f"resolve-{number}"
-            recordings = recordings.joined(session_recordings(self.store, session), folder)
+            later = session_recordings(self.store, session)
+            if self.request.recordings is not None:
+                from lab.resolve import check_same_cameras
+
+                check_same_cameras(self.request.recordings, later)
+            recordings = recordings.joined(later, folder)
         return recordings
 
     def _keep_resolved(self) -> None:
@@ -563,13 +590,12 @@ class _Pipeline:
         return camera_models.camera_files(self.store, camera_models.record(self.store, self._results["diagnose"]))
 
     def _session_files(self) -> Path:
-        """Write the results and the improved cameras into the session's folder; where its report belongs."""
+        """Write the results and the improved cameras into the folder of this pipeline; where its report belongs."""
         from lab.formats.camera_file import write_camera
         from lab.formats.result_file import write_result
 
-        assert self.store is not None
-        assert self._session is not None
-        folder = self.store.folder(self._session)
+        folder = self._folder()
+        folder.mkdir(parents=True, exist_ok=True)
         for kind, result in (("fit", self._fit), ("validate", self._validation), ("diagnose", self._diagnosis)):
             if result is not None:
                 write_result(result, folder / f"{kind}.json")

@@ -10,21 +10,31 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from hashlib import sha256
 from itertools import combinations
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drivers.errors import InstrumentError
+from lab.capture.blocking_calls import in_thread
 from lab.capture.catalogue import StepTimes, estimate, step_times
 from lab.capture.durable_files import write_durably
 from lab.capture.session import CaptureSession
+from lab.capture.station import drivers_of
 from lab.diagnose.outcome.expected_information import entropy, expected_information
 from lab.diagnose.outcome.next_capture import Doubt, OpenCapture
 from lab.diagnose.policy import DecisionPolicy
-from lab.errors import InputError
+from lab.errors import DeviceError, InputError
+from lab.formats.recording_set import RecordingSet, Snapshots, manifest_json
 from lab.formats.result_file import read_result, result_json
 from lab.formats.results import DiagnosisResult, Resolution, ResolveEnd, ResolveJournal, RivalOdds
 
 if TYPE_CHECKING:
-    from lab.capture.station import Station
+    from collections.abc import Callable
+
+    from drivers.instrument import Identity, Instrument
+    from lab.capture.station import Drivers, Station
     from lab.capture.store import Store
     from sim.camera import Side
 
@@ -32,6 +42,8 @@ if TYPE_CHECKING:
 JOURNAL = "resolve.json"
 #: Captures that are taken for one session at most, where nobody says otherwise.
 MOST_ROUNDS = 6
+#: How long (s) a camera is waited for that is asked who it is.
+IDENTITY_S = 60.0
 #: Captures of which pairs are formed: the best by information per second, and the best by information.
 PAIRED = 12
 
@@ -118,19 +130,27 @@ def choose(doubt: Doubt, options: Sequence[Option], policy: DecisionPolicy, left
 # --- the journal ------------------------------------------------------------------------------------------------------
 
 
-def read_journal(store: Store, session: str) -> ResolveJournal | None:
-    """Return the journal of a session's resolving; None where it was never resolved."""
-    file = store.folder(session) / JOURNAL
+def read_journal(folder: Path) -> ResolveJournal | None:
+    """Return the journal in the folder of a session, or of a recording set that is resolved; None: it never was."""
+    file = folder / JOURNAL
     return read_result(ResolveJournal, file) if file.is_file() else None
 
 
 class Resolver:
-    """The resolving of one session. `journal` is what is on disk."""
+    """The resolving of one session, or recording set, by captures of `station`. `journal` is what is on disk, in
+    `folder`."""
 
-    def __init__(self, store: Store, session: str, limits: ResolveLimits, policy: DecisionPolicy | None = None) -> None:
-        self._store, self._session, self._policy = store, session, policy or DecisionPolicy()
-        self._limits = limits
-        found = read_journal(store, session) or ResolveJournal()
+    def __init__(
+        self,
+        store: Store,
+        folder: Path,
+        station: Station,
+        limits: ResolveLimits,
+        policy: DecisionPolicy | None = None,
+    ) -> None:
+        self._store, self._folder, self._station = store, folder, station
+        self._policy, self._limits = policy or DecisionPolicy(), limits
+        found = read_journal(folder) or ResolveJournal()
         self.journal = found.model_copy(
             update={"budget_min": limits.minutes, "most_rounds": limits.rounds, "end": None}
         )
@@ -149,7 +169,7 @@ class Resolver:
             left = "nothing is judged" if result.verdict == "nothing_judged" else "no rivals are left, but a mismatch"
             self._ended("this station can't", _and_then(left, result))
             return None
-        station = self._store.station(self._session)
+        station = self._station
         times = step_times(self._store, station)
         taken = {(step.side, step.capture) for step in self.journal.resolutions}
         left_s = math.inf if self._limits.minutes is None else 60.0 * self._limits.minutes - self.spent_s
@@ -189,8 +209,7 @@ class Resolver:
         """Register the session of a choice and note it in the journal; nothing moves yet. Returns its id."""
         plan = choice.first.capture.plan
         assert plan is not None  # else it is no option
-        station = self._store.station(self._session)
-        session = CaptureSession.start(self._store, station, plan, name=name).id
+        session = CaptureSession.start(self._store, self._station, plan, name=name).id
         step = Resolution(
             side=choice.doubt.side,
             rivals=odds_of(choice.doubt),
@@ -226,7 +245,7 @@ class Resolver:
 
     def _keep(self, **changes: object) -> None:
         self.journal = self.journal.model_copy(update=changes)
-        write_durably(self._store.folder(self._session) / JOURNAL, result_json(self.journal).encode("utf-8"))
+        write_durably(self._folder / JOURNAL, result_json(self.journal).encode("utf-8"))
 
 
 def _and_then(what: str, result: DiagnosisResult) -> str:
@@ -270,3 +289,92 @@ def _priced(
         except InputError as error:
             lacking.append((capture, str(error)))
     return options, lacking
+
+
+# --- recordings and the station that made them ------------------------------------------------------------------------
+
+
+def resolving_folder(root: Path, recordings: RecordingSet) -> Path:
+    """Return where the journal of a recording set's resolving lies in the data folder `root`. The same recordings have
+    the same folder, wherever they lie."""
+    key = sha256(manifest_json(recordings.manifest).encode("utf-8")).hexdigest()
+    return root / "resolving" / key[:16]
+
+
+def station_of(
+    recordings: RecordingSet, station: Station, connect: Callable[[Station], Drivers] = drivers_of
+) -> Station:
+    """Return the station with the cameras of the recordings alone, after these were asked who they are. Nothing moves,
+    and nothing is exposed.
+
+    Raises InputError, one line, where it isn't the same cameras: one is lacking, its data sheet contradicts the
+    recordings', it has another serial number, or one of the two doesn't say it. DeviceError where one doesn't answer.
+    """
+    for side in recordings.sides:
+        if side not in station.cameras:
+            raise InputError(
+                f"{recordings.source}: has a {side} camera, and the station has none; name the station that made the "
+                "recordings"
+            )
+        check_same_data_sheet(recordings, side, station)
+        if not _serial_number(recordings.manifest.instruments, side):
+            raise InputError(
+                f"{recordings.source}: doesn't say the serial number of its {side} camera, so that nobody can tell "
+                f"whether it is the station's; write it into the manifest as instruments.'camera {side}'.serial_number"
+            )
+    own = station.model_copy(update={"cameras": {side: station.cameras[side] for side in recordings.sides}})
+    cameras = connect(own).cameras
+    asked = {side: in_thread(partial(_identity, cameras[side])) for side in recordings.sides}
+    for side, answer in asked.items():
+        try:
+            found = answer.result(IDENTITY_S)
+        except TimeoutError:
+            raise DeviceError(f"camera {side}: didn't say who it is within {IDENTITY_S:g} s; look after it") from None
+        except InstrumentError as error:
+            raise DeviceError(str(error)) from error
+        _check_serial_number(recordings, side, found.serial_number)
+    return own
+
+
+def _identity(driver: Instrument) -> Identity:
+    try:
+        driver.connect()
+        return driver.identity()
+    finally:
+        driver.close()
+
+
+def check_same_cameras(recordings: RecordingSet, later: RecordingSet) -> None:
+    """Raise InputError where later captures are of other cameras than the recordings that they are to be joined to."""
+    for side in recordings.sides:
+        _check_serial_number(recordings, side, _serial_number(later.manifest.instruments, side))
+
+
+def check_same_data_sheet(recordings: RecordingSet, side: Side, station: Station) -> None:
+    """Raise InputError where the recordings and the station file state different data of a camera."""
+    stated = recordings.manifest.cameras[side].model_dump(exclude={"quantum_efficiency", "lens_file"})
+    there = station.cameras[side].datasheet.model_dump()
+    for key, value in stated.items():
+        if None not in (value, there.get(key)) and value != there[key]:
+            raise InputError(
+                f"{recordings.source}: the {side} camera's data sheet says {key} = {value}, the station file "
+                f"{there[key]}; name the station that made the recordings, or correct one of them"
+            )
+
+
+def _serial_number(instruments: Snapshots, side: Side) -> str:
+    found = instruments.get(f"camera {side}")
+    return "" if found is None else found.serial_number
+
+
+def _check_serial_number(recordings: RecordingSet, side: Side, found: str) -> None:
+    wanted = _serial_number(recordings.manifest.instruments, side)
+    if not found:
+        raise InputError(
+            f"station: its {side} camera doesn't say a serial number; only {wanted} can settle a doubt here"
+        )
+    if wanted != found:
+        raise InputError(
+            f"{recordings.source}: was recorded with the {side} camera {wanted}, the station has {found}; "
+            "connect that one, or name the station that made the recordings"
+        )

@@ -40,6 +40,8 @@ from mocks.targets import (
     SCREEN_ROWS,
     STOPS,
     TARGETS,
+    TEMPERATURES_C,
+    TURNS_DEG,
     ShownCells,
     UInt8Array,
     scene,
@@ -146,6 +148,7 @@ class Bench:
         self._light = LightSettings()
         self._placed = "cap"
         self._stop = NOMINAL_STOP
+        self._turn_deg, self._sensor_c = 0.0, TEMPERATURES_C["usual"]
         self._stopped: dict[tuple[Side, str], HiddenCamera] = {}
         self._shown = ShownCells()
 
@@ -229,13 +232,17 @@ class Bench:
             return self._placed
 
     def place(self, name: str) -> None:
-        """Put a target in front of both cameras, or turn their aperture rings to a stop of `STOPS`. Raises `BenchError`
-        for a name that isn't in `targets`."""
+        """Put a target in front of both cameras, turn their aperture rings to a stop of `STOPS`, the edges' holder, or
+        heat the sensors. Raises `BenchError` for a name that isn't in `targets`."""
         if name not in self.targets:
             raise BenchError(f"no target {name!r} on this bench: it has {', '.join(self.targets)}")
         with self._lock:
             if name in STOPS:
                 self._stop = name
+            elif name in TURNS_DEG:
+                self._turn_deg = TURNS_DEG[name]
+            elif name in TEMPERATURES_C:
+                self._sensor_c = TEMPERATURES_C[name]
             else:
                 self._placed = name
 
@@ -268,6 +275,8 @@ class Bench:
 
     def sensor_temperature_c(self, side: Side, at_s: float | None = None) -> float:
         """Temperature of one camera's sensor at a virtual time, None: now, as the camera itself reports it."""
+        if self._sensor_c is not None:
+            return self._sensor_c
         since_s = (self.clock.now() if at_s is None else at_s) - self._started_s
         warmer = -self._warm_up_c * float(np.expm1(-since_s / WARMING_S))
         return self.temperature_c + SELF_HEATING_C[side] + warmer
@@ -341,17 +350,24 @@ class Bench:
         seen last."""
         with self._lock:
             placed, light, shown, stop = self._placed, self._light, self._shown, self._stop
+            turn_deg = self._turn_deg
         camera = self._camera(side)
         if not light.shutter_open and placed not in ("cap", "screen"):
             placed, light = "sphere", LightSettings()
-        key: tuple[object, ...] = (side, stop, placed, {"cap": None, "screen": shown.serial}.get(placed, light))
+        key: tuple[object, ...] = (
+            side,
+            stop,
+            turn_deg,
+            placed,
+            {"cap": None, "screen": shown.serial}.get(placed, light),
+        )
         with self._camera_locks[side]:
             with self._lock:
                 kept = self._lights.get(key)
                 if kept is not None:
                     self._lights.move_to_end(key)
                     return kept
-            seen = scene(camera, placed, light, shown)
+            seen = scene(camera, placed, light, shown, turn_deg)
             drawn = scene_light(
                 camera.model,
                 seen,

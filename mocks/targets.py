@@ -72,8 +72,18 @@ _TEXEL_MM = 0.5
 #: The stops of the lenses' aperture rings, which the operator turns; and the one at which they stand.
 STOPS, NOMINAL_STOP = {"f/4": 4.0, "f/5.6": 5.6, "f/8": 8.0}, "f/4"
 
+#: Turns of the knife edges' holder about its middle (deg, the top to the right), and temperatures (C) of both sensors,
+#: as the operator sets them by hand; None: as they are.
+TURNS_DEG, TEMPERATURES_C = (
+    {"turn 0": 0.0, "turn 45": 45.0, "turn 90": 90.0},
+    {"usual": None, "35 C": 35.0, "45 C": 45.0},
+)
+
 #: Names of all targets.
-TARGETS = ("cap", "sphere", "colorchecker", *EDGE_ANGLES_DEG, "screen", *BOARD_POSES, *STOPS)
+TARGETS = (
+    *("cap", "sphere", "colorchecker", *EDGE_ANGLES_DEG, "screen", *BOARD_POSES),
+    *(*STOPS, *TURNS_DEG, *TEMPERATURES_C),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +115,6 @@ class Pose:
         return Warp.of(np.asarray(camera.geometry.camera_matrix) @ plane, camera.geometry)
 
 
-#: Upright at the targets' distance.
-FACING = Pose.of((0.0, 0.0, DISTANCE_MM), (0.0, 0.0, 0.0))
 _CHART = Pose.of((-103.0, -70.0, DISTANCE_MM), (0.0, 0.0, 0.7))
 SCREEN_POSE = Pose.of((1.7, -0.9, DISTANCE_MM), (0.3, -0.4, 0.5))
 
@@ -175,9 +183,9 @@ def _edges(name: str, camera: HiddenCamera) -> tuple[PlaneEdge, ...]:
     return tuple(found)
 
 
-def scene(camera: HiddenCamera, placed: str, light: LightSettings, shown: ShownCells) -> Scene:
+def scene(camera: HiddenCamera, placed: str, light: LightSettings, shown: ShownCells, turn_deg: float = 0.0) -> Scene:
     """Return what one camera sees of a target: its light is what the lamp and the monochromator give when nothing is
-    wrong.
+    wrong. `turn_deg`: of the knife edges' holder.
 
     First-order light is of the kind "narrowband" on every target: what goes wrong in a monochromator does so whatever
     it lights."""
@@ -199,7 +207,7 @@ def scene(camera: HiddenCamera, placed: str, light: LightSettings, shown: ShownC
         corners: Corners = (a, b), (c, d), (e, f), (g, h)
         return ReflectanceChart(corners, shine(1.0), gap=CHART_GAP, kind=kind("chart"), geometry=camera.geometry)
     if placed in EDGE_ANGLES_DEG:
-        pose = FACING.before(camera)
+        pose = Pose.of((0.0, 0.0, DISTANCE_MM), (0.0, 0.0, turn_deg)).before(camera)
         lights = shine(BLADE_REFLECTANCE), shine(1.0)
         return PosedEdges(_edges(placed, camera), *pose, camera.geometry, *lights, kind=kind("slanted_edge"))
     if placed in BOARD_POSES:
@@ -237,13 +245,13 @@ def station_targets(cameras: Mapping[Side, HiddenCamera]) -> dict[str, Any]:
     """Nominal layout of the targets in the frames, for the station file's `[targets]`: as good as a hand that places
     them and an eye that reads them off a first picture (corners to half a pixel, regions to the pixel). Keys by target:
 
-    - all: `kind` ("cap" "sphere" "colorchecker" "slanted_edge" "screen" "charuco" "aperture")
+    - all: `kind` ("cap" "sphere" "colorchecker" "slanted_edge" "screen" "charuco" "aperture" "turn" ...)
     - colorchecker: `chart`; `[targets.colorchecker.left]` `corners` (4 x [row, col], as in the recording set)
     - edge-N: `angle_deg`; `[[targets."edge-1".left.regions]]` `name` ("centre" "mid" "corner"), `region`
       [row0, col0, row1, col1], `angle_deg`, `field_mm` [row, col]
     - screen: `rows`, `cols`, `pixel_mm`; `[targets.screen.left]` `camera_px_per_screen_px`,
       `visible` [row0, col0, row1, col1] in screen pixels (what surely lies inside the frame)
-    - f/N: `f_number`
+    - f/N: `f_number`; turn N: `angle_deg`; N C: `sensor_c`
     - charuco-NN: `dictionary`, `squares` [rows, cols], `square_mm`, `marker_mm`, `pose`
     """
 
@@ -271,6 +279,9 @@ def station_targets(cameras: Mapping[Side, HiddenCamera]) -> dict[str, Any]:
         }
     for name, f_number in STOPS.items():
         targets[name] = {"kind": "aperture", "f_number": f_number}
+    targets |= {name: {"kind": "turn", "angle_deg": angle_deg} for name, angle_deg in TURNS_DEG.items()}
+    for name, sensor_c in TEMPERATURES_C.items():
+        targets[name] = {"kind": "sensor_temperature"} | ({} if sensor_c is None else {"sensor_c": sensor_c})
     return targets
 
 

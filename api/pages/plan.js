@@ -8,7 +8,7 @@ let latest = 0; // the newest question: an answer to an older one comes too late
 const rows = new Map(); // sequence -> its parts
 
 const about = (seconds, learned) => `${learned ? "about" : "perhaps"} ${duration(seconds)}`;
-const text = (value) => (value == null ? "all" : [value].flat().map((one) => Number(one.toPrecision(6))).join(", "));
+const text = (value) => (value == null ? "not set" : [value].flat().map((one) => Number(one.toPrecision(6))).join(", "));
 
 function parameterField(parameter) {
   const { name, unit, meaning, lower, upper, several } = parameter;

@@ -41,6 +41,8 @@ function card(name, title) {
   };
   parts.step.setAttribute("aria-live", "polite");
   parts.problem.setAttribute("role", "alert");
+  parts.byHand = at("p", "problem by-hand");
+  parts.byHand.setAttribute("role", "alert");
   parts.bar.setAttribute("aria-label", `progress on ${title}`);
   const actions = at("p", "actions");
   const halts = at("p", "actions");
@@ -64,7 +66,7 @@ function card(name, title) {
   parts.run = at("div", "run", element("p", {}, parts.name), parts.bar, parts.step, parts.remarks, actions);
   const fact = (label, value) => element("div", {}, element("dt", { textContent: label }), value);
   const facts = element("dl", { className: "facts" }, fact("Shutter", parts.shutter), fact("Light", parts.light), fact("Sensor", parts.temperature));
-  parts.whole = element("article", { className: "station" }, element("header", {}, parts.title, parts.state), facts, parts.run, halts, parts.problem);
+  parts.whole = element("article", { className: "station" }, element("header", {}, parts.title, parts.state), facts, parts.run, halts, parts.byHand, parts.problem);
   return parts;
 }
 
@@ -171,6 +173,18 @@ document.addEventListener("connection", (event) => {
   }
 });
 
+// What an operator's hand changed and nobody put back: a station that captures so would capture something else.
+function showByHand(parts, name, left) {
+  const words = left.map((one) => `${one.session}: ${one.words}`).join(" · ");
+  if (parts.byHand.dataset.words === words) return;
+  parts.byHand.dataset.words = words;
+  parts.byHand.replaceChildren(words);
+  if (!words || !may("operate")) return;
+  const button = named("button", "It is put back", name);
+  button.addEventListener("click", told(parts.problem, async () => (await post(`/stations/${encodeURIComponent(name)}/put-back`), follower())));
+  parts.byHand.append(" ", button);
+}
+
 function showRun(parts, session, safety) {
   parts.known = { session, safety };
   const begun = parts.session !== session?.id;
@@ -214,7 +228,7 @@ export async function showStations(stations, sessions) {
   const live = await running(stations, sessions);
   const wanted = new Map();
   for (const one of stations.filter((s) => !s.problem)) {
-    wanted.set(one.name, { title: one.title === one.name ? one.name : `${one.name}: ${one.title}`, name: one.name, safety: one.safety, session: live.find((s) => s.id === one.busy_with) });
+    wanted.set(one.name, { title: one.title === one.name ? one.name : `${one.name}: ${one.title}`, name: one.name, safety: one.safety, left: one.left_by_hand, session: live.find((s) => s.id === one.busy_with) });
   }
   const shown = new Set([...wanted.values()].map((one) => one.session?.id));
   for (const session of live) if (!shown.has(session.id)) wanted.set(session.id, { title: "elsewhere", name: null, session });
@@ -229,6 +243,7 @@ export async function showStations(stations, sessions) {
       $("stations").append(cards.get(id).whole);
     }
     showRun(cards.get(id), one.session, one.safety);
+    showByHand(cards.get(id), one.name, one.session ? [] : (one.left ?? []));
   }
 }
 

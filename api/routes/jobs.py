@@ -19,7 +19,8 @@ from api.service import ADMIN, CALIBRATE, HEX_ID, READ, SESSION_ID, Here, HexId,
 from lab.challenge.kept import WORK
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
-from lab.resolve import resolve_limits
+from lab.pipeline import source_recordings
+from lab.resolve import resolve_limits, station_of
 
 router = APIRouter()
 
@@ -112,12 +113,31 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     dependencies=[CALIBRATE],
     responses=answers(401, 403, 404, 409, 422),
 )
-def start_recordings_job(service: Here, recordings_id: HexId, start: JobStart, response: Response) -> Job:
-    """Start work on recordings that were sent in. They have no station, so nothing can be resolved."""
+def start_recordings_job(
+    service: Here, request: Request, recordings_id: HexId, start: JobStart, response: Response
+) -> Job:
+    """Start work on recordings that were sent in. A `pipeline` with `resolve` and `station` settles what they leave in
+    doubt by captures of the station that made them: its cameras are asked for their serial numbers first, and the
+    key's scope has to be `admin`. 409 while a session runs on it."""
     folder = str(service.recordings(recordings_id))
-    if start.station is not None:
-        raise HTTPException(422, "station: recordings that were sent in have none; leave it out")
-    return accepted(service, _submit(service, start, folder), response)
+    if start.station is None and not start.resolve:
+        return accepted(service, _submit(service, start, folder), response)
+    if start.station is None or not start.resolve or start.kind != "pipeline":
+        raise HTTPException(
+            422,
+            "resolve, station: recordings are settled by a pipeline on the station that made them; give both, or none",
+        )
+    Demand(Permission.ADMIN)(request, None, None)
+    limits = resolve_limits(start.resolve, start.resolve_minutes, start.resolve_rounds)
+    station = service.station(start.station)
+    let_go = service.live.hold(station)
+    try:
+        own = station_of(source_recordings(folder, lambda: None), station, service.live.connect)
+    finally:
+        let_go()
+    capturer = service.live.capturer(own)
+    job_id = service.jobs.submit("pipeline", folder, resolve=limits, capturer=capturer, station=own)
+    return accepted(service, job_id, response)
 
 
 @router.get(

@@ -22,6 +22,7 @@ from api.preview import Form as PictureForm
 from api.schemas import (
     CaptureCount,
     CaptureKind,
+    LeftChanged,
     ListedSession,
     SessionDetail,
     SessionResume,
@@ -35,6 +36,7 @@ from api.security import Demand
 from api.service import ADMIN, OPERATE, OVER, READ, Here, RegistryId, Service, SessionId, missing_session
 from api.then import check_webhook, keep_request, kept_request, then_of
 from lab.calibration.overview import SessionOverview, overviews, sessions_of_verdict, tags_of
+from lab.capture.by_hand import left_by_hand
 from lab.capture.plan import full_plan
 from lab.capture.queue import put_into_queue
 from lab.capture.records import CaptureInfo, SessionInfo
@@ -68,6 +70,10 @@ def station_state(service: Service, name: str) -> StationState:
         sequences=full_plan(station).names,
         busy_with=service.live.busy(station),
         safety=service.safety(station),
+        left_by_hand=tuple(
+            LeftChanged(session=left.session, words=service.public(left.words))
+            for left in left_by_hand(service.store.root, station)
+        ),
     )
 
 
@@ -203,7 +209,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
         ),
         results=service.store.newest_results(session_id),
-        resolving=read_journal(service.store, session_id),
+        resolving=read_journal(service.store.folder(session_id)),
     )
 
 

@@ -9,12 +9,13 @@ from fastapi import APIRouter, HTTPException, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import PlainTextResponse
 
-from api.errors import answers, known
+from api.errors import Conflict, answers, known
 from api.routes.sessions import station_state
 from api.schemas import ConnectedDevice, DeviceCheck, DeviceState, PlanAsked, StationState
 from api.service import OPERATE, READ, Here, Service
 from drivers import discovery
 from drivers.errors import InstrumentError
+from lab.capture.by_hand import left_by_hand, note_put_back
 from lab.capture.catalogue import PlanEstimate, SequenceDescription, catalogue, described, estimate, step_times
 from lab.capture.station import Station
 from lab.errors import DeviceError
@@ -71,6 +72,18 @@ def _device(service: Service, name: str, station: Station, device: str) -> Devic
 def get_station(service: Here, name: StationName) -> StationState:
     """One station."""
     service.station_file(name)
+    return station_state(service, name)
+
+
+@router.post("/stations/{name}/put-back", dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422))
+def put_back(service: Here, name: StationName) -> StationState:
+    """Say that everything in `left_by_hand` is put back. Without that, the next session on these instruments asks for
+    it. 409 while a session runs on them."""
+    station = service.station(name)
+    if (busy := service.live.busy(station)) is not None:
+        raise Conflict(f"session {busy} runs on these instruments and puts back what it changes; wait for its end")
+    for left in left_by_hand(service.store.root, station):
+        note_put_back(service.store.root, left.session)
     return station_state(service, name)
 
 

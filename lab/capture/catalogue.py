@@ -25,8 +25,8 @@ from sim.parameters import Frozen, read_quantities
 
 #: What a step does, in seconds where a station hasn't shown it yet: a search takes some six test frames and a change of
 #: the light, a spectroradiometer 3 to 12 s at the levels of a monochromator, a pair of frames its read-out and its
-#: files.
-TYPICAL_S = {"search": 5.0, "measurement": 6.0, "frame": 0.5}
+#: files, and an operator's hand half a minute.
+TYPICAL_S = {"search": 5.0, "measurement": 6.0, "frame": 0.5, "hand": 30.0}
 #: Sessions of a station that its times are learned from, of so many that are looked at, the newest ones.
 LEARNED_FROM, LOOKED_AT = 3, 40
 
@@ -136,6 +136,7 @@ def _work(step: Step) -> Work:
         "search": isinstance(step.exposure, FindExposure),
         "measurement": step.radiance is not None,
         "frame": bool(step.captures),
+        "hand": bool(step.setting.by_hand) and not step.captures,
     }
     return step.sequence, tuple(name for name, so in does.items() if so)
 

@@ -26,6 +26,7 @@ from drivers.photodiode.base import IrradianceMeasurement, Photodiode
 from drivers.spectroradiometer.base import Spectroradiometer
 from drivers.stage.base import Stage
 from lab.capture.blocking_calls import STOP_S, Status, bounded, in_thread
+from lab.capture.by_hand import ByHand
 from lab.capture.records import StoredFile
 from lab.formats.recording_set import DataSheet
 from sim.camera import Side
@@ -66,10 +67,10 @@ class Device:
 
 
 class TargetDevice(Device):
-    """The stage: which target stands before the cameras, or which stop the lenses have. Movable to a target's name."""
+    """The stage: which target stands before the cameras. Movable to a target's name."""
 
-    def __init__(self, stage: Stage, name: str = "target") -> None:
-        super().__init__(name)
+    def __init__(self, stage: Stage) -> None:
+        super().__init__("target")
         self.stage = stage
         self.value: str | None = None  # None: not known
 
@@ -86,6 +87,25 @@ class TargetDevice(Device):
 
     def readings(self) -> dict[str, float | str]:
         return {"target": self.value or ""}
+
+
+class HandDevice(TargetDevice):
+    """What the stage's operator changes by hand. Movable to the name of an adjustment; `by_hand` has it on disk from
+    before he is asked until it is put back."""
+
+    def __init__(self, stage: Stage, by_hand: ByHand) -> None:
+        super().__init__(stage)
+        self.by_hand = by_hand
+
+    def set(self, target: str) -> Status:
+        def change() -> None:
+            self.value = None
+            self.by_hand.note_asked(target)
+            self.stage.place(target)
+            self.by_hand.note_done(target)
+            self.value = target
+
+        return Status("stage", change, PLACE_S)
 
 
 @dataclass(frozen=True)

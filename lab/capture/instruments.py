@@ -19,9 +19,11 @@ from drivers.errors import InstrumentError
 from drivers.instrument import Instrument, Setting
 from drivers.monochromator.base import Monochromator
 from lab.capture.blocking_calls import STOP_S, in_thread
+from lab.capture.by_hand import ByHand
 from lab.capture.devices import (
     CamerasDevice,
     Device,
+    HandDevice,
     LightDevice,
     PhotodiodeDevice,
     RadiometerDevice,
@@ -34,9 +36,9 @@ from lab.capture.devices import (
 )
 from lab.capture.records import now
 from lab.capture.station import Drivers, Station
-from lab.capture_kinds.base import CaptureLimits, FixedExposure, Step
+from lab.capture_kinds.base import Adjustment, CaptureLimits, FixedExposure, Step
 from lab.capture_kinds.irradiance import irradiance_nm
-from lab.errors import DeviceError
+from lab.errors import DeviceError, InputError
 from lab.formats.recording_set import DataSheet, InstrumentSnapshot
 from sim.camera import Side
 from sim.parameters import Frozen
@@ -78,13 +80,13 @@ class Instruments:
         write_frame: WriteFrame,
         write_spectrum: WriteSpectrum,
         cells: Callable[[str], NDArray[np.uint8]],
+        by_hand: ByHand,
     ) -> None:
-        self.station, self.drivers = station, drivers
+        self.station, self.drivers, self.by_hand = station, drivers, by_hand
         sheets = {side: camera.datasheet for side, camera in station.cameras.items()}
         self.cameras = CamerasDevice(drivers.cameras, sheets, write_frame)
         self.target = TargetDevice(drivers.stage) if drivers.stage else None
-        #: The lenses' stop, which the stage's operator sets.
-        self.aperture = TargetDevice(drivers.stage, "aperture") if drivers.stage else None
+        self._hands: dict[type[Adjustment], HandDevice] = {}
         self.light = LightDevice(drivers.monochromator) if drivers.monochromator else None
         self.shutter = ShutterDevice(drivers.monochromator) if drivers.monochromator else None
         self.screen = ScreenDevice(drivers.display, cells) if drivers.display else None
@@ -96,6 +98,20 @@ class Instruments:
     def limits(self) -> CaptureLimits:
         """The station's limits."""
         return self.station.limits
+
+    def hand(self, adjustment: str) -> HandDevice:
+        """Return what an adjustment is a state of. Raises InputError where nobody can be asked for it."""
+        if self.drivers.stage is None:
+            raise InputError(
+                f"station: {adjustment!r} is set by hand and there is no [stage] to ask for it; add one (driver "
+                "'prompt' asks you)"
+            )
+        return self._hands.setdefault(self.by_hand.kind_of(adjustment), HandDevice(self.drivers.stage, self.by_hand))
+
+    def questions(self, step: Step) -> tuple[str, ...]:
+        """Return what a step will ask of the operator's hand, a line each."""
+        asked = [name for name in step.setting.by_hand if self.hand(name).value != name]
+        return tuple(f"by hand: {self.station.targets[name].instruction} ({name})" for name in asked)
 
     @property
     def devices(self) -> tuple[Device, ...]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from lab.capture_kinds.base import SEQUENCES, Cells, Equipment, Sequence, Step, name_of
+from lab.capture_kinds.base import SEQUENCES, Adjustment, Cells, Equipment, Sequence, Step, name_of
 from lab.errors import InputError
 from sim.parameters import read_quantities
 
@@ -29,10 +29,22 @@ class CapturePlan:
         return tuple(sequence.name for sequence in self.sequences)
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
-        """All steps. Raises InputError if the station lacks what one of them needs, and where a step is there twice."""
-        made = tuple(step for sequence in self.sequences for step in sequence.steps(station))
+        """All steps. What a hand puts back only to change it again at once stays as it is. Raises InputError if the
+        station lacks what one of them needs, and where a step is there twice."""
+        every = [step for sequence in self.sequences for step in sequence.steps(station)]
+        kinds = {name: type(one) for name, one in station.list_targets(Adjustment).items()}
+        made = tuple(
+            step
+            for step, following in zip(every, [*every[1:], None], strict=True)
+            if following is None or not _is_changed_again(step, following, kinds)
+        )
         times = Counter(name_of(step.id) for step in made)
         for step in made:
+            if step.setting.by_hand and station.lacks("stage"):
+                raise InputError(
+                    f"station: {step.setting.by_hand[0]!r} is set by hand and there is no [stage] to ask for it; add "
+                    "one (driver 'prompt' asks you)"
+                )
             if (there := times[name_of(step.id)]) > 1:
                 raise InputError(
                     f"sequences: the step {step.id} is there {there} times; take each sequence once, and give every "
@@ -51,6 +63,13 @@ class CapturePlan:
         for sequence in self.sequences:
             found.setdefault(sequence.name, []).append(sequence.model_dump(mode="json", exclude_none=True))
         return {name: taken[0] if len(taken) == 1 else taken for name, taken in found.items()}
+
+
+def _is_changed_again(step: Step, following: Step, kinds: Mapping[str, type[Adjustment]]) -> bool:
+    """Return whether a step only puts back what the following one has changed again. `kinds`: of adjustments."""
+    if step.captures or step.exposure is not None or not name_of(step.id).endswith("-back"):
+        return False
+    return {kinds[name] for name in step.setting.by_hand} <= {kinds[name] for name in following.setting.by_hand}
 
 
 def full_plan(

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture.blocking_calls import Status
+from lab.capture.by_hand import ByHand
 from lab.capture.devices import (
     CamerasDevice,
     LightDevice,
@@ -116,6 +117,7 @@ def plan_devices(
         write_frame=write_frame,
         write_spectrum=write_spectrum,
         cells=lambda path: np.load(folder / path, allow_pickle=False),
+        by_hand=ByHand(folder, "plan", station),
     )
     try:
         there = found.connect()

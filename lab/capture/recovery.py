@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from drivers.instrument import Instrument
 from drivers.monochromator.base import Monochromator
 from lab.capture.blocking_calls import STOP_S, in_thread
+from lab.capture.by_hand import left_by_session
 from lab.capture.file_lock import Lock
 from lab.capture.instruments import SafeState, Shutter, made_safe
 from lab.capture.records import now
@@ -165,6 +166,8 @@ class Recovery:
                 return
             self._next_try_s.pop(session_id, None)
             then, again = self._what_next(session_id, station)
+            left = left_by_session(self._store.root, session_id)
+            then += "" if left is None else f"; {left.words}"
             self._store.set_state(session_id, "interrupted", error=f"{began}; its station was made safe; {then}")
             log.warning("session %s: %s; its station was made safe; %s", session_id, began, then)
             if again:

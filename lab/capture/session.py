@@ -28,12 +28,13 @@ from bluesky.utils import DuringTask, FailedStatus, Msg, RunEngineInterrupted, T
 
 from drivers.errors import InstrumentError
 from lab.capture.blocking_calls import STOP_S, in_thread
+from lab.capture.by_hand import ByHand, left_by_session, note_put_back
 from lab.capture.instruments import BenchState, Instruments, SafeState
 from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import JournalEntry, RunRecord, SessionInfo, now
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
-from lab.capture.take_step import Taken, repeats_ahead, take
+from lab.capture.take_step import Taken, adjust, repeats_ahead, take
 from lab.capture_kinds.base import Step
 from lab.errors import DeviceError, InputError
 from lab.formats.recording_set import Snapshots, differences
@@ -275,11 +276,18 @@ class CaptureSession:
                     self._tell("finished", "done")
                     return
         except BaseException as error:
-            self.store.set_state(self.id, "failed", error=str(error) or type(error).__name__)
+            said = str(error) or type(error).__name__
+            self.store.set_state(self.id, "failed", error=said + self._left_by_hand())
             self._tell("failed", str(error), quietly=True)
             raise
-        self.store.set_state(self.id, "interrupted", error=self._ended_by)
-        self._tell("interrupted", self._ended_by or "")
+        said = (self._ended_by or "") + self._left_by_hand()
+        self.store.set_state(self.id, "interrupted", error=said)
+        self._tell("interrupted", said)
+
+    def _left_by_hand(self) -> str:
+        """Return what the session leaves changed by hand, as the end of a sentence; empty: nothing."""
+        left = left_by_session(self.store.root, self.id)
+        return "" if left is None else f"; {left.words}"
 
     def _tell_packing(self, what: str, share: float) -> None:
         self._check_goes_on()
@@ -294,6 +302,8 @@ class CaptureSession:
         """Connect, run the plan, and bring all instruments into their safe state."""
         self._tell("connecting", "connecting to the instruments")
         self._writes = _Writes()
+        by_hand = ByHand(self.store.root, self.id, self.station)
+        by_hand.check_can_put_back()
         instruments = Instruments(
             self.station,
             self._connect(self.station),
@@ -304,6 +314,7 @@ class CaptureSession:
                 lambda: self.store.write_spectrum(self.id, path, spectrum)
             ),
             cells=self.store.recording_set(self.id).target,
+            by_hand=by_hand,
         )
         failure: BaseException | None = None
         with self._held:
@@ -417,6 +428,7 @@ class CaptureSession:
         def steps() -> Generator[Msg, Any, None]:
             yield Msg("open_run", None)
             results.update({entry.step.id: entry.result for entry in entries if _has_exposure(entry.result)})
+            yield from self._put_back(instruments)
             to_do = Counter(entry.step.sequence for entry in entries if entry.finished is None)
             repeats = repeats_ahead([None if entry.finished else entry.step for entry in entries])
             for entry, following in zip(entries, repeats, strict=True):
@@ -427,6 +439,8 @@ class CaptureSession:
                 if self._ended_by is not None:
                     break
                 self._tell("running", step.what, step.sequence, to_do)
+                for question in instruments.questions(step):
+                    self._tell("running", step.what, step.sequence, to_do, remark=question)
                 started, began_s = now(), time.monotonic()
                 taken: Taken = yield from take(step, instruments, results, following)
                 yield Msg("in_a_thread", None, call=lambda s=step, t=taken, b=started: self._keep(s, t, b))
@@ -445,6 +459,14 @@ class CaptureSession:
             yield Msg("in_a_thread", None, call=instruments.make_safe)
 
         yield from bpp.finalize_wrapper(steps(), leave)
+
+    def _put_back(self, instruments: Instruments) -> Generator[Msg, Any, None]:
+        """Have put back, before anything is captured, what other sessions left changed by hand."""
+        for left in instruments.by_hand.left_by_others():
+            for change in left.changes:
+                self._tell("running", f"putting back what session {left.session} changed", remark=change.words)
+                yield from adjust(change.back, instruments)
+                note_put_back(self.store.root, left.session, change.changes)
 
     def _keep(self, step: Step, taken: Taken, started: Any) -> None:
         self._writes.do(

@@ -147,6 +147,11 @@ class Station(Frozen):
             )
         return float(stated.pop() or 0.0)
 
+    def frame_px(self, side: Side) -> tuple[int, int]:
+        """Rows and columns of one camera's frame."""
+        sheet = self.cameras[side].datasheet
+        return sheet.rows, sheet.cols
+
     @property
     def devices(self) -> dict[str, Address]:
         """Its instruments by the name of their table: `monochromator`, `cameras.left`."""

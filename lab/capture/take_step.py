@@ -53,17 +53,8 @@ def arrange(step: Step, instruments: Instruments) -> Plan[None]:
                 "'prompt' asks you)"
             )
         moves.append((instruments.target, setting.target))
-    if setting.aperture is not None:
-        if instruments.aperture is None:
-            raise InputError(
-                f"station: step {step.id!r} needs the lens at {setting.aperture!r} and there is no [stage] to ask for "
-                "it; add one (driver 'prompt' asks you)"
-            )
-        # Before all else: the same hand puts the target there.
-        if instruments.aperture.value != setting.aperture:
-            yield Msg("set", instruments.aperture, setting.aperture, group="aperture")
-            yield Msg("wait", None, group="aperture")
-            cameras.in_series = False
+    for name in setting.by_hand:  # before all else: the same hand puts the target there
+        yield from adjust(name, instruments)
     if light is not None and instruments.shutter is not None:
         if setting.wavelength_nm is None:
             moves.append((instruments.shutter, False))
@@ -80,6 +71,15 @@ def arrange(step: Step, instruments: Instruments) -> Plan[None]:
     if opens:
         yield from _set_shutter(instruments, True)
     cameras.in_series = cameras.in_series and not moves and not opens
+
+
+def adjust(name: str, instruments: Instruments) -> Plan[None]:
+    """Have an adjustment set by hand, where it isn't known to be so. Raises InputError where nobody can be asked."""
+    hand = instruments.hand(name)
+    if hand.value != name:
+        yield Msg("set", hand, name, group="by hand")
+        yield Msg("wait", None, group="by hand")
+        instruments.cameras.in_series = False
 
 
 def _set_shutter(instruments: Instruments, opened: bool) -> Plan[None]:

@@ -234,6 +234,18 @@ class Target(Frozen):
         return None
 
 
+class Adjustment(Target):
+    """A state of what only an operator's hand changes: the lenses' stop, the knife edge's direction, the sensors'
+    temperature. He is asked for it as for a target. Each kind is a thing of its own; one of its states is the usual
+    one, in which it stands where no step asks for another."""
+
+    changes: ClassVar[str]  # the thing, in words
+
+    def is_usual(self, station: Equipment) -> bool:
+        """Return whether this is the state in which the thing stands between sessions."""
+        raise NotImplementedError
+
+
 TargetT = TypeVar("TargetT", bound=Target)
 TARGETS: ByKind[Target] = ByKind("target")
 AnyTarget = Annotated[Target, TARGETS]
@@ -272,13 +284,14 @@ class Equipment(Protocol):
     def limits(self) -> CaptureLimits: ...
     @property
     def f_number(self) -> float: ...
+    def frame_px(self, side: Side) -> tuple[int, int]: ...
     def list_targets(self, kind: type[TargetT]) -> dict[str, TargetT]: ...
     def one(self, kind: type[Target]) -> str: ...
     def lacks(self, *families: str) -> tuple[str, ...]: ...
 
 
 class Setting(Frozen):
-    """The bench's setting for a step. `target`, `slit_um` None: left as it is.
+    """The bench's setting for a step. `target`, `slit_um` None: left as it is. `by_hand`: adjustments, by name.
 
     `wavelength_nm`: of the monochromator; 0 is zero order (white light), None keeps its shutter closed. `pattern`: path
     in the session of what the screen shows; None leaves the screen dark. `cell_px`: screen pixels per cell of the
@@ -289,7 +302,16 @@ class Setting(Frozen):
     slit_um: float | None = None
     pattern: str | None = None
     cell_px: int = 1
-    aperture: str | None = None
+    by_hand: tuple[str, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _aperture_by_hand(cls, value: Any) -> Any:
+        """Journals that were written before there were other adjustments have the lenses' stop as `aperture`."""
+        if not isinstance(value, dict) or "aperture" not in value:
+            return value
+        kept = {key: one for key, one in value.items() if key != "aperture"}
+        return kept if value["aperture"] is None else kept | {"by_hand": (value["aperture"],)}
 
 
 class FixedExposure(Frozen):
@@ -363,6 +385,7 @@ class Sequence(Frozen):
     purpose: ClassVar[str]  # what is determined with it, in words
     instruments: ClassVar[tuple[str, ...]] = ()  # families of the station file that it can't do without
     targets: ClassVar[tuple[type[Target], ...]] = ()  # kinds of target that it puts before the cameras
+    adjustments: ClassVar[tuple[type[Adjustment], ...]] = ()  # kinds of what an operator's hand may change for it
 
     @classmethod
     def possible(cls, station: Equipment) -> bool:
@@ -428,6 +451,27 @@ def planned_keys(step_id: str, side: Side) -> dict[str, Any]:
     return {"id": f"{name_of(step_id)}-{side}", "side": side, "frame": frame_path(step_id, side), "exposure_s": 0.0}
 
 
+def usual_of(kind: type[Adjustment], station: Equipment) -> str:
+    """Return the name of an adjustment's usual state. Raises InputError where the station has none, as nothing could
+    be put back then."""
+    for name, one in station.list_targets(kind).items():
+        if one.is_usual(station):
+            return name
+    wanted = get_args(kind.model_fields["kind"].annotation)[0]
+    raise InputError(
+        f"station: no target of kind {wanted!r} is the usual state of {kind.changes}, so that it could be put back; "
+        "add that one to the station file"
+    )
+
+
+def back_step(stem: str, kind: type[Adjustment], station: Equipment) -> Step:
+    """Return the step `STEM/back`, in which an operator's hand puts an adjustment back. Raises InputError as
+    `usual_of`."""
+    usual = usual_of(kind, station)
+    what = f"{kind.changes} back to {usual}"
+    return Step(id=f"{stem}/back", what=what, setting=Setting(target=None, by_hand=(usual,)))
+
+
 def exposure_step(stem: str, what: str, setting: Setting, level: float, *, measures_light: bool = True) -> Step:
     """Return the step `STEM/exposure`: with `measures_light` it measures the radiance (at `spectrum_path` of its id),
     then finds the exposure for `level`."""
@@ -454,7 +498,7 @@ def register(kind: type[Capture]) -> None:
         return
     if SEQUENCES.setdefault(kind.sequence.name, kind.sequence) is not kind.sequence:
         raise ValueError(f"{kind.__name__}: the sequence name {kind.sequence.name!r} is taken; choose another name")
-    for target in kind.sequence.targets:
+    for target in (*kind.sequence.targets, *kind.sequence.adjustments):
         TARGETS.add(target)
 
 

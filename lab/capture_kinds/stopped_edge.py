@@ -11,14 +11,16 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
-from lab.capture_kinds.base import Equipment, Sequence, Setting, Step, Target
-from lab.capture_kinds.slanted_edge import EdgeCapture, EdgeSequence, EdgeTarget, edge_steps
+from lab.capture_kinds.base import Adjustment, Equipment, Sequence, Step, Target, back_step
+from lab.capture_kinds.slanted_edge import EdgeCapture, EdgeSequence, EdgeTarget, TurnTarget, edge_steps
 from lab.errors import InputError
 from sim.parameters import Quantity
 
 
-class ApertureTarget(Target):
-    """A stop of the lenses' aperture rings; the stop of the data sheet's f-number is one, too."""
+class ApertureTarget(Adjustment):
+    """A stop of the lenses' aperture rings; the stop of the data sheet's f-number is one, too, the usual one."""
+
+    changes: ClassVar[str] = "the lenses' aperture"
 
     kind: Literal["aperture"]
     f_number: float = Field(gt=0)
@@ -27,6 +29,9 @@ class ApertureTarget(Target):
     def instruction(self) -> str:
         return f"turn the aperture ring of each lens to f/{self.f_number:g}, and move neither focus nor target"
 
+    def is_usual(self, station: Equipment) -> bool:
+        return self.f_number == station.f_number
+
 
 class StoppedEdgeSequence(EdgeSequence):
     """Knife edges at `f_number`; the lenses are set back at the end."""
@@ -34,6 +39,7 @@ class StoppedEdgeSequence(EdgeSequence):
     name: ClassVar[str] = "stopped_edge"
     purpose: ClassVar[str] = "MTF at another f-number: which part of a blur is the lens's"
     targets: ClassVar[tuple[type[Target], ...]] = (EdgeTarget, ApertureTarget)
+    adjustments: ClassVar[tuple[type[Adjustment], ...]] = (TurnTarget,)
 
     f_number: Annotated[float, Quantity("1", "f-number that the lenses are set to", lower=0.5, upper=64.0)]
 
@@ -45,15 +51,11 @@ class StoppedEdgeSequence(EdgeSequence):
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
         stops = {stop.f_number: name for name, stop in station.list_targets(ApertureTarget).items()}
-        opened, usual = _stop_of(stops, self.f_number), _stop_of(stops, station.f_number)
+        opened = _stop_of(stops, self.f_number)
+        _stop_of(stops, station.f_number)
         stem = f"stopped_edge/f{self.f_number:g}"
-        taken = edge_steps(self, station, stem, StoppedEdgeCapture, aperture=opened, f_number=self.f_number)
-        back = Step(
-            id=f"{stem}/back",
-            what=f"lens back to {usual}",
-            setting=Setting(target=None, aperture=usual),
-        )
-        return (*taken, back)
+        taken = edge_steps(self, station, stem, StoppedEdgeCapture, by_hand=(opened,), f_number=self.f_number)
+        return (*taken, back_step(stem, ApertureTarget, station))
 
 
 def _stop_of(stops: Mapping[float, str], f_number: float) -> str:

@@ -66,16 +66,21 @@ def summary(runs: Mapping[str, LiveRun]) -> str:
     for name, group in groups.items():
         counts = ", ".join(f"{outcome} {n}" for outcome, n in Counter(run.outcome for run in group).most_common())
         lines.append(f"| {name} | {len(group)} | {counts or '-'} |")
-    by_commit: dict[str, list[str]] = {}
-    for name, run in runs.items():
-        by_commit.setdefault(run.commit or "unknown", []).append(name)
-    usual = max(by_commit, key=lambda commit: len(by_commit[commit]), default="unknown")
-    lines.append(f"\nRun at commit {usual}" + ("." if len(by_commit) < 2 else ", except:"))
-    lines += [f"- {commit}: {', '.join(names)}" for commit, names in by_commit.items() if commit != usual]
+    lines += commits(runs)
     unseen = sorted(name for name in runs if name in library() and name not in names_of(name))
     if unseen:
         lines.append(f"\nNot looked for, or shown by no measurement, so that no name is right: {', '.join(unseen)}.")
     return "\n".join(lines)
+
+
+def commits(runs: Mapping[str, LiveRun]) -> list[str]:
+    """Return the commits that cases were run at, as lines of Markdown."""
+    by_commit: dict[str, list[str]] = {}
+    for name, run in runs.items():
+        by_commit.setdefault(run.commit or "unknown", []).append(name)
+    usual = max(by_commit, key=lambda commit: len(by_commit[commit]), default="unknown")
+    lines = [f"\nRun at commit {usual}" + ("." if len(by_commit) < 2 else ", except:")]
+    return [*lines, *(f"- {commit}: {', '.join(names)}" for commit, names in by_commit.items() if commit != usual)]
 
 
 def table(runs: Mapping[str, LiveRun]) -> str:
@@ -248,12 +253,12 @@ FIRST_SESSION = ("dark", "flat", "screen")
 
 #: Weak losses of contrast that are alike in all directions: `--isotropic` resolves each in three captures at most.
 ISOTROPIC: dict[str, tuple[str, ...]] = {
-    "defocus": ("defocus_um=6", "defocus_um=9", "defocus_um=13", "defocus_um=5", "defocus_um=7.5"),
-    "spherical_aberration": ("w040_um=0.07", "w040_um=0.1", "w040_um=0.14", "w040_um=0.04", "w040_um=0.055"),
-    "charge_diffusion": ("length_um=0.45", "length_um=0.6", "length_um=0.8", "length_um=0.55", "length_um=0.7"),
-    "pixel_aperture": tuple(f"side_change_um={um}" for um in (-0.25, -0.4, -0.55, -0.8, -1.1)),
+    "defocus": tuple(f"defocus_um={um}" for um in (6, 9, 13, 5, 7.5, 8, 10, 11)),
+    "spherical_aberration": tuple(f"w040_um={um}" for um in (0.07, 0.1, 0.14, 0.04, 0.055, 0.06, 0.08, 0.12)),
+    "charge_diffusion": tuple(f"length_um={um}" for um in (0.45, 0.6, 0.8, 0.55, 0.7, 0.5, 0.65, 0.75)),
+    "pixel_aperture": tuple(f"side_change_um={um}" for um in (-0.25, -0.4, -0.55, -0.8, -1.1, -0.5, -0.65, -0.95)),
     "optical_low_pass_filter": tuple(
-        f"displacement_x_um={um},displacement_y_um={um}" for um in (0.8, 1.1, 1.4, 1.0, 1.25)
+        f"displacement_x_um={um},displacement_y_um={um}" for um in (0.8, 1.1, 1.4, 1.0, 1.25, 0.9, 1.2, 1.3)
     ),
 }
 MOST_CAPTURES = 3
@@ -403,6 +408,9 @@ def isotropic_table(runs: Mapping[str, LiveRun]) -> str:
     """Markdown: how many are named right, by the concealed name alone, after each capture; then each case."""
     done = [run for run in runs.values() if run.stages]
     lines = [
+        f"{len(runs)} of {len(isotropic_cases())} cases run.",
+        *commits(runs),
+        "",
         "| captures | named right | with a rival left | another name | no name | lab time, s |",
         "| --- " * 6 + "|",
     ]
@@ -653,9 +661,13 @@ def main(
     runs = run_all({name: case for name, case in every.items() if not only or name in only}, out)
     if isotropic:
         print(isotropic_table(runs))
-    if page is not None and not isotropic:  # with the results of earlier runs
+    if page is not None:  # with the results of earlier runs
         there = {name: out / "results" / f"{name}.json" for name in every}
-        write_page({name: load(LiveRun, file) for name, file in there.items() if file.exists()}, page)
+        found = {name: load(LiveRun, file) for name, file in there.items() if file.exists()}
+        if isotropic:
+            page.write_text(placed(page.read_text(encoding="utf-8"), "isotropic", isotropic_table(found)), "utf-8")
+        else:
+            write_page(found, page)
     right = sum(run.outcome in ("named", "healthy") for run in runs.values())
     print(f"{right} of {len(runs)} right; results in {out / 'results'}")
 

@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from lab.cli.bench_process import mock_bench
 from lab.cli.console import check_writable, err, out, write_json
-from lab.cli.sources import Json, StoreFolder, open_store, run_here
+from lab.cli.sources import Json, StoreFolder, open_store, recordings_of, run_here, store_to_read
 from lab.cli.tables import print_fit, print_resolving, print_sequences
 from lab.errors import InputError
 from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult, capture_here
@@ -21,6 +21,7 @@ from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult, captur
 if TYPE_CHECKING:
     from lab.capture.session import Progress as CaptureProgress
     from lab.capture.store import Store
+    from lab.resolve import ResolveLimits
 
 commands = typer.Typer()
 
@@ -111,6 +112,15 @@ def run(
         int | None,
         typer.Option("--resolve-rounds", metavar="N", help="with --resolve: captures that it takes at most (else 6)"),
     ] = None,
+    recordings: Annotated[
+        str,
+        typer.Option(
+            "--recordings",
+            metavar="SOURCE",
+            help="with --resolve and --station: settle what these leave in doubt, a recording set's folder or a stored "
+            "session's id, by captures of the station that made them",
+        ),
+    ] = "",
     only: Only = None,
     parameters: Set = None,
     conceal: Conceal = None,
@@ -123,14 +133,26 @@ def run(
 
     limits = resolve_limits(resolve, resolve_minutes, resolve_rounds)
     store = open_store(out_folder)
-    session = CaptureRequest(
-        session=resume,
-        quick=quick,
-        only=tuple(only or ()),
-        parameters=parse_parameters(parameters or ()),
-        name=name,
-    )
-    request = PipelineRequest("pipeline", capture=session, resolve=limits)
+    if recordings:
+        if station is None or limits is None:
+            raise InputError(
+                "--recordings: are settled by captures of the station that made them; give --station and --resolve, or "
+                "take `calibench report`"
+            )
+        if quick or name or resume or only or parameters or conceal:
+            raise InputError(
+                "--recordings: were captured already; leave --quick, --name, --resume, --only, --set and --conceal out"
+            )
+        request = _settling(recordings, station, limits, out_folder)
+    else:
+        session = CaptureRequest(
+            session=resume,
+            quick=quick,
+            only=tuple(only or ()),
+            parameters=parse_parameters(parameters or ()),
+            name=name,
+        )
+        request = PipelineRequest("pipeline", capture=session, resolve=limits)
     verb = ["run"]  # what goes on then fits and diagnoses, too
     verb += ["--resolve"] if resolve else []
     verb += [] if resolve_minutes is None else [f"--resolve-minutes={resolve_minutes:g}"]
@@ -147,8 +169,19 @@ def run(
         for line in lines:
             out.print(escape(line))
     print_resolving(found.diagnosis)
-    out.print(f"\nsession: {found.session}")
+    out.print("" if found.session is None else f"\nsession: {found.session}")
     out.print(f"report: {found.report}")
+
+
+def _settling(source: str, station_file: Path, limits: ResolveLimits, data: Path | None) -> PipelineRequest:
+    """Return the request that settles what recordings leave in doubt, on the station that made them. Raises InputError
+    where it is another one."""
+    from lab.capture.station import read_station
+    from lab.resolve import station_of
+
+    station = read_station(station_file)
+    recordings = recordings_of(source, data)
+    return PipelineRequest("pipeline", recordings=recordings, resolve=limits, station=station_of(recordings, station))
 
 
 @commands.command()
@@ -183,6 +216,31 @@ def sequences(
         print_sequences(catalogue(), found)
 
 
+@commands.command("put-back")
+def put_back(
+    session: Annotated[
+        str, typer.Argument(metavar="[SESSION]", help="say that what this session left changed is put back")
+    ] = "",
+    data: StoreFolder = None,
+) -> None:
+    """What sessions that ended early left changed by hand, and how to put it back; with SESSION: it is put back."""
+    from lab.capture.by_hand import left_by_hand, note_put_back
+
+    root = store_to_read(data).root
+    left = {one.session: one for one in left_by_hand(root)}
+    if session and session not in left:
+        known = f"; those are {', '.join(left)}" if left else "; nothing is"
+        raise InputError(f"session {session}: left nothing changed by hand{known}")
+    if session:
+        note_put_back(root, session)
+        out.print(f"session {escape(session)}: put back")
+        return
+    for one in left.values():
+        out.print(f"session {escape(one.session)}: {escape(one.words)}")
+    if not left:
+        out.print("nothing is left changed by hand")
+
+
 def _carried_out(
     request: PipelineRequest, store: Store, station_file: Path | None, conceal: list[str] | None, verb: list[str]
 ) -> PipelineResult:
@@ -190,24 +248,33 @@ def _carried_out(
     for each session. Where it is interrupted, tells the command that goes on; `verb`: its first words."""
     if station_file is not None and conceal:
         raise InputError("--conceal: only the mock bench conceals effects; leave --station out")
-    assert request.capture is not None
-    session = request.capture.session
+    from lab.capture.by_hand import left_by_session
+
+    captured_here: dict[str, None] = {}
+    session = "" if request.capture is None else request.capture.session
 
     def captured(wanted: CaptureRequest, tell: Callable[[CaptureProgress], None]) -> str:
         from lab.capture.station import read_station
 
         def told(progress: CaptureProgress) -> None:
             nonlocal session
+            captured_here[progress.session] = None
             session = session or progress.session  # the first: later ones resolve its doubts
             tell(progress)
 
+        if request.station is not None:
+            return capture_here(store, request.station, wanted, told)
         with contextlib.nullcontext(station_file) if station_file else mock_bench(conceal or []) as file:
             return capture_here(store, read_station(file), wanted, told)
 
     try:
         return run_here(request, store, captured)
-    except KeyboardInterrupt:
-        if session:
+    except BaseException as error:
+        for left in filter(None, (left_by_session(store.root, one) for one in captured_here)):
+            err.print(f"calibench: session {escape(left.session)}: {escape(left.words)}")
+        if request.capture is None and isinstance(error, KeyboardInterrupt):
+            err.print("calibench: the same command goes on where it was")
+        elif session and isinstance(error, KeyboardInterrupt):
             command = _resuming(verb, session, store, station_file, conceal or [])
             err.print(f"calibench: go on with `{escape(command)}`")
         raise

@@ -16,7 +16,9 @@ from typing import Any
 import pytest
 
 from api.client import ServiceClient
+from lab.capture.by_hand import ByHand, left_by_hand
 from lab.capture.queue import put_into_queue
+from lab.capture.station import read_station
 from lab.formats.camera_file import CameraFile, default_camera, write_camera
 from lab.formats.recording_set import packed
 from tests.api.conftest import STATION, Running, serving, until_state
@@ -702,6 +704,25 @@ def test_a_key_that_may_only_read_gets_no_button_that_fails(browser: Any, lab: R
         words = {button.inner_text() for button in page.query_selector_all("main button") if button.is_visible()}
         assert address == "/drift" or words <= harmless, address
     watched.close()
+
+
+def test_what_a_hand_changed_is_told_until_somebody_says_that_it_is_put_back(browser: Any, tmp_path: Path) -> None:
+    with serving(tmp_path) as running:
+        station = running.store.root / "stations" / "fakes.toml"
+        stops = "".join(f'\n[targets."f/{n}"]\nkind = "aperture"\nf_number = {n}\n' for n in (4, 8))
+        station.write_text(station.read_text().replace("rows =", "f_number = 4.0, rows =") + stops)
+        by_hand = ByHand(running.store.root, "20260101-000000-abcdef", read_station(station))
+        by_hand.note_asked("f/8")
+        by_hand.note_done("f/8")
+        watched = Watched(browser, running)
+        watched.log_in(running, "operate")
+        told = watched.page.wait_for_selector("#stations .by-hand:has-text('stands at f/8')")
+        assert "turn the aperture ring of each lens to f/4" in told.inner_text()
+        assert watched.faults() == []
+        watched.page.click("text=It is put back")
+        watched.page.wait_for_selector("#stations .by-hand:empty", state="attached")
+        assert left_by_hand(running.store.root) == ()
+        watched.close()
 
 
 def test_what_was_chosen_stays_chosen(browser: Any, lab: Running) -> None:

@@ -33,6 +33,7 @@ ROUTES = [
     ("POST", "/stations/{name}/devices/{device}/check", "operate"),
     ("GET", "/stations/{name}/devices/{device}/transcript", "read"),
     ("POST", "/stations/{name}/check", "operate"),
+    ("POST", "/stations/{name}/put-back", "operate"),
     ("GET", "/sessions", "read"),
     ("POST", "/sessions", "operate"),
     ("GET", "/sessions/{session_id}", "read"),

@@ -18,6 +18,7 @@ import lab.resolve
 from lab.capture.catalogue import StepTimes
 from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession, Progress
+from lab.capture.station import Station
 from lab.capture.store import Store
 from lab.capture.take_step import DUMMY_FRAMES
 from lab.capture_kinds.dark import DarkSequence
@@ -39,7 +40,7 @@ from lab.pipeline import (
     run_pipeline,
     source_recordings,
 )
-from lab.resolve import ResolveLimits, read_journal
+from lab.resolve import ResolveLimits, check_same_cameras, read_journal, resolving_folder, station_of
 from tests.lab import fake_bench
 from tests.lab.doubts import DARKS, doubt, offered
 
@@ -382,7 +383,7 @@ def test_resolving_captures_and_diagnoses_until_it_is_settled(
     assert [store.session(one.session).name for one in told.resolutions] == ["one resolve"] * len(taken)
     assert seen == [8 * (1 + number) for number in range(len(taken) + 1)]  # each diagnosis sees all captures before it
     assert len(remarks) == 1 and remarks[0] == f"resolve: {end}: {told.resolve_reason}"
-    journal = read_journal(store, found.session)
+    journal = read_journal(store.folder(found.session))
     assert journal is not None and (journal.resolutions, journal.end) == (told.resolutions, told.resolve_end)
     assert store.results(found.session, "diagnose")[0].document == told.model_dump(mode="json")
 
@@ -433,7 +434,7 @@ def test_a_resolving_that_ended_in_the_middle_goes_on_where_it_was(
         with pytest.raises(KilledError):
             resolving(store, monkeypatch, first, tell=kill)
     base = next(one.id for one in store.sessions() if one.name == "one")
-    journal = read_journal(store, base)
+    journal = read_journal(store.folder(base))
     assert journal is not None
     (begun,) = journal.resolutions
     assert (begun.capture, begun.rivals_after, journal.end) == ("darks", None, None)
@@ -471,3 +472,95 @@ def test_without_a_diagnosis_of_its_own_nothing_is_resolved(
     with pytest.raises(InputError, match=said) as refused:
         PipelineRequest(goal, resolve=ResolveLimits(), **source, **more)
     assert "\n" not in str(refused.value)
+
+
+# --- recordings with a station ----------------------------------------------------------------------------------------
+
+
+def sent_in(store: Store, folder: Path) -> RecordingSet:
+    """A recording set that the fake station has made, as somebody sends it in."""
+    found = run_pipeline(
+        PipelineRequest("capture", capture=CaptureRequest(plan=DARKS)), store=store, capturer=Bench(store)
+    )
+    assert found.session is not None
+    recording_set.write(store.recording_set(found.session), folder)
+    store.delete_session(found.session)
+    return recording_set.read(folder)
+
+
+def test_what_recordings_leave_in_doubt_is_settled_on_the_station_that_made_them(
+    store: Store, steps: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It ends while the capture is taken; the same request goes on with it, and the recordings are left as they are."""
+    recordings, bench, seen = sent_in(store, tmp_path / "set"), Bench(store), []
+    own = station_of(recordings, fake_bench.station(), bench.bench.drivers)
+    assert bench.bench.shots == 0
+
+    def examine(given: RecordingSet, *_: Any, **more: Any) -> Diagnosis:
+        assert more["station"] == own
+        seen.append(len(given.captures()))
+        left = tuple(doubt(offered("darks"))) if len(given.captures()) == 8 else ()
+        return Diagnosis(DiagnosisResult(source="x", verdict=TIE if left else "explained"), {}, left)
+
+    monkeypatch.setattr(lab.diagnose, "examine", examine)
+    monkeypatch.setattr(lab.resolve, "step_times", lambda *_: StepTimes({}))
+    request = PipelineRequest("pipeline", recordings=recordings, resolve=ResolveLimits(), station=own)
+
+    def cancel(progress: PipelineProgress) -> None:
+        if progress.step == "resolve" and progress.capture is not None and progress.capture.done == 2:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        run_pipeline(request, cancel, store=store, capturer=bench)
+    (begun,) = store.sessions()
+    found = run_pipeline(request, store=store, capturer=bench)
+    assert [one.id for one in store.sessions()] == [begun.id]
+    assert seen == [8, 16]
+    assert found.diagnosis is not None and found.diagnosis.resolve_end == "settled"
+    assert found.report == resolving_folder(store.root, recordings) / "report.html"
+    journal = read_journal(resolving_folder(store.root, recordings))
+    assert journal is not None and [one.session for one in journal.resolutions] == [begun.id]
+    assert len(recording_set.read(tmp_path / "set").captures()) == 8
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("another camera", "was recorded with the left camera SN-1, the station has SN-2; connect that one, or name"),
+        ("no serial number", "doesn't say a serial number; only SN-1 can settle"),
+        ("nobody knows", "doesn't say the serial number of its left camera"),
+        ("another data sheet", "the left camera's data sheet says bit_depth = 12, the station file 10"),
+        ("one camera", "has a right camera, and the station has none"),
+    ],
+)
+def test_another_station_is_refused_in_one_line(what: str, said: str, store: Store, tmp_path: Path) -> None:
+    recordings, bench = sent_in(store, tmp_path / "set"), fake_bench.Bench()
+    table = fake_bench.station().model_dump(mode="json")
+    if what in ("another camera", "no serial number"):
+        bench.serials[fake_bench.FakeCamera(bench, "left").who] = "SN-2" if what == "another camera" else ""
+    elif what == "nobody knows":
+        recordings = recordings.under(recordings.manifest.model_copy(update={"instruments": {}}))
+    elif what == "another data sheet":
+        table["cameras"]["left"]["datasheet"]["bit_depth"] = 10
+    else:
+        del table["cameras"]["right"]
+    with pytest.raises(InputError, match=said) as refused:
+        station_of(recordings, Station.model_validate(table), bench.drivers)
+    assert "\n" not in str(refused.value) and bench.shots == 0
+
+
+def test_a_station_with_more_cameras_settles_with_those_of_the_recordings(store: Store, tmp_path: Path) -> None:
+    recordings = sent_in(store, tmp_path / "set")
+    cameras = {"left": recordings.manifest.cameras["left"]}
+    left = tuple(c for c in recordings.captures() if c.side == "left")
+    manifest = recordings.manifest.model_copy(update={"cameras": cameras, "captures": left})
+    own = station_of(recordings.under(manifest), fake_bench.station(), fake_bench.Bench().drivers)
+    assert own.sides == ("left",)
+
+
+def test_a_camera_that_is_exchanged_between_captures_is_refused(store: Store, tmp_path: Path) -> None:
+    recordings, other = sent_in(store, tmp_path / "set"), Bench(store)
+    other.bench.serials[fake_bench.FakeCamera(other.bench, "left").who] = "SN-2"
+    found = run_pipeline(PipelineRequest("capture", capture=CaptureRequest(plan=DARKS)), store=store, capturer=other)
+    with pytest.raises(InputError, match="the station has SN-2"):
+        check_same_cameras(recordings, found.recordings)

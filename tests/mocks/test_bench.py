@@ -261,6 +261,34 @@ class TestTargets:
         finally:
             bench.place("f/4")
 
+    def test_a_turned_edge_leans_to_the_right_by_its_turn(self, bench: Bench) -> None:
+        """By the places of half the light in 40 rows of a channel. Rounded to a pixel (0.29 px), their slope is known
+        to 0.29 / (11.5 sqrt 40) = 0.004, a quarter of a degree at 45; the lens bends lines by as much."""
+
+        def lean_deg() -> float:
+            rate = bench._light_rate("left")[1:480:2, 1:640:2][100:140, 110:210]  # one channel, about the middle
+            half = 0.5 * (rate.min() + rate.max())
+            crossing = np.argmin(np.abs(rate - half), axis=1)
+            return float(np.degrees(np.arctan(-np.polyfit(np.arange(len(crossing)), crossing, 1)[0])))
+
+        bench.place("edge-1")
+        try:
+            straight = lean_deg()
+            bench.place("turn 45")
+            assert bench.placed == "edge-1"
+            assert lean_deg() - straight == pytest.approx(45.0, abs=0.7)
+        finally:
+            bench.place("turn 0")
+
+    def test_sensors_are_brought_to_a_temperature_and_back(self, bench: Bench) -> None:
+        usual = bench.sensor_temperature_c("left")
+        try:
+            bench.place("35 C")
+            assert bench.sensor_temperature_c("left") == bench.sensor_temperature_c("right") == 35.0
+        finally:
+            bench.place("usual")
+        assert bench.sensor_temperature_c("left") == pytest.approx(usual, abs=0.2)  # the air's own change
+
     def test_every_target_has_a_layout(self, bench: Bench) -> None:
         assert set(bench.station_targets()) == set(bench.targets)
 

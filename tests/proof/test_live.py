@@ -27,6 +27,7 @@ from lab.challenge.live import (
     isotropic_cases,
     isotropic_table,
     judged,
+    main,
     run_all,
     run_case,
     summary,
@@ -160,6 +161,30 @@ def test_results_that_are_there_are_not_run_again(tmp_path: Path) -> None:
     assert "Run at commit unknown." in text
     others = {name: kept.model_copy(update={"commit": "1234567"}) for name in ("coma", "ghost")}
     assert "Run at commit 1234567, except:\n- unknown: defocus" in summary(runs | others)
+
+
+def test_the_isotropic_cases_that_have_run_go_into_the_page(tmp_path: Path) -> None:
+    """Each with what stood before and after its captures; the rest of the page stays."""
+    found = result("explained", ("defocus", ("left",), {"defocus_um": 6.0}, ()))
+    cases = isotropic_cases()
+    assert len(cases) == 40
+    for name in list(cases)[:3]:  # of three effects
+        run = judged(cases[name], found).model_copy(update={"commit": "abcdef0"})
+        store(run, tmp_path / "results" / f"{name}.json")
+    page = tmp_path / "page.md"
+    page.write_text("# Proof\n")
+    for _ in range(2):
+        main(out=tmp_path, only=list(cases)[:1], page=page, cases=False, isotropic=True)
+    text = page.read_text()
+    assert text.startswith("# Proof\n") and text.count("3 of 40 cases run.") == 1
+    assert "Run at commit abcdef0." in text
+    assert "| 0 | 1 of 3 | 0 of 3 | 2 of 3 | 0 of 3 | 0 |" in text
+
+
+@pytest.mark.parametrize("case", isotropic_cases().values(), ids=lambda case: case.name)
+def test_the_bench_takes_every_isotropic_case(case: LiveCase) -> None:
+    concealed = parse(case.concealed)
+    assert [effect.name for effect in concealed["left"]] == [case.effects[0]]
 
 
 def test_a_size_with_an_interval_is_drawn_and_told_with_it() -> None:

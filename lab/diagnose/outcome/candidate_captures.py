@@ -10,11 +10,11 @@ import numpy as np
 
 from lab.capture.plan import CapturePlan
 from lab.capture_kinds.base import Equipment
-from lab.capture_kinds.dark import DarkCapture, DarkSequence
+from lab.capture_kinds.dark import DarkCapture, DarkSequence, TemperatureTarget
 from lab.capture_kinds.flat import FlatSequence
 from lab.capture_kinds.narrowband import NarrowbandSequence
 from lab.capture_kinds.screen import ScreenSequence
-from lab.capture_kinds.slanted_edge import EdgeSequence, EdgeTarget
+from lab.capture_kinds.slanted_edge import EdgeSequence, EdgeTarget, TurnTarget
 from lab.capture_kinds.stopped_edge import ApertureTarget, StoppedEdgeSequence
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.curves import CURVE_ROUGH_STD
@@ -42,6 +42,11 @@ NUISANCE_STD = 10.0
 #: Directions of knife edges (deg from the vertical) where no station says them, and wavelengths of their light beside
 #: white. A channel that sees less of a light than this share of the brightest isn't counted.
 EDGE_ANGLES_DEG, EDGE_LIGHTS_NM, DIMMEST_CHANNEL = (5.0, 50.0, 95.0, 140.0), (450.0, 550.0, 650.0), 0.02
+#: Turns of a knife edge by hand (deg) where a station says none; a direction is a new one where it lies so far (deg)
+#: from every other.
+TURNS_DEG, LEAST_TURN_DEG = (45.0, 90.0), 15.0
+#: By how much (C) sensors are warmed where a station says no temperatures, and exposures (s) of darks at each.
+WARMER_C, WARM_EXPOSURES_S = (10.0, 20.0), (0.01, 1.0, 5.0)
 #: What a station lacks for a capture that no sequence takes.
 BY_HAND = "no sequence takes it; take it by hand and diagnose it with the session's captures"
 #: Length of a session (s), over which drifts show.
@@ -99,7 +104,7 @@ def candidate_captures(
     yield from _edges(camera, model, lamp, station)
     yield from _exposure_series(camera, lamp)
     yield from _steady(camera, lamp)
-    yield from _darks(camera)
+    yield from _darks(camera, station)
     yield from _again(recordings, side, model)
 
 
@@ -165,6 +170,7 @@ def _edges(
         places = np.unique(x)
         std = np.interp(frequency, places, [float(np.sqrt(variance[x == place].min())) for place in places])
     edges = _edge_angles(station)
+    turned = _turned_edges(station, edges)
     lights = {("the lamp's light", 0.0): lamp} | {
         (f"light of {nm:g} nm", nm): Spectrum.of((nm - 10.0, nm, nm + 10.0), (0.0, 1e-3, 0.0)) for nm in EDGE_LIGHTS_NM
     }
@@ -178,8 +184,11 @@ def _edges(
         lit = {c: float(np.sqrt(brightest / one)) for c, one in rate.items() if one > DIMMEST_CHANNEL * brightest > 0.0}
         for f_number in stops if lit else ():
             at = "" if f_number == usual else f" at f/{f_number:g}"
-            for which in [tuple(edges), *((one,) for one in edges)]:
-                angles = np.deg2rad([edges[name] for name in which])
+            # what two hands change, the ring's and the holder's, is never proposed at once
+            by_turn = {0.0: [tuple(edges), *((one,) for one in edges)]} | (turned if f_number == usual else {})
+            for turn_deg, which in ((turn, one) for turn, ones in by_turn.items() for one in ones):
+                at_deg = [edges[name] + turn_deg for name in which]
+                angles = np.deg2rad(at_deg)
                 fx, fy = np.outer(np.cos(angles), frequency), np.outer(np.sin(angles), frequency)
 
                 def predict(
@@ -197,13 +206,15 @@ def _edges(
                     )
 
                 noise = np.concatenate([np.tile(dimmer * std, len(which)) for dimmer in lit.values()])
-                one = f" at {edges[which[0]]:.3g} degrees" if len(which) == 1 else ""
-                every = "" if one else f" at {_listed(edges.values())} degrees"
+                is_one = len(which) == 1
+                words = f"{'a slanted edge' if is_one else 'slanted edges'} at {_listed(at_deg)} degrees"
+                words += f", {which[0]} turned by {turn_deg:g} degrees," if turn_deg else ""
+                named = which if is_one and station is not None else ()
                 yield CandidateCapture(
-                    f"{'a slanted edge' if one else 'slanted edges'}{one or every} in {light_words}{at}",
+                    f"{words} in {light_words}{at}",
                     predict,
                     np.diag(np.square(noise)),
-                    _edge_plan(nm, f_number, usual, which if one and station is not None else ()),
+                    _edge_plan(nm, f_number, usual, named, turn_deg),
                 )
 
 
@@ -214,15 +225,34 @@ def _edge_angles(station: Equipment | None) -> dict[str, float]:
     return {name: edge.angle_deg for name, edge in there.items()} or {f"edge {a:g}": a for a in EDGE_ANGLES_DEG}
 
 
+def _turned_edges(station: Equipment | None, edges: dict[str, float]) -> dict[float, list[tuple[str, ...]]]:
+    """Return the turns of a station's knife edges by hand that give a direction which it hasn't otherwise, each with
+    the edge that is turned; of a station without such turns, those of `TURNS_DEG`, which it then lacks."""
+    if station is None:
+        return {}
+    there = sorted({turn.angle_deg for turn in station.list_targets(TurnTarget).values()} - {0.0}) or TURNS_DEG
+    known = list(edges.values())
+    found: dict[float, list[tuple[str, ...]]] = {}
+    for turn_deg in there:
+        for name, angle_deg in edges.items():
+            if all(abs((angle_deg + turn_deg - other + 90.0) % 180.0 - 90.0) >= LEAST_TURN_DEG for other in known):
+                known.append(angle_deg + turn_deg)
+                found.setdefault(turn_deg, []).append((name,))
+    return found
+
+
 def _stops(station: Equipment | None, usual: float) -> tuple[float, ...]:
     """Return the f-numbers that a station's lenses are set to; without any, twice the usual one."""
     there = station.list_targets(ApertureTarget) if station is not None else {}
     return tuple(sorted({stop.f_number for stop in there.values()} - {usual})) or (2.0 * usual,)
 
 
-def _edge_plan(wavelength_nm: float, f_number: float, usual: float, edges: tuple[str, ...]) -> CapturePlan:
+def _edge_plan(
+    wavelength_nm: float, f_number: float, usual: float, edges: tuple[str, ...], turn_deg: float
+) -> CapturePlan:
     if f_number == usual:
-        return CapturePlan((EdgeSequence(frames=REPEATS, wavelength_nm=wavelength_nm, edges=edges),))
+        edge = EdgeSequence(frames=REPEATS, wavelength_nm=wavelength_nm, edges=edges, turn_deg=turn_deg)
+        return CapturePlan((edge,))
     stopped = StoppedEdgeSequence(frames=REPEATS, wavelength_nm=wavelength_nm, edges=edges, f_number=f_number)
     return CapturePlan((stopped,))
 
@@ -297,15 +327,19 @@ def _steady(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateCapture]:
     )
 
 
-def _darks(camera: CameraModel) -> Iterator[CandidateCapture]:
-    """Dark frames by exposure, by time and by temperature; black level and dark current are nuisance parameters."""
+def _darks(camera: CameraModel, station: Equipment | None) -> Iterator[CandidateCapture]:
+    """Dark frames by exposure, by time and by temperature; black level and dark current are nuisance parameters. The
+    temperatures are those that a hand brings the sensors of `station` to."""
     gain, reference = camera.conversion_gain_dn_per_e, camera.dark_current_reference_c
     times = np.linspace(0.0, SESSION_S, 13)
+    known = () if station is None else station.list_targets(TemperatureTarget).values()
+    warm_c = sorted({one.sensor_c for one in known if one.sensor_c is not None})
+    warm_words = f"dark frames with the sensor at {_listed(warm_c)} C" if warm_c else ""
+    if not warm_c:
+        warm_c, warm_words = [reference + c for c in WARMER_C], "dark frames with the sensor 10 and 20 degrees warmer"
     series = {
         "dark frames every five minutes for an hour": [(0.01, t, reference) for t in times],
-        "dark frames with the sensor 10 and 20 degrees warmer": [
-            (s, 0.0, reference + c) for c in (0, 10, 20) for s in (0.01, 1.0, 5.0)
-        ],
+        warm_words: [(s, 0.0, at_c) for at_c in (reference, *warm_c) for s in WARM_EXPOSURES_S],
         "dark frames from 1 ms to 20 s": [(s, 0.0, reference) for s in np.geomspace(0.001, 20.0, 10)],
     }
     for words, steps in series.items():
@@ -321,9 +355,17 @@ def _darks(camera: CameraModel) -> Iterator[CandidateCapture]:
         seconds = np.array([s for s, _, _ in steps])
         covariance = np.eye(len(steps)) * (2 * BLACK_FLOOR_DN) ** 2
         covariance += NUISANCE_STD**2 * (np.ones_like(covariance) + np.outer(seconds, seconds))
-        exposures = "from 1 ms" in words
-        plan = CapturePlan((DarkSequence(exposures_s=tuple(seconds.round(4).tolist()), frames=REPEATS),))
-        yield CandidateCapture(words, predict, covariance, plan if exposures else None)
+        plan = None
+        if "from 1 ms" in words:
+            plan = CapturePlan((DarkSequence(exposures_s=tuple(seconds.round(4).tolist()), frames=REPEATS),))
+        elif words == warm_words and station is not None:
+            plan = CapturePlan(
+                tuple(
+                    DarkSequence(exposures_s=WARM_EXPOSURES_S, frames=REPEATS, sensor_c=at_c)
+                    for at_c in (None, *warm_c)
+                )
+            )
+        yield CandidateCapture(words, predict, covariance, plan)
 
 
 def _again(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Iterator[CandidateCapture]:

@@ -16,10 +16,12 @@ import lab.fit
 import lab.jobs
 import lab.predict.validate
 import lab.report
+from api.client import ServiceClient
 from api.security import REPORT_POLICY
 from lab.capture.store import Store
 from lab.diagnose import Diagnosis
 from lab.errors import InputError
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, DiagnosisResult, FitResult, NoiseFit, ReportFile, ValidationResult
 from lab.pipeline import PipelineProgress, PipelineRequest, Tell
 from tests.api.conftest import Running, events, serving, until, until_state
@@ -215,6 +217,37 @@ def test_a_pipeline_resolves_and_its_session_tells_the_journal(
     assert step["capture"] == "more darks" and step["rivals_after"] == []
     assert step["rivals"] == [{"name": "defocus", "probability": 0.7}, {"name": "coma", "probability": 0.3}]
     assert told["resolutions"] == journal["resolutions"] and told["resolve_end"] == "settled"
+
+
+def test_recordings_are_settled_on_the_station_that_made_them(
+    running: Running, quick_steps: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def examine(recordings: RecordingSet, *_: object, **__: object) -> Diagnosis:
+        left = tuple(doubt(offered("more darks"))) if len(recordings.captures()) == first else ()
+        return Diagnosis(DiagnosisResult(source="x", verdict="unexplained" if left else "explained"), {}, left)
+
+    monkeypatch.setattr(lab.diagnose, "examine", examine)
+    asked = {"kind": "pipeline", "resolve": True, "station": "fakes"}
+    (running.store.root / "reports").mkdir()  # the page is a stand-in
+    with running.client("admin") as client, ServiceClient(running.url, running.keys["admin"]) as sender:
+        made = client.post("/api/v1/sessions", json={"station": "fakes", "quick": True, "sequences": ["dark"]}).json()
+        until_state(client, made["id"], "finished")
+        sent = sender.send_recordings(sender.fetch_session(made["id"], running.store.root / "made.zip"))
+        here, first = f"/api/v1/recordings/{sent.id}/jobs", sent.captures
+        with running.client("calibrate") as other:
+            assert other.post(here, json=asked).status_code == 403
+        for half in ({"resolve": True}, {"station": "fakes"}):
+            refused = client.post(here, json={"kind": "pipeline"} | half)
+            assert refused.status_code == 422 and "give both, or none" in refused.json()["detail"]
+        running.bench.serials["camera left"] = "SN-2"
+        refused = client.post(here, json=asked)
+        assert refused.status_code == 422 and "the station has SN-2" in refused.json()["detail"]
+        running.bench.serials.clear()
+        job = client.post(here, json=asked).json()
+        ended = until(client, f"/api/v1/jobs/{job['id']}", lambda now: now["state"] not in ("queued", "running"))
+        assert ended["state"] == "done", ended["error"]
+        told = client.get(f"/api/v1/jobs/{job['id']}/result").json()["diagnosis"]
+    assert [one["capture"] for one in told["resolutions"]] == ["more darks"] and told["resolve_end"] == "settled"
 
 
 @pytest.mark.parametrize(

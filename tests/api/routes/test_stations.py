@@ -16,6 +16,8 @@ from drivers import discovery
 from drivers.contract.scripted import ScriptedPeer
 from drivers.discovery import Found
 from drivers.errors import Disconnected
+from lab.capture.by_hand import ByHand, left_by_hand
+from lab.capture.station import read_station
 from lab.capture_kinds.base import SEQUENCES
 from tests.api.conftest import Running, until, until_state
 from tests.lab.fake_bench import Bench, FakeMonochromator
@@ -231,3 +233,23 @@ def test_the_typed_client_estimates(shared: Running) -> None:
         assert [one.name for one in found.sequences] == list(client.station("fakes").sequences)
         with pytest.raises(ServiceProblem, match="no station 'none'"):
             client.estimate("none")
+
+
+# --- by hand ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_was_left_changed_by_hand_is_told_until_it_is_put_back(running: Running) -> None:
+    station = running.store.root / "stations" / "fakes.toml"
+    stops = "".join(f'\n[targets."f/{n}"]\nkind = "aperture"\nf_number = {n}\n' for n in ("4.0", "8.0"))
+    station.write_text(station.read_text().replace("rows =", "f_number = 4.0, rows =") + stops)
+    by_hand = ByHand(running.store.root, "20260101-000000-abcdef", read_station(station))
+    with running.client("operate") as client:
+        assert client.get("/api/v1/stations/fakes").json()["left_by_hand"] == []
+        by_hand.note_asked("f/8.0")
+        by_hand.note_done("f/8.0")
+        (left,) = client.get("/api/v1/stations/fakes").json()["left_by_hand"]
+        assert left["session"] == "20260101-000000-abcdef"
+        assert "stands at f/8.0" in left["words"] and "to f/4" in left["words"]
+        answer = client.post("/api/v1/stations/fakes/put-back")
+        assert answer.status_code == 200 and answer.json()["left_by_hand"] == []
+    assert left_by_hand(running.store.root) == ()

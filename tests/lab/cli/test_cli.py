@@ -23,6 +23,7 @@ import typer
 import lab.diagnose
 import lab.fit
 from lab import cli
+from lab.capture.by_hand import HandChange, LeftByHand
 from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession
 from lab.capture_kinds.dark import DarkSequence
@@ -637,6 +638,40 @@ def test_an_interrupted_session_is_told_with_the_whole_command(
     assert cli.main([*verb, "--out", str(data), "--station", "lab.toml"]) == 130
     command = f"calibench {' '.join(verb)} --resume session-1 --out '{data}' --station lab.toml"
     assert capsys.readouterr().err.splitlines()[0] == f"calibench: go on with `{command}`"
+
+
+def test_a_session_that_ends_early_tells_what_its_hand_left_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change = HandChange(changes="the aperture", now="f/8", is_confirmed=True, back="f/4", how="turn it")
+    left = LeftByHand(session="session-1", addresses=(), changes=(change,))
+
+    def captured(store: object, station: object, request: object, tell: Callable[[object], None]) -> str:
+        tell(SimpleNamespace(session="session-1"))
+        raise DeviceError("camera left: unplugged")
+
+    monkeypatch.setattr(capturing, "capture_here", captured)
+    monkeypatch.setattr("lab.capture.by_hand.left_by_session", lambda root, session: {left.session: left}[session])
+    monkeypatch.setattr("lab.capture.station.read_station", lambda file: None)
+    assert cli.main(["capture", "--out", str(tmp_path), "--station", "lab.toml"]) != 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert "session session-1: changed by hand and not put back: the aperture stands at f/8: turn it (f/4)" in told
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ([], "give --station and --resolve"),
+        (["--station", "lab.toml"], "give --station and --resolve"),
+        (["--resolve"], "give --station and --resolve"),
+        (["--station", "lab.toml", "--resolve", "--quick"], "leave --quick, --name, --resume, --only, --set"),
+    ],
+)
+def test_recordings_need_their_station_and_nothing_of_a_session(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["run", "--recordings", "set", "--out", str(tmp_path), *options]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(

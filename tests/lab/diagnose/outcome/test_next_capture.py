@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from lab.capture.plan import CapturePlan
+from lab.capture.station import Station
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
@@ -18,9 +20,11 @@ from lab.diagnose.outcome.next_capture import doubt_of, next_sentence
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import visibility
+from lab.errors import InputError
 from lab.formats.camera_file import default_camera
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import NextCapture, Unexplained
+from sim.effects.astigmatism import Astigmatism
 from sim.effects.base import Effect
 from sim.effects.black_level_drift import BlackLevelDrift
 from sim.effects.infrared_cut_filter import InfraredCutFilter
@@ -28,6 +32,7 @@ from sim.effects.library import effect
 from sim.effects.nonlinearity import Nonlinearity
 from sim.effects.source_drift import SourceDrift
 from sim.point import TRANSFER, Blur
+from tests.lab import fake_bench
 from tests.lab.diagnose.on_blocks import declared
 
 CAMERA = default_camera().camera
@@ -244,3 +249,53 @@ def test_wrong_metadata_is_corrected_before_anything_is_captured() -> None:
     said = settling_sentence(recordings, "left", [wrong, _left("dark", "exposure", ("d1.0-0",))])
     assert said is not None
     assert "dark frames" in said
+
+
+def _station(targets: dict[str, object]) -> Station:
+    """The fake station with one knife edge, and these targets beside."""
+    table = fake_bench.station().model_dump(mode="json")
+    kept = {name: one for name, one in table["targets"].items() if not name.startswith("edge-") or name == "edge-1"}
+    for camera in table["cameras"].values():
+        camera["datasheet"]["f_number"] = CAMERA.lens.f_number
+    return Station.model_validate(table | {"targets": kept | targets})
+
+
+def _offered(**targets: object) -> dict[str, CapturePlan | None]:
+    """What is considered on that station, by words."""
+    there = _station(targets)
+    return {one.words: one.plan for one in candidate_captures(SET, "left", _model(), there)}
+
+
+def test_a_turned_edge_is_considered_where_it_is_a_new_direction() -> None:
+    """Astigmatism at 45 degrees from one edge: the turned edge shows it, by the forward model."""
+    turns = {f"turn {deg}": {"kind": "turn", "angle_deg": deg} for deg in (0, 10, 45)}
+    found = _offered(**turns)
+    turned = [words for words in found if "turned by" in words]
+    assert {words.partition(" turned by ")[2].split()[0] for words in turned} == {"45"}  # 10 is too near to 0
+    plan = found[turned[0]]
+    assert plan is not None and plan.sequences[0].turn_deg == 45.0  # type: ignore[attr-defined]
+    held = [Hypothesis("", (), CAMERA), Hypothesis("", (Astigmatism(defocus_x_um=20.0),), CAMERA)]
+    captures = {one.words: one for one in candidate_captures(SET, "left", _model(), _station(turns))}
+    apart = [captures[turned[0]].predict(h) for h in held]
+    assert float(np.abs(apart[0] - apart[1]).max()) > 0.01
+
+
+def test_temperatures_are_those_that_the_station_can_be_brought_to() -> None:
+    found = _offered(usual={"kind": "sensor_temperature"}, warm={"kind": "sensor_temperature", "sensor_c": 33.0})
+    plan = found["dark frames with the sensor at 33 C"]
+    assert plan is not None
+    assert [one.sensor_c for one in plan.sequences] == [None, 33.0]  # type: ignore[attr-defined]
+
+
+def test_a_station_without_these_targets_lacks_them_in_one_line() -> None:
+    there = _station({})
+    found = _offered()
+    for words in (
+        "dark frames with the sensor 10 and 20 degrees warmer",
+        next(w for w in found if "turned by 45" in w),
+    ):
+        plan = found[words]
+        assert plan is not None
+        with pytest.raises(InputError, match="add ") as refused:
+            plan.steps(there)
+        assert "\n" not in str(refused.value)
