@@ -212,7 +212,7 @@ def _seed(case: str, seed: int) -> int:
 def concealed_camera(case: str, noise_draw: int = 0, seed: int = SEED, **settings: Any) -> ConcealedCamera:
     """Return the camera of a case in a setting."""
     dark = DARK_LAW(1.3, 0, _seed(case, seed))
-    settings = {"f_number": F_NUMBER} | settings
+    settings = {"f_number": F_NUMBER, "stated_f_number": F_NUMBER} | settings
     return ConcealedCamera(
         _seed(case, seed), [*laws_of(case, seed), dark], rows=ROWS, cols=COLS, noise_draw=noise_draw, **settings
     )

@@ -45,6 +45,7 @@ from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.effects.other_f_number import OtherFNumber
 from sim.sensor.electrons import dark_current_e_per_s, gain_dn_per_e
 from sim.spectrum import FloatArray
+from sim.stop_down import effects_at_f_number
 
 #: The measurements that a twin predicts.
 QUANTITIES = (CHART, NOISE, SLANTED_EDGE, DARK)
@@ -88,7 +89,8 @@ def predict(
     checked = {side: (carried(models[side], changes), posterior_of(models[side])) for side in sides}
     found = {}
     for side, (content, posterior) in checked.items():
-        found[side] = _side(content, posterior, plan, side, changes, light_std, fitted)
+        fitted_f_number = models[side].camera.lens.f_number
+        found[side] = _side(content, posterior, fitted_f_number, plan, side, changes, light_std, fitted)
     return SealedPrediction(
         model=model, plan=plan.source, changes=changes, sides=found,
         cameras={side: content.camera.model_dump_json() for side, (content, _) in checked.items()},
@@ -148,6 +150,7 @@ def is_predicted(block: Block, label: Label) -> bool:
 def _side(
     content: CameraFile,
     posterior: ModelPosterior,
+    fitted_f_number: float,
     plan: RecordingSet,
     side: Side,
     changes: Changes,
@@ -173,7 +176,8 @@ def _side(
     for block in blocks:
         if light is not None and block.measurement is PHOTON_TRANSFER:
             light = light.about(rates_per_dose(study, block))
-    mean, covariance = _distribution(model, effects, posterior, growth_std, light_std, light)
+    unnamed = effects_at_f_number(with_unnamed(effects, posterior), fitted_f_number, content.camera.lens.f_number)
+    mean, covariance = _distribution(model, effects, unnamed, posterior, growth_std, light_std, light)
     use = np.array([is_predicted(b, label) for b in blocks for label in b.labels])
     is_level = np.array([b.measurement.is_level for b in blocks for _ in b.labels])
     full = is_level & (mean > HIGHEST_SHARE * study.saturation_dn)
@@ -184,7 +188,7 @@ def _side(
         )
         skipped.append(Skipped(step="twin saturation", reason=reason, side=side))
         use &= ~full
-    names = _names(model, content, posterior, mean, use)
+    names = _names(model, content, posterior, fitted_f_number, mean, use)
     kept = covariance[np.ix_(use, use)]
     numbers = [n for n, used in zip(_numbers(study, model, effects, mean, covariance), use, strict=True) if used]
     lens = content.camera.lens
@@ -200,7 +204,12 @@ def _side(
 
 
 def _names(
-    model: MeasurementModel, content: CameraFile, posterior: ModelPosterior, mean: FloatArray, use: np.ndarray
+    model: MeasurementModel,
+    content: CameraFile,
+    posterior: ModelPosterior,
+    fitted_f_number: float,
+    mean: FloatArray,
+    use: np.ndarray,
 ) -> tuple[PredictedName, ...]:
     """Every name of the model with what its rivals predict of the numbers in `use` (n,), of `mean` (n,) with it. Of a
     model that knows no rivals: with nothing in its place."""
@@ -221,7 +230,14 @@ def _names(
             PredictedRival(
                 name=one.name,
                 probability=one.probability,
-                numbers=numbers((*(e.effect() for e in one.effects), *kept), one.shift),
+                numbers=numbers(
+                    effects_at_f_number(
+                        (*(e.effect() for e in one.effects), *kept),
+                        fitted_f_number,
+                        content.camera.lens.f_number,
+                    ),
+                    one.shift,
+                ),
             )
             for one in doubt.rivals
         ]
@@ -283,14 +299,14 @@ def _study(
 def _distribution(
     model: MeasurementModel,
     effects: Effects,
+    acting: Effects,
     posterior: ModelPosterior,
     growth_std: float,
     light_std: float,
     light: RelativeLight | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (n,) and covariance (n, n) of all numbers."""
+    """Mean (n,) and covariance (n, n) of all numbers. `acting`: the effects and, at none, those that nobody named."""
     columns = {k: v for k, v in model.nuisance_jacobian(effects).items() if k != "warmth"}
-    acting = with_unnamed(effects, posterior)
     coords = coordinates(acting, model.camera)
     by_effect = effect_jacobian(model, acting, coords).T
     columns |= {

@@ -22,6 +22,7 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.errors import InputError
 from lab.fit import fit_recording_set
 from lab.formats.camera_file import CameraFile, read_camera, write_camera
+from lab.formats.model_posterior import NameInDoubt, RivalModel, StoredEffect
 from lab.formats.recording_set import Manifest, RecordingSet, write
 from lab.formats.recording_set.files import MemoryFiles
 from lab.twin.changes import Changes, carried, parse_changes
@@ -33,6 +34,7 @@ from sim.camera import CameraModel, Lens
 from sim.effects.charge_diffusion import ChargeDiffusion
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
 from sim.effects.defocus import Defocus
+from sim.effects.spherical_aberration import SphericalAberration
 from sim.effects.veiling_glare import VeilingGlare
 from sim.spectrum import Spectrum
 from sim.uniform import electron_rate
@@ -270,6 +272,27 @@ def test_a_change_that_cant_be_carried_is_one_line(content: CameraFile, change: 
     with pytest.raises(InputError) as refused:
         predict({"left": content}, PLAN, parse_changes(change))
     assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_aberrations_say_at_which_aperture_they_were_fitted() -> None:
+    """W040 of f/4 is a sixteenth at f/8, in the effects of the model, and in a rival's."""
+    spherical, changes = SphericalAberration(w040_um=0.3), Changes(f_number=8.0, radiance_factor=4.0)
+    model = replace(trained(3), effects=(DarkCurrentTemperature(doublings_per_c=0.14), spherical))
+    there = carried(model, changes)
+    assert there.effects[1] == SphericalAberration(w040_um=0.3, stated_f_number=4.0)
+    posterior = model.posterior
+    assert posterior is not None
+    beside = StoredEffect.of(model.effects[0])
+    rival = RivalModel(name="coma", probability=0.5, effects=(beside, StoredEffect.of(spherical)), shift={})
+    doubt = NameInDoubt(effect="spherical_aberration", told="isotropic_contrast_loss", probability=0.5,
+                        named=tuple(e.name for e in model.effects), rivals=(rival,))  # fmt: skip
+    model = replace(model, posterior=posterior.model_copy(update={"doubts": (doubt,)}))
+    found = predict({"left": model}, PLAN, changes, light_std=0.0).sides["left"]
+    weak = replace(model, effects=(model.effects[0], SphericalAberration(w040_um=0.3 / 16.0, stated_f_number=8.0)))
+    same = predict({"left": weak}, PLAN, changes, light_std=0.0).sides["left"]
+    np.testing.assert_allclose([n.predicted for n in same.numbers], [n.predicted for n in found.numbers], rtol=1e-9)
+    # the rival is the same effect: of 9 digits that are sealed, the same numbers
+    np.testing.assert_allclose(found.names[0].rivals[0].numbers, [n.predicted for n in found.numbers], rtol=1e-6)
 
 
 def test_a_temperature_needs_a_law_of_dark_current(content: CameraFile) -> None:
