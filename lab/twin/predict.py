@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import nnls
 
 from lab.capture_kinds.base import Capture
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -177,7 +178,7 @@ def _side(
         if light is not None and block.measurement is PHOTON_TRANSFER:
             light = light.about(rates_per_dose(study, block))
     unnamed = effects_at_f_number(with_unnamed(effects, posterior), fitted_f_number, content.camera.lens.f_number)
-    mean, covariance = _distribution(model, effects, unnamed, posterior, growth_std, light_std, light)
+    mean, covariance = _distribution(model, study, effects, unnamed, posterior, growth_std, light_std, light)
     use = np.array([is_predicted(b, label) for b in blocks for label in b.labels])
     is_level = np.array([b.measurement.is_level for b in blocks for _ in b.labels])
     full = is_level & (mean > HIGHEST_SHARE * study.saturation_dn)
@@ -298,6 +299,7 @@ def _study(
 
 def _distribution(
     model: MeasurementModel,
+    study: Study,
     effects: Effects,
     acting: Effects,
     posterior: ModelPosterior,
@@ -324,8 +326,9 @@ def _distribution(
             variance = (model.noise.gain * charge_dn + model.noise.read_dn**2) / (camera.rows * camera.cols)
             covariance[at, at] += np.diag(variance)
         if block.measurement is NOISE:
-            change = _beyond_correction(block, model, effects) * model.mean(effects)[at]
-            covariance[at, at] += np.outer(change, change)
+            _hold_what_is_corrected(columns, at, block, model, study, acting, len(effects))
+            variance = model.mean(effects)[at]
+            covariance[at, at] += _correction_error(block, model, effects) * np.outer(variance, variance)
         if block.measurement is CHART:
             covariance[at, at] += light_std**2 * np.outer(block.scale, block.scale)
             patches = _patch_columns(block, at, len(covariance))
@@ -356,16 +359,66 @@ def _distribution(
     return np.asarray(model.mean(effects) + shift), np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _beyond_correction(block: Block, model: MeasurementModel, effects: Effects) -> FloatArray:
-    """Relative standard deviation (n,) of variances beyond the levels of a correction, which holds its last factor
-    there: the range of its factors, in proportion to the way beyond."""
-    found = np.zeros(len(block.labels))
+def _corrections(effects: Effects) -> list[ModelDiscrepancy]:
+    """Return the corrections of temporal variances."""
+    return [e for e in effects if isinstance(e, ModelDiscrepancy) and e.along == "variance_signal_e"]
+
+
+def _hold_what_is_corrected(
+    columns: dict[str, FloatArray], at: slice, block: Block, model: MeasurementModel, study: Study, acting: Effects,
+    named: int,
+) -> None:  # fmt: skip
+    """Take from `columns`, the derivatives by the laws beyond the first `named` of `acting`, what a correction of the
+    variances holds of them already: it was read from variances in which they acted. What is left is their change from
+    the nearest level that it knows."""
+    gain = study.noise.gain
+    signal_dn = np.array([label.x for label in block.labels])
+    for correction in _corrections(acting):
+        nearest_dn = np.clip(signal_dn, gain * correction.at[0], gain * correction.at[-1])
+
+        def there(effects: Effects, dn: FloatArray = nearest_dn) -> Prediction:
+            shot_dn2 = shot_variance(study, dn, np.full(len(dn), gain), effects)
+            return Prediction(shot_dn2 + study.noise.read_dn**2, {})
+
+        held = MeasurementModel((replace(block, predict=there),), study.camera)
+        coords = [c for c in coordinates(acting, model.camera) if c.index >= named]
+        share = model.mean(acting)[at] / held.mean(acting)
+        for c, column in zip(coords, effect_jacobian(held, acting, coords).T, strict=True):
+            name = coordinate_name(acting, c)
+            if name in columns:
+                columns[name] = columns[name].copy()
+                columns[name][at] -= share * column
+
+
+def _correction_error(block: Block, model: MeasurementModel, effects: Effects) -> FloatArray:
+    """Relative covariance (n, n) of variances by what a correction, read at some levels, is wrong by at others: its
+    factors scatter from level to level, and drift, and both go on.
+
+    With g(d) half the mean squared difference of factors that are d apart, c + b d by least squares, and w (n, k) the
+    weights by which the correction is drawn through its k factors, the error f - w f_k has the covariance
+
+        w g(k, n) + g(n, k) w' - g(n, n) - w g(k, k) w'
+
+    (N. Cressie, Statistics for Spatial Data, 1993, section 3.1). A level departs by itself: no level of the session to
+    come is one of the fitted."""
+    found = np.zeros((len(block.labels),) * 2)
     signal_e = np.array([label.x for label in block.labels]) / model.camera.conversion_gain_dn_per_e
-    for effect in effects:
-        if isinstance(effect, ModelDiscrepancy) and effect.along == "variance_signal_e":
-            first, last = effect.at[0], effect.at[-1]
-            way = np.maximum(signal_e - last, 0.0) / max(last - first, 1e-9)
-            found += way * float(np.ptp(effect.factor)) * effect.strength
+    for correction in _corrections(effects):
+        at = np.array(correction.at)
+        there, among = (np.abs(np.subtract.outer(x, at)) for x in (signal_e, at))
+        first, second = np.triu_indices(len(at), 1)
+        lag, half = (
+            among[first, second],
+            0.5 * np.subtract.outer(correction.factor, correction.factor)[first, second] ** 2,
+        )
+        near = lag <= 0.5 * np.ptp(at)
+        (alone, drift), _ = nnls(np.column_stack([np.ones(near.sum()), lag[near]]), half[near])
+        weights = np.array([np.interp(signal_e, at, one) for one in np.eye(len(at))]).T
+        across = weights @ (alone + drift * there).T
+        apart = np.abs(np.subtract.outer(signal_e, signal_e))
+        between = drift * apart + alone * (1.0 - np.eye(len(signal_e)))
+        own = drift * among + alone * (1.0 - np.eye(len(at)))
+        found += correction.strength**2 * (across + across.T - between - weights @ own @ weights.T)
     return found
 
 
