@@ -328,7 +328,9 @@ def _distribution(
         if block.measurement is NOISE:
             _hold_what_is_corrected(columns, at, block, model, study, acting, len(effects))
             variance = model.mean(effects)[at]
-            covariance[at, at] += _correction_error(block, model, effects) * np.outer(variance, variance)
+            signal_e = np.array([label.x for label in block.labels]) / model.camera.conversion_gain_dn_per_e
+            for correction in _corrections(effects):
+                covariance[at, at] += correction_covariance(correction, signal_e) * np.outer(variance, variance)
         if block.measurement is CHART:
             covariance[at, at] += light_std**2 * np.outer(block.scale, block.scale)
             patches = _patch_columns(block, at, len(covariance))
@@ -390,36 +392,28 @@ def _hold_what_is_corrected(
                 columns[name][at] -= share * column
 
 
-def _correction_error(block: Block, model: MeasurementModel, effects: Effects) -> FloatArray:
-    """Relative covariance (n, n) of variances by what a correction, read at some levels, is wrong by at others: its
-    factors scatter from level to level, and drift, and both go on.
+def correction_covariance(correction: ModelDiscrepancy, x: FloatArray) -> FloatArray:
+    """Covariance (n, n) of what a correction's factor is wrong by at places `x` (n,) of its axis: its factors scatter
+    from place to place, and drift, and both go on between and beyond them.
 
     With g(d) half the mean squared difference of factors that are d apart, c + b d by least squares, and w (n, k) the
     weights by which the correction is drawn through its k factors, the error f - w f_k has the covariance
 
         w g(k, n) + g(n, k) w' - g(n, n) - w g(k, k) w'
 
-    (N. Cressie, Statistics for Spatial Data, 1993, section 3.1). A level departs by itself: no level of the session to
-    come is one of the fitted."""
-    found = np.zeros((len(block.labels),) * 2)
-    signal_e = np.array([label.x for label in block.labels]) / model.camera.conversion_gain_dn_per_e
-    for correction in _corrections(effects):
-        at = np.array(correction.at)
-        there, among = (np.abs(np.subtract.outer(x, at)) for x in (signal_e, at))
-        first, second = np.triu_indices(len(at), 1)
-        lag, half = (
-            among[first, second],
-            0.5 * np.subtract.outer(correction.factor, correction.factor)[first, second] ** 2,
-        )
-        near = lag <= 0.5 * np.ptp(at)
-        (alone, drift), _ = nnls(np.column_stack([np.ones(near.sum()), lag[near]]), half[near])
-        weights = np.array([np.interp(signal_e, at, one) for one in np.eye(len(at))]).T
-        across = weights @ (alone + drift * there).T
-        apart = np.abs(np.subtract.outer(signal_e, signal_e))
-        between = drift * apart + alone * (1.0 - np.eye(len(signal_e)))
-        own = drift * among + alone * (1.0 - np.eye(len(at)))
-        found += correction.strength**2 * (across + across.T - between - weights @ own @ weights.T)
-    return found
+    (N. Cressie, Statistics for Spatial Data, 1993, section 3.1). Every place departs by itself: none of the session to
+    come is one of those that were fitted."""
+    at = np.array(correction.at)
+    lag, half = np.abs(np.subtract.outer(at, at)), 0.5 * np.subtract.outer(correction.factor, correction.factor) ** 2
+    near = np.triu(lag <= 0.5 * np.ptp(at), 1)
+    (alone, drift), _ = nnls(np.column_stack([np.ones(near.sum()), lag[near]]), half[near])
+    weights = np.array([np.interp(x, at, one) for one in np.eye(len(at))]).T
+
+    def apart(places: FloatArray) -> FloatArray:
+        return drift * np.abs(np.subtract.outer(places, places)) + alone * (1.0 - np.eye(len(places)))
+
+    across = weights @ (alone + drift * np.abs(np.subtract.outer(at, x)))
+    return np.asarray(correction.strength**2 * (across + across.T - apart(x) - weights @ apart(at) @ weights.T))
 
 
 def _forms(model: MeasurementModel, effects: Effects) -> FloatArray:

@@ -26,14 +26,16 @@ from lab.formats.model_posterior import NameInDoubt, RivalModel, StoredEffect
 from lab.formats.recording_set import Manifest, RecordingSet, write
 from lab.formats.recording_set.files import MemoryFiles
 from lab.twin.changes import Changes, carried, parse_changes
-from lab.twin.predict import predict
+from lab.twin.predict import correction_covariance, predict
 from lab.twin.score import score, together
-from lab.twin.sealed import open_seal, seal
+from lab.twin.sealed import PredictedNumber, open_seal, seal
 from lab.twin.session import future_session
 from sim.camera import CameraModel, Lens
+from sim.effects.base import Effect
 from sim.effects.charge_diffusion import ChargeDiffusion
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
 from sim.effects.defocus import Defocus
+from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.effects.spherical_aberration import SphericalAberration
 from sim.effects.veiling_glare import VeilingGlare
 from sim.spectrum import Spectrum
@@ -192,6 +194,78 @@ def test_levels_of_stated_photons_are_predicted_relative_to_the_fitted_ones(
     wrong = replace(content, camera=content.camera.model_copy(update={"black_level_dn": 80.0}))
     missed = score(predict({"left": wrong}, high, Changes(), fitted=low), high)
     assert missed.chi2 > 10.0 * found.chi2
+
+
+def test_a_correction_is_as_wrong_elsewhere_as_it_scatters_and_drifts() -> None:
+    """Of factors that scatter by s alone, the last one held is wrong by sqrt(2) s, a mean of two by sqrt(3 / 2) s, and
+    held levels share the last one's s. Of a drift alone, by the root of the way beyond."""
+    at, rng = np.arange(1.0, 401.0), np.random.default_rng(4)
+    x = np.array([200.5, 410.0, 450.0])
+    # of 400 factors the mean square is known to sqrt(2 / 400), 7 %: within four of that
+    alone = ModelDiscrepancy(along="variance_signal_e", at=tuple(at), strength=1.0,
+                             factor=tuple(1.0 + 0.01 * rng.standard_normal(400)))  # fmt: skip
+    found = correction_covariance(alone, x) / 1e-4
+    np.testing.assert_allclose(np.diag(found), [1.5, 2.0, 2.0], rtol=0.3)
+    assert found[1, 2] == pytest.approx(0.5 * found[1, 1], rel=0.2) and abs(found[0, 1]) < 0.2
+    walk = 1.0 + 0.001 * np.cumsum(np.random.default_rng(4).standard_normal(400))
+    drifts = ModelDiscrepancy(along="variance_signal_e", at=tuple(at), factor=tuple(walk), strength=1.0)
+    beyond = correction_covariance(drifts, np.array([410.0, 440.0, 480.0]))
+    assert beyond[2, 2] - beyond[1, 1] == pytest.approx(40.0 / 30.0 * (beyond[1, 1] - beyond[0, 0]), rel=1e-6)
+    # the lags of one walk overlap: its slope is known to a factor
+    assert 0.3e-6 < (beyond[2, 2] - beyond[1, 1]) / (2.0 * 40.0) / 0.5 < 3e-6
+    even = ModelDiscrepancy(along="variance_signal_e", at=tuple(at), factor=(1.02,) * 400, strength=1.0)
+    np.testing.assert_allclose(correction_covariance(even, x), 0.0, atol=1e-15)
+
+
+def test_a_correction_of_variances_holds_what_unnamed_laws_do_there(
+    of_photons: tuple[CameraFile, RecordingSet, RecordingSet],
+) -> None:
+    """A bend that nobody named, at 1 % more by the posterior, moves no variance where a correction was read, and beyond
+    its last level by the change from there alone; without a correction, by all of it."""
+    content, low, high = of_photons
+    posterior = content.posterior
+    assert posterior is not None
+    mean = np.array(posterior.mean)
+    mean[posterior.names.index("nonlinearity.quadratic_percent")] += 1.0
+    bent = replace(content, posterior=posterior.model_copy(update={"mean": tuple(mean.tolist())}))
+    levels_e = np.array([n.x for n in _noise(content, high, low)]) / content.camera.conversion_gain_dn_per_e
+
+    def moved(effects: tuple[Effect, ...]) -> np.ndarray:
+        before, after = (_noise(replace(one, effects=effects), high, low) for one in (content, bent))
+        # the rate of the light is another, too: at the same level
+        same = [b.predicted + b.level_slope * (a.x - b.x) for a, b in zip(before, after, strict=True)]
+        return np.array(same) / [a.predicted for a in before] - 1.0
+
+    def held_to(last_e: float) -> np.ndarray:
+        correction = ModelDiscrepancy(along="variance_signal_e", at=(10.0, last_e), factor=(1.0, 1.0), strength=1.0)
+        return moved((correction,))
+
+    by_all, middle_e = moved(()), float(np.median(levels_e))
+    assert np.abs(by_all).max() > 0.005  # 1 % at full well changes the slope, and its square by twice that
+    assert np.abs(held_to(1.01 * levels_e.max())).max() < 0.02 * np.abs(by_all).max()
+    beyond, at_middle = levels_e > middle_e, np.interp(middle_e, np.sort(levels_e), by_all[np.argsort(levels_e)])
+    np.testing.assert_allclose(held_to(middle_e)[beyond], (by_all - at_middle)[beyond], atol=0.1 * np.ptp(by_all))
+
+
+def _noise(content: CameraFile, plan: RecordingSet, fitted: RecordingSet) -> list[PredictedNumber]:
+    found = predict({"left": content}, plan, Changes(), fitted=fitted).sides["left"].numbers
+    return [n for n in found if n.quantity == "noise"]
+
+
+def test_a_model_without_a_correction_has_no_wider_intervals(content: CameraFile) -> None:
+    """What a correction is wrong by is in the intervals of variances alone, and of a model that has one."""
+
+    def std(one: CameraFile) -> dict[str, np.ndarray]:
+        numbers = predict({"left": one}, PLAN, Changes(), light_std=0.0).sides["left"].numbers
+        kinds = {n.quantity for n in numbers}
+        return {kind: np.array([n.std for n in numbers if n.quantity == kind]) for kind in kinds}
+
+    scatters = ModelDiscrepancy(along="variance_signal_e", at=(10.0, 2000.0, 4000.0, 6000.0, 9000.0),
+                                factor=(1.0, 1.02, 0.98, 1.02, 0.98), strength=1.0)  # fmt: skip
+    plain, corrected = std(content), std(replace(content, effects=(*content.effects, scatters)))
+    assert np.all(corrected["noise"] > 2.0 * plain["noise"])
+    for kind in ("chart", "slanted_edge", "dark"):
+        np.testing.assert_allclose(corrected[kind], plain[kind], rtol=0.01)  # drawn frames differ
 
 
 def test_stated_photons_need_the_fitted_recordings(of_photons: tuple[CameraFile, RecordingSet, RecordingSet]) -> None:
