@@ -25,9 +25,10 @@ from lab.formats.camera_file import CameraFile, read_camera, write_camera
 from lab.formats.model_posterior import NameInDoubt, RivalModel, StoredEffect
 from lab.formats.recording_set import Manifest, RecordingSet, write
 from lab.formats.recording_set.files import MemoryFiles
+from lab.twin import score as twin_score
 from lab.twin.changes import Changes, carried, parse_changes
 from lab.twin.predict import correction_covariance, predict
-from lab.twin.score import score, together
+from lab.twin.score import TwinVerdict, conclusion, score, together
 from lab.twin.sealed import PredictedNumber, open_seal, seal
 from lab.twin.session import future_session
 from sim.camera import CameraModel, Lens
@@ -153,6 +154,7 @@ def test_an_effect_that_the_camera_lacks_is_withdrawn() -> None:
     found = score(predict({"left": trained(2, wrong=True)}, PLAN, changes, light_std=0.0), captured(changes, 8))
     verdicts = {effect.name: effect.verdict for effect in found.effects}
     assert verdicts == {"dark_current_temperature": "survives", "veiling_glare": "withdrawn"}
+    assert conclusion(found.effects) == "stands: dark current temperature; withdrawn: veiling glare"
 
 
 def _photons(recordings: RecordingSet, levels: slice) -> RecordingSet:
@@ -305,6 +307,20 @@ def test_a_transfer_tells_which_of_two_rivals_blurs() -> None:
     name = next(one for one in tests if one.effect == "charge_diffusion")
     assert (name.verdict, name.becomes) == ("withdrawn", "defocus")
     assert together([tests, tests])[0].gain == pytest.approx(2.0 * tests[0].gain)
+
+
+def test_the_conclusion_says_what_became_of_every_name() -> None:
+    def one(name: str, verdict: TwinVerdict, becomes: str | None = None) -> twin_score.TestedEffect:
+        return twin_score.TestedEffect(side="left", name=name, effect="defocus", gain=1.0, before=0.5, verdict=verdict,
+                            becomes=becomes)  # fmt: skip
+
+    said = conclusion([one("coma", "survives"), one("isotropic_contrast_loss", "named", "defocus"),
+                       one("ghost", "withdrawn"), one("row_noise", "untested"),
+                       one("defocus", "withdrawn", "charge_diffusion")])  # fmt: skip
+    assert said == (
+        "stands: coma, defocus, charge diffusion in place of defocus; withdrawn: ghost, defocus; untested: row noise"
+    )
+    assert conclusion([one("ghost", "withdrawn")]) == "stands: no name; withdrawn: ghost"
 
 
 def test_the_surroundings_of_chart_and_edge_are_those_of_the_plans_frames() -> None:
