@@ -21,8 +21,8 @@ class Defocus(Effect):
     """Path error W020 = dz / (8 N^2) at the pupil's rim: the OTF of a circular pupil with a quadratic path error
     (Hopkins).
 
-    Away from its focus a lens has some spherical aberration, too: W = W020 (r^2 + s (r^4 - r^2)). The share s is that
-    at `stated_f_number` N0: at f/N, r^4 is (N0 / N)^2 less of the whole.
+    Away from its focus a lens has some spherical aberration, too: W = W020 (r^2 + s (r^4 - r^2)) at `stated_f_number`
+    N0. At f/N the share of r^4 is s (N0 / N)^2.
     """
 
     name: ClassVar[str] = "defocus"
