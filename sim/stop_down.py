@@ -6,16 +6,10 @@ from collections.abc import Sequence
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
-from sim.effects.coma import Coma
-from sim.effects.spherical_aberration import SphericalAberration
 from sim.optics.imaging import DiffractionLimited
 
-#: Parameters that are path errors at the pupil's rim, with the power of the rim's height that they go with (Seidel).
-#: Effects that are stated by a displacement of the image (defocus, astigmatism) follow the f-number by themselves.
-RIM_POWERS: dict[type[Effect], dict[str, int]] = {
-    SphericalAberration: {"w040_um": 4},
-    Coma: {"w131_x_um": 3, "w131_y_um": 3},
-}
+#: Field of the effects that are path errors at the pupil's rim.
+STATED = "stated_f_number"
 
 
 def at_f_number(camera: CameraModel, f_number: float) -> CameraModel:
@@ -29,14 +23,15 @@ def at_f_number(camera: CameraModel, f_number: float) -> CameraModel:
 
 
 def effects_at_f_number(effects: Sequence[Effect], stated: float, f_number: float) -> tuple[Effect, ...]:
-    """Effects whose parameters hold at the f-number `stated`, as they are at `f_number`: a smaller pupil has its rim
-    where the path errors are less."""
-    share = stated / f_number
-    found = []
-    for effect in effects:
-        powers = RIM_POWERS.get(type(effect), {}) if share != 1.0 else {}
-        bounds = type(effect).quantities()
-        values = {name: getattr(effect, name) * share**power for name, power in powers.items()}
-        within = {name: min(max(v, bounds[name].lower), bounds[name].upper) for name, v in values.items()}
-        found.append(effect.replace_fields(**within) if within else effect)
-    return tuple(found)
+    """Effects that hold for a lens of f-number `stated`, as they act when it is at `f_number`: a path error says at
+    which f-number it is stated, unless it does already. Displacements of the image follow the f-number by
+    themselves."""
+    if stated == f_number:
+        return tuple(effects)
+    return tuple(
+        effect.model_copy(update={STATED: stated}) if _lacks_f_number(effect) else effect for effect in effects
+    )
+
+
+def _lacks_f_number(effect: Effect) -> bool:
+    return STATED in type(effect).model_fields and getattr(effect, STATED) is None

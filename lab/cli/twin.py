@@ -113,7 +113,7 @@ def score(
 
 
 def _print(found: TwinScore) -> None:
-    from lab.twin.score import title
+    from lab.twin.score import conclusion, title
 
     table = Table(box=None, pad_edge=False)
     for heading in ("quantity", "n", "median", "95 % of all within", "in 95 % intervals", "chi2 / n"):
@@ -128,6 +128,8 @@ def _print(found: TwinScore) -> None:
     out.print(f"chi2 {found.chi2:.1f} of {found.n} numbers; {found.missing} predicted numbers weren't measured")
     for effect in found.effects:
         out.print(escape(f"{effect.side}: {effect.words}"))
+    for side in dict.fromkeys(effect.side for effect in found.effects):
+        out.print(escape(f"{side}, after this session: {conclusion([e for e in found.effects if e.side == side])}"))
 
 
 @commands.command()

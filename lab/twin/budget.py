@@ -3,7 +3,9 @@
 g = d use / d z at the model, by differences; the variance of the use is g' V g with V the posterior covariance. What a
 group k of parameters adds is what knowing it exactly would take away (linear propagation, conditional covariance):
 
-    added_k = g' V g - g_r' (V_rr - V_rk V_kk^-1 V_kr) g_r,   r: all others
+    added_k = c_k' V_kk c_k,   c_k = V_kk^-1 V_k g
+
+An error z_k of the group is an error c_k' z_k of the use, with all that goes along with it.
 
 With a station, each sequence that it can take is ranked by what it would take away from the use's standard deviation
 for a minute of lab time (`lab.twin.lab_minutes`).
@@ -12,7 +14,7 @@ for a minute of lab time (`lab.twin.lab_minutes`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,6 +40,8 @@ from sim.uniform import FieldPoints, Uniform, electron_rate
 
 #: The light of all uses, of equal energy, and how far it fills the brightest channel.
 LIGHT, FILLED = Spectrum.of((380.0, 780.0), (0.01, 0.01)), 0.7
+#: Relative standard deviation of a dark's variance beside chance: rounding, pixels that blink.
+DARK_VARIANCE_FLOOR = 0.01
 FREQUENCY = np.linspace(0.0, 1.0, 101)  # cy/px
 Effects = tuple[Effect, ...]
 
@@ -149,15 +153,28 @@ def budget(
 ) -> BudgetResult:
     """Return the budget of every use, and with a `station` what its sequences would make of it, at the step `times`
     that are known there. Raises InputError where the model states no uncertainties."""
-    posterior = posterior_of(content)
+    posterior = with_darks(posterior_of(content), content.camera)
     content = replace(content, effects=with_unnamed(content.effects, posterior))
     covariance = np.array(posterior.covariance)
     after = []
     for one in lab_captures(content, posterior.first, station, times or StepTimes({})) if station is not None else ():
         jacobian = _slopes(content, posterior, one.numbers(content), one.numbers).T
         after.append((one, one.known_after(covariance, jacobian)))
-    return BudgetResult(
-        model=content.name, uses=tuple(_use(content, posterior, covariance, use, after) for use in uses)
+    return BudgetResult(model=content.name, uses=tuple(_use(content, posterior, use, after) for use in uses))
+
+
+def with_darks(posterior: ModelPosterior, camera: CameraModel) -> ModelPosterior:
+    """Return a posterior with what dark frames tell of the read noise beside it: a diagnosis knows that by the photon
+    transfer's intercept alone. Two frames of N pixels measure the dark's variance to sqrt(2 / N), and to
+    `DARK_VARIANCE_FLOOR`."""
+    if "read" not in posterior.names:
+        return posterior
+    at = posterior.names.index("read")
+    covariance, mean = np.array(posterior.covariance), np.array(posterior.mean)
+    std = np.hypot(np.sqrt(2.0 / (camera.rows * camera.cols)), DARK_VARIANCE_FLOOR) / READ_STD
+    gained = covariance[at] / (covariance[at, at] + std**2)
+    return ModelPosterior.of(
+        posterior.first, posterior.names, mean - gained * mean[at], covariance - np.outer(gained, covariance[at])
     )
 
 
@@ -173,40 +190,63 @@ def _relative_std(gradient: FloatArray, covariance: FloatArray) -> float:
     return float(np.sqrt(max(np.mean(np.einsum("km,kl,lm->m", gradient, covariance, gradient)), 0.0)))
 
 
-def _use(
-    content: CameraFile,
-    posterior: ModelPosterior,
-    covariance: FloatArray,
-    use: str,
-    after: list[tuple[LabCapture, FloatArray]],
-) -> UseBudget:
+@dataclass(frozen=True)
+class LinearUse:
+    """The numbers (m,) of a use as linear in k parameters: their relative `gradient` (k, m), and the parameters'
+    `covariance` (k, k)."""
+
+    names: tuple[str, ...]
+    gradient: FloatArray
+    covariance: FloatArray
+
+    @property
+    def std(self) -> float:
+        """Relative standard deviation, rms over the numbers."""
+        return _relative_std(self.gradient, self.covariance)
+
+    def groups(self) -> dict[str, list[int]]:
+        """Return the indices of the parameters that the use knows, by effect or part of the camera."""
+        found: dict[str, list[int]] = {}
+        for i, name in enumerate(self.names):
+            if self.gradient[i].any():
+                found.setdefault(_group(name), []).append(i)
+        return found
+
+    def told_by(self, members: list[int]) -> FloatArray:
+        """Return c (q, m): errors z (q,) of these parameters are relative errors z c of the use, with all that goes
+        along with them."""
+        inside = np.linalg.pinv(self.covariance[np.ix_(members, members)], hermitian=True)
+        return np.asarray(inside @ self.covariance[members] @ self.gradient)
+
+
+def linear_use(content: CameraFile, posterior: ModelPosterior, use: str) -> LinearUse:
+    """Return a use of the camera about its model; `content` has the effects that the posterior knows
+    (`with_unnamed`)."""
     exposure_s = _exposure_s(content.camera)
 
     def numbers(changed: CameraFile) -> FloatArray:
         return USES[use](changed.camera, changed.effects, exposure_s)
 
     base = numbers(content)
-    gradient = _slopes(content, posterior, base, numbers)
-    gradient = gradient / np.maximum(np.abs(base), 1e-12)  # (k, m), relative
-    std = _relative_std(gradient, covariance)
-    whole = std**2
-    groups: dict[str, list[int]] = {}
-    for i, name in enumerate(posterior.names):
-        if gradient[i].any():
-            groups.setdefault(_group(name), []).append(i)
+    slopes = _slopes(content, posterior, base, numbers) / np.maximum(np.abs(base), 1e-12)
+    return LinearUse(posterior.names, slopes, np.array(posterior.covariance))
+
+
+def _use(
+    content: CameraFile, posterior: ModelPosterior, use: str, after: list[tuple[LabCapture, FloatArray]]
+) -> UseBudget:
+    linear = linear_use(content, posterior, use)
+    covariance = linear.covariance
+    gradient, std = linear.gradient, linear.std
     found = []
-    for name, members in groups.items():
-        rest = [i for i in range(len(gradient)) if i not in members]
+    for name, members in linear.groups().items():
         inside = covariance[np.ix_(members, members)]
-        between = covariance[np.ix_(rest, members)]
-        left = covariance[np.ix_(rest, rest)] - between @ np.linalg.pinv(inside) @ between.T
-        remaining = _relative_std(gradient[rest], left) ** 2
-        share = (whole - remaining) / whole if whole > 0 else 0.0
-        alone = _relative_std(gradient[members], inside)
+        added = _relative_std(linear.told_by(members), inside) ** 2
         found.append(
             Contribution(
-                name=name, parameters=tuple(posterior.names[i] for i in members), share_percent=100.0 * share,
-                std_percent=100.0 * alone,
+                name=name, parameters=tuple(posterior.names[i] for i in members),
+                share_percent=100.0 * added / std**2 if std > 0 else 0.0,
+                std_percent=100.0 * _relative_std(gradient[members], inside),
             )
         )  # fmt: skip
     found.sort(key=lambda one: -one.share_percent)

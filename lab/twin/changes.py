@@ -21,6 +21,7 @@ from sim.optics.illumination import irradiance_factor
 from sim.optics.imaging import DiffractionLimited
 from sim.parameters import Frozen, Quantity
 from sim.spectrum import Spectrum
+from sim.stop_down import effects_at_f_number
 
 #: Change of the temperature (C) that needs no law of dark current.
 SAME_C = 0.5
@@ -85,7 +86,9 @@ def checked_changes(values: Mapping[str, Any], where: str) -> Changes:
 
 
 def carried(content: CameraFile, changes: Changes) -> CameraFile:
-    """Return the model with the changes to its lens. Raises InputError where it can't carry one of the changes."""
+    """Return the model with the changes to its lens; aberrations say at which f-number they were fitted. Raises
+    InputError where it can't carry one of the changes."""
+    fitted_f_number = content.camera.lens.f_number
     if changes.lens is not None:
         if not changes.lens.is_file():
             raise InputError(f"lens: {changes.lens} isn't there; name the prescription, a .zmx file")
@@ -100,6 +103,8 @@ def carried(content: CameraFile, changes: Changes) -> CameraFile:
             )
         lens = camera.lens.model_copy(update={"f_number": changes.f_number})
         content = replace(content, camera=camera.model_copy(update={"lens": lens}))
+    acting = effects_at_f_number(content.effects, fitted_f_number, content.camera.lens.f_number)
+    content = replace(content, effects=acting)
     reference_c = reference_temperature_c(content)
     if changes.temperature_c is not None:
         if reference_c is None:

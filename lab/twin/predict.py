@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import nnls
 
 from lab.capture_kinds.base import Capture
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -45,6 +46,7 @@ from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.effects.other_f_number import OtherFNumber
 from sim.sensor.electrons import dark_current_e_per_s, gain_dn_per_e
 from sim.spectrum import FloatArray
+from sim.stop_down import effects_at_f_number
 
 #: The measurements that a twin predicts.
 QUANTITIES = (CHART, NOISE, SLANTED_EDGE, DARK)
@@ -88,7 +90,8 @@ def predict(
     checked = {side: (carried(models[side], changes), posterior_of(models[side])) for side in sides}
     found = {}
     for side, (content, posterior) in checked.items():
-        found[side] = _side(content, posterior, plan, side, changes, light_std, fitted)
+        fitted_f_number = models[side].camera.lens.f_number
+        found[side] = _side(content, posterior, fitted_f_number, plan, side, changes, light_std, fitted)
     return SealedPrediction(
         model=model, plan=plan.source, changes=changes, sides=found,
         cameras={side: content.camera.model_dump_json() for side, (content, _) in checked.items()},
@@ -148,6 +151,7 @@ def is_predicted(block: Block, label: Label) -> bool:
 def _side(
     content: CameraFile,
     posterior: ModelPosterior,
+    fitted_f_number: float,
     plan: RecordingSet,
     side: Side,
     changes: Changes,
@@ -173,7 +177,8 @@ def _side(
     for block in blocks:
         if light is not None and block.measurement is PHOTON_TRANSFER:
             light = light.about(rates_per_dose(study, block))
-    mean, covariance = _distribution(model, effects, posterior, growth_std, light_std, light)
+    unnamed = effects_at_f_number(with_unnamed(effects, posterior), fitted_f_number, content.camera.lens.f_number)
+    mean, covariance = _distribution(model, study, effects, unnamed, posterior, growth_std, light_std, light)
     use = np.array([is_predicted(b, label) for b in blocks for label in b.labels])
     is_level = np.array([b.measurement.is_level for b in blocks for _ in b.labels])
     full = is_level & (mean > HIGHEST_SHARE * study.saturation_dn)
@@ -184,7 +189,7 @@ def _side(
         )
         skipped.append(Skipped(step="twin saturation", reason=reason, side=side))
         use &= ~full
-    names = _names(model, content, posterior, mean, use)
+    names = _names(model, content, posterior, fitted_f_number, mean, use)
     kept = covariance[np.ix_(use, use)]
     numbers = [n for n, used in zip(_numbers(study, model, effects, mean, covariance), use, strict=True) if used]
     lens = content.camera.lens
@@ -200,7 +205,12 @@ def _side(
 
 
 def _names(
-    model: MeasurementModel, content: CameraFile, posterior: ModelPosterior, mean: FloatArray, use: np.ndarray
+    model: MeasurementModel,
+    content: CameraFile,
+    posterior: ModelPosterior,
+    fitted_f_number: float,
+    mean: FloatArray,
+    use: np.ndarray,
 ) -> tuple[PredictedName, ...]:
     """Every name of the model with what its rivals predict of the numbers in `use` (n,), of `mean` (n,) with it. Of a
     model that knows no rivals: with nothing in its place."""
@@ -221,7 +231,14 @@ def _names(
             PredictedRival(
                 name=one.name,
                 probability=one.probability,
-                numbers=numbers((*(e.effect() for e in one.effects), *kept), one.shift),
+                numbers=numbers(
+                    effects_at_f_number(
+                        (*(e.effect() for e in one.effects), *kept),
+                        fitted_f_number,
+                        content.camera.lens.f_number,
+                    ),
+                    one.shift,
+                ),
             )
             for one in doubt.rivals
         ]
@@ -282,15 +299,16 @@ def _study(
 
 def _distribution(
     model: MeasurementModel,
+    study: Study,
     effects: Effects,
+    acting: Effects,
     posterior: ModelPosterior,
     growth_std: float,
     light_std: float,
     light: RelativeLight | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (n,) and covariance (n, n) of all numbers."""
+    """Mean (n,) and covariance (n, n) of all numbers. `acting`: the effects and, at none, those that nobody named."""
     columns = {k: v for k, v in model.nuisance_jacobian(effects).items() if k != "warmth"}
-    acting = with_unnamed(effects, posterior)
     coords = coordinates(acting, model.camera)
     by_effect = effect_jacobian(model, acting, coords).T
     columns |= {
@@ -308,8 +326,11 @@ def _distribution(
             variance = (model.noise.gain * charge_dn + model.noise.read_dn**2) / (camera.rows * camera.cols)
             covariance[at, at] += np.diag(variance)
         if block.measurement is NOISE:
-            change = _beyond_correction(block, model, effects) * model.mean(effects)[at]
-            covariance[at, at] += np.outer(change, change)
+            _hold_what_is_corrected(columns, at, block, model, study, acting, len(effects))
+            variance = model.mean(effects)[at]
+            signal_e = np.array([label.x for label in block.labels]) / model.camera.conversion_gain_dn_per_e
+            for correction in _corrections(effects):
+                covariance[at, at] += correction_covariance(correction, signal_e) * np.outer(variance, variance)
         if block.measurement is CHART:
             covariance[at, at] += light_std**2 * np.outer(block.scale, block.scale)
             patches = _patch_columns(block, at, len(covariance))
@@ -340,17 +361,59 @@ def _distribution(
     return np.asarray(model.mean(effects) + shift), np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _beyond_correction(block: Block, model: MeasurementModel, effects: Effects) -> FloatArray:
-    """Relative standard deviation (n,) of variances beyond the levels of a correction, which holds its last factor
-    there: the range of its factors, in proportion to the way beyond."""
-    found = np.zeros(len(block.labels))
-    signal_e = np.array([label.x for label in block.labels]) / model.camera.conversion_gain_dn_per_e
-    for effect in effects:
-        if isinstance(effect, ModelDiscrepancy) and effect.along == "variance_signal_e":
-            first, last = effect.at[0], effect.at[-1]
-            way = np.maximum(signal_e - last, 0.0) / max(last - first, 1e-9)
-            found += way * float(np.ptp(effect.factor)) * effect.strength
-    return found
+def _corrections(effects: Effects) -> list[ModelDiscrepancy]:
+    """Return the corrections of temporal variances."""
+    return [e for e in effects if isinstance(e, ModelDiscrepancy) and e.along == "variance_signal_e"]
+
+
+def _hold_what_is_corrected(
+    columns: dict[str, FloatArray], at: slice, block: Block, model: MeasurementModel, study: Study, acting: Effects,
+    named: int,
+) -> None:  # fmt: skip
+    """Take from `columns`, the derivatives by the laws beyond the first `named` of `acting`, what a correction of the
+    variances holds of them already: it was read from variances in which they acted. What is left is their change from
+    the nearest level that it knows."""
+    gain = study.noise.gain
+    signal_dn = np.array([label.x for label in block.labels])
+    for correction in _corrections(acting):
+        nearest_dn = np.clip(signal_dn, gain * correction.at[0], gain * correction.at[-1])
+
+        def there(effects: Effects, dn: FloatArray = nearest_dn) -> Prediction:
+            shot_dn2 = shot_variance(study, dn, np.full(len(dn), gain), effects)
+            return Prediction(shot_dn2 + study.noise.read_dn**2, {})
+
+        held = MeasurementModel((replace(block, predict=there),), study.camera)
+        coords = [c for c in coordinates(acting, model.camera) if c.index >= named]
+        share = model.mean(acting)[at] / held.mean(acting)
+        for c, column in zip(coords, effect_jacobian(held, acting, coords).T, strict=True):
+            name = coordinate_name(acting, c)
+            if name in columns:
+                columns[name] = columns[name].copy()
+                columns[name][at] -= share * column
+
+
+def correction_covariance(correction: ModelDiscrepancy, x: FloatArray) -> FloatArray:
+    """Covariance (n, n) of what a correction's factor is wrong by at places `x` (n,) of its axis: its factors scatter
+    from place to place, and drift, and both go on between and beyond them.
+
+    With g(d) half the mean squared difference of factors that are d apart, c + b d by least squares, and w (n, k) the
+    weights by which the correction is drawn through its k factors, the error f - w f_k has the covariance
+
+        w g(k, n) + g(n, k) w' - g(n, n) - w g(k, k) w'
+
+    (N. Cressie, Statistics for Spatial Data, 1993, section 3.1). Every place departs by itself: none of the session to
+    come is one of those that were fitted."""
+    at = np.array(correction.at)
+    lag, half = np.abs(np.subtract.outer(at, at)), 0.5 * np.subtract.outer(correction.factor, correction.factor) ** 2
+    near = np.triu(lag <= 0.5 * np.ptp(at), 1)
+    (alone, drift), _ = nnls(np.column_stack([np.ones(near.sum()), lag[near]]), half[near])
+    weights = np.array([np.interp(x, at, one) for one in np.eye(len(at))]).T
+
+    def apart(places: FloatArray) -> FloatArray:
+        return drift * np.abs(np.subtract.outer(places, places)) + alone * (1.0 - np.eye(len(places)))
+
+    across = weights @ (alone + drift * np.abs(np.subtract.outer(at, x)))
+    return np.asarray(correction.strength**2 * (across + across.T - apart(x) - weights @ apart(at) @ weights.T))
 
 
 def _forms(model: MeasurementModel, effects: Effects) -> FloatArray:

@@ -136,6 +136,26 @@ class TwinScore(Frozen):
     skipped: tuple[Skipped, ...] = ()
 
 
+def conclusion(effects: Sequence[TestedEffect]) -> str:
+    """Return what is named of one camera after its tests, in a line: names that stand, those that were withdrawn, and
+    those that the session doesn't test."""
+
+    def listed(*verdicts: TwinVerdict) -> str:
+        mine = [one for one in effects if one.verdict in verdicts]
+        return ", ".join((one.becomes or one.name).replace("_", " ") for one in mine)
+
+    gone = [one for one in effects if one.verdict == "withdrawn"]
+    named = ", ".join(
+        f"{one.becomes} in place of {one.name}".replace("_", " ") for one in gone if one.becomes is not None
+    )
+    parts = {
+        "stands": ", ".join(filter(None, (listed("survives", "named"), named))) or "no name",
+        "withdrawn": ", ".join(one.name.replace("_", " ") for one in gone),
+        "untested": listed("untested"),
+    }
+    return "; ".join(f"{key}: {said}" for key, said in parts.items() if said)
+
+
 @one_blas_thread
 def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
     """Predicted beside measured. Raises InputError where the recordings aren't of the session that was predicted."""

@@ -33,6 +33,8 @@ class ConcealedCamera:
     bit_depth           of the converter; a code of another depth than 12 has as much more or less charge, so that the
     full well stays
     amplification       of the signal before the converter, which then holds less charge
+    stated_f_number     at which path errors of laws are stated; None: f_number. A lens that is stopped down keeps its
+    glass: its path errors follow the pupil
     distance_mm         of the scene; None: so far that the image lies in the focal plane
     """
 
@@ -40,7 +42,7 @@ class ConcealedCamera:
         self, seed: int, laws: Sequence[Law] = (), *, cfa: str | None = None, f_number: float | None = None,
         rows: int = 384, cols: int = 512, noise_draw: int = 0,
         side: str = "left", offset_mm: float = 0.0, pair_middle_mm: float = 0.0, bit_depth: int = BIT_DEPTH,
-        amplification: float = 1.0, distance_mm: float | None = None,
+        amplification: float = 1.0, distance_mm: float | None = None, stated_f_number: float | None = None,
     ) -> None:  # fmt: skip
         self.side, self.offset_mm, self.pair_middle_mm = side, offset_mm, pair_middle_mm
         self.seed, self.noise_draw, self.rows, self.cols = seed, noise_draw, rows, cols
@@ -51,6 +53,8 @@ class ConcealedCamera:
         self.fill_factor = float(rng.uniform(0.5, 1.0))
         drawn_f_number = float(rng.choice([2.0, 2.8, 4.0, 5.6]))
         self.f_number = f_number or drawn_f_number
+        #: Radius of the open pupil over that for which path errors of laws are stated.
+        self.open_pupil = (stated_f_number or self.f_number) / self.f_number
         self.focal_length_mm = float(rng.choice([6.0, 8.0, 12.0]))
         magnification = 0.0 if distance_mm is None else self.focal_length_mm / (distance_mm - self.focal_length_mm)
         #: Image distance over the aperture: of a near scene the image lies behind the focal plane.

@@ -12,7 +12,10 @@ from sim.stages import Image
 
 
 class Astigmatism(Effect):
-    """Path errors quadratic along x and y apart: W = (x_defocus x^2 + y_defocus y^2) / (8 N^2)."""
+    """Path errors quadratic along x and y apart: W = (x_defocus x^2 - y_defocus y^2) / (8 N^2).
+
+    The distances are the lens's, and stay as it is stopped down: the path errors go with the square of the pupil.
+    """
 
     name: ClassVar[str] = "astigmatism"
     family: ClassVar[Family] = Family.DIRECTIONAL_CONTRAST

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal, Self, get_args, get_origin
+from typing import Annotated, ClassVar, Literal, Self, get_args, get_origin
 
 import numpy as np
+from pydantic import Field
 from pydantic.fields import FieldInfo
 
 from sim.camera import CameraModel
@@ -20,6 +21,13 @@ from sim.stages import Charge, Codes, Image, Light, Signal
 
 #: The stages in the order of the light, and the method by which an effect acts on each.
 STAGES = {"light": "on_light", "image": "on_image", "charge": "on_charge", "signal": "on_signal", "codes": "on_codes"}
+
+#: The f-number at whose pupil an aberration's path error is stated. At another it is that of the part of the pupil that
+#: is open there (`sim.optics.pupil.Wavefront.stopped`).
+StatedFNumber = Annotated[
+    float | None,
+    Field(ge=0.5, le=64.0, description="f-number at which the path error is stated; not given: the camera's"),
+]
 
 
 def _is_told(field: FieldInfo) -> bool:
@@ -71,6 +79,11 @@ class Effect(Frozen):
     is_candidate: ClassVar[bool] = True
     #: One sentence for the report: what physics was left out and how that shows.
     sentence: ClassVar[str]
+
+    def pupil_share(self, f_number: float) -> float:
+        """Return the radius of the pupil at `f_number` over that at which the effect's path error is stated."""
+        stated: float | None = getattr(self, "stated_f_number", None)
+        return 1.0 if stated is None else stated / f_number
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:

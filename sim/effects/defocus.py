@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from sim.effects.base import Effect
+from sim.effects.base import Effect, StatedFNumber
 from sim.effects.families import Family
 from sim.optics.pupil import seidel
 from sim.parameters import Quantity
@@ -21,7 +21,8 @@ class Defocus(Effect):
     """Path error W020 = dz / (8 N^2) at the pupil's rim: the OTF of a circular pupil with a quadratic path error
     (Hopkins).
 
-    Away from its focus a lens has some spherical aberration, too: W = W020 (r^2 + s (r^4 - r^2)).
+    Away from its focus a lens has some spherical aberration, too: W = W020 (r^2 + s (r^4 - r^2)) at `stated_f_number`
+    N0. At f/N the share of r^4 is s (N0 / N)^2.
     """
 
     name: ClassVar[str] = "defocus"
@@ -49,10 +50,15 @@ class Defocus(Effect):
     ] = 0.0
 
     spherical_share: Annotated[float, Field(description="share of spherical aberration in the path error")] = 0.0
+    stated_f_number: StatedFNumber = None
 
     def on_image(self, image: Image) -> Image:
         if self.defocus_um == 0.0:
             return image
-        rim_um = self.defocus_um / (8.0 * image.camera.lens.f_number**2)
-        path = seidel(defocus_um=rim_um * (1.0 - self.spherical_share), spherical_um=rim_um * self.spherical_share)
+        f_number = image.camera.lens.f_number
+        share = self.pupil_share(f_number)
+        rim_um = self.defocus_um / (8.0 * (share * f_number) ** 2)  # of the stated pupil
+        path = seidel(
+            defocus_um=rim_um * (1.0 - self.spherical_share), spherical_um=rim_um * self.spherical_share
+        ).stopped(share)
         return image.add_laws(pupil=lambda wavelength_nm: path)

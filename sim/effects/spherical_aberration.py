@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.effects.base import Effect
+from sim.effects.base import Effect, StatedFNumber
 from sim.effects.families import Family
 from sim.optics.pupil import seidel
 from sim.parameters import Quantity
@@ -12,7 +12,10 @@ from sim.stages import Image
 
 
 class SphericalAberration(Effect):
-    """Path error W040 rho^4 over the pupil, in the paraxial focus."""
+    """Path error W040 rho^4 over the pupil, in the paraxial focus.
+
+    W040 is that at the rim of the pupil of `stated_f_number` N0: at f/N it is (N0 / N)^4 of it.
+    """
 
     name: ClassVar[str] = "spherical_aberration"
     family: ClassVar[Family] = Family.ISOTROPIC_CONTRAST
@@ -31,8 +34,10 @@ class SphericalAberration(Effect):
         ),
     ] = 0.0
 
+    stated_f_number: StatedFNumber = None
+
     def on_image(self, image: Image) -> Image:
         if self.w040_um == 0.0:
             return image
-        path = seidel(spherical_um=self.w040_um)
+        path = seidel(spherical_um=self.w040_um).stopped(self.pupil_share(image.camera.lens.f_number))
         return image.add_laws(pupil=lambda wavelength_nm: path)

@@ -91,6 +91,12 @@ class Wavefront:
         """Times a number."""
         return Wavefront(tuple((i, j, um * factor) for i, j, um in self.terms if factor != 0.0))
 
+    def stopped(self, share: float) -> Wavefront:
+        """Return W(share x, share y): of the pupil that reaches `share` as far out, over its own rim. A term of degree
+        k goes with share^k: W040 with the fourth power, W131 with the third, W222 and W020 with the second.
+        """
+        return Wavefront(tuple((i, j, um * share ** (i + j)) for i, j, um in self.terms))
+
     def plus(self, coefficients: Mapping[tuple[int, int], float]) -> Wavefront:
         """With {(i, j): um} added."""
         total = dict(self.coefficients)

@@ -11,7 +11,9 @@ from lab.fit.mtf import edge_mtf
 from mocks.former import LISTED, OUTSIDE, WAVELENGTH_NM, ConcealedCamera, Law, Plan
 from mocks.former.camera import poisson
 from mocks.former.laws import (
+    AstigmatismLaw,
     ChargeDiffusionLaw,
+    ComaLaw,
     DefocusLaw,
     OpticalLowPassFilterLaw,
     SphericalAberrationLaw,
@@ -108,6 +110,43 @@ def test_strong_defocus_blurs_by_a_disc() -> None:
         31, cfa="MONO", f_number=2.0, rows=32, cols=32
     ).lens.diffraction(f / camera.pitch_um, 0.555)
     assert blur == pytest.approx(2 * j1(q) / q, abs=0.02)
+
+
+@pytest.mark.parametrize("f_number", [2.8, 4.0, 8.0])
+@pytest.mark.parametrize(
+    ("law", "power", "slope"),
+    [
+        (SphericalAberrationLaw(1.2), 4, 2.0),
+        (SphericalAberrationLaw(1.2, 1), 4, None),
+        (AstigmatismLaw(1.2), 2, 1.0),
+        (ComaLaw(1.2), 3, 0.5),
+        (ComaLaw(1.2, 1), 3, 0.5),
+        (DefocusLaw(1.2 * 128.0, 1), 2, 1.0),
+        (DefocusLaw(1.2 * 128.0, 2), 2, None),
+    ],
+)
+def test_aberrations_follow_the_pupil_as_the_seidel_sums_do(
+    law: Law, power: int, slope: float | None, f_number: float
+) -> None:
+    """Rays land 2 N dW/dx off: at low frequencies the contrast is 1 - 2 pi^2 f^2 (2 N)^2 <(dW/dx)^2> about the mean,
+    which over the pupil is 2 W^2 of W r^4, W^2 of W (x^2 - y^2) and of W r^2, W^2 / 2 of W r^2 x along x, W (4 / N)^k.
+    The overlap of the pupils leaves out 3 % at 0.01 of the cutoff."""
+    n, share = f_number, 4.0 / f_number
+    if slope is None:  # radial: <(W' cos)^2> = the integral of W'^2 r, W' by the terms' own powers
+        r = np.linspace(0.0, 1.0, 2001)
+        by_term = {4: 1.2, 6: 0.24} if isinstance(law, SphericalAberrationLaw) else {2: 0.9 * 1.2, 4: 0.1 * 1.2}
+        steep = sum(w * share**k * k * r ** (k - 1) for k, w in by_term.items())
+        rms_um = 2.0 * n * float(np.sqrt(np.trapezoid(steep**2 * r, r)))
+    else:
+        rms_um = 2.0 * n * 1.2 * share**power * np.sqrt(slope)
+    law_there, plain = (
+        ConcealedCamera(31, laws, cfa="MONO", f_number=n, rows=32, cols=32, stated_f_number=4.0) for laws in ([law], [])
+    )
+    along = 2.0 * np.pi * float(law.uniform[0]) if isinstance(law, ComaLaw) else 0.0
+    f = np.array([min(0.02 / rms_um, 0.01 / (0.555 * n))])
+    spread = law_there.lens._pupil(f, along, 555.0) / plain.lens.diffraction(f, 0.555)
+    level = law_there.lens._pupil(0.0 * f, along, 555.0)
+    assert 1.0 - abs(spread[0] / level[0]) == pytest.approx(2.0 * np.pi**2 * f[0] ** 2 * rms_um**2, rel=0.06)
 
 
 def test_a_split_has_its_null_and_diffusion_its_gaussian() -> None:

@@ -35,7 +35,7 @@ class OpticalLowPassFilterLaw(Law):
 
 class DefocusLaw(Law):
     """Displaced focus. Variants: path difference of a sphere; its parabola; the parabola and 0.1 of spherical
-    aberration."""
+    aberration, which a stopped lens has the less of."""
 
     name = effect = "defocus"
     variants, unit, nominal, limits, power, shown_by = 3, "um", 12.0, (0.5, 60.0), 2.0, OPTICAL
@@ -46,7 +46,7 @@ class DefocusLaw(Law):
             sine2 = 1.0 / (4.0 * n * n)  # path difference dz (1 - cos theta), which isn't quite a parabola
             return self.strength * (1.0 - np.sqrt(1.0 - sine2 * rho2))
         w = self.strength / (8.0 * n * n)
-        return w * rho2 + (0.1 * w * (rho2 * rho2 - rho2) if self.variant == 2 else 0.0)
+        return w * rho2 + (0.1 * w * (self.camera.open_pupil**2 * rho2 * rho2 - rho2) if self.variant == 2 else 0.0)
 
     def library_parameters(self) -> dict[str, float]:
         return {"defocus_um": self.strength} if self.variant < 2 else {}
@@ -59,8 +59,8 @@ class SphericalAberrationLaw(Law):
     variants, unit, nominal, limits, power, shown_by = 2, "um", 0.2, (0.01, 1.2), 2.0, OPTICAL
 
     def path_error_um(self, x: Array, y: Array, wavelength_nm: float) -> Array:
-        rho2 = x * x + y * y
-        return self.strength * (rho2**2 + (0.2 * rho2**3 if self.variant == 1 else 0.0))
+        height2 = self.camera.open_pupil**2 * (x * x + y * y)
+        return self.strength * (height2**2 + (0.2 * height2**3 if self.variant == 1 else 0.0))
 
     def library_parameters(self) -> dict[str, float]:
         return {"w040_um": self.strength} if self.variant == 0 else {}
@@ -73,7 +73,8 @@ class AstigmatismLaw(Law):
     variants, unit, nominal, limits, power, shown_by = 2, "um", 0.2, (0.01, 1.2), 2.0, OPTICAL
 
     def path_error_um(self, x: Array, y: Array, wavelength_nm: float) -> Array:
-        return self.strength * (x * x - (1.0 if self.variant == 0 else 0.5) * y * y)
+        at_rim_um = self.strength * self.camera.open_pupil**2
+        return at_rim_um * (x * x - (1.0 if self.variant == 0 else 0.5) * y * y)
 
 
 class ComaLaw(Law):
@@ -84,8 +85,9 @@ class ComaLaw(Law):
 
     def path_error_um(self, x: Array, y: Array, wavelength_nm: float) -> Array:
         t = 2.0 * np.pi * self.uniform[0]
+        rim = self.camera.open_pupil
         along = x * np.cos(t) + y * np.sin(t)
-        return self.strength * (x * x + y * y - (2.0 / 3.0 if self.variant == 1 else 0.0)) * along
+        return self.strength * rim * (rim**2 * (x * x + y * y) - (2.0 / 3.0 if self.variant == 1 else 0.0)) * along
 
 
 class TrefoilLaw(Law):
@@ -95,7 +97,7 @@ class TrefoilLaw(Law):
     families = frozenset({"directional_contrast_loss"})
 
     def path_error_um(self, x: Array, y: Array, wavelength_nm: float) -> Array:
-        return self.strength * (x**3 - 3 * x * y * y)
+        return self.strength * self.camera.open_pupil**3 * (x**3 - 3 * x * y * y)
 
 
 class AxialColourLaw(Law):

@@ -10,11 +10,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from lab.challenge.budgets import BudgetCheck, check_budget
 from lab.challenge.recordings import recordings_of
 from lab.challenge.transfers import (
+    DARK_LAW,
     TRANSFERS,
     CameraRun,
     TransferRun,
+    budget_names,
     case_names,
     concealed_camera,
     drawing,
@@ -26,10 +29,16 @@ from lab.challenge.transfers import (
 )
 from lab.challenge.truth import store
 from lab.errors import InputError
+from lab.formats.camera_file import CameraFile
+from lab.formats.model_posterior import ModelPosterior
 from lab.twin import score as twin_score
 from lab.twin.changes import Changes
 from lab.twin.predict import predict
-from mocks.former import Plan
+from mocks.former import WAVELENGTH_NM, ConcealedCamera, Plan
+from sim.camera import CameraModel, Lens
+from sim.effects.dark_current_temperature import DarkCurrentTemperature
+from sim.spectrum import Spectrum
+from tests.lab.twin.test_budget import FIRST
 from tests.lab.twin.test_twin import PLAN, captured, trained
 
 
@@ -88,8 +97,15 @@ def _run(case: str, away: float) -> CameraRun:
                 side="left", name="a_family", effect="coma", gain=9.0, before=0.4, verdict="named", becomes=right
             )
         )
+    sure = BudgetCheck(
+        use="MTF50", stated={"defocus": 2.0, "gain": 0.1}, found={"defocus": 1.0, "gain": 0.1}, std_percent=2.0,
+        error_percent=1.0, probability=0.97,
+    )  # fmt: skip
+    doubtful = sure.model_copy(update={"use": "patches", "found": {"defocus": 0.1, "gain": 5.0}, "probability": 0.5,
+                                       "error_percent": 5.0})  # fmt: skip
     return CameraRun(
         case=case,
+        budget=(sure, doubtful),
         concealed=tuple(law.name for law in laws_of(case)),
         told=("defocus",),
         tested=tuple(tests),
@@ -102,15 +118,70 @@ def test_the_page_counts_deviations_intervals_and_names(tmp_path: Path) -> None:
     text = section(runs)
     assert "2 of 32 cameras (1 of 8 healthy, 1 of 8 single, 0 of 8 double, 0 of 8 weak)" in text
     assert "| patches of the chart | 0.5 % | 0.5 % | 0.8 % | 1 % | 75.0 % | 90 to 98 % |" in text
-    assert "Families: 1, of which 1 became a name, 1 of them the right one." in text
+    assert "Families: 1, of which 1 (100 %) became a name, 1 of them the right one; wanted: 80 %." in text
     assert "Names: 2, 2 of them wrong, of which 2 were withdrawn;" in text
     assert "| f/4 to f/8 | 1.00 | 0 | 2 of 2 |" in text
+    assert "| MTF50 | 2 | 100 % | 97 % | 2 | 100 % | 90 % | 100 % |" in text
+    assert "| patches | 2 | 0 % | 50 % | 0 | - | 90 % | 0 % |" in text
+    assert "| all | 4 | 50 % | 74 % | 2 | 100 % | 90 % | 50 % |" in text
     ElementTree.fromstring(drawing(runs))
     for case, run in runs.items():
         store(run, tmp_path / "results" / f"{case}.json")
     assert run_all(tmp_path, ["healthy-1", "single-1"], 4177) == runs
     with pytest.raises(InputError, match="is of seed 4177, not 5"):
         run_all(tmp_path, ["healthy-1"], 5)
+
+
+def test_a_case_for_the_budget_alone_is_no_camera_of_the_transfers() -> None:
+    assert len(set(budget_names())) == 18 and not set(budget_names()) & set(case_names())
+    assert {len(laws_of(case)) for case in budget_names()} == {1, 2}
+    one = _run("single-9", 0.2).model_copy(update={"transfers": {}, "tested": ()})
+    assert section({"single-9": one}).startswith("0 of 32 cameras") and "| MTF50 | 1 | 100 % |" in section({"9": one})
+
+
+def _fitted(truth: ConcealedCamera, std: dict[str, float], **wrong: float) -> CameraFile:
+    """The model of a camera of the second former as it is, but for what is `wrong`, with a posterior of `std`."""
+    curves = {c: Spectrum.of(WAVELENGTH_NM, q) for c, q in truth.quantum_efficiency.items()}
+    camera = CameraModel(
+        rows=truth.rows, cols=truth.cols, pixel_pitch_um=truth.pitch_um, fill_factor=truth.fill_factor, cfa=truth.cfa,
+        bit_depth=12, black_level_dn=truth.black_level_dn, white_level_dn=4095.0,
+        conversion_gain_dn_per_e=truth.gain_dn_per_e, full_well_e=truth.full_well_e,
+        read_noise_e=truth.read_noise_e, dark_current_e_per_s=truth.dark_e_per_s, dark_current_reference_c=25.0,
+        dsnu_e=1.0, prnu_percent=0.5, quantum_efficiency=curves,
+        lens=Lens(f_number=truth.f_number, focal_length_mm=truth.focal_length_mm),
+    )  # fmt: skip
+    effects = (DarkCurrentTemperature(doublings_per_c=wrong.pop("doublings_per_c", 0.13)),)
+    posterior = ModelPosterior.of(FIRST, tuple(std), np.zeros(len(std)), np.diag(np.square(list(std.values()))))
+    return CameraFile("fitted", camera.model_copy(update=wrong), effects, posterior=posterior)
+
+
+def test_a_budget_is_held_against_what_its_parameters_are_wrong_by() -> None:
+    """Doublings that are 0.01 a degree off make ten degrees' dark signal wrong by 10 ln 2 x 0.01, one at the reference
+    not: rms over the two. The budget's first is the truth's where the largest error is its largest doubt."""
+    truth = concealed_camera("healthy-1", f_number=4.0)
+    name = "dark_current_temperature.doublings_per_c"
+
+    def dark(std: dict[str, float], **wrong: float) -> BudgetCheck:
+        return {one.use: one for one in check_budget(_fitted(truth, std, **wrong), truth, truth.laws)}["dark mean"]
+
+    first = dark({name: 0.02, "dark": 0.01}, doublings_per_c=0.14)
+    wanted = 100.0 * 0.01 * 10.0 * np.log(2.0) / np.sqrt(2.0)
+    # a derivative in place of a difference of 7 %
+    assert first.found["dark_current_temperature"] == pytest.approx(wanted, rel=0.04)
+    assert first.found["dark"] == pytest.approx(0.0, abs=1e-9)
+    assert first.is_first and first.probability > 0.9
+    assert first.stated["dark_current_temperature"] == pytest.approx(2.0 * wanted, rel=0.08)
+    brighter = dark({name: 0.02, "dark": 0.01}, dark_current_e_per_s=1.1 * truth.dark_e_per_s)
+    assert not brighter.is_first and brighter.found["dark"] == pytest.approx(100.0 / 11.0, rel=0.01)
+
+
+def test_a_size_that_the_law_has_no_parameter_for_is_left_out() -> None:
+    """The quadratic form of the concealed law has no doubling: its contribution is compared with nothing."""
+    dark = DARK_LAW(1.3, 1, 5)
+    truth = concealed_camera("healthy-1", f_number=4.0)
+    name = "dark_current_temperature.doublings_per_c"
+    checks = check_budget(_fitted(truth, {name: 0.02, "dark": 0.01}), truth, [dark])
+    assert not dark.library_parameters() and "dark mean" not in {one.use for one in checks}
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from lab.capture.station import Station, read_station
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import FirstEstimates, ModelPosterior
-from lab.twin.budget import CaptureGain, budget, parse_uses
+from lab.twin.budget import CaptureGain, LinearUse, budget, parse_uses, with_darks
 from lab.twin.lab_minutes import LabCapture
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
 from sim.effects.defocus import Defocus
@@ -109,6 +109,27 @@ def test_a_capture_leaves_what_information_adds_up_to() -> None:
     # information adds: V'^-1 = V^-1 + J' S^-1 J
     wanted = np.linalg.inv(np.linalg.inv(known) + jacobian.T @ np.diag(1.0 / noise) @ jacobian)
     assert one.known_after(known, jacobian) == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+
+
+def test_dark_frames_tell_the_read_noise_beside_the_photon_transfer() -> None:
+    """A pair of frames of 120 x 160 px measures the dark's variance to sqrt(2 / 19200), and to 1 %, in units of 30 %:
+    of two correlated parameters the other is known better by what the correlation says."""
+    posterior = ModelPosterior.of(FIRST, ("gain", "read"), np.array([0.5, 2.0]), np.array([[1.0, -0.6], [-0.6, 1.0]]))
+    found = with_darks(posterior, TRUTH.camera)
+    std2 = (2.0 / 19200.0 + 1e-4) / 0.3**2
+    np.testing.assert_allclose(
+        found.covariance, [[1.0 - 0.36 / (1.0 + std2), -0.6 * std2 / (1.0 + std2)],
+                           [-0.6 * std2 / (1.0 + std2), std2 / (1.0 + std2)]], rtol=1e-6)  # fmt: skip
+    np.testing.assert_allclose(found.mean, [0.5 + 1.2 / (1.0 + std2), 2.0 * std2 / (1.0 + std2)], rtol=1e-6)
+
+
+def test_what_goes_along_with_a_parameter_is_its_own() -> None:
+    """Of use = a + 2 b with correlation r, to know a takes away (1 + 2 r)^2: its own, and what it tells of b."""
+    r = 0.5
+    one = LinearUse(("a", "b"), np.array([[1.0], [2.0]]), np.array([[1.0, r], [r, 1.0]]))
+    assert one.groups() == {"a": [0], "b": [1]}
+    assert one.told_by([0])[0, 0] == pytest.approx(1.0 + 2.0 * r)
+    assert one.std == pytest.approx(np.sqrt(1.0 + 4.0 + 4.0 * r))
 
 
 def test_an_unknown_use_and_a_model_without_uncertainties_are_refused() -> None:

@@ -22,17 +22,22 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.errors import InputError
 from lab.fit import fit_recording_set
 from lab.formats.camera_file import CameraFile, read_camera, write_camera
+from lab.formats.model_posterior import NameInDoubt, RivalModel, StoredEffect
 from lab.formats.recording_set import Manifest, RecordingSet, write
 from lab.formats.recording_set.files import MemoryFiles
+from lab.twin import score as twin_score
 from lab.twin.changes import Changes, carried, parse_changes
-from lab.twin.predict import predict
-from lab.twin.score import score, together
-from lab.twin.sealed import open_seal, seal
+from lab.twin.predict import correction_covariance, predict
+from lab.twin.score import TwinVerdict, conclusion, score, together
+from lab.twin.sealed import PredictedNumber, open_seal, seal
 from lab.twin.session import future_session
 from sim.camera import CameraModel, Lens
+from sim.effects.base import Effect
 from sim.effects.charge_diffusion import ChargeDiffusion
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
 from sim.effects.defocus import Defocus
+from sim.effects.model_discrepancy import ModelDiscrepancy
+from sim.effects.spherical_aberration import SphericalAberration
 from sim.effects.veiling_glare import VeilingGlare
 from sim.spectrum import Spectrum
 from sim.uniform import electron_rate
@@ -149,6 +154,7 @@ def test_an_effect_that_the_camera_lacks_is_withdrawn() -> None:
     found = score(predict({"left": trained(2, wrong=True)}, PLAN, changes, light_std=0.0), captured(changes, 8))
     verdicts = {effect.name: effect.verdict for effect in found.effects}
     assert verdicts == {"dark_current_temperature": "survives", "veiling_glare": "withdrawn"}
+    assert conclusion(found.effects) == "stands: dark current temperature; withdrawn: veiling glare"
 
 
 def _photons(recordings: RecordingSet, levels: slice) -> RecordingSet:
@@ -192,6 +198,78 @@ def test_levels_of_stated_photons_are_predicted_relative_to_the_fitted_ones(
     assert missed.chi2 > 10.0 * found.chi2
 
 
+def test_a_correction_is_as_wrong_elsewhere_as_it_scatters_and_drifts() -> None:
+    """Of factors that scatter by s alone, the last one held is wrong by sqrt(2) s, a mean of two by sqrt(3 / 2) s, and
+    held levels share the last one's s. Of a drift alone, by the root of the way beyond."""
+    at, rng = np.arange(1.0, 401.0), np.random.default_rng(4)
+    x = np.array([200.5, 410.0, 450.0])
+    # of 400 factors the mean square is known to sqrt(2 / 400), 7 %: within four of that
+    alone = ModelDiscrepancy(along="variance_signal_e", at=tuple(at), strength=1.0,
+                             factor=tuple(1.0 + 0.01 * rng.standard_normal(400)))  # fmt: skip
+    found = correction_covariance(alone, x) / 1e-4
+    np.testing.assert_allclose(np.diag(found), [1.5, 2.0, 2.0], rtol=0.3)
+    assert found[1, 2] == pytest.approx(0.5 * found[1, 1], rel=0.2) and abs(found[0, 1]) < 0.2
+    walk = 1.0 + 0.001 * np.cumsum(np.random.default_rng(4).standard_normal(400))
+    drifts = ModelDiscrepancy(along="variance_signal_e", at=tuple(at), factor=tuple(walk), strength=1.0)
+    beyond = correction_covariance(drifts, np.array([410.0, 440.0, 480.0]))
+    assert beyond[2, 2] - beyond[1, 1] == pytest.approx(40.0 / 30.0 * (beyond[1, 1] - beyond[0, 0]), rel=1e-6)
+    # the lags of one walk overlap: its slope is known to a factor
+    assert 0.3e-6 < (beyond[2, 2] - beyond[1, 1]) / (2.0 * 40.0) / 0.5 < 3e-6
+    even = ModelDiscrepancy(along="variance_signal_e", at=tuple(at), factor=(1.02,) * 400, strength=1.0)
+    np.testing.assert_allclose(correction_covariance(even, x), 0.0, atol=1e-15)
+
+
+def test_a_correction_of_variances_holds_what_unnamed_laws_do_there(
+    of_photons: tuple[CameraFile, RecordingSet, RecordingSet],
+) -> None:
+    """A bend that nobody named, at 1 % more by the posterior, moves no variance where a correction was read, and beyond
+    its last level by the change from there alone; without a correction, by all of it."""
+    content, low, high = of_photons
+    posterior = content.posterior
+    assert posterior is not None
+    mean = np.array(posterior.mean)
+    mean[posterior.names.index("nonlinearity.quadratic_percent")] += 1.0
+    bent = replace(content, posterior=posterior.model_copy(update={"mean": tuple(mean.tolist())}))
+    levels_e = np.array([n.x for n in _noise(content, high, low)]) / content.camera.conversion_gain_dn_per_e
+
+    def moved(effects: tuple[Effect, ...]) -> np.ndarray:
+        before, after = (_noise(replace(one, effects=effects), high, low) for one in (content, bent))
+        # the rate of the light is another, too: at the same level
+        same = [b.predicted + b.level_slope * (a.x - b.x) for a, b in zip(before, after, strict=True)]
+        return np.array(same) / [a.predicted for a in before] - 1.0
+
+    def held_to(last_e: float) -> np.ndarray:
+        correction = ModelDiscrepancy(along="variance_signal_e", at=(10.0, last_e), factor=(1.0, 1.0), strength=1.0)
+        return moved((correction,))
+
+    by_all, middle_e = moved(()), float(np.median(levels_e))
+    assert np.abs(by_all).max() > 0.005  # 1 % at full well changes the slope, and its square by twice that
+    assert np.abs(held_to(1.01 * levels_e.max())).max() < 0.02 * np.abs(by_all).max()
+    beyond, at_middle = levels_e > middle_e, np.interp(middle_e, np.sort(levels_e), by_all[np.argsort(levels_e)])
+    np.testing.assert_allclose(held_to(middle_e)[beyond], (by_all - at_middle)[beyond], atol=0.1 * np.ptp(by_all))
+
+
+def _noise(content: CameraFile, plan: RecordingSet, fitted: RecordingSet) -> list[PredictedNumber]:
+    found = predict({"left": content}, plan, Changes(), fitted=fitted).sides["left"].numbers
+    return [n for n in found if n.quantity == "noise"]
+
+
+def test_a_model_without_a_correction_has_no_wider_intervals(content: CameraFile) -> None:
+    """What a correction is wrong by is in the intervals of variances alone, and of a model that has one."""
+
+    def std(one: CameraFile) -> dict[str, np.ndarray]:
+        numbers = predict({"left": one}, PLAN, Changes(), light_std=0.0).sides["left"].numbers
+        kinds = {n.quantity for n in numbers}
+        return {kind: np.array([n.std for n in numbers if n.quantity == kind]) for kind in kinds}
+
+    scatters = ModelDiscrepancy(along="variance_signal_e", at=(10.0, 2000.0, 4000.0, 6000.0, 9000.0),
+                                factor=(1.0, 1.02, 0.98, 1.02, 0.98), strength=1.0)  # fmt: skip
+    plain, corrected = std(content), std(replace(content, effects=(*content.effects, scatters)))
+    assert np.all(corrected["noise"] > 2.0 * plain["noise"])
+    for kind in ("chart", "slanted_edge", "dark"):
+        np.testing.assert_allclose(corrected[kind], plain[kind], rtol=0.01)  # drawn frames differ
+
+
 def test_stated_photons_need_the_fitted_recordings(of_photons: tuple[CameraFile, RecordingSet, RecordingSet]) -> None:
     content, _, high = of_photons
     with pytest.raises(InputError, match="states photons and no radiance; give the fitted recordings"):
@@ -229,6 +307,20 @@ def test_a_transfer_tells_which_of_two_rivals_blurs() -> None:
     name = next(one for one in tests if one.effect == "charge_diffusion")
     assert (name.verdict, name.becomes) == ("withdrawn", "defocus")
     assert together([tests, tests])[0].gain == pytest.approx(2.0 * tests[0].gain)
+
+
+def test_the_conclusion_says_what_became_of_every_name() -> None:
+    def one(name: str, verdict: TwinVerdict, becomes: str | None = None) -> twin_score.TestedEffect:
+        return twin_score.TestedEffect(side="left", name=name, effect="defocus", gain=1.0, before=0.5, verdict=verdict,
+                            becomes=becomes)  # fmt: skip
+
+    said = conclusion([one("coma", "survives"), one("isotropic_contrast_loss", "named", "defocus"),
+                       one("ghost", "withdrawn"), one("row_noise", "untested"),
+                       one("defocus", "withdrawn", "charge_diffusion")])  # fmt: skip
+    assert said == (
+        "stands: coma, defocus, charge diffusion in place of defocus; withdrawn: ghost, defocus; untested: row noise"
+    )
+    assert conclusion([one("ghost", "withdrawn")]) == "stands: no name; withdrawn: ghost"
 
 
 def test_the_surroundings_of_chart_and_edge_are_those_of_the_plans_frames() -> None:
@@ -270,6 +362,27 @@ def test_a_change_that_cant_be_carried_is_one_line(content: CameraFile, change: 
     with pytest.raises(InputError) as refused:
         predict({"left": content}, PLAN, parse_changes(change))
     assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_aberrations_say_at_which_aperture_they_were_fitted() -> None:
+    """W040 of f/4 is a sixteenth at f/8, in the effects of the model, and in a rival's."""
+    spherical, changes = SphericalAberration(w040_um=0.3), Changes(f_number=8.0, radiance_factor=4.0)
+    model = replace(trained(3), effects=(DarkCurrentTemperature(doublings_per_c=0.14), spherical))
+    there = carried(model, changes)
+    assert there.effects[1] == SphericalAberration(w040_um=0.3, stated_f_number=4.0)
+    posterior = model.posterior
+    assert posterior is not None
+    beside = StoredEffect.of(model.effects[0])
+    rival = RivalModel(name="coma", probability=0.5, effects=(beside, StoredEffect.of(spherical)), shift={})
+    doubt = NameInDoubt(effect="spherical_aberration", told="isotropic_contrast_loss", probability=0.5,
+                        named=tuple(e.name for e in model.effects), rivals=(rival,))  # fmt: skip
+    model = replace(model, posterior=posterior.model_copy(update={"doubts": (doubt,)}))
+    found = predict({"left": model}, PLAN, changes, light_std=0.0).sides["left"]
+    weak = replace(model, effects=(model.effects[0], SphericalAberration(w040_um=0.3 / 16.0, stated_f_number=8.0)))
+    same = predict({"left": weak}, PLAN, changes, light_std=0.0).sides["left"]
+    np.testing.assert_allclose([n.predicted for n in same.numbers], [n.predicted for n in found.numbers], rtol=1e-9)
+    # the rival is the same effect: of 9 digits that are sealed, the same numbers
+    np.testing.assert_allclose(found.names[0].rivals[0].numbers, [n.predicted for n in found.numbers], rtol=1e-6)
 
 
 def test_a_temperature_needs_a_law_of_dark_current(content: CameraFile) -> None:
