@@ -179,7 +179,7 @@ def statement(side: Side, found: PredictiveTable) -> str:
         rms = float(np.std(base.departure[look.seen.index]))
         what += f" differ by {say(rms).removeprefix('+')} rms, without a period"
     elif look.at:
-        what += f" follows the {line}: {base.said}"
+        what += f" follows the {line.replace(' x ', ' and the ')}: {base.said}"
     else:
         what += f" have {base.said}"
     suspects = suspects_of(found)
