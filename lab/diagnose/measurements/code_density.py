@@ -81,7 +81,7 @@ def code_block(study: Study) -> Block:
         )
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
-    sets: list[tuple[CodeCounts, sparse.csr_array, list[_Part]]] = []
+    sets: dict[bool, tuple[CodeCounts, sparse.csr_array, list[_Part]]] = {}
     values, covariances, scales = [], [], []
     for held_out in (False, True):
         codes = prepared(study, counts[held_out])
@@ -116,19 +116,24 @@ def code_block(study: Study) -> Block:
         places += [(float(codes.first + b), 0.0) for b in boundaries]
         places += [(0.0, far * k) for k in range(len(names))]
         places += [(label.x, 0.0) for label in labels[len(places) :]]
-        sets.append((codes, sparse.csr_array(linear), parts))
+        sets[held_out] = codes, sparse.csr_array(linear), parts
     if not labels:
         raise NotDetermined(
             "code_density", f"no even light over {LEAST_CODES} codes and more whose noise exceeds {LEAST_NOISE:g} codes"
         )
 
     def predict(effects: Effects) -> Prediction:
-        found = []
-        for codes, linear, parts in sets:
+        found, scatter = [], {}
+        for held_out, (codes, linear, parts) in sets.items():
             change = codes.expected * (widths(codes, effects, study) - 1.0)
             moved = codes.rough @ change
-            found += [linear @ change, np.array([p.excess(moved) for p in parts])]
-        return Prediction(np.concatenate(found), {})
+            excess = np.array([p.excess(moved) for p in parts])
+            at = sum(len(numbers) for numbers in found) + linear.shape[0]
+            found += [linear @ change, excess]
+            for k in np.flatnonzero(excess > 0.0):
+                scatter[f"codes:{held_out}:{k}"] = at + k, parts[k].scatter(excess[k])
+        mean = np.concatenate(found)
+        return Prediction(mean, {name: std * np.eye(len(mean))[i] for name, (i, std) in scatter.items()})
 
     return Block(
         measurement=CODE_DENSITY, reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
@@ -328,6 +333,11 @@ class _Part:
     def excess(self, residual: FloatArray) -> float:
         """chi2 of the residuals (codes,) over its standard deviation."""
         return float(np.sum(np.square(residual[self.at]) / self.variance)) / self.chi2_std
+
+    def scatter(self, excess: float) -> float:
+        """Standard deviation of a predicted excess by the residuals' noise: chi2 of noncentrality l has the variance
+        2 n + 4 l."""
+        return float(np.sqrt(4.0 * excess / self.chi2_std))
 
 
 def _parts(codes: CodeCounts) -> list[_Part]:
