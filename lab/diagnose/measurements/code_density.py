@@ -124,17 +124,18 @@ def code_block(study: Study) -> Block:
         )
 
     def predict(effects: Effects) -> Prediction:
-        found, scatter = [], {}
+        found: list[FloatArray] = []
+        scatter: dict[str, tuple[int, float]] = {}
         for held_out, (codes, linear, parts) in sets.items():
             change = codes.expected * (widths(codes, effects, study) - 1.0)
             moved = codes.rough @ change
             excess = np.array([p.excess(moved) for p in parts])
-            at = sum(len(numbers) for numbers in found) + linear.shape[0]
+            at = sum(map(len, found)) + int(linear.shape[0])
             found += [linear @ change, excess]
             for k in np.flatnonzero(excess > 0.0):
-                scatter[f"codes:{held_out}:{k}"] = at + k, parts[k].scatter(excess[k])
+                scatter[f"codes:{held_out}:{k}"] = at + int(k), parts[k].scatter(float(excess[k]))
         mean = np.concatenate(found)
-        return Prediction(mean, {name: std * np.eye(len(mean))[i] for name, (i, std) in scatter.items()})
+        return Prediction(mean, {name: std * (np.arange(len(mean)) == i) for name, (i, std) in scatter.items()})
 
     return Block(
         measurement=CODE_DENSITY, reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
