@@ -49,7 +49,8 @@ AROUND = 9  # side of the box in a plane of the mosaic whose mean is the light a
 STEP_OF_LEVELS = 0.2
 PARTS = 4  # of the range of codes, each with a chi2 of its own
 FINE = 8  # samples a code at which the converter's law is evaluated where it isn't straight
-JUMP = 1e-3  # codes by which a sample's middle may land off the mean of its ends, for the law to be straight in it
+#: Codes by which the middle of 1 / `FINE` of a code may land off the mean of its ends, where the law is straight.
+JUMP = 1e-3
 STRAIGHT = 1e-9  # codes: second difference of a law between codes, of rounding alone
 MARGIN = 64  # codes beyond those that are counted
 
@@ -81,7 +82,7 @@ def code_block(study: Study) -> Block:
         )
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
-    sets: list[tuple[CodeCounts, sparse.csr_array, list[_Part]]] = []
+    sets: dict[bool, tuple[CodeCounts, sparse.csr_array, list[_Part]]] = {}
     values, covariances, scales = [], [], []
     for held_out in (False, True):
         codes = prepared(study, counts[held_out])
@@ -116,19 +117,25 @@ def code_block(study: Study) -> Block:
         places += [(float(codes.first + b), 0.0) for b in boundaries]
         places += [(0.0, far * k) for k in range(len(names))]
         places += [(label.x, 0.0) for label in labels[len(places) :]]
-        sets.append((codes, sparse.csr_array(linear), parts))
+        sets[held_out] = codes, sparse.csr_array(linear), parts
     if not labels:
         raise NotDetermined(
             "code_density", f"no even light over {LEAST_CODES} codes and more whose noise exceeds {LEAST_NOISE:g} codes"
         )
 
     def predict(effects: Effects) -> Prediction:
-        found = []
-        for codes, linear, parts in sets:
+        found: list[FloatArray] = []
+        scatter: dict[str, tuple[int, float]] = {}
+        for held_out, (codes, linear, parts) in sets.items():
             change = codes.expected * (widths(codes, effects, study) - 1.0)
             moved = codes.rough @ change
-            found += [linear @ change, np.array([p.excess(moved) for p in parts])]
-        return Prediction(np.concatenate(found), {})
+            excess = np.array([p.excess(moved) for p in parts])
+            at = sum(map(len, found)) + int(linear.shape[0])
+            found += [linear @ change, excess]
+            for k in np.flatnonzero(excess > 0.0):
+                scatter[f"codes:{held_out}:{k}"] = at + int(k), parts[k].scatter(float(excess[k]))
+        mean = np.concatenate(found)
+        return Prediction(mean, {name: std * (np.arange(len(mean)) == i) for name, (i, std) in scatter.items()})
 
     return Block(
         measurement=CODE_DENSITY, reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
@@ -349,6 +356,11 @@ class _Part:
         """chi2 of the residuals (codes,) over its standard deviation."""
         return float(np.sum(np.square(residual[self.at]) / self.variance)) / self.chi2_std
 
+    def scatter(self, excess: float) -> float:
+        """Standard deviation of a predicted excess by the residuals' noise: chi2 of noncentrality l has the variance
+        2 n + 4 l."""
+        return float(np.sqrt(4.0 * excess / self.chi2_std))
+
 
 def _parts(codes: CodeCounts) -> list[_Part]:
     """Return the parts with codes enough. Var(chi2) = 2 n sum_k r_k^2 with the residuals' autocorrelation r of the
@@ -376,7 +388,8 @@ def widths(codes: CodeCounts, effects: Effects, study: Study) -> FloatArray:
     """Width (codes,) of each code: the interval of the converter's input that gives it, 1 for an ideal converter.
 
     The input is cut at the edges of the ideal converter's codes. Where the converter's law is straight over several of
-    these intervals, what lands on each code is exact; other intervals are sampled `FINE` times.
+    these intervals, what lands on each code is exact; other intervals are sampled `FINE` times, and samples in which it
+    bends as often again.
     """
     size, law = len(codes.count), Uniform(study.camera, effects).codes
     edge = np.asarray(np.arange(size + 2 * MARGIN + 1) - 0.5 - MARGIN, float)  # from the first counted code on
@@ -386,19 +399,24 @@ def widths(codes: CodeCounts, effects: Effects, study: Study) -> FloatArray:
     bent[:-1] |= bend
     bent[1:] |= bend
     found = np.zeros(size)
-    # a sample is an interval of 1 / FINE of a code, which the law stretches and two codes may share
-    samples = edge[:-1][bent][:, None] + np.arange(FINE + 1) / FINE
-    lands_on = law(samples.ravel() + codes.first).reshape(samples.shape) - codes.first
-    low, high = (end(lands_on[:, :-1], lands_on[:, 1:]).ravel() for end in (np.minimum, np.maximum))
-    middle = law((samples[:, :-1].ravel() + 0.5 / FINE) + codes.first) - codes.first
-    jumps = np.abs(middle - 0.5 * (low + high)) > JUMP  # there: where its middle lands, as wide as without the law
-    low[jumps], high[jumps] = middle[jumps] - 0.5 / FINE, middle[jumps] + 0.5 / FINE
-    code = np.rint(high).astype(int)
-    stretch = high - low
-    above = np.where(stretch > 0.0, np.clip((high - code + 0.5) / np.maximum(stretch, 1e-12), 0.0, 1.0), 1.0)
-    for at, share in ((code, above), (code - 1, 1.0 - above)):
-        inside = (at >= 0) & (at < size)
-        found += np.bincount(at[inside], share[inside], minlength=size) / FINE
+    begin, step = edge[:-1][bent], 1.0
+    for is_last in (False, True):
+        # a sample is an interval of `step` codes, which the law stretches and two codes may share
+        step /= FINE
+        begin = (begin[:, None] + step * np.arange(FINE)).ravel()
+        one, other, middle = (law(begin + share * step + codes.first) - codes.first for share in (0.0, 1.0, 0.5))
+        low, high = np.minimum(one, other), np.maximum(one, other)
+        bends = np.abs(middle - 0.5 * (low + high)) > JUMP * (FINE * step)
+        if is_last:  # it lands where its middle lands, as wide as without the law
+            low[bends], high[bends] = middle[bends] - 0.5 * step, middle[bends] + 0.5 * step
+        else:  # is looked at more finely
+            low, high, begin = low[~bends], high[~bends], begin[bends]
+        code = np.rint(high).astype(int)
+        stretch = high - low
+        above = np.where(stretch > 0.0, np.clip((high - code + 0.5) / np.maximum(stretch, 1e-12), 0.0, 1.0), 1.0)
+        for at, share in ((code, above), (code - 1, 1.0 - above)):
+            inside = (at >= 0) & (at < size)
+            found += np.bincount(at[inside], share[inside], minlength=size) * step
     turns = np.flatnonzero(np.diff(np.r_[True, bent, True]))
     for begin, end in zip(turns[::2], turns[1::2], strict=True):
         low, high = lands[begin], lands[end]

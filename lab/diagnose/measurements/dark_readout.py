@@ -15,6 +15,8 @@ from lab.diagnose.measurements.block import Block, Label, Measurement, Predictio
 from lab.diagnose.measurements.dark_frames import (
     CELL_FLOOR_DN,
     DarkCondition,
+    DarkNoise,
+    DarkPattern,
     DarkStatistics,
     by_part,
     captures_of,
@@ -104,7 +106,7 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
     value: list[FloatArray] = []
     labels: list[Label] = []
     factor: list[FloatArray] = []
-    share = _fixed_share(first)
+    share = _fixed_share(first, lines, length)
     for out, part in first.fixed.items():
         _, power, level = part.lines[lines]
         value.append(np.log(bands.mean(power)) - log_mean_bias(bands.modes) - log_mean_bias(level))
@@ -115,13 +117,9 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
     correlation = np.array([[1.0 if a == b else share[a] * share[b] for b in first.fixed] for a in first.fixed])
     covariance = np.kron(correlation, one) + np.eye(pieces * len(one)) * (POWER_FLOOR**2 + 0.01**2)
     parity = np.array([part.parity_dn[lines] for part in first.fixed.values()])
-    pixel = np.array([4.0 * part.white_dn2 / size for part in first.fixed.values()])
-    offset = np.array([4.0 * part.line_dn2[lines] * length / size for part in first.fixed.values()])
-    parity_cov = (
-        np.sqrt(np.outer(pixel, pixel)) * correlation
-        + np.sqrt(np.outer(offset, offset))
-        + np.eye(pieces) * CELL_FLOOR_DN**2
-    )
+    scatter = np.array([4.0 * _line_dn2(part, lines, length) * length / size for part in first.fixed.values()])
+    # powers are squares: lines themselves have the root of the powers' correlation
+    parity_cov = np.sqrt(np.outer(scatter, scatter) * correlation) + np.eye(pieces) * CELL_FLOOR_DN**2
     n = len(covariance)
     whole = np.zeros((n + pieces, n + pieces))
     whole[:n, :n], whole[n:, n:] = covariance, parity_cov
@@ -153,13 +151,19 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
     )  # fmt: skip
 
 
-def _fixed_share(frames: DarkStatistics) -> dict[bool, float]:
-    """Share of the mean frame's pixel variance that is fixed, and so common to seen and held-out frames, by part."""
-    changing = next((c.white_dn2 for c in frames.changing.values()), None)
+def _line_dn2(part: DarkPattern | DarkNoise, lines: Lines, length: int) -> float:
+    """Variance of the mean of a line of `length` pixels, DN^2: by pixels' and by lines' own noise."""
+    return part.white_dn2 / length + part.line_dn2[lines]
+
+
+def _fixed_share(frames: DarkStatistics, lines: Lines, length: int) -> dict[bool, float]:
+    """Share of the variance of the mean frame's lines that is fixed, and so common to seen and held-out frames, by
+    part. `length`: of a line, px."""
+    changing = next((_line_dn2(c, lines, length) for c in frames.changing.values()), None)
     if changing is None:
         return dict.fromkeys(frames.fixed, 0.0)
     return {
-        out: float(np.clip(1.0 - changing / part.frames / part.white_dn2, 0.0, 1.0))
+        out: float(np.clip(1.0 - changing / part.frames / _line_dn2(part, lines, length), 0.0, 1.0))
         for out, part in frames.fixed.items()
     }
 

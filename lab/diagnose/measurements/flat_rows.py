@@ -66,13 +66,13 @@ def flicker_block(study: Study) -> Block:
 
     q(r) = row means of a frame / row means of all frames - 1. Power at k cycles a frame: |sum over r of q(r) exp(-2 pi
     i k r / rows)|^2 / (rows x variance of a row's mean). The cube root of its mean over a band is nearly normal (Wilson
-    and Hilferty 1931): mean 1 - 2 / (9 v), variance 2 / (9 v) for v degrees of freedom. The rows' offsets in dark
-    frames are subtracted, and the spectrum of their noise is expected in light as well (`dark_readout`), with its
-    standard deviation as a nuisance parameter of each band. Without repeated dark frames the spectrum is a free
-    parameter of each band up to `MOST_ROW_NOISE`, so that only what grows with the light is seen. Other nuisance
-    parameters: the spectrum of the pixels' noise, and the fixed pattern of rows. A frame begins at that time within a
-    period of the light for which the predicted rows are most like its own. Raises NotDetermined without unclipped,
-    repeated flats, and for too few rows.
+    and Hilferty 1931): over the cube root of the true power, mean 1 - 2 / (9 v) and variance 2 / (9 v) for v degrees of
+    freedom. The rows' offsets in dark frames are subtracted, and the spectrum of their noise is expected in light as
+    well (`dark_readout`), with its standard deviation as a nuisance parameter of each band. Without repeated dark
+    frames the spectrum is a free parameter of each band up to `MOST_ROW_NOISE`, so that only what grows with the light
+    is seen. Other nuisance parameters: the spectrum of the pixels' noise, and the fixed pattern of rows. A frame begins
+    at that time within a period of the light for which the predicted rows are most like its own. Raises NotDetermined
+    without unclipped, repeated flats, and for too few rows.
     """
     groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
     groups = [g[:MOST_FRAMES] for g in groups if len(g) > 1 and _is_lit(study, g[0])]
@@ -112,12 +112,13 @@ def flicker_block(study: Study) -> Block:
         more = [(1.0 / level.signal - whole) ** 2 / level.variance for level in levels]
         usual = usual + of_levels(more, left.power_dn2)
         own["dark"] = of_levels(more, left.std_dn2)
+    usual = np.maximum(usual, LEAST_POWER)
     colour = np.tile(COLOUR_STD * (1.0 + 4.0 * (frequency > 0.15)), len(levels))
     band = np.tile(np.arange(len(bands)), len(levels))
 
     def predict(effects: Effects) -> Prediction:
         model = Uniform(study.camera, effects)
-        power = np.maximum(usual, LEAST_POWER)
+        power = usual
         if model.varies_by_row:
             power = power + _added_power(model, study.camera.rows, levels, bands, step)
         if model.leaks or (dark is None and model.adds_signal):
@@ -132,7 +133,7 @@ def flicker_block(study: Study) -> Block:
 
     return Block(
         measurement=FLAT_ROWS, reach=LOG_REACH, along=np.log(np.tile(frequency, len(levels))),
-        value=value, covariance=np.diag(2.0 / (9.0 * freedom)),
+        value=value, covariance=np.diag(np.cbrt(np.square(usual)) * 2.0 / (9.0 * freedom)),
         labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s",
         tuple(c.id for c in level.captures), level.held_out)
                      for level in levels for f in frequency),

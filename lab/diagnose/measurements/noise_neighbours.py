@@ -1,4 +1,4 @@
-"""The correlation of the temporal noise of neighbouring pixels, in the dark and in uniform light."""
+"""The correlation of the temporal noise of neighbouring pixels, in the dark and in uniform light; and tones in it."""
 
 from __future__ import annotations
 
@@ -68,6 +68,33 @@ def neighbour_block(study: Study) -> Block:
         labels=tuple(Label(r.level if bright else 0.0, name, f"{r.exposure_s:.4g} s" if bright else f"dark, {r.exposure_s:.4g} s", r.captures, r.held_out)  # noqa: E501
                      for r, bright in zip(points, lit, strict=True) for name in names),
         reads=frozenset({"signal.filters", "charge.correlation"}), predict=predict, scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+def tone_block(study: Study) -> Block:
+    """Share of tones in the variance of dark frames' temporal noise.
+
+    Tones are frequencies across a frame that stand out of the noise by `temporal_noise.OUTLIER`, beside those of whole
+    rows and columns: clocks of the read-out, of another phase in every frame. The standard deviation is the spread over
+    settings, as phases are random (of a single one, its share), and that of one tone. Raises NotDetermined without
+    repeated dark frames whose noise exceeds a code.
+    """
+    dark = [r for r in study.once(dark_repeats) if np.all(np.isfinite(r.correlation))]
+    if not dark:
+        raise NotDetermined("noise_tones", "no repeats of dark captures whose noise exceeds a code")
+    value, variance, labels = [], [], []
+    for held_out in sorted({r.held_out for r in dark}):
+        points = [r for r in dark if r.held_out == held_out]
+        shares = np.array([r.tones for r in points])
+        spread = float(shares.std(ddof=1)) if len(shares) > 1 else float(shares[0])
+        value.append(float(shares.mean()))
+        variance.append((spread**2 + float(np.mean([r.one_tone for r in points])) ** 2) / len(points))
+        labels.append(Label(0.0, "all", "dark", tuple(c for r in points for c in r.captures), held_out))
+    # no effect leaves tones
+    return Block(
+        measurement=NOISE_TONES, reach=LEVEL_REACH, value=np.array(value), covariance=np.diag(variance),
+        labels=tuple(labels), reads=frozenset(),
+        predict=lambda effects: Prediction(np.zeros(len(value)), {}), scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -145,5 +172,15 @@ NOISE_NEIGHBOURS = Measurement(
     unit="DN",
     make=neighbour_block,
     quantity="correlation",
+    of_variances=True,
+)
+NOISE_TONES = Measurement(
+    "noise_tones",
+    title="tones in the noise of dark frames",
+    order=185,
+    axis="level",
+    unit="DN",
+    make=tone_block,
+    quantity="share of the temporal variance",
     of_variances=True,
 )

@@ -4,7 +4,8 @@ pixels.
 Noise is the departure of a frame from the mean of its repeats. Before, the frame's level is removed in each plane of
 the mosaic (as a factor for flats, so that shading and PRNU cancel where the lamp varies), and afterwards the mean of
 every row and column (row and column noise, flicker). The variance that this takes from the pixels is restored. Pixels
-beyond `OUTLIER` standard deviations are left out of the correlation.
+beyond `OUTLIER` standard deviations are left out of the correlation, and so are frequencies: clocks of the read-out
+leave tones in a frame, of another phase in the next.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from scipy import fft
 
 from lab.errors import NotDetermined
 from lab.measure.study import CLIPPED_SHARE, Study, held_out_flats
@@ -51,6 +53,8 @@ class Repeats:
     relative_std: dict[str, float]  # relative standard deviation of the variance
     correlation: FloatArray  # by `PAIRS`, (6,); NaN where it isn't determined
     correlation_covariance: FloatArray  # (6, 6)
+    tones: float  # share of the variance at frequencies that stand out, which is in no correlation
+    one_tone: float  # the same of a single one that only just does
 
     @property
     def level(self) -> float:
@@ -107,6 +111,7 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
         for plane in planes:
             np.divide(plane, np.float32(np.sqrt(max(variance[name], 1e-12))), out=plane)
             plane[np.abs(plane) > OUTLIER] = 0.0
+    tones = [_take_out_tones(frame) for frame in frames]
     correlation = _correlations(frames, freedom, cfa)
     covariance = independent_correlations(first.shape, freedom, cfa)[1]
     clean = {name: share < 0.1 * CLIPPED_SHARE for name, share in clipped.items()}
@@ -128,6 +133,8 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
         },
         correlation=correlation,
         correlation_covariance=covariance * spread,
+        tones=float(np.mean(tones)),
+        one_tone=OUTLIER**2 / first.size / freedom,
     )
 
 
@@ -148,6 +155,19 @@ def _level_out(frames: Sequence[Any], cfa: Cfa, black_dn: float | None) -> None:
             np.subtract(plane, average, out=plane)
             np.subtract(plane, plane.mean(axis=1, keepdims=True), out=plane)
             np.subtract(plane, plane.mean(axis=0, keepdims=True), out=plane)
+
+
+def _take_out_tones(frame: Any) -> float:
+    """Take frequencies whose power is beyond `OUTLIER`^2 times the mean out of departures, in place. Return their share
+    of the power. Of independent pixels the power is distributed exponentially: 2e-16 of the frequencies are beyond."""
+    spectrum = fft.rfft2(frame)
+    power = np.square(np.abs(spectrum))
+    is_tone = power > OUTLIER**2 * power.mean()
+    if not is_tone.any():
+        return 0.0
+    before = float(np.vdot(frame, frame))
+    frame -= fft.irfft2(np.where(is_tone, spectrum, 0.0), s=frame.shape)
+    return 1.0 - float(np.vdot(frame, frame)) / before
 
 
 #: Number of pairs of each kind that a pixel belongs to.

@@ -145,6 +145,19 @@ def test_numbers_scatter_about_what_dark_frames_predict() -> None:
     assert max(chi2) < 4.0
 
 
+def test_strong_noise_of_rows_scatters_as_it_is_strong() -> None:
+    """Rows of 50 times the pixels' power: a band's power has the relative scatter of chi2 whatever it is, so that its
+    cube root is 3.7 times as wide as that of the pixels' noise. chi2 of 8 draws within 3 / sqrt(8) of its standard
+    deviation, and 0.6 for what is free; it is 4.6 of them too large where the scatter is taken as that of pixels.
+    """
+    found = []
+    for seed in range(8):
+        recordings = session(800 + seed, 6, row_dn2=8.0, levels_dn=(60.0, 200.0, 1500.0), shape=(64, 256), repeats=3)
+        found.append(sigmas(measured_model(recordings, flicker_block)))
+    assert np.max(measured_model(recordings, flicker_block).value) > 3.0
+    assert abs(np.mean(found)) < 3.0 / np.sqrt(len(found)) + 0.6
+
+
 @pytest.mark.parametrize("contrasts", [1, 3, 20])
 def test_the_spectrum_of_dark_rows_has_a_true_uncertainty(contrasts: int) -> None:
     """Of a flat spectrum of power 1, from one difference of repeats on: N = 400 draws of five bands. The cube root's

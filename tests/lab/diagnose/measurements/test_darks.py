@@ -19,6 +19,7 @@ from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import TAIL_EDGES, DarkCondition
 from lab.diagnose.measurements.dark_level import dark_level_block
+from lab.diagnose.measurements.dark_readout import fixed_line_block
 from lab.diagnose.measurements.library import measurements
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
@@ -39,6 +40,7 @@ from sim.spectrum import Spectrum
 from sim.stages import signal_of
 
 ROWS, COLS = 96, 128
+DRAWN = 24  # cameras
 OF_DARK_FRAMES = [one for one in measurements() if one.order < 200]
 
 
@@ -99,6 +101,21 @@ def _verdict(recordings: RecordingSet) -> Verdict:
 
 def _names(verdict: Verdict) -> list[str]:
     return [c.effect.name for c in verdict.named]
+
+
+@pytest.mark.parametrize(("noise_e", "offset_e"), [(3.0, 0.0), (0.0, 3.0)])
+def test_odd_and_even_rows_share_what_is_fixed(noise_e: float, offset_e: float) -> None:
+    """Odd less even rows of seen and of held-out dark frames: noise of rows is another in both, offsets are the same.
+    chi2 of both numbers, of variance 4 in a draw: its mean over N draws within 4 sqrt(4 / N) of 2."""
+    found = []
+    for seed in range(DRAWN):
+        noisy = RowNoise(noise_e=noise_e, offset_e=offset_e, pattern_seed=seed)
+        recordings = _sim_darks(seed, [noisy], plan=[(0.001, 25.0)] * 12)
+        block = fixed_line_block("rows", Study(recordings, "left", camera_model(recordings, "left")))
+        at = [k for k, label in enumerate(block.labels) if label.condition == "odd and even"]
+        assert [block.labels[k].held_out for k in at] == [False, True]
+        found.append(chi2((block.value - block.predict([noisy]).mean)[at], block.covariance[np.ix_(at, at)]))
+    assert abs(np.mean(found) - 2.0) < 4.0 * np.sqrt(4.0 / DRAWN)
 
 
 # --- statistics against drawn numbers ---------------------------------------------------------------------------------
