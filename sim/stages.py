@@ -248,6 +248,26 @@ class Image(State):
 
 
 @dataclass(frozen=True)
+class Traps:
+    """Traps that take the share `share` of the charge that a frame reads, and release it with the time constant
+    `release_s`. What is released before an exposure begins is reset with the pixels.
+    """
+
+    share: float
+    release_s: float
+
+    def release(self, trapped_e: FloatArray, since_s: float, exposure_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return the electrons that an exposure collects from the traps, and those that they hold at its end.
+
+        trapped_e : electrons in the traps when the exposure before ended
+        since_s : from that end to this exposure's beginning, s
+        """
+        held = trapped_e * np.exp(-max(since_s, 0.0) / self.release_s)
+        left = held * np.exp(-exposure_s / self.release_s)
+        return held - left, left
+
+
+@dataclass(frozen=True)
 class Charge(State):
     """Electrons in the pixels: where they come from and where they end up.
 
@@ -262,9 +282,9 @@ class Charge(State):
     whole frames, and on transfer functions (`sim.point.mix_channels` for a mosaic). `exchange`: mean electrons (rows,
     cols) -> the same after neighbours have exchanged charge by how much they hold: their sum stays, and equal
     neighbours exchange none. `overflow`: mean electrons (rows, cols) -> the same after full wells have run over. `lag`:
-    electrons collected -> electrons that stay for the next frame, from none to all. `variance_e2`: (mean electrons,
-    shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of the shot noise with each of the
-    four next pixels.
+    electrons collected -> electrons that stay for the next frame, from none to all. `traps`: what fills in a frame and
+    empties over the frames that follow. `variance_e2`: (mean electrons, shot noise's variance) -> variance.
+    `correlation`: mean electrons -> correlation of the shot noise with each of the four next pixels.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
@@ -277,6 +297,7 @@ class Charge(State):
     exchange: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     overflow: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     lag: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    traps: tuple[Traps, ...] = ()
     variance_e2: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     correlation: tuple[Callable[[FloatArray], FloatArray | float], ...] = ()
 

@@ -301,6 +301,23 @@ class Uniform:
         """Return how many of a frame's electrons stay for the next."""
         return self._charge.hold_lag(electrons)
 
+    def released_e(self, begin_s: FloatArray, exposure_s: FloatArray, electrons: FloatArray) -> FloatArray:
+        """Electrons that each of a series of frames collects from traps, which the frames before have filled.
+
+        begin_s, exposure_s : of the frames in the order in which they are taken (n,)
+        electrons : read in each, in k groups of pixels (n, k)
+
+        Returns (n, k).
+        """
+        found = np.zeros(electrons.shape)
+        for traps in self._charge.traps:
+            held, end_s = np.zeros(electrons.shape[1]), 0.0
+            for k, (start_s, open_s) in enumerate(zip(begin_s, exposure_s, strict=True)):
+                released, left = traps.release(held, start_s - end_s, open_s)
+                found[k] += released
+                held, end_s = left + traps.share * electrons[k], start_s + open_s
+        return found
+
     def shot_e2(self, electrons: FloatArray) -> FloatArray:
         """Variance of the shot noise (e^2) at mean signals."""
         return self._charge.shot_e2(electrons)

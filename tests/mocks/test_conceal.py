@@ -107,6 +107,7 @@ CASES = (
     Case("left:on_chip_smoothing:strength=0.4", (EDGE, DARK)),
     Case("left:optical_low_pass_filter:displacement_x_um=2,displacement_y_um=2", (EDGE, SCREEN)),
     Case("left:other_f_number:ratio=2", (EDGE, SCREEN)),
+    Case("left:persistence:share_percent=20,release_s=4", (FLAT, replace(DARK, wait_s=1.0), replace(DARK, wait_s=2.0))),
     Case("left:phase_detection_rows:loss_percent=20,period=12,first_row=5", (FLAT, SWEPT)),
     Case("left:pixel_aperture:side_change_um=1.5", (SCREEN,)),
     Case("both:radiometer_nonlinearity:exponent_percent=12,growth=0.5", (SWEPT,)),

@@ -17,6 +17,7 @@ from mocks.former.laws.charge import (
     InterPixelCapacitanceLaw,
     LeakyShutterLaw,
     LightLeakLaw,
+    PersistenceLaw,
     PhaseDetectionRowsLaw,
     ResponseTailLaw,
     SmearLaw,
@@ -145,11 +146,13 @@ LISTED: tuple[type[Law], ...] = (
     LeakyShutterLaw,
 )
 
-#: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.
+#: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
+#: cameras has none of them.
 BESIDE: tuple[type[Law], ...] = (
     LensDistortionLaw,
     LensDecentreLaw,
     StereoGainLaw,
+    PersistenceLaw,
 )
 
 #: Laws that no effect of the list describes, among them close relatives of listed ones.

@@ -15,7 +15,9 @@ from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     BitWeightsLaw,
     ColouredLineNoiseLaw,
+    ImageLagLaw,
     LeakyShutterLaw,
+    PersistenceLaw,
     PhaseDetectionRowsLaw,
     ResponseKneeLaw,
     TapGainLaw,
@@ -44,6 +46,11 @@ STRONG: tuple[Law, ...] = (
     LeakyShutterLaw(60.0, 0, 9),
     LeakyShutterLaw(60.0, 1, 9),
     LeakyShutterLaw(60.0, 2, 9),
+    PersistenceLaw(1.0, 0, 9),
+    PersistenceLaw(1.0, 1, 9),
+    PersistenceLaw(1.0, 2, 9),
+    # its likest law
+    ImageLagLaw(1.0, 0, 9),
 )
 NEW = {str(law.effect) for law in STRONG}
 
@@ -51,7 +58,9 @@ NEW = {str(law.effect) for law in STRONG}
 @cache
 def _diagnosed(law: Law | None, cfa: str = "MONO", seed: int = 930) -> DiagnosisResult:
     camera = ConcealedCamera(seed, [] if law is None else [law], cfa=cfa, rows=192, cols=256)
-    return diagnose(recordings_of(camera, Plan(kinds=("dark", "flat", "narrowband"))), at_once=False)
+    remembers = law is None or law.effect in {"persistence", "image_lag"}
+    plan = Plan(kinds=("dark", "flat", "narrowband"), dark_again=remembers)
+    return diagnose(recordings_of(camera, plan), at_once=False)
 
 
 @pytest.mark.parametrize("law", STRONG, ids=lambda law: f"{law.name}-{law.variant}")
