@@ -436,7 +436,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         sum((one.mean_e(shape) for one in disturbances), 0.0),
         sum((one.variance_e2(shape) for one in disturbances), 0.0),
         codes.convert if codes.codes else None,
-        (lambda electrons: np.asarray(charge.neighbour_correlation(electrons))) if charge.correlation else None,
+        charge.neighbour_correlation if charge.correlation else None,
         signal.filter_kernel(),
         signal.gain_map(shape),
     )

@@ -284,7 +284,8 @@ class Charge(State):
     neighbours exchange none. `overflow`: mean electrons (rows, cols) -> the same after full wells have run over. `lag`:
     electrons collected -> electrons that stay for the next frame, from none to all. `traps`: what fills in a frame and
     empties over the frames that follow. `variance_e2`: (mean electrons, shot noise's variance) -> variance.
-    `correlation`: mean electrons -> correlation of the shot noise with each of the four next pixels.
+    `correlation`: mean electrons (...) -> correlation (2, ...) of the shot noise with each of the two next pixels in
+    the row, and of the two next in the column.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
@@ -299,7 +300,7 @@ class Charge(State):
     lag: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     traps: tuple[Traps, ...] = ()
     variance_e2: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
-    correlation: tuple[Callable[[FloatArray], FloatArray | float], ...] = ()
+    correlation: tuple[Callable[[FloatArray], FloatArray], ...] = ()
 
     def collected_s(self, exposure_s: float) -> float:
         """Return the time in which light is collected, given the time that was asked for."""
@@ -356,9 +357,9 @@ class Charge(State):
         """Variance of the shot noise at mean signals, in e^2."""
         return reduce(lambda value, law: law(electrons, value), self.variance_e2, electrons)
 
-    def neighbour_correlation(self, electrons: FloatArray) -> FloatArray | float:
-        """Correlation of a pixel's shot noise with each of its four next pixels', between 0 and 1/4."""
-        return sum((law(electrons) for law in self.correlation), 0.0)
+    def neighbour_correlation(self, electrons: FloatArray) -> FloatArray:
+        """Correlation (2, ...) of a pixel's shot noise with each of the two next in its row, and in its column."""
+        return sum((law(electrons) for law in self.correlation), np.zeros((2, *np.shape(electrons))))
 
 
 class Disturbance(Protocol):

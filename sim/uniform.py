@@ -328,8 +328,9 @@ class Uniform:
         return bool(self._charge.correlation)
 
     def neighbour_correlation(self, electrons: FloatArray) -> FloatArray:
-        """Correlation of a pixel's shot noise with each of its four next pixels' at mean signals."""
-        return np.asarray(self._charge.neighbour_correlation(electrons) * np.ones(np.shape(electrons)))
+        """Correlation (2, ...) of a pixel's shot noise, at mean signals, with each of the two next in its row, and in
+        its column."""
+        return self._charge.neighbour_correlation(electrons)
 
     # --- read-out ----------------------------------------------------------------------------------------------------
 

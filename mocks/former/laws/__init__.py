@@ -6,6 +6,7 @@ don't."""
 from mocks.former.law import Law
 from mocks.former.laws.charge import (
     AmplifierGlowLaw,
+    AnisotropicBrighterFatterLaw,
     BrighterFatterLaw,
     ChargeDiffusionLaw,
     CrosstalkLaw,
@@ -144,6 +145,7 @@ LISTED: tuple[type[Law], ...] = (
     TapGainLaw,
     TapOffsetLaw,
     LeakyShutterLaw,
+    AnisotropicBrighterFatterLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
