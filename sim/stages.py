@@ -147,7 +147,8 @@ class Veil:
 class Image(State):
     """Irradiance on the sensor by wavelength and place.
 
-    `transmittance`: (wavelength_nm, sine of the chief ray's angle) -> factor. `pupil`: wavelength_nm -> path error;
+    `transmittance`: (wavelength_nm, sine of the chief ray's angle) -> factor. `ripple`: wavelength_nm -> factor that
+    changes too fast with the wavelength for a blur in white light to feel it. `pupil`: wavelength_nm -> path error;
     `pupil_at`: (wavelength_nm, x_um, y_um) -> path error at a place: path errors add up before the transfer function is
     formed. `transfer`: (fx, fy in cy/um, wavelength_nm) -> factor on the optical transfer function, 1 at zero
     frequency. `veils`: scattered light. `shading`: (x_um, y_um) -> factor. `shift`: (x_um, y_um, wavelength_nm) -> (dx,
@@ -156,6 +157,7 @@ class Image(State):
     """
 
     transmittance: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
+    ripple: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     pupil: tuple[Callable[[float], Wavefront], ...] = ()
     pupil_at: tuple[Callable[[float, float, float], Wavefront], ...] = ()
     transfer: tuple[Callable[[FloatArray, FloatArray, float], FloatArray | ComplexArray], ...] = ()
@@ -168,7 +170,8 @@ class Image(State):
         """Factor on the light by wavelength and sine of the chief ray's angle at the sensor, which broadcast."""
         sine = np.asarray(sin_theta, float)
         none = np.ones(np.broadcast_shapes(np.shape(wavelength_nm), sine.shape))
-        return reduce(lambda value, law: value * law(wavelength_nm, sine), self.transmittance, none)
+        passed = reduce(lambda value, law: value * law(wavelength_nm, sine), self.transmittance, none)
+        return reduce(lambda value, law: value * law(wavelength_nm), self.ripple, passed)
 
     def wavefront(self, wavelength_nm: float, place_um: tuple[float, float] = (0.0, 0.0)) -> Wavefront:
         """Return the sum of all path errors (um) at a place."""

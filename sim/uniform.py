@@ -21,7 +21,7 @@ from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
 
 #: Quantities of the stages that rates by wavelength depend on.
-SPECTRAL = frozenset({"light.spectrum", "image.transmittance"})
+SPECTRAL = frozenset({"light.spectrum", "image.transmittance", "image.ripple"})
 #: Those that shade the light by place.
 SHADING = frozenset({"light.shading", "image.shading"})
 #: Those that levels of uniform light depend on, at given rates.

@@ -186,6 +186,7 @@ SIZES: dict[str, str] = {
     "empirical_law": "both:strength=1",
     "exposure_offset": "left:offset_us=25",
     "field_curvature": "left:curvature_um=25",
+    "fringes": "left:cos_percent=6,optical_thickness_um=4",
     "ghost": "left:share_percent=2",
     "green_imbalance": "left:imbalance_percent=2",
     "hot_pixels": "left:excess_e_per_s=1500,share_ppm=500",

@@ -41,7 +41,8 @@ class Persistence(Effect):
         ),
     ] = 0.0  # fmt: skip
     release_s: Annotated[
-        float, Quantity("s", "time constant with which traps release it", lower=0.1, upper=1e4, absent=30.0)
+        float,
+        Quantity("s", "time constant with which traps release it", lower=0.1, upper=1e4, absent=30.0, logarithmic=True),
     ] = 30.0
 
     @classmethod

@@ -92,6 +92,7 @@ CASES = (
     Case("left:distortion:corner_percent=3", (BOARD, EDGE, SCREEN)),
     Case("left:exposure_offset:offset_us=300", (FLAT,)),
     Case("left:field_curvature:curvature_um=60,tilt_x_um=30", (EDGE,)),
+    Case("left:fringes:cos_percent=-40,optical_thickness_um=2.8", (SWEPT, RED)),
     Case("left:ghost:share_percent=10", (EDGE, SCREEN)),
     Case("left:green_imbalance:imbalance_percent=6", (FLAT, SWEPT)),
     Case("left:hot_pixels:excess_e_per_s=400,share_ppm=20000", (DARK,)),

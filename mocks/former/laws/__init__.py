@@ -146,6 +146,7 @@ LISTED: tuple[type[Law], ...] = (
     TapOffsetLaw,
     LeakyShutterLaw,
     AnisotropicBrighterFatterLaw,
+    CoverGlassFringeLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
@@ -159,7 +160,6 @@ BESIDE: tuple[type[Law], ...] = (
 
 #: Laws that no effect of the list describes, among them close relatives of listed ones.
 OUTSIDE: tuple[type[Law], ...] = (
-    CoverGlassFringeLaw,
     AbsorptionBandLaw,
     RedLeakLaw,
     PolarisedLightLaw,

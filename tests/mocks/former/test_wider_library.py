@@ -15,6 +15,7 @@ from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     BitWeightsLaw,
     ColouredLineNoiseLaw,
+    CoverGlassFringeLaw,
     ImageLagLaw,
     LeakyShutterLaw,
     PersistenceLaw,
@@ -49,7 +50,9 @@ STRONG: tuple[Law, ...] = (
     PersistenceLaw(1.0, 0, 9),
     PersistenceLaw(1.0, 1, 9),
     PersistenceLaw(1.0, 2, 9),
-    # its likest law
+    CoverGlassFringeLaw(2.0, 0, 9),
+    CoverGlassFringeLaw(5.0, 1, 4),
+    # the likest law of persistence
     ImageLagLaw(1.0, 0, 9),
 )
 NEW = {str(law.effect) for law in STRONG}
