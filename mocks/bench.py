@@ -50,7 +50,9 @@ from mocks.targets import (
 from mocks.truth import AIR_C, COLS, ROWS, SELF_HEATING_C, HiddenCamera, Truth, hidden_truth
 from sim.camera import Side
 from sim.frame import (
+    EMPTY,
     Exposure,
+    Kept,
     KeptTransfers,
     SceneLight,
     collected_electrons,
@@ -138,7 +140,7 @@ class Bench:
         self._noise = {side: np.random.default_rng([seed, 101 + k]) for k, side in enumerate(SIDES)}
         self._camera_locks = {side: threading.Lock() for side in SIDES}
         self._transfers = {(side, stop): KeptTransfers() for side in SIDES for stop in STOPS}
-        self._left_behind: dict[Side, FloatArray | float] = dict.fromkeys(SIDES, 0.0)
+        self._kept: dict[Side, Kept] = dict.fromkeys(SIDES, EMPTY)
         self._lights: OrderedDict[tuple[object, ...], tuple[Scene, SceneLight]] = OrderedDict()
         self.clock = Clock(real_time_factor=real_time_factor)
         self._started_s = self.clock.now()
@@ -322,9 +324,7 @@ class Bench:
         with self._camera_locks[side]:
             source *= unsteady_source(camera.model, camera.acting, exposure.elapsed_s)
             held = collected_electrons(light, camera.model, exposure, camera.acting, source=source)
-            if isinstance(self._left_behind[side], np.ndarray):
-                held += self._left_behind[side]
-            read, self._left_behind[side] = read_electrons(held, camera.model, camera.acting)
+            read, self._kept[side] = read_electrons(held, camera.model, exposure, camera.acting, self._kept[side])
             frame = sample_from(
                 read,
                 camera.model,

@@ -157,21 +157,43 @@ def collected_electrons(
     return charge.overflow_wells(charge.move_charge(mean))
 
 
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """Mean electrons (rows, cols) that pixels keep when a frame has been read: `lag_e` are read with the next, and
+    `trapped_e` are in each kind of traps. `end_s`: end of its exposure, after the first capture.
+    """
+
+    lag_e: FloatArray | float = 0.0
+    trapped_e: tuple[FloatArray, ...] = ()
+    end_s: float = 0.0
+
+
+EMPTY = Kept()
+
+
 def read_electrons(
-    collected: FloatArray, camera: CameraModel, effects: Sequence[Effect] = ()
-) -> tuple[FloatArray, FloatArray | float]:
-    """Split the electrons that a frame collects into those that are read and those that lag behind.
+    collected: FloatArray, camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), kept: Kept = EMPTY
+) -> tuple[FloatArray, Kept]:
+    """Return the electrons that a frame reads, and what the pixels keep afterwards.
 
-    collected : mean electrons a pixel (rows, cols)
-
-    Returns the electrons that this frame reads, and those that stay in the pixels for the next frame; 0 without image
-    lag.
+    collected : mean electrons a pixel (rows, cols) that this exposure makes
+    kept : by the frame before
     """
     charge = charge_of(camera, effects)
-    if not charge.lag:
-        return collected, 0.0
-    left = charge.hold_lag(np.minimum(collected, camera.full_well_e))
-    return collected - left, left
+    if not (charge.lag or charge.traps):
+        return collected, EMPTY
+    since_s, total, held = exposure.elapsed_s - kept.end_s, collected + kept.lag_e, []
+    empty: FloatArray = np.zeros(collected.shape)
+    for traps, trapped_e in zip(charge.traps, kept.trapped_e or (empty,) * len(charge.traps), strict=True):
+        released_e, left_e = traps.release(trapped_e, since_s, exposure.exposure_s)
+        total = total + released_e
+        held.append(left_e)
+    lag_e = charge.hold_lag(np.minimum(total, camera.full_well_e))
+    read = total - lag_e
+    filled = (
+        e + traps.share * np.minimum(read, camera.full_well_e) for e, traps in zip(held, charge.traps, strict=True)
+    )
+    return read, Kept(lag_e, tuple(filled), exposure.elapsed_s + exposure.exposure_s)
 
 
 def is_steady(camera: CameraModel, effects: Sequence[Effect]) -> bool:
@@ -350,8 +372,8 @@ def expected_sequence(
     drawn: bool = False,
 ) -> Iterator[FloatArray]:
     """Mean electrons (rows, cols) that are read in each exposure of a sequence, one after the other: charge that
-    isn't read with a frame (image lag) is read with the next. The first follows empty pixels; an exposure that is the
-    same object as the one before is drawn once.
+    isn't read with a frame (image lag) is read with the next, and traps release theirs over those that follow. The
+    first follows empty pixels; an exposure that is the same object as the one before is drawn once.
 
     Drawing every frame's electrons from these means on their own is exact: of Poisson electrons that are told apart one
     by one, those read and those that stay are independent Poisson variables. `drawn`: of frames with an unsteady
@@ -359,7 +381,7 @@ def expected_sequence(
     """
     before: Exposure | None = None
     new: FloatArray = np.zeros(())
-    left: FloatArray | float = 0.0
+    kept = EMPTY
     for exposure in exposures:
         if exposure is not before:
             source = unsteady_source(camera, effects, exposure.elapsed_s) if drawn else 1.0
@@ -367,7 +389,7 @@ def expected_sequence(
                 camera, exposure, effects, oversample=oversample, margin_px=margin_px, source=source
             )
             before = exposure
-        read, left = read_electrons(new + left, camera, effects)
+        read, kept = read_electrons(new, camera, exposure, effects, kept)
         yield read
 
 
@@ -419,7 +441,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         sum((one.mean_e(shape) for one in disturbances), 0.0),
         sum((one.variance_e2(shape) for one in disturbances), 0.0),
         codes.convert if codes.codes else None,
-        (lambda electrons: np.asarray(charge.neighbour_correlation(electrons))) if charge.correlation else None,
+        charge.neighbour_correlation if charge.correlation else None,
         signal.filter_kernel(),
         signal.gain_map(shape),
     )

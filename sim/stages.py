@@ -153,7 +153,8 @@ class Veil:
 class Image(State):
     """Irradiance on the sensor by wavelength and place.
 
-    `transmittance`: (wavelength_nm, sine of the chief ray's angle) -> factor. `pupil`: wavelength_nm -> path error;
+    `transmittance`: (wavelength_nm, sine of the chief ray's angle) -> factor. `ripple`: wavelength_nm -> factor that
+    changes too fast with the wavelength for a blur in white light to feel it. `pupil`: wavelength_nm -> path error;
     `pupil_at`: (wavelength_nm, x_um, y_um) -> path error at a place: path errors add up before the transfer function is
     formed. `transfer`: (fx, fy in cy/um, wavelength_nm) -> factor on the optical transfer function, 1 at zero
     frequency. `veils`: scattered light. `shading`: (x_um, y_um) -> factor. `shift`: (x_um, y_um, wavelength_nm) -> (dx,
@@ -162,6 +163,7 @@ class Image(State):
     """
 
     transmittance: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
+    ripple: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     pupil: tuple[Callable[[float], Wavefront], ...] = ()
     pupil_at: tuple[Callable[[float, float, float], Wavefront], ...] = ()
     transfer: tuple[Callable[[FloatArray, FloatArray, float], FloatArray | ComplexArray], ...] = ()
@@ -174,7 +176,8 @@ class Image(State):
         """Factor on the light by wavelength and sine of the chief ray's angle at the sensor, which broadcast."""
         sine = np.asarray(sin_theta, float)
         none = np.ones(np.broadcast_shapes(np.shape(wavelength_nm), sine.shape))
-        return reduce(lambda value, law: value * law(wavelength_nm, sine), self.transmittance, none)
+        passed = reduce(lambda value, law: value * law(wavelength_nm, sine), self.transmittance, none)
+        return reduce(lambda value, law: value * law(wavelength_nm), self.ripple, passed)
 
     def wavefront(self, wavelength_nm: float, place_um: tuple[float, float] = (0.0, 0.0)) -> Wavefront:
         """Return the sum of all path errors (um) at a place."""
@@ -254,6 +257,26 @@ class Image(State):
 
 
 @dataclass(frozen=True)
+class Traps:
+    """Traps that take the share `share` of the charge that a frame reads, and release it with the time constant
+    `release_s`. What is released before an exposure begins is reset with the pixels.
+    """
+
+    share: float
+    release_s: float
+
+    def release(self, trapped_e: FloatArray, since_s: float, exposure_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return the electrons that an exposure collects from the traps, and those that they hold at its end.
+
+        trapped_e : electrons in the traps when the exposure before ended
+        since_s : from that end to this exposure's beginning, s
+        """
+        held = trapped_e * np.exp(-max(since_s, 0.0) / self.release_s)
+        left = held * np.exp(-exposure_s / self.release_s)
+        return held - left, left
+
+
+@dataclass(frozen=True)
 class Charge(State):
     """Electrons in the pixels: where they come from and where they end up.
 
@@ -268,8 +291,9 @@ class Charge(State):
     mosaic). `exchange`: mean electrons (rows, cols) -> the same after neighbours have exchanged charge by how much they
     hold: their sum stays, and equal neighbours exchange none. `overflow`: mean electrons (rows, cols) -> the same after
     full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame, from none to all.
-    `variance_e2`: (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of
-    the shot noise with each of the four next pixels.
+    `traps`: what fills in a frame and empties over the frames that follow. `variance_e2`: (mean electrons, shot noise's
+    variance) -> variance. `correlation`: mean electrons (...) -> correlation (2, ...) of the shot noise with each of
+    the two next pixels in the row, and of the two next in the column.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
@@ -282,8 +306,9 @@ class Charge(State):
     exchange: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     overflow: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     lag: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    traps: tuple[Traps, ...] = ()
     variance_e2: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
-    correlation: tuple[Callable[[FloatArray], FloatArray | float], ...] = ()
+    correlation: tuple[Callable[[FloatArray], FloatArray], ...] = ()
 
     def collected_s(self, exposure_s: float) -> float:
         """Return the time in which light is collected, given the time that was asked for."""
@@ -341,9 +366,9 @@ class Charge(State):
         """Variance of the shot noise at mean signals, in e^2."""
         return reduce(lambda value, law: law(electrons, value), self.variance_e2, electrons)
 
-    def neighbour_correlation(self, electrons: FloatArray) -> FloatArray | float:
-        """Correlation of a pixel's shot noise with each of its four next pixels', between 0 and 1/4."""
-        return sum((law(electrons) for law in self.correlation), 0.0)
+    def neighbour_correlation(self, electrons: FloatArray) -> FloatArray:
+        """Correlation (2, ...) of a pixel's shot noise with each of the two next in its row, and in its column."""
+        return sum((law(electrons) for law in self.correlation), np.zeros((2, *np.shape(electrons))))
 
 
 class Disturbance(Protocol):

@@ -21,7 +21,7 @@ from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
 
 #: Quantities of the stages that rates by wavelength depend on.
-SPECTRAL = frozenset({"light.spectrum", "image.transmittance"})
+SPECTRAL = frozenset({"light.spectrum", "image.transmittance", "image.ripple"})
 #: Those that shade the light by place.
 SHADING = frozenset({"light.shading", "image.shading"})
 #: Those that levels of uniform light depend on, at given rates.
@@ -306,6 +306,23 @@ class Uniform:
         """Return how many of a frame's electrons stay for the next."""
         return self._charge.hold_lag(electrons)
 
+    def released_e(self, begin_s: FloatArray, exposure_s: FloatArray, electrons: FloatArray) -> FloatArray:
+        """Electrons that each of a series of frames collects from traps, which the frames before have filled.
+
+        begin_s, exposure_s : of the frames in the order in which they are taken (n,)
+        electrons : read in each, in k groups of pixels (n, k)
+
+        Returns (n, k).
+        """
+        found = np.zeros(electrons.shape)
+        for traps in self._charge.traps:
+            held, end_s = np.zeros(electrons.shape[1]), 0.0
+            for k, (start_s, open_s) in enumerate(zip(begin_s, exposure_s, strict=True)):
+                released, left = traps.release(held, start_s - end_s, open_s)
+                found[k] += released
+                held, end_s = left + traps.share * electrons[k], start_s + open_s
+        return found
+
     def shot_e2(self, electrons: FloatArray) -> FloatArray:
         """Variance of the shot noise (e^2) at mean signals."""
         return self._charge.shot_e2(electrons)
@@ -316,8 +333,9 @@ class Uniform:
         return bool(self._charge.correlation)
 
     def neighbour_correlation(self, electrons: FloatArray) -> FloatArray:
-        """Correlation of a pixel's shot noise with each of its four next pixels' at mean signals."""
-        return np.asarray(self._charge.neighbour_correlation(electrons) * np.ones(np.shape(electrons)))
+        """Correlation (2, ...) of a pixel's shot noise, at mean signals, with each of the two next in its row, and in
+        its column."""
+        return self._charge.neighbour_correlation(electrons)
 
     # --- read-out ----------------------------------------------------------------------------------------------------
 

@@ -191,6 +191,7 @@ SIZES: dict[str, str] = {
     "empirical_law": "both:strength=1",
     "exposure_offset": "left:offset_us=25",
     "field_curvature": "left:curvature_um=25",
+    "fringes": "left:cos_percent=6,optical_thickness_um=4",
     "ghost": "left:share_percent=2",
     "green_imbalance": "left:imbalance_percent=2",
     "hot_pixels": "left:excess_e_per_s=1500,share_ppm=500",
@@ -206,6 +207,7 @@ SIZES: dict[str, str] = {
     "on_chip_smoothing": "left:strength=0.3",
     "optical_low_pass_filter": "left:displacement_x_um=2,displacement_y_um=2",
     "other_f_number": "left:ratio=1.4",
+    "persistence": "left:share_percent=5,release_s=10",
     "phase_detection_rows": "left:loss_percent=4,period=8,first_row=3",
     "pixel_aperture": "left:side_change_um=-0.7",
     "radiometer_nonlinearity": "both:exponent_percent=4",
@@ -279,8 +281,8 @@ NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
 NOT_SHOWN_BY_BENCH = frozenset({"second_order_light", "stereo_time_offset"})
 
 #: Effects that one session can't show: distortion is fitted to its boards, so that only an earlier calibration shows a
-#: change.
-NOT_IN_ONE_SESSION = frozenset({"distortion", "decentre"})
+#: change; and it takes its dark frames before any light, so that nothing persists in them.
+NOT_IN_ONE_SESSION = frozenset({"distortion", "decentre", "persistence"})
 
 
 class LiveCase(Frozen):

@@ -37,6 +37,7 @@ BEGIN = datetime(2026, 3, 2, 9, tzinfo=UTC)
 #: Time between captures (s), no multiple of a mains period; and between boards, which move meanwhile.
 STEP_S, BOARD_STEP_S = 20.0137, 0.31
 DARKS = ((0.001, 25.0), (0.5, 25.0), (2.0, 25.0), (2.0, 35.0), (2.0, 45.0))  # exposure (s), temperature (C)
+DARK_AFTER_LIGHT_S = 1.0  # exposure of darks after the flats: what light leaves in the pixels fades in them
 LEVELS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.65, 0.8, 0.92)  # share of the full well
 ANGLES_DEG = (5.0, 50.0, 95.0, 140.0)
 EDGE_SIDE_PX, EDGE_PLACES = (
@@ -148,6 +149,7 @@ class _SideSession:
         full_s = self.exposure_for(self.lamp, 1.0)
         for level in (*LEVELS, *LEVELS[::-1]):
             self.take("flat", flat, level * full_s, 2, radiance=lamp)
+        self.take("dark", Darkness(), DARK_AFTER_LIGHT_S, 6)
         self.sweep()
         light = self.lamp.scale(0.3)
         corners = ((30.0, 40.0), (30.0, 280.0), (210.0, 280.0), (210.0, 40.0))

@@ -6,8 +6,8 @@ from __future__ import annotations
 from sim.effects.base import Effect, Effects
 from sim.effects.library import list_changes
 
-#: Image lag.
-LAG = frozenset({"charge.lag"})
+#: What frames before leave in a frame: image lag, and charge that traps release.
+LAG = frozenset({"charge.lag", "charge.traps"})
 DARK_CURRENT = frozenset({"charge.dark_current"})
 #: Light that pixels of a colour collect unlike others.
 COLLECTED = frozenset({"charge.collected"})

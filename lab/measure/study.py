@@ -11,7 +11,9 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from lab.capture_kinds.base import Capture
+from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
+from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
@@ -179,12 +181,16 @@ class Study:
         return cast(T, found)
 
     @cached_property
-    def _before(self) -> dict[str, Capture]:
-        """Id of a capture -> the capture whose frame was read before its own: by time where all have one, else in the
-        manifest's order. After dummy frames that is a frame of the same capture."""
+    def _order(self) -> list[Capture]:
+        """The side's captures as they were taken: by time where all have one, else in the manifest's order."""
         order: list[Capture] = list(self.recordings.captures(side=self.side))
-        if all(c.time is not None for c in order):
-            order.sort(key=self.elapsed_s)
+        return sorted(order, key=self.elapsed_s) if all(c.time is not None for c in order) else order
+
+    @cached_property
+    def _before(self) -> dict[str, Capture]:
+        """Id of a capture -> the capture whose frame was read before its own. After dummy frames that is a frame of the
+        same capture."""
+        order = self._order
         return {c.id: before for before, c in pairwise(order)} | {c.id: c for c in order if c.dummy_frames}
 
     def settled(self, group: Sequence[C]) -> list[C]:
@@ -195,23 +201,53 @@ class Study:
         return found if len(found) > 1 else list(group)
 
     def carried_e(self, effects: Effects) -> Callable[[Capture, str], float]:
-        """Function of a capture and a channel: change of the mean by image lag, electrons.
+        """Function of a capture and a channel: change of the mean by what frames before leave, electrons.
 
         Lag of share q reads y_t = (1 - q) x_t + q y_(t-1) for the charge x_t. The change is taken as q (y_(t-1) - y_t)
-        from the measured levels, generally lag_e(y_(t-1)) - lag_e(y_t). Before the first capture pixels are empty."""
+        from the measured levels, generally lag_e(y_(t-1)) - lag_e(y_t). Before the first capture pixels are empty.
+        Traps fill and empty with the measured levels, too (`_released_e`)."""
         if not acting(effects, LAG):
             return lambda capture, channel: 0.0
         model = Uniform(self.camera, effects)
+        released = self._released_e(model) if acting(effects, frozenset({"charge.traps"})) else {}
 
         def carried(capture: Capture, channel: str) -> float:
             before = self._before.get(capture.id)
-            read, left = (
-                max(self.levels(c).whole[channel] - self.noise.black, 0.0) / self.noise.gain if c is not None else 0.0
-                for c in (capture, before)
-            )
-            return float(np.mean(model.lag_e(np.array([left])) - model.lag_e(np.array([read]))))
+            read, left = (0.0 if c is None else self._read_e(c, channel) for c in (capture, before))
+            lag_e = float(np.mean(model.lag_e(np.array([left])) - model.lag_e(np.array([read]))))
+            return lag_e + released.get((capture.id, channel), 0.0)
 
         return carried
+
+    def carried_mean_e(self, effects: Effects) -> Callable[[Capture], float]:
+        """Function of a capture: the same of the mean of all pixels."""
+        carried = self.carried_e(effects)
+
+        def mean(capture: Capture) -> float:
+            pixels = self.levels(capture).pixels
+            return sum(n * carried(capture, channel) for channel, n in pixels.items()) / sum(pixels.values())
+
+        return mean
+
+    def _read_e(self, capture: Capture, channel: str) -> float:
+        return max(self.levels(capture).whole[channel] - self.noise.black, 0.0) / self.noise.gain
+
+    def _released_e(self, model: Uniform) -> dict[tuple[str, str], float]:
+        """Electrons that traps release by (id of a capture, channel), up to the last capture of even light or none, so
+        that no frames are read for it besides. None where a capture has no time: how much is left by then isn't known.
+        Dummy frames are taken as one directly after the other."""
+        order = self._order
+        even = [k for k, c in enumerate(order) if isinstance(c, DarkCapture | FlatCapture | NarrowbandCapture)]
+        taken = order[: even[-1] + 1] if even else []
+        if any(c.time is None for c in taken):
+            return {}
+        frames = [(c, back) for c in taken for back in range(c.dummy_frames or 0, -1, -1)]
+        exposure_s = np.array([c.exposure_s for c, _ in frames])
+        begin_s = np.array([self.elapsed_s(c) - back * c.exposure_s for c, back in frames])
+        read_e = np.array([[self._read_e(c, channel) for channel in self.channels] for c, _ in frames])
+        found = model.released_e(begin_s, exposure_s, read_e)
+        kept = ((c, row) for (c, back), row in zip(frames, found, strict=True) if back == 0)
+        return {(c.id, channel): float(e) for c, row in kept for channel, e in zip(self.channels, row, strict=True)}
 
     def offset(self, effects: Effects) -> Callable[[Capture], float]:
         """Function of a capture: change of its black level by effects, DN."""

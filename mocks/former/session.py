@@ -34,6 +34,7 @@ class Plan:
 
     lights      edges in two narrowband lights, too
     warm        darks at two higher temperatures, too
+    dark_again  darks after the flats, too, of an exposure of their own
     shuttle     flats up and down again
     exposures   edges at a quarter of the exposure in four times the light, too
     screen_cell_px, screen_turn_deg   the size of a screen's cells in the camera, and how far the screen is turned
@@ -47,6 +48,7 @@ class Plan:
     kinds: tuple[str, ...] = ("dark", "flat", "narrowband", "chart", "slanted_edge", "screen")
     lights: bool = False
     warm: bool = False
+    dark_again: bool = False
     shuttle: bool = False
     exposures: bool = False
     repeats: int = 3
@@ -188,6 +190,8 @@ class _Recorder:
         repeats = 2 if plan.shuttle else max(plan.repeats, 3)
         for level in levels:
             self.take("flat", images, self.camera.exposure_for(light, level), repeats, radiance=path)
+        if plan.dark_again:
+            self.take("dark", None, plan.longer * 1.0, 6)
 
     def sweep(self, plan: Plan) -> None:
         def light(centre_nm: float) -> Array:

@@ -13,21 +13,20 @@ from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Charge
 
-#: Sum over the four next pixels less four times the own.
-NEXT_LESS_OWN = np.array([[0.0, 1.0, 0.0], [1.0, -4.0, 1.0], [0.0, 1.0, 0.0]])
-
 
 class BrighterFatter(Effect):
     """Temporal variance e (1 - a x) while the mean stays, x = e / full well: charge already collected repels the next,
-    which goes to the neighbours and so has them share noise: correlation (b / 4) x with each of the four next ones.
+    which goes to the neighbours and so has them share noise: correlation (b / 4) x with each of the four next ones, on
+    average. Barriers along columns and rows differ: it is (b / 4) (1 + r) x in the row and (b / 4) (1 - r) x in the
+    column.
 
     Where all that a pixel loses goes to these four b is a (charge is conserved: the covariances of all pixels sum up to
     e). Part of it lands farther away, or in the depth of other pixels, so that both are free.
 
     Means move between unequal neighbours, such as the colours of a mosaic in even light: the border between pixels of e
     and f electrons moves in proportion to e - f and takes the light that falls there, (e + f) / 2, along, so that the
-    fuller one loses c / (4 W) (e^2 - f^2), W the full well. If borders are all there is, a and b are 4 c. Walls of
-    charge between colours make c smaller.
+    fuller one loses c / (4 W) (e^2 - f^2), W the full well, and 1 + r or 1 - r times as much. If borders are all there
+    is, a and b are 4 c. Walls of charge between colours make c smaller.
     """
 
     name: ClassVar[str] = "brighter_fatter"
@@ -35,9 +34,8 @@ class BrighterFatter(Effect):
     family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = "P. Astier et al., A&A 629, A36 (2019)"
     form_tolerance: ClassVar[float] = 0.15
-    invariances: ClassVar[frozenset[str]] = frozenset(
-        {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
-    )
+    shapes: ClassVar[frozenset[str]] = frozenset({"row_excess"})
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "time"})
     sentence: ClassVar[str] = (
         "Full pixels repel charge: the noise of bright flats is lower than photon statistics say while their mean is "
         "on its line, and the missing variance appears as covariance of neighbours."
@@ -66,7 +64,18 @@ class BrighterFatter(Effect):
             absent=0.0,
         ),
     ] = 0.0
-
+    row_excess: Annotated[
+        float,
+        Quantity(
+            "1",
+            "covariance with each neighbour in the row over the mean of both kinds, less 1: -1 is none in the row",
+            lower=-1.0,
+            upper=1.0,
+            prior=(0.0, 0.3),
+            absent=0.0,
+            dispensable=True,
+        ),
+    ] = 0.0
     exchanged_percent: Annotated[
         float,
         Quantity(
@@ -100,15 +109,18 @@ class BrighterFatter(Effect):
             )
         if self.shared_percent != 0.0:
             charge = charge.add_laws(
-                correlation=lambda electrons: (
-                    0.25 * (self.shared_percent / 100.0) * np.clip(electrons / full_well_e, 0.0, 1.0)
+                correlation=lambda electrons: np.multiply.outer(
+                    0.25 * (self.shared_percent / 100.0) * np.array([1.0 + self.row_excess, 1.0 - self.row_excess]),
+                    np.clip(electrons / full_well_e, 0.0, 1.0),
                 )
             )
         if self.exchanged_percent != 0.0:
+            along, down = 1.0 + self.row_excess, 1.0 - self.row_excess
+            next_less_own = np.array([[0.0, down, 0.0], [along, -4.0, along], [0.0, down, 0.0]])
             pair = 0.01 * self.exchanged_percent / (4.0 * full_well_e)
             charge = charge.add_laws(
                 exchange=lambda electrons: (
-                    electrons + pair * convolve(np.square(electrons), NEXT_LESS_OWN, mode="mirror")
+                    electrons + pair * convolve(np.square(electrons), next_less_own, mode="mirror")
                 )
             )
         return charge

@@ -79,7 +79,10 @@ _TOLD = {
         "slanted edges in narrowband light, in the middle and in the corners",
     ),
     Family.SPECTRAL_FILTER: _Told(
-        "spectral filter or leak", "Something in the light's way passes other wavelengths than stated."
+        "spectral filter or leak",
+        "Something in the light's way passes other wavelengths than stated.",
+        "narrowband light in finer steps: fringes come again evenly in the inverse of the wavelength, a filter has one "
+        "edge",
     ),
     Family.RESPONSE: _Told(
         "response to light",

@@ -34,11 +34,11 @@ class InterPixelCapacitance(Crosstalk):
         if self.share_percent == 0.0:
             return charge
         kernel = self.kernel()
-        own, mean = kernel[1, 1], 0.5 * (kernel[0, 1] + kernel[1, 0])
-        shared = float(2.0 * own * mean / (own * own + 4.0 * mean * mean))
+        along, down, own = kernel[1, 0], kernel[0, 1], kernel[1, 1]
+        shared = 2.0 * own * np.array([along, down]) / (own * own + 2.0 * along * along + 2.0 * down * down)
         lost = 1.0 - float(np.sum(np.square(kernel)))
         return charge.add_laws(
             kernels=kernel,
-            correlation=lambda electrons: shared,
+            correlation=lambda electrons: np.multiply.outer(shared, np.ones(np.shape(electrons))),
             variance_e2=lambda electrons, variance_e2: variance_e2 - electrons * lost,
         )

@@ -38,7 +38,7 @@ class ReadOut:
     shape, of mean `added_e`
                   and variance `added_e2`
     codes         DN before rounding -> DN
-    neighbours    mean electrons -> correlation of the shot noise with each of four neighbours
+    neighbours    mean electrons -> correlation (2, ...) of the shot noise with each neighbour in the row, in the column
     processing    kernel of a filter of each colour's DN before rounding
     offset_dn     added to the black level
     gain          factor (rows, cols) on what is read of every pixel, its noise alike, before `added`
@@ -383,24 +383,29 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
     return charge
 
 
-#: A pixel's four neighbours.
-CROSS = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+#: A pixel's two neighbours in its row, and those in its column.
+NEXT = np.array([[1.0, 0.0, 1.0]]), np.array([[1.0], [0.0], [1.0]])
 
 
-def solve_passed_share(correlation: FloatArray | float) -> FloatArray:
-    """Share g of each neighbour's deviation that a pixel takes over, given the correlation r that results between two
-    equal ones: r = 2 g / (1 + 4 g^2)."""
+def solve_passed_share(correlation: FloatArray) -> FloatArray:
+    """Shares g (2, ...) of each neighbour's deviation that a pixel takes over, in the row and in the column, given the
+    correlations r (2, ...) that result between two equal ones: r = 2 g / n with n = 1 + 2 sum g^2, so that
+    n = 1 + sum r^2 n^2 / 2."""
     r = np.clip(np.asarray(correlation, float), 0.0, 0.49)
-    return np.asarray(2.0 * r / (2.0 + 2.0 * np.sqrt(1.0 - 4.0 * r * r)))
+    n = 2.0 / (1.0 + np.sqrt(1.0 - 2.0 * np.sum(np.square(r), axis=0)))
+    return np.asarray(0.5 * r * n)
 
 
 def shared_departures(departure: NDArray[F], mean: NDArray[F], correlation: FloatArray) -> FloatArray:
     """Deviations (rows, cols) of Poisson variables of given means after every pixel has taken over a share of its
-    neighbours', with unchanged variances: d_i + g_i sum d_j, over sqrt(1 + g_i^2 sum v_j / v_i)."""
-    share = solve_passed_share(correlation)
-    spread = convolve(np.asarray(mean, float), CROSS, mode="mirror") / np.maximum(mean, 1e-12)
-    taken = departure + share * convolve(departure, CROSS, mode="mirror")
-    return np.asarray(taken / np.sqrt(1.0 + np.square(share) * spread))
+    neighbours', with unchanged variances: d_i + sum g_i d_j, over sqrt(1 + sum g_i^2 v_j / v_i). `correlation` (2,
+    rows, cols): with each neighbour in the row, in the column."""
+    taken, spread = np.asarray(departure, float), np.ones(departure.shape)
+    for share, neighbours in zip(solve_passed_share(correlation), NEXT, strict=True):
+        taken = taken + share * convolve(departure, neighbours, mode="mirror")
+        around = convolve(np.asarray(mean, float), neighbours, mode="mirror")
+        spread = spread + np.square(share) * around / np.maximum(mean, 1e-12)
+    return np.asarray(taken / np.sqrt(spread))
 
 
 def filter_planes(frame: NDArray[F], kernel: FloatArray, cfa: Cfa) -> NDArray[F]:

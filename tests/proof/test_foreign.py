@@ -12,8 +12,8 @@ from lab.formats.recording_set import read
 from lab.formats.results import DiagnosisResult
 from mocks.former import ConcealedCamera, Law
 from mocks.former.laws import (
+    AbsorptionBandLaw,
     ChargeDiffusionLaw,
-    CoverGlassFringeLaw,
     DefocusLaw,
     InfraredCutFilterLaw,
     NonlinearityLaw,
@@ -110,7 +110,7 @@ def test_more_concealed_effects(concealed: tuple[Law, ...]) -> None:
 
 @pytest.mark.slow
 def test_what_nobody_lists_is_located_and_not_named() -> None:
-    result = diagnose(recordings_of(ConcealedCamera(920, [CoverGlassFringeLaw(3.0)], cfa="GBRG")))
+    result = diagnose(recordings_of(ConcealedCamera(920, [AbsorptionBandLaw(10.0)], cfa="GBRG")))
     assert not result.effects
     assert result.verdict == "unexplained"
     assert any(m.measurement == "narrowband" for m in result.mismatches)

@@ -20,7 +20,6 @@ from lab.formats.results import DiagnosisResult
 from mocks.former import Law
 from mocks.former.laws import (
     AbsorptionBandLaw,
-    CoverGlassFringeLaw,
     DustShadowLaw,
     InfraredCutFilterLaw,
     LampJumpLaw,
@@ -35,7 +34,6 @@ PLAIN: tuple[type[Law], ...] = (OpticalLowPassFilterLaw, InfraredCutFilterLaw, N
 #: Of the kinds that no list names, some that are soon diagnosed.
 STRANGE: tuple[type[Law], ...] = (
     AbsorptionBandLaw,
-    CoverGlassFringeLaw,
     DustShadowLaw,
     LampJumpLaw,
     TreeRingsLaw,

@@ -13,6 +13,7 @@ from sim.effects.source_drift import SourceDrift
 from sim.effects.stereo_gain_mismatch import StereoGainMismatch
 from sim.effects.wavelength_offset import WavelengthOffset
 from sim.frame import (
+    EMPTY,
     Exposure,
     KeptTransfers,
     collected_electrons,
@@ -82,12 +83,12 @@ def test_transfers_are_made_once_a_light() -> None:
 def test_read_and_lagging_charge_add_up_to_the_charge_held(colour_camera: CameraModel, lamp: Spectrum) -> None:
     effects = (ImageLag(lag_percent=4.0),)
     exposures = [Exposure(UniformField(lamp), 0.01), Exposure(Darkness(), 0.01)]
-    left: np.ndarray[tuple[int, ...], np.dtype[np.float64]] | float = 0.0
+    kept = EMPTY
     for exposure, together in zip(exposures, expected_sequence(colour_camera, exposures, effects), strict=True):
-        held = expected_electrons(colour_camera, exposure, effects) + left
-        read, left = read_electrons(held, colour_camera, effects)
+        new, before = expected_electrons(colour_camera, exposure, effects), kept
+        read, kept = read_electrons(new, colour_camera, exposure, effects, before)
         assert np.allclose(read, together)
-        assert np.allclose(read + left, held)
+        assert np.allclose(read + kept.lag_e, new + before.lag_e)
 
 
 def test_effects_of_the_rig_act_outside_a_frame(colour_camera: CameraModel, lamp: Spectrum) -> None:

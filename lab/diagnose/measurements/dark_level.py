@@ -70,11 +70,10 @@ def dark_level_block(study: Study) -> Block:
     lines = LineMeans(study, [(c, None) for c, *_ in captures])
 
     def predict(effects: Effects) -> Prediction:
-        offset, more, carried = study.offset(effects), added_dark_dn(study, effects), study.carried_e(effects)
+        offset, more, carried = study.offset(effects), added_dark_dn(study, effects), study.carried_mean_e(effects)
         mean = base.copy()
         for i, (capture, _, _) in enumerate(captures):
-            lag_e = np.mean([carried(capture, c) for c in study.channels])
-            mean[i] += offset(capture) + more(capture) + gain * float(lag_e)
+            mean[i] += offset(capture) + more(capture) + gain * carried(capture)
         model = Uniform(study.camera, effects)
         if not model.has_even_codes:
             mean = model.codes(mean[:, None] + gain * study.camera.read_noise_e * noise_values(1)).mean(axis=1)

@@ -6,16 +6,18 @@ import numpy as np
 from scipy.special import ndtr
 
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.dark_frames import DEFECTS, captures_of, dark_frames, too_coarse
+from lab.diagnose.measurements.dark_frames import DEFECTS, DarkCondition, captures_of, dark_frames, too_coarse
 from lab.diagnose.measurements.dark_level import added_dark_e_per_s
 from lab.errors import NotDetermined
 from lab.measure.noise_figures import CLIP
+from lab.measure.reads import DARK_CURRENT, LAG, LINES, acting
 from lab.measure.study import Study
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
 VARIANCE_FLOOR = 0.004  # relative standard deviation of a temporal variance beside chance
+CARRIED_STD = 0.3  # relative prior standard deviation of what frames before leave: the mean level measures it
 LEAST_NOISE_DN = 0.4  # below, codes are too coarse to measure temporal noise
 
 
@@ -23,8 +25,8 @@ def dark_noise_block(study: Study) -> Block:
     """Temporal variance of dark frames by exposure and temperature, DN^2. It grows with the dark signal (shot noise),
     not with an offset.
 
-    Nuisance parameters: read noise, dark current, gain. Raises NotDetermined without repeats, and where codes are too
-    coarse."""
+    Nuisance parameters: read noise, dark current, gain, charge that frames before leave. Raises NotDetermined without
+    repeats, and where codes are too coarse."""
     frames = study.once(dark_frames)
     points = [(f, out, c) for f in frames for out, c in f.changing.items()]
     if not points:
@@ -57,19 +59,22 @@ def dark_noise_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         mean = base.copy()
-        shot = dark.copy()
+        shot, carried = dark.copy(), np.zeros(len(points))
         model = Uniform(study.camera, effects)
         more_at = added_dark_e_per_s(study, effects)
         lines = sum((one.variance_e2(()) for one in model.lines), 0.0)
-        for i, (f, *_) in enumerate(points):
+        for i, (f, out, _) in enumerate(points):
             t, temperature = f.condition.exposure_s, f.condition.temperature_c
-            shot[i] += noise.gain**2 * more_at(temperature) * t
+            carried[i] = noise.gain**2 * _carried_e(study, effects, f.condition, out)
+            shot[i] += noise.gain**2 * more_at(temperature) * t + carried[i]
             mean[i] += shot[i] - dark[i]
             mean[i] += _defect_variance(model, noise.gain, t, float(value[i])) + noise.gain**2 * lines
         jacobian = {
             "dark_read": np.full(len(points), 0.5 * shortest + 0.1),
             "dark": noise.gain * exposures * noise.dark_std,
         }
+        if np.any(carried):
+            jacobian["dark_noise:carried"] = CARRIED_STD * carried
         jacobian["gain" if flats else "dark_gain"] = gain_std * shot
         return Prediction(mean, jacobian)
 
@@ -78,8 +83,21 @@ def dark_noise_block(study: Study) -> Block:
         covariance=covariance,
         labels=tuple(Label(f.condition.exposure_s, "all", f.condition.name, captures_of(f, out), out) for f, out,
         _ in points),
-        reads=DEFECTS | {"charge.dark_current", "signal.lines"}, predict=predict, scale=value,
+        reads=DEFECTS | DARK_CURRENT | LAG | LINES, predict=predict, scale=value,
     )  # fmt: skip
+
+
+def _carried_e(study: Study, effects: Effects, condition: DarkCondition, held_out: bool) -> float:
+    """Return the mean electrons that frames before leave in the contrasts of one part of a condition, whose shot noise
+    is theirs: contrast k has k / (k + 1) (e_k + <e_0 .. e_(k-1)> / k)."""
+    if not acting(effects, LAG):
+        return 0.0
+    carried = study.carried_mean_e(effects)
+    e = np.array([carried(c) for c in condition.captures])
+    k = np.arange(1.0, len(e))
+    contrasts = k / (k + 1.0) * (e[1:] + np.cumsum(e)[:-1] / k**2)
+    part = contrasts[len(condition.seen) - 1 :] if held_out else contrasts[: len(condition.seen) - 1]
+    return float(part.mean())
 
 
 def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn2: float) -> float:

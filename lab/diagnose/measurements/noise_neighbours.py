@@ -109,15 +109,15 @@ def correlations(
 ) -> FloatArray:
     """Predicted correlations by `PAIRS` in uniform light, (6,): means over the phases of the mosaic.
 
-    `shot_e2` and `share` (planes,): variance of the shot noise, and share of each neighbour's departure from its mean
-    that a pixel takes over. Read noise (`read_e2`) is independent. `kernel` filters both within a plane. Rounding
-    (`rounding_e2`) is added last and is independent.
+    `shot_e2` (planes,): variance of the shot noise; `share` (2, planes): share of the departure from its mean of each
+    neighbour in the row, and of each in the column, that a pixel takes over. Read noise (`read_e2`) is independent.
+    `kernel` filters both within a plane. Rounding (`rounding_e2`) is added last and is independent.
     """
     period = 1 if cfa == "MONO" else 2
     at = dict.fromkeys(planes, (0, 0)) if period == 1 else _phase_of(cfa)
-    variance, taken = np.zeros((period, period)), np.zeros((period, period))
-    for name, v, g in zip(planes, shot_e2, share, strict=True):
-        variance[at[name]], taken[at[name]] = v, g
+    variance, taken = np.zeros((period, period)), np.zeros((2, period, period))
+    for name, v, g in zip(planes, shot_e2, share.T, strict=True):
+        variance[at[name]], taken[:, *at[name]] = v, g
     taps = np.ones((1, 1)) if kernel is None else kernel
     half = taps.shape[0] // 2 * period + 1
     reach = half + 2
@@ -127,16 +127,15 @@ def correlations(
     weights: dict[tuple[int, int], FloatArray] = {}  # (shot and read noise, size, size)
     for phase in np.ndindex(period, period):
         row, col = (phase[0] + offset) % period, (phase[1] + offset) % period
-        own, g = variance[np.ix_(row, col)], taken[np.ix_(row, col)]
-        shifted = _four_neighbours(own)
-        norm = 1.0 / np.sqrt(1.0 + np.square(g) * shifted / np.maximum(own, 1e-12))
+        own, shares = variance[np.ix_(row, col)], [g[np.ix_(row, col)] for g in taken]
+        more = sum(np.square(g) * _neighbours(own, axis) for g, axis in zip(shares, (1, 0), strict=True))
+        norm = 1.0 / np.sqrt(1.0 + more / np.maximum(own, 1e-12))
         read = np.zeros((size, size))
         middle = taps.shape[0] // 2
         for (i, j), tap in np.ndenumerate(taps):
             read[reach + (i - middle) * period, reach + (j - middle) * period] = tap
         shot = read * norm
-        passed = read * norm * g
-        shot = shot + _four_neighbours(passed)
+        shot = shot + sum(_neighbours(read * norm * g, axis) for g, axis in zip(shares, (1, 0), strict=True))
         weights[phase] = np.stack([shot * np.sqrt(own), read * np.sqrt(read_e2)])
     total = {p: float(np.vdot(w, w)) + rounding_e2 for p, w in weights.items()}
     for k, lags in enumerate(PAIRS.values()):
@@ -151,11 +150,10 @@ def correlations(
     return found
 
 
-def _four_neighbours(values: FloatArray) -> FloatArray:
-    """Sum of each pixel's four neighbours, with zeros beyond the border."""
-    wide = np.zeros((values.shape[0] + 2, values.shape[1] + 2))
-    wide[1:-1, 1:-1] = values
-    return np.asarray(wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:])
+def _neighbours(values: FloatArray, axis: int) -> FloatArray:
+    """Sum of each pixel's two neighbours along an axis, with zeros beyond the border."""
+    wide = np.pad(values, 1)[:, 1:-1] if axis == 0 else np.pad(values, 1)[1:-1]
+    return np.asarray(wide[:-2] + wide[2:] if axis == 0 else wide[:, :-2] + wide[:, 2:])
 
 
 def _phase_of(cfa: Cfa) -> dict[str, tuple[int, int]]:

@@ -6,6 +6,7 @@ don't."""
 from mocks.former.law import Law
 from mocks.former.laws.charge import (
     AmplifierGlowLaw,
+    AnisotropicBrighterFatterLaw,
     BrighterFatterLaw,
     ChargeDiffusionLaw,
     CrosstalkLaw,
@@ -17,6 +18,7 @@ from mocks.former.laws.charge import (
     InterPixelCapacitanceLaw,
     LeakyShutterLaw,
     LightLeakLaw,
+    PersistenceLaw,
     PhaseDetectionRowsLaw,
     ResponseTailLaw,
     SmearLaw,
@@ -143,18 +145,21 @@ LISTED: tuple[type[Law], ...] = (
     TapGainLaw,
     TapOffsetLaw,
     LeakyShutterLaw,
+    AnisotropicBrighterFatterLaw,
+    CoverGlassFringeLaw,
 )
 
-#: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.
+#: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
+#: cameras has none of them.
 BESIDE: tuple[type[Law], ...] = (
     LensDistortionLaw,
     LensDecentreLaw,
     StereoGainLaw,
+    PersistenceLaw,
 )
 
 #: Laws that no effect of the list describes, among them close relatives of listed ones.
 OUTSIDE: tuple[type[Law], ...] = (
-    CoverGlassFringeLaw,
     AbsorptionBandLaw,
     RedLeakLaw,
     PolarisedLightLaw,

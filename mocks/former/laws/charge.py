@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.ndimage import convolve
 
 from mocks.former.law import DARK, OPTICAL, Array, Law
+
+if TYPE_CHECKING:
+    from mocks.former.camera import ConcealedCamera
 
 
 class ChargeDiffusionLaw(Law):
@@ -82,6 +87,28 @@ class BrighterFatterLaw(Law):
 
     def library_parameters(self) -> dict[str, float]:
         return {"loss_percent": self.strength} if self.variant == 0 else {}
+
+
+class AnisotropicBrighterFatterLaw(Law):
+    """Charge repels charge, unlike in the two directions, as channel stops hold it along rows and gates along columns
+    (Antilogus 2014). Variants: three times as much goes to neighbours in the row; borders move, three times as much
+    towards neighbours in the column."""
+
+    name, effect = "anisotropic_brighter_fatter", "brighter_fatter"
+    variants, unit, nominal, limits = 2, "%", 6.0, (0.1, 20.0)
+
+    def drawn_e(self, electrons: Array, mean_e: Array) -> Array:
+        full, share = self.camera.full_well_e, self.strength / 100.0
+        if self.variant == 1:
+            turned = np.array([[0.0, 1.5, 0.0], [0.5, -4.0, 0.5], [0.0, 1.5, 0.0]])
+            return electrons + share / (16.0 * full) * convolve(np.square(electrons), turned, mode="mirror")
+        moved = np.array([[0.0, 0.125, 0.0], [0.375, -1.0, 0.375], [0.0, 0.125, 0.0]])
+        filled = np.clip(mean_e / full, 0.0, 1.0)
+        return electrons + 0.5 * share * filled * convolve(electrons - mean_e, moved, mode="mirror")
+
+    def library_parameters(self) -> dict[str, float]:
+        sizes = {"loss_percent": self.strength, "shared_percent": self.strength}
+        return sizes | {"row_excess": 0.5 if self.variant == 0 else -0.5}
 
 
 class GreenImbalanceLaw(Law):
@@ -235,6 +262,40 @@ class ImageLagLaw(Law):
 
     def library_parameters(self) -> dict[str, float]:
         return {"lag_percent": self.strength} if self.variant == 0 else {}
+
+
+class PersistenceLaw(Law):
+    """Traps fill with a share of a frame's charge and empty slowly; the pixels are reset when an exposure begins.
+    Variants: one kind, of 30 s; two kinds of half the strength, of 12 and 120 s; one of 30 s that is full at a third of
+    the well (its filling saturates exponentially)."""
+
+    name = effect = "persistence"
+    variants, unit, nominal, limits, shown_by = 3, "%", 1.0, (0.01, 20.0), DARK
+
+    def bind(self, camera: ConcealedCamera) -> None:
+        super().bind(camera)
+        #: Occupied traps (rows, cols) of each kind, when the last exposure ended (s).
+        self._occupied: list[Array] = [0.0, 0.0]
+        self._ended_s = 0.0
+
+    def lag_e(self, previous_e: Array | None) -> Array:
+        begins_s, total = self.frame.elapsed_s, 0.0
+        for kind, tau_s in enumerate((12.0, 120.0) if self.variant == 1 else (30.0,)):
+            if previous_e is not None:
+                full, share = self.camera.full_well_e, self.strength / 100.0 / (1 + (self.variant == 1))
+                level = np.minimum(previous_e, full)
+                if self.variant == 2:
+                    level = full / 3.0 * (1.0 - np.exp(-3.0 * level / full))
+                self._occupied[kind] = self._occupied[kind] + share * level
+            waits_s = begins_s - self._ended_s
+            begin = self._occupied[kind] * np.exp(-waits_s / tau_s)
+            self._occupied[kind] = begin * np.exp(-self.frame.exposure_s / tau_s)
+            total = total + begin - self._occupied[kind]
+        self._ended_s = begins_s + self.frame.exposure_s
+        return total
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"share_percent": self.strength, "release_s": 30.0} if self.variant == 0 else {}
 
 
 class DarkCurrentTemperatureLaw(Law):

@@ -31,13 +31,26 @@ class InfraredCutFilterLaw(Law):
 
 
 class CoverGlassFringeLaw(Law):
-    """Interference in a plate: T = 1 + m cos(2 pi (2 n t) / wavelength), slow enough for steps of 1 nm."""
+    """Interference in a plate, slow enough for steps of 1 nm. Variants: T = 1 + m cos(2 pi (2 n t) / wavelength); an
+    etalon's, by the sum of all reflections (Airy), with the loss of the mean in the quantum efficiency."""
 
-    name, unit, nominal, limits, shown_by = "cover_glass_fringe", "%", 2.0, (0.05, 20.0), SPECTRAL
-    families = frozenset({"spectral_filter"})
+    name, effect = "cover_glass_fringe", "fringes"
+    variants, unit, nominal, limits, shown_by = 2, "%", 2.0, (0.05, 20.0), SPECTRAL
+
+    @property
+    def _path_nm(self) -> float:
+        return 14000.0 + 8000.0 * float(self.uniform[0])
 
     def transmittance(self, channel: str) -> Array:
-        return 1 + self.strength / 100 * np.cos(2 * np.pi * (14000.0 + 8000.0 * self.uniform[0]) / WAVELENGTH_NM)
+        depth = self.strength / 100
+        if self.variant == 0:
+            return 1 + depth * np.cos(2 * np.pi * self._path_nm / WAVELENGTH_NM)
+        finesse = 2 * depth / (1 - depth)
+        passed = 1 / (1 + finesse * np.sin(np.pi * self._path_nm / WAVELENGTH_NM) ** 2)
+        return passed * np.sqrt(1 + finesse)
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"cos_percent": self.strength, "optical_thickness_um": self._path_nm / 2000.0}
 
 
 class AbsorptionBandLaw(Law):

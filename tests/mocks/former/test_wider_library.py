@@ -15,7 +15,10 @@ from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     BitWeightsLaw,
     ColouredLineNoiseLaw,
+    CoverGlassFringeLaw,
+    ImageLagLaw,
     LeakyShutterLaw,
+    PersistenceLaw,
     PhaseDetectionRowsLaw,
     ResponseKneeLaw,
     TapGainLaw,
@@ -44,6 +47,13 @@ STRONG: tuple[Law, ...] = (
     LeakyShutterLaw(60.0, 0, 9),
     LeakyShutterLaw(60.0, 1, 9),
     LeakyShutterLaw(60.0, 2, 9),
+    PersistenceLaw(1.0, 0, 9),
+    PersistenceLaw(1.0, 1, 9),
+    PersistenceLaw(1.0, 2, 9),
+    CoverGlassFringeLaw(2.0, 0, 9),
+    CoverGlassFringeLaw(5.0, 1, 4),
+    # the likest law of persistence
+    ImageLagLaw(1.0, 0, 9),
 )
 NEW = {str(law.effect) for law in STRONG}
 
@@ -51,7 +61,9 @@ NEW = {str(law.effect) for law in STRONG}
 @cache
 def _diagnosed(law: Law | None, cfa: str = "MONO", seed: int = 930) -> DiagnosisResult:
     camera = ConcealedCamera(seed, [] if law is None else [law], cfa=cfa, rows=192, cols=256)
-    return diagnose(recordings_of(camera, Plan(kinds=("dark", "flat", "narrowband"))), at_once=False)
+    remembers = law is None or law.effect in {"persistence", "image_lag"}
+    plan = Plan(kinds=("dark", "flat", "narrowband"), dark_again=remembers)
+    return diagnose(recordings_of(camera, plan), at_once=False)
 
 
 @pytest.mark.parametrize("law", STRONG, ids=lambda law: f"{law.name}-{law.variant}")

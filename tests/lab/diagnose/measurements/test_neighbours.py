@@ -22,7 +22,13 @@ from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.measure.study import Study, held_out_flats
 from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import BrighterFatterLaw, InterPixelCapacitanceLaw, OnChipSharpeningLaw, OnChipSmoothingLaw
+from mocks.former.laws import (
+    AnisotropicBrighterFatterLaw,
+    BrighterFatterLaw,
+    InterPixelCapacitanceLaw,
+    OnChipSharpeningLaw,
+    OnChipSmoothingLaw,
+)
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.brighter_fatter import BrighterFatter
@@ -107,12 +113,12 @@ def test_correlations_of_a_filter_are_its_autocorrelation() -> None:
     kernel = np.array([[0.0, 0.05, 0.0], [0.05, 0.8, 0.05], [0.0, 0.05, 0.0]])
     size = np.sum(kernel**2)
     own = {"1,0": 2 * 0.8 * 0.05 / size, "1,1": 2 * 0.05**2 / size, "2,0": 0.05**2 / size}
-    mono = correlations("MONO", ["Y"], np.array([100.0]), np.zeros(1), 4.0, 0.0, kernel)
+    mono = correlations("MONO", ["Y"], np.array([100.0]), np.zeros((2, 1)), 4.0, 0.0, kernel)
     np.testing.assert_allclose(mono[:5], [own["1,0"], own["1,0"], own["1,1"], own["2,0"], own["2,0"]], atol=1e-12)
-    bayer = correlations("RGGB", ["R", "G1", "G2", "B"], np.full(4, 100.0), np.zeros(4), 4.0, 0.0, kernel)
+    bayer = correlations("RGGB", ["R", "G1", "G2", "B"], np.full(4, 100.0), np.zeros((2, 4)), 4.0, 0.0, kernel)
     np.testing.assert_allclose(bayer, [0.0, 0.0, 0.0, own["1,0"], own["1,0"], own["1,1"]], atol=1e-12)
     # rounding is each pixel's own: half of the variance halves all
-    rounded = correlations("MONO", ["Y"], np.array([100.0]), np.zeros(1), 4.0, 104.0 * size, kernel)
+    rounded = correlations("MONO", ["Y"], np.array([100.0]), np.zeros((2, 1)), 4.0, 104.0 * size, kernel)
     np.testing.assert_allclose(rounded, 0.5 * mono, atol=1e-12)
 
 
@@ -155,6 +161,7 @@ def test_tones_of_the_read_out_are_told_and_leave_no_correlation() -> None:
     "one",
     [
         effect("brighter_fatter")(loss_percent=12.0, shared_percent=10.0),
+        effect("brighter_fatter")(loss_percent=12.0, shared_percent=10.0, row_excess=0.6),
         effect("on_chip_smoothing")(strength=0.06),
         effect("on_chip_sharpening")(strength=0.06),
     ],
@@ -199,6 +206,19 @@ def test_borders_that_move_between_colours_are_measured_by_their_means() -> None
     found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std
     for name, truth in (("loss_percent", 6.0), ("shared_percent", 6.0), ("exchanged_percent", 1.5)):
         assert abs(found[name] - truth) < 3.5 * (std[name] or 0.0)
+
+
+@pytest.mark.parametrize(("cfa", "variant"), [("MONO", 0), ("MONO", 1), ("RGGB", 1)])
+def test_charge_that_prefers_a_direction_is_measured_by_the_two_covariances(cfa: str, variant: int) -> None:
+    """Three times as much to neighbours in the row, or in the column: sizes and excess within 3.5 standard
+    uncertainties, and the excess at least 4 from none."""
+    law = AnisotropicBrighterFatterLaw(18.0, variant)
+    verdict = _verdict(_concealed(770051, (law,), cfa=cfa, repeats=6))
+    assert [c.told_name for c in verdict.named] == ["brighter_fatter"]
+    found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std
+    for name, truth in law.library_parameters().items():
+        assert abs(found[name] - truth) < 3.5 * (std[name] or 0.0)
+    assert abs(found["row_excess"]) > 4.0 * (std["row_excess"] or np.inf)
 
 
 def test_few_repeats_hold_whole_levels_out_and_many_their_last_third() -> None:

@@ -1,0 +1,55 @@
+"""Persistence: charge that traps take from a bright frame comes out again over the frames that follow."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Self
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect
+from sim.effects.families import Family
+from sim.parameters import Quantity
+from sim.stages import Charge, Traps
+
+
+class Persistence(Effect):
+    """Traps hold q x when a frame of x electrons has been read, and release it by exp(-t / tau): an exposure T that
+    begins t later collects q x (exp(-t / tau) - exp(-(t + T) / tau)), a dark current that decays. Frames add up. What
+    comes out between exposures is reset with the pixels, and what traps take is part of the quantum efficiency.
+
+    Image lag comes whole with the next frame, whenever that is taken.
+    """
+
+    name: ClassVar[str] = "persistence"
+    family: ClassVar[Family] = Family.FRAME_MEMORY
+    reference: ClassVar[str] = (
+        "R. M. Smith et al., A theory for image persistence in HgCdTe photodiodes, Proc. SPIE 7021, 70210J (2008); the "
+        "Pyxel detection framework, simple persistence"
+    )
+    form_tolerance: ClassVar[float] = 0.1
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "orientation"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"release_s"})
+    sentence: ClassVar[str] = (
+        "Persistence: after bright frames dark ones have more signal, in proportion to their exposure, and it fades "
+        "over the frames that follow."
+    )
+
+    share_percent: Annotated[
+        float,
+        Quantity(
+            "%", "share of a frame's charge that traps hold afterwards", lower=0.0, upper=50.0, prior=(0.0, 1.0),
+            absent=0.0,
+        ),
+    ] = 0.0  # fmt: skip
+    release_s: Annotated[
+        float,
+        Quantity("s", "time constant with which traps release it", lower=0.1, upper=1e4, absent=30.0, logarithmic=True),
+    ] = 30.0
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return tuple((cls(share_percent=0.3, release_s=release_s),) for release_s in (30.0, 1.0, 5.0, 150.0, 1000.0))
+
+    def on_charge(self, charge: Charge) -> Charge:
+        if self.share_percent == 0.0:
+            return charge
+        return charge.add_laws(traps=Traps(self.share_percent / 100.0, self.release_s))
