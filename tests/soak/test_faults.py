@@ -308,6 +308,7 @@ class Subject:
         model = driver.identity().model
         opened = self.family == "monochromator" and rng.random() < 0.7
         if opened:
+            driver.move_nm(550.0)  # a CM110 has no shutter and opens at the wavelength that it was told
             driver.open_shutter()
         broken = break_something(self.peer, rng, self.timeout_s)
         what = f"{self.driver_name} {label} with {broken.kind}"
