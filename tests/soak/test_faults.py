@@ -86,6 +86,8 @@ LONG = {
     "place": ("place_timeout_s",),
     "measure": ("measure_timeout_s", "fetch_timeout_s"),
 }
+#: Drivers whose shutter is a motion: a blank in the filter wheel, or a wavelength that lets nothing through.
+SHUT_BY_MOTION = {"monochromator.sp2150", "monochromator.cm110"}
 
 
 # --- breaking an answer -----------------------------------------------------------------------------------------------
@@ -262,7 +264,8 @@ class Subject:
 
     def stated_s(self, call: str, connecting: bool = False) -> float:
         """How long a call may take, as the station file states it: its own time-outs, or the one for an answer."""
-        own = [float(self.settings.get(key) or 0.0) for key in LONG.get(call, ())]
+        by_motion = self.driver_name in SHUT_BY_MOTION and call in ("open_shutter", "close_shutter")
+        own = [float(self.settings.get(key) or 0.0) for key in LONG.get("move_nm" if by_motion else call, ())]
         exposure_s = 3 * EXPOSURE_S if self.family == "camera" else 0.0
         connect_s = (
             float(self.settings.get("connect_timeout_s", 0.0)) if connecting or self.family == "display" else 0.0
