@@ -154,15 +154,29 @@ const focused = () => /** @type {HTMLElement | null} */ (document.activeElement)
  * @type {Model<"DraftedLimits"> | null} */
 let drafted = null;
 
-/** @param {"certify" | "revoke"} id */
-function close(id) {
-  $(id).close();
+const DIALOGS = /** @type {const} */ (["certify", "revoke"]);
+/** @typedef {typeof DIALOGS[number]} DialogId */
+
+/** Opens a dialog: the keyboard reaches it and the head, with its halt, and not the view behind.
+ * @param {DialogId} id */
+function open(id) {
+  opener = focused();
+  $("desk").inert = true;
+  $(id).show();
+}
+
+function closeAll() {
+  for (const id of DIALOGS) $(id).close();
+  $("desk").inert = false;
+}
+
+function close() {
+  closeAll();
   opener?.focus();
 }
 
 /** @param {string} id */
 async function openCertify(id) {
-  opener = focused();
   const found = await ask(`/calibrations/${id}`);
   certifying = id;
   drafted = null;
@@ -177,7 +191,7 @@ async function openCertify(id) {
   $("certify-go").disabled = found.judgements.length === 0 || found.judgements.some((j) => ["bad", "missing"].includes(j.mark));
   $("certify-warnings").hidden = !found.judgements.some((j) => j.mark === "warn");
   $("certify-judgements").replaceChildren(...found.judgements.map(judgementRow));
-  $("certify").show();
+  open("certify");
   $("certify-cancel").focus();
 }
 
@@ -220,12 +234,12 @@ $("certify-form").addEventListener(
     const limit = drafted?.limits.map(({ figure, side, place, good }) => ({ figure, side, place, good }));
     const limits = limit && { limit, valid_days: days === "" ? null : Number(days) };
     await post(`/calibrations/${certifying}/certify`, { accept_warnings: fields.accept.checked, ...(limits ? { limits } : {}) });
-    close("certify");
+    close();
     await findCertified();
     await showView();
   }),
 );
-$("certify-cancel").addEventListener("click", () => close("certify"));
+$("certify-cancel").addEventListener("click", close);
 
 // --- revoking -------------------------------------------------------------------------------------------------------
 
@@ -233,21 +247,19 @@ let revoking = ""; // the id of the calibration
 
 /** @param {string} id */
 function openRevoke(id) {
-  opener = focused();
   revoking = id;
   $("revoke-form").reset();
   $("revoke-problem").textContent = "";
-  $("revoke").show();
+  open("revoke");
   $("revoke-form").elements.why.focus();
 }
 
 $("revoke-form").addEventListener("submit", told("revoke-problem", async () => {
   await post(`/calibrations/${revoking}/revoke`, { why: $("revoke-form").elements.why.value });
-  close("revoke");
+  close();
   await findCertified();
   await showView();
 }));
-$("revoke-cancel").addEventListener("click", () => close("revoke"));
-const DIALOGS = /** @type {const} */ (["certify", "revoke"]);
-for (const id of DIALOGS) $(id).addEventListener("keydown", (event) => event.key === "Escape" && close(id));
-window.addEventListener("hashchange", () => DIALOGS.forEach((id) => $(id).close()));
+$("revoke-cancel").addEventListener("click", close);
+for (const id of DIALOGS) $(id).addEventListener("keydown", (event) => event.key === "Escape" && close());
+window.addEventListener("hashchange", closeAll);

@@ -40,6 +40,7 @@ async function enter() {
   queueIs(refresh);
   await look();
   await showView(true);
+  heading()?.focus();
 }
 
 $("login-form").addEventListener("submit", async (event) => {
@@ -238,6 +239,21 @@ $("skip").addEventListener("click", (event) => {
   event.preventDefault();
   heading()?.focus();
 });
+
+// What had the focus, innermost first: a button that is disabled, hidden or gone hands it to the nearest heading.
+/** @type {HTMLElement[]} */
+let held = [];
+document.addEventListener("focusin", (event) => (held = event.composedPath().filter((one) => one instanceof HTMLElement)));
+new MutationObserver(() => {
+  const [last, ...around] = held;
+  if (!last || ![last, document.body].includes(/** @type {HTMLElement} */ (document.activeElement))) return;
+  if (last.isConnected && last.checkVisibility() && !last.matches(":disabled")) return;
+  const near = around.filter((one) => one.isConnected).map((one) => [...one.querySelectorAll("h2, h3")].find((title) => title.checkVisibility()));
+  const title = /** @type {HTMLElement | undefined} */ (near.find(Boolean));
+  if (!title) return;
+  title.tabIndex = -1;
+  title.focus({ preventScroll: true });
+}).observe($("desk"), { subtree: true, childList: true, attributeFilter: ["disabled", "hidden", "open"] });
 
 // What runs tells of itself through its events; the rest is looked at now and then, and not where nobody sees it.
 setInterval(() => document.hidden || refresh().catch(() => {}), LOOK_MS);
