@@ -231,8 +231,7 @@ $("certify-form").addEventListener(
   told("certify-problem", async () => {
     const fields = $("certify-form").elements;
     const days = fields.valid_days.value;
-    const limit = drafted?.limits.map(({ figure, side, place, good }) => ({ figure, side, place, good }));
-    const limits = limit && { limit, valid_days: days === "" ? null : Number(days) };
+    const limits = drafted && { ...drafted, valid_days: days === "" ? null : Number(days) };
     await post(`/calibrations/${certifying}/certify`, { accept_warnings: fields.accept.checked, ...(limits ? { limits } : {}) });
     close();
     await findCertified();

@@ -288,7 +288,8 @@ function deviceRow(one) {
   }
   if (one.transcript) actions.append(named("a", "Transcript", one.name, { href: one.transcript, target: "_blank", rel: "noopener" }));
   const state = element("td", {}, element("span", { className: `state ${CLASSES[one.state] ?? ""}`, textContent: one.state }));
-  if (one.words) state.append(element("div", { className: one.state === "fails" ? "reason" : "hint", textContent: one.words }));
+  const words = one.words.replace(/^works, and /, ""); // the state above has said so
+  if (words) state.append(element("div", { className: one.state === "fails" ? "reason" : "hint", textContent: words }));
   const made = element(
     "tr",
     {},

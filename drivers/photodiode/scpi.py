@@ -208,12 +208,12 @@ class ScpiPhotodiode(Photodiode):
                     break
                 told = self._heard("*IDN?")
             self._drain()
-            return told
         except Disconnected as error:
             reason = str(error.__cause__).partition(":")[0] if error.__cause__ is not None else str(error)
             raise Disconnected(
                 f"{self._who}: can't be reached ({reason}); check the cable, the power and the address"
             ) from error
+        return told
 
     def _currents(self) -> list[float]:
         return [self._current() for _ in range(self.readings)]
