@@ -88,6 +88,7 @@ LONG = {
 }
 #: Drivers whose shutter is a motion: a blank in the filter wheel, or a wavelength that lets nothing through.
 SHUT_BY_MOTION = {"monochromator.sp2150", "monochromator.cm110"}
+MOVES_ITS_SHUTTER = ("open_shutter", "close_shutter", "stop", "close")
 
 
 # --- breaking an answer -----------------------------------------------------------------------------------------------
@@ -264,7 +265,7 @@ class Subject:
 
     def stated_s(self, call: str, connecting: bool = False) -> float:
         """How long a call may take, as the station file states it: its own time-outs, or the one for an answer."""
-        by_motion = self.driver_name in SHUT_BY_MOTION and call in ("open_shutter", "close_shutter")
+        by_motion = self.driver_name in SHUT_BY_MOTION and call in MOVES_ITS_SHUTTER
         own = [float(self.settings.get(key) or 0.0) for key in LONG.get("move_nm" if by_motion else call, ())]
         exposure_s = 3 * EXPOSURE_S if self.family == "camera" else 0.0
         connect_s = (
