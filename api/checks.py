@@ -15,7 +15,9 @@ from pydantic import TypeAdapter, ValidationError
 
 from api.errors import Conflict
 from api.live import LiveSessions
+from api.safety import StationSafety
 from lab.capture.durable_files import write_durably
+from lab.capture.instruments import Shutter
 from lab.capture.records import now
 from lab.capture.self_test import SelfTest, record_transcript, self_test
 from lab.capture.station import Drivers, Station
@@ -24,6 +26,8 @@ from lab.errors import DeviceError, InputError
 log = logging.getLogger(__name__)
 #: How long (s) the service's end waits for tests that are under way: an instrument that is let go is in its safe state.
 PATIENCE_S = 30.0
+#: Instruments that let no light out, whether they work or not, by the beginning of their names.
+NO_LIGHT = ("cameras.", "spectroradiometer", "photodiode", "stage")
 
 
 @dataclass(frozen=True)
@@ -104,8 +108,17 @@ class DeviceChecks:
                 except (OSError, InputError) as error:
                     log.warning("check of %s, %s: isn't kept: %s", name, device, error)
                 self._latest[name, device] = checked
+            self._note_safety(name, station, devices)
         finally:
             let_go()
+
+    def _note_safety(self, name: str, station: Station, devices: Sequence[str]) -> None:
+        """Keep that the station is safe where each of its instruments that may let light out was checked now and is."""
+        may_shine = {device for device in station.devices if not device.startswith(NO_LIGHT)}
+        works = {device for device in devices if (one := self._latest.get((name, device))) and one.state == "works"}
+        if may_shine and may_shine <= works:
+            shutter: Shutter = "none" if station.monochromator is None else "closed"
+            self._live.safety.note(station, StationSafety(state="safe", shutter=shutter, at=now()))
 
     def _test(self, name: str, station: Station, device: str, keep_transcript: bool) -> SelfTest:
         try:

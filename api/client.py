@@ -615,9 +615,13 @@ class ServiceClient:
         return self._post(CalibrationRecord, f"/calibrations/{calibration_id}/revoke", Revoke(why=why))
 
     def certify(
-        self, calibration_id: str, limits: CalibrationLimits | None = None, *, accept_warnings: bool = False
+        self,
+        calibration_id: str,
+        limits: CalibrationLimits | DraftedLimits | None = None,
+        *,
+        accept_warnings: bool = False,
     ) -> CalibrationRecord:
-        """Certify a candidate, against `limits` or those of the service's data folder."""
+        """Certify a candidate, against `limits`, drafted ones among them, or those of the service's data folder."""
         asked = Certify(limits=limits, accept_warnings=accept_warnings)
         return self._post(CalibrationRecord, f"/calibrations/{calibration_id}/certify", asked)
 

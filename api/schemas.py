@@ -6,7 +6,7 @@ from collections.abc import Collection
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from api.keys import Permission
 from api.safety import StationSafety
@@ -14,7 +14,7 @@ from api.strict_kinds import check_kind
 from lab.calibration.camera_models import Kind as CameraModelKind
 from lab.calibration.camera_models import ModelOfCamera
 from lab.calibration.life import CalibrationRecord
-from lab.calibration.limits import CalibrationLimits, Mark
+from lab.calibration.limits import CalibrationLimits, Limit, Mark
 from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.queue import QueuedSession
 from lab.capture.records import RunRecord
@@ -270,6 +270,36 @@ class Halted(Schema):
     stations: tuple[HaltedStation, ...] = ()
 
 
+class DraftedLimit(Schema):
+    """A drafted limit, with the names that a lab reads."""
+
+    figure: str
+    title: str
+    unit: str
+    side: Side | None
+    place: str
+    good: tuple[float | None, float | None]
+
+
+class DraftedLimits(Schema):
+    """Limits drafted from the history of a calibration's cameras. `words`: from what they were drafted."""
+
+    words: str
+    valid_days: float | None = Field(description="that of the data folder's limits")
+    limits: tuple[DraftedLimit, ...]
+
+    def stated(self) -> CalibrationLimits:
+        """Return them as limits to certify against. Raises pydantic's ValidationError: there is none, or a band has no
+        end."""
+        kept = tuple(Limit(figure=one.figure, side=one.side, place=one.place, good=one.good) for one in self.limits)
+        return CalibrationLimits(valid_days=self.valid_days, limit=kept)
+
+
+def _kind_of_limits(given: object) -> str:
+    """Tell drafted limits, as they were answered, from a laboratory's own."""
+    return "drafted" if isinstance(given, DraftedLimits) or (isinstance(given, dict) and "limits" in given) else "own"
+
+
 class Certify(Asked):
     """Certifies a calibration."""
 
@@ -284,8 +314,26 @@ class Certify(Asked):
         }
     )
 
-    limits: CalibrationLimits | None = Field(default=None, description="null: those of the data folder, `limits.toml`")
+    limits: (
+        Annotated[
+            Annotated[CalibrationLimits, Tag("own")] | Annotated[DraftedLimits, Tag("drafted")],
+            Discriminator(_kind_of_limits),
+        ]
+        | None
+    ) = Field(
+        default=None,
+        description="null: those of the data folder, `limits.toml`; what `drafted-limits` answered is taken, too",
+    )
     accept_warnings: bool = Field(default=False, description="certify with figures in the warning band")
+
+    @model_validator(mode="after")
+    def _state_drafted(self) -> Self:
+        self.stated()
+        return self
+
+    def stated(self) -> CalibrationLimits | None:
+        """Return the limits to certify against; None: those of the data folder."""
+        return self.limits.stated() if isinstance(self.limits, DraftedLimits) else self.limits
 
 
 class CameraModels(Schema):
@@ -330,25 +378,6 @@ class FigureOfFit(NamedFigure):
     std: float
     good: tuple[float | None, float | None] | None = Field(default=None, description="the good band of its limit")
     mark: Mark | None = Field(default=None, description="by its limit; null without one")
-
-
-class DraftedLimit(Schema):
-    """A drafted limit, with the names that a lab reads."""
-
-    figure: str
-    title: str
-    unit: str
-    side: Side | None
-    place: str
-    good: tuple[float | None, float | None]
-
-
-class DraftedLimits(Schema):
-    """Limits drafted from the history of a calibration's cameras. `words`: from what they were drafted."""
-
-    words: str
-    valid_days: float | None = Field(description="that of the data folder's limits")
-    limits: tuple[DraftedLimit, ...]
 
 
 class Revoke(Asked):

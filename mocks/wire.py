@@ -96,6 +96,10 @@ class Grammar(ABC):
         """The next command fails with this code (None: `fault_code`)."""
         self._fail_with = self.fault_code if code is None else code
 
+    def fail_no_more(self) -> None:
+        """The next command doesn't fail."""
+        self._fail_with = None
+
     def _failure(self) -> int | None:
         code, self._fail_with = self._fail_with, None
         return code
@@ -194,7 +198,8 @@ class FaultyLine:
         self.fail(faults)
 
     def fail(self, faults: Iterable[Fault]) -> None:
-        """Break the answers to come, which count from 1."""
+        """Break the answers to come, which count from 1. What was to fail before and hasn't yet is forgotten."""
+        self.grammar.fail_no_more()
         self.faults = FaultPlan(faults)
         self.answers = 0
         self._arm()

@@ -3,38 +3,47 @@
 import { bandText, figureRow, mark, measured, searchIn, unitText } from "./figures.js";
 import { $, Listing, addView, api, ask, cells, element, may, named, post, show, showView, time, told } from "./page.js";
 
+/** @typedef {Model<"CalibrationRecord"> | Model<"CalibrationDetail">} Calibration */
+
+/** @param {Calibration} one */
 const rig = (one) => JSON.stringify(Object.entries(one.cameras).sort());
 const NEWEST = 200; // of which the certified ones are known, with which others are compared
-let certifiedOf = new Map(); // rig -> id of its certified calibration
+/** The id of each rig's certified calibration.
+ * @type {Map<string, string>} */
+let certifiedOf = new Map();
 
 async function findCertified() {
   const known = await ask(`/calibrations?limit=${NEWEST}`);
   certifiedOf = new Map(known.filter((one) => one.state === "certified").map((one) => [rig(one), one.id]));
 }
 
+/** @param {Calibration} one */
 function comparison(one) {
   const other = certifiedOf.get(rig(one));
   if (!other || other === one.id) return [];
-  const link = { href: `${api}/comparisons/page?${new URLSearchParams({ a: other, b: one.id })}`, target: "_blank", rel: "noopener" };
-  link.textContent = "Compare";
-  const made = element("a", link);
+  const href = `${api}/comparisons/page?${new URLSearchParams({ a: other, b: one.id })}`;
+  const made = element("a", { href, target: "_blank", rel: "noopener" }, "Compare");
   made.setAttribute("aria-label", `Compare ${one.name} with the certified calibration`);
   return [made];
 }
 
+/** @param {Calibration} one */
 const certificate = (one) => named("a", "Certificate", one.name, { href: `${api}/calibrations/${one.id}/certificate`, target: "_blank", rel: "noopener" });
 
+/** @param {Calibration} one */
 const who = (one) => {
   const until = one.expires ? ` until ${one.expires.slice(0, 10)}` : "";
-  return one.certified_by ? `${one.certified_by}, ${one.certified.slice(0, 10)}${until}` : "";
+  return one.certified_by && one.certified ? `${one.certified_by}, ${one.certified.slice(0, 10)}${until}` : "";
 };
 
+/** @param {Calibration} one @param {keyof Elements} problem */
 function certifyButton(one, problem) {
   const button = named("button", "Certify …", one.name);
   button.addEventListener("click", told(problem, () => openCertify(one.id)));
   return button;
 }
 
+/** @param {Model<"CalibrationRecord">} one */
 function row(one) {
   const actions = element("td", {}, ...comparison(one).flatMap((link) => [link, " "]));
   if (one.certified) actions.append(certificate(one), " ");
@@ -52,6 +61,7 @@ function row(one) {
   return cells(made, "", "Cameras", "Fitted", "", "By");
 }
 
+/** @type {Listing<"/calibrations">} */
 const list = new Listing("calibrations", "/calibrations", row);
 
 addView({
@@ -66,6 +76,7 @@ addView({
 
 // --- one ------------------------------------------------------------------------------------------------------------
 
+/** @type {Model<"FigureOfFit">[]} */
 let figures = [];
 let shown = "";
 
@@ -74,6 +85,7 @@ const drawFigures = searchIn("calibration-search", () => figures, (found) => {
   $("no-calibration-figures").hidden = found.length > 0;
 });
 
+/** @param {Model<"Judgement">} j */
 const judgementRow = (j) =>
   element(
     "tr",
@@ -84,7 +96,9 @@ const judgementRow = (j) =>
     element("td", {}, mark(j.mark)),
   );
 
+/** @param {string} label @param {string | Node | null | undefined} value */
 const fact = (label, value) => (value ? [element("div", {}, element("dt", { textContent: label }), element("dd", {}, value))] : []);
+/** @param {keyof Elements} place @param {string[]} texts */
 const lines = (place, texts) => $(place).replaceChildren(...texts.map((text) => element("li", { textContent: text })));
 
 addView({
@@ -104,13 +118,14 @@ addView({
     $("calibration-facts").replaceChildren(
       ...fact("Id", one.id),
       ...fact("State", element("span", { className: `state ${one.state}`, textContent: one.state })),
-      ...fact("Session", element("a", { href: `#/sessions/${one.session_id}`, textContent: one.session_id })),
+      ...fact("Session", one.session_id && element("a", { href: `#/sessions/${one.session_id}`, textContent: one.session_id })),
       ...fact("Cameras", Object.entries(one.cameras).map(([side, name]) => `${side} ${name}`).join(", ")),
       ...fact("Fitted (UTC)", time(one.created)),
       ...fact("Certified", who(one)),
       ...fact("Revoked", one.revoked ? `${one.revoked_by}, ${one.revoked.slice(0, 10)}: ${one.revoked_why}` : ""),
     );
     lines("calibration-warnings", one.warnings);
+    /** @type {(HTMLAnchorElement | HTMLButtonElement)[]} */
     const actions = comparison(one);
     if (one.certified) actions.push(certificate(one));
     if (one.has_cameras) actions.push(named("a", "Camera files", one.name, { href: `${api}/camera-models/${one.id}/archive.zip` }));
@@ -120,7 +135,7 @@ addView({
       button.addEventListener("click", () => openRevoke(one.id));
       actions.push(button);
     }
-    const words = actions.map((link) => [link.textContent, link.href ?? ""]);
+    const words = actions.map((link) => [link.textContent, "href" in link ? link.href : ""]);
     show("calibration-actions", [{ id: 0, words, of: one.id }], () => element("span", { className: "actions" }, ...actions.flatMap((link) => [link, " "])));
     show("calibration-judgements", one.judgements, judgementRow);
     $("no-judgements").hidden = one.judgements.length > 0;
@@ -130,17 +145,38 @@ addView({
 
 // --- certifying -----------------------------------------------------------------------------------------------------
 
-let certifying = null;
-let opener = null; // what has the focus again when the dialog is closed
-let drafted = null; // the limits that are being edited; null: those that stand
+let certifying = ""; // the id of the calibration
+/** What has the focus again when the dialog is closed.
+ * @type {HTMLElement | null} */
+let opener = null;
+const focused = () => /** @type {HTMLElement | null} */ (document.activeElement);
+/** The limits that are being edited; null: those that stand.
+ * @type {Model<"DraftedLimits"> | null} */
+let drafted = null;
 
-function close(id) {
-  $(id).close();
+const DIALOGS = /** @type {const} */ (["certify", "revoke"]);
+/** @typedef {typeof DIALOGS[number]} DialogId */
+
+/** Opens a dialog: the keyboard reaches it and the head, with its halt, and not the view behind.
+ * @param {DialogId} id */
+function open(id) {
+  opener = focused();
+  $("desk").inert = true;
+  $(id).show();
+}
+
+function closeAll() {
+  for (const id of DIALOGS) $(id).close();
+  $("desk").inert = false;
+}
+
+function close() {
+  closeAll();
   opener?.focus();
 }
 
+/** @param {string} id */
 async function openCertify(id) {
-  opener = document.activeElement;
   const found = await ask(`/calibrations/${id}`);
   certifying = id;
   drafted = null;
@@ -155,21 +191,24 @@ async function openCertify(id) {
   $("certify-go").disabled = found.judgements.length === 0 || found.judgements.some((j) => ["bad", "missing"].includes(j.mark));
   $("certify-warnings").hidden = !found.judgements.some((j) => j.mark === "warn");
   $("certify-judgements").replaceChildren(...found.judgements.map(judgementRow));
-  $("certify").show();
+  open("certify");
   $("certify-cancel").focus();
 }
 
-// A limit whose ends are edited.
+/** A limit whose ends are edited.
+ * @param {Model<"DraftedLimit">} limit */
 function limitRow(limit) {
+  /** @param {number} at @param {string} says */
   const end = (at, says) => {
-    const field = element("input", { type: "number", step: "any", value: limit.good[at] ?? "" });
+    const field = element("input", { type: "number", step: "any", value: String(limit.good[at] ?? "") });
     field.setAttribute("aria-label", `${limit.title}, ${limit.side ?? "both cameras"}: ${says}`);
-    field.addEventListener("change", () => (limit.good = limit.good.map((old, n) => (n === at ? (field.value === "" ? null : Number(field.value)) : old))));
+    field.addEventListener("change", () => (limit.good[at] = field.value === "" ? null : Number(field.value)));
     return element("td", {}, field);
   };
   const away = named("button", "Leave out", `${limit.title}, ${limit.side ?? "both cameras"}`, { type: "button", className: "quiet" });
   const made = element("tr", {}, element("td", { textContent: `${limit.title}${limit.unit === "1" ? "" : `, ${limit.unit}`}`, title: limit.figure }), element("td", { textContent: limit.side ?? "both" }), end(0, "at least"), end(1, "at most"), element("td", {}, away));
   away.addEventListener("click", () => {
+    if (!drafted) return;
     drafted.limits = drafted.limits.filter((one) => one !== limit);
     made.remove();
     $("certify-go").disabled = drafted.limits.length === 0;
@@ -181,7 +220,7 @@ $("certify-draft").addEventListener("click", told("certify-problem", async () =>
   drafted = await ask(`/calibrations/${certifying}/drafted-limits`);
   $("certify-drafted-words").textContent = drafted.words;
   $("certify-limits").replaceChildren(...drafted.limits.map(limitRow));
-  $("certify-form").elements.valid_days.value = drafted.valid_days ?? "";
+  $("certify-form").elements.valid_days.value = String(drafted.valid_days ?? "");
   $("certify-drafted").hidden = false;
   $("certify-none").hidden = $("certify-table").hidden = $("certify-draft").hidden = $("certify-warnings").hidden = true;
   $("certify-go").disabled = drafted.limits.length === 0;
@@ -189,38 +228,37 @@ $("certify-draft").addEventListener("click", told("certify-problem", async () =>
 
 $("certify-form").addEventListener(
   "submit",
-  told("certify-problem", async (event) => {
-    const fields = event.target.elements;
+  told("certify-problem", async () => {
+    const fields = $("certify-form").elements;
     const days = fields.valid_days.value;
-    const limit = drafted?.limits.map(({ figure, side, place, good }) => ({ figure, side, place, good }));
-    const limits = drafted && { limit, valid_days: days === "" ? null : Number(days) };
+    const limits = drafted && { ...drafted, valid_days: days === "" ? null : Number(days) };
     await post(`/calibrations/${certifying}/certify`, { accept_warnings: fields.accept.checked, ...(limits ? { limits } : {}) });
-    close("certify");
+    close();
     await findCertified();
     await showView();
   }),
 );
-$("certify-cancel").addEventListener("click", () => close("certify"));
+$("certify-cancel").addEventListener("click", close);
 
 // --- revoking -------------------------------------------------------------------------------------------------------
 
-let revoking = null;
+let revoking = ""; // the id of the calibration
 
+/** @param {string} id */
 function openRevoke(id) {
-  opener = document.activeElement;
   revoking = id;
   $("revoke-form").reset();
   $("revoke-problem").textContent = "";
-  $("revoke").show();
+  open("revoke");
   $("revoke-form").elements.why.focus();
 }
 
-$("revoke-form").addEventListener("submit", told("revoke-problem", async (event) => {
-  await post(`/calibrations/${revoking}/revoke`, { why: event.target.elements.why.value });
-  close("revoke");
+$("revoke-form").addEventListener("submit", told("revoke-problem", async () => {
+  await post(`/calibrations/${revoking}/revoke`, { why: $("revoke-form").elements.why.value });
+  close();
   await findCertified();
   await showView();
 }));
-$("revoke-cancel").addEventListener("click", () => close("revoke"));
-for (const id of ["certify", "revoke"]) $(id).addEventListener("keydown", (event) => event.key === "Escape" && close(id));
-window.addEventListener("hashchange", () => ["certify", "revoke"].forEach((id) => $(id).close()));
+$("revoke-cancel").addEventListener("click", close);
+for (const id of DIALOGS) $(id).addEventListener("keydown", (event) => event.key === "Escape" && close());
+window.addEventListener("hashchange", closeAll);

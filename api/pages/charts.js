@@ -2,7 +2,7 @@
 
 import { $ } from "./page.js";
 
-const SVG = $("svg").content.firstElementChild.namespaceURI;
+const SVG = $("svg").content.firstElementChild?.namespaceURI ?? "";
 const WIDTH = 360;
 const HEIGHT = 230;
 const LEFT = 52;
@@ -10,26 +10,36 @@ const RIGHT = 10;
 const TOP = 10;
 const BOTTOM = 40;
 
+/** A number in so many digits.
+ * @param {number} value */
 export const number = (value, digits = 5) => Number(value.toPrecision(digits)).toString();
 
+/** An element of SVG with attributes and children.
+ * @param {string} tag
+ * @param {Record<string, string | number>} attributes
+ * @param {...(Node | string)} children */
 export function svg(tag, attributes, ...children) {
   const made = document.createElementNS(SVG, tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, String(value));
   made.append(...children);
   return made;
 }
 
-// Round values between two ends, four or so.
+/** Round values between two ends, four or so.
+ * @param {number} low
+ * @param {number} high */
 export function ticks(low, high) {
   const rough = (high - low) / 5;
   const power = 10 ** Math.floor(Math.log10(rough));
-  const step = power * [1, 2, 2.5, 5, 10].find((factor) => factor * power >= rough);
+  const step = power * ([1, 2, 2.5, 5].find((factor) => factor * power >= rough) ?? 10);
   const found = [];
   for (let at = Math.ceil(low / step); at * step <= high; at++) found.push(Number((at * step).toPrecision(12)));
   return found;
 }
 
-// Powers of ten, and 2 and 5 times them where the range is short.
+/** Powers of ten, and 2 and 5 times them where the range is short.
+ * @param {number} low
+ * @param {number} high */
 const decades = (low, high) => {
   const steps = high / low > 300 ? [1] : [1, 2, 5];
   const found = [];
@@ -37,8 +47,10 @@ const decades = (low, high) => {
   return found.filter((value) => value >= low * 0.9999 && value <= high * 1.0001);
 };
 const short = new Intl.NumberFormat("en", { notation: "compact", maximumSignificantDigits: 3 });
+/** @param {number} value */
 const label = (value) => (Math.abs(value) >= 10_000 ? short.format(value) : number(value, 3));
 
+/** @type {((x: number, y: number) => Element)[]} */
 const SHAPES = [
   (x, y) => svg("circle", { cx: x, cy: y, r: 3 }),
   (x, y) => svg("rect", { x: x - 2.8, y: y - 2.8, width: 5.6, height: 5.6 }),
@@ -46,17 +58,27 @@ const SHAPES = [
   (x, y) => svg("path", { d: `M${x - 3.8} ${y}L${x} ${y - 3.8}L${x + 3.8} ${y}L${x} ${y + 3.8}Z` }),
 ];
 
-function scale(values, { log = false, from, to } = {}, first, last) {
+/** Points [x, y] of one colour: marks of a shape of their own, or a line.
+ * @typedef {{name: string, colour: number, points: number[][], line?: boolean, dashed?: boolean}} Series */
+/** @typedef {{label: string, log?: boolean, from?: number, to?: number}} Axis */
+
+/** Where values of an axis stand between two places of the picture.
+ * @param {number[]} values
+ * @param {Axis} axis
+ * @param {number} first
+ * @param {number} last */
+function scale(values, { log = false, from, to }, first, last) {
   const usable = log ? values.filter((v) => v > 0) : values;
   let low = from ?? Math.min(...usable);
   let high = to ?? Math.max(...usable);
   if (!(high > low)) [low, high] = log ? [low / 2, low * 2] : [low - 1, low + 1];
-  const into = log ? Math.log10 : (v) => v;
-  const place = (v) => first + ((last - first) * (into(v) - into(low))) / (into(high) - into(low));
-  return { place, ticks: log ? decades(low, high) : ticks(low, high), takes: (v) => Number.isFinite(v) && (!log || v > 0) };
+  const into = log ? Math.log10 : (/** @type {number} */ v) => v;
+  const place = (/** @type {number} */ v) => first + ((last - first) * (into(v) - into(low))) / (into(high) - into(low));
+  return { place, ticks: log ? decades(low, high) : ticks(low, high), takes: (/** @type {number} */ v) => Number.isFinite(v) && (!log || v > 0) };
 }
 
-// `series`: [{name, colour, points: [[x, y], ...], line}]; `x`, `y`: {label, log, from, to}. `title` says in words what is seen.
+/** A chart; `title` says in words what is seen.
+ * @param {{title: string, series: Series[], x: Axis, y: Axis}} of */
 export function chart({ title, series, x, y }) {
   const picture = svg("svg", { class: "chart", viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": title });
   const every = series.flatMap((one) => one.points);
@@ -85,7 +107,8 @@ export function chart({ title, series, x, y }) {
   return picture;
 }
 
-// The key of a chart: a name beside a mark of its colour and shape.
+/** The key of a chart: a name beside a mark of its colour and shape.
+ * @param {Omit<Series, "points">[]} names */
 export const key = (names) =>
   names.map(({ name, colour, line, dashed }) => {
     const entry = document.createElement("span");

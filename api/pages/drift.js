@@ -11,31 +11,43 @@ const TOP = 12;
 const BOTTOM = 34;
 const form = $("drift-form").elements;
 
-let board = null;
+/** @type {Model<"DriftBoard">} */
+let board;
 let asked = ""; // camera and reference temperature of the board
 let figure = ""; // key of the row whose history stands there
 
+/** @typedef {Model<"BoardRow">} Row */
+/** @typedef {Model<"HistoryPoint">} Point */
+
+/** @param {Row} one */
 const keyOf = (one) => JSON.stringify([one.figure, one.place]);
+/** @param {{title?: string, figure: string, place?: string}} one */
 const titleOf = (one) => one.title || [one.figure, one.place].filter(Boolean).join(" ");
+/** @param {number | null | undefined} temperature_c */
+const degrees = (temperature_c) => (temperature_c == null ? "" : `${number(temperature_c, 3)} °C`);
+/** @param {string} name */
 const cameraName = (name) => (name.startsWith("{") ? "the pair" : name);
-const needsLook = (row) => row.cells.some((cell) => cell && (cell.drifted || ["warn", "bad"].includes(cell.mark)));
+/** @param {Row} row */
+const needsLook = (row) => row.cells.some((cell) => cell && (cell.drifted || ["warn", "bad"].includes(cell.mark ?? "")));
 
 // --- the board ------------------------------------------------------------------------------------------------------
 
+/** @param {Model<"BoardCell"> | null} one @param {Model<"BoardColumn">} column @param {Row} row */
 function cell(one, column, row) {
   if (!one) return element("td", { className: "cell none", textContent: "–" });
   const state = [one.mark ?? "", one.drifted ? "drifted" : ""].join(" ");
   const made = element("td", { className: `cell ${state}`, textContent: `${one.drifted ? "◆ " : ""}${number(one.value, 4)}` });
-  const words = [one.mark, one.drifted ? `drifted, ${number(one.significance_sigma, 3)} σ` : "", one.corrected ? `at ${number(row.reference_c, 3)} °C` : ""];
+  const words = [one.mark, one.drifted ? `drifted, ${number(one.significance_sigma ?? NaN, 3)} σ` : "", one.corrected ? `at ${degrees(row.reference_c)}` : ""];
   made.title = `${column.name}, ${time(column.created)}: ${measured(one.value, one.std)}${unitText(row.unit)}${words.filter(Boolean).map((word) => `, ${word}`).join("")}`;
   return made;
 }
 
+/** @param {Row} row */
 function rowOf(row) {
   const link = element("button", { className: "quiet", textContent: titleOf(row), title: `${row.figure} ${row.place}`.trim() });
   link.addEventListener("click", told("drift-problem", () => openHistory(row)));
   const name = element("th", { scope: "row" }, link);
-  name.append(element("span", { className: "hint", textContent: `${row.unit === "1" ? "" : ` ${row.unit}`}${row.reference_c == null ? "" : ` at ${number(row.reference_c, 3)} °C`}` }));
+  name.append(element("span", { className: "hint", textContent: `${row.unit === "1" ? "" : ` ${row.unit}`}${row.reference_c == null ? "" : ` at ${degrees(row.reference_c)}`}` }));
   return element("tr", {}, name, ...row.cells.map((one, at) => cell(one, board.columns[at], row)));
 }
 
@@ -57,10 +69,11 @@ function draw() {
   const look = board.rows.filter(needsLook).length;
   const law = board.rows.find((row) => row.law);
   const words = [`${found.length} of ${board.rows.length} figures, ${board.columns.length} calibrations, the oldest first`, `${look || "none"} out of limits or drifted`];
-  if (law) words.push(`dark currents at ${number(law.reference_c, 3)} °C: ${law.law}`);
+  if (law) words.push(`dark currents at ${degrees(law.reference_c)}: ${law.law}`);
   $("drift-told").textContent = words.join("; ");
 }
 
+/** @param {boolean} anew */
 async function showBoard(anew) {
   const camera = form.camera.value;
   const wanted = new URLSearchParams({ camera });
@@ -75,6 +88,7 @@ async function showBoard(anew) {
 
 // --- a figure's history ---------------------------------------------------------------------------------------------
 
+/** @param {Row} row */
 async function openHistory(row) {
   figure = keyOf(row);
   const parts = { camera: form.camera.value, figure: row.figure, place: row.place };
@@ -85,8 +99,10 @@ async function openHistory(row) {
   $("history-part").scrollIntoView({ block: "nearest" });
 }
 
+/** @param {number} from @param {number} to */
 const rangeOf = (from, to) => (to > from ? [from, to] : [from - 1, to + 1]);
 
+/** @param {Model<"History">} history */
 function drawHistory(history) {
   const width = Math.min(Math.max($("history").clientWidth || 720, 320), 720); // a phone's letters are as large as a desktop's
   const points = history.points;
@@ -95,16 +111,17 @@ function drawHistory(history) {
   const [least, most] = rangeOf(Math.min(...ends), Math.max(...ends));
   const spread = most - least;
   // The ends of the bands are shown where that leaves the points half of the height.
-  const near = bands.flat().filter((end) => end != null && end > least - spread && end < most + spread);
+  const near = bands.flat().filter((end) => end !== null).filter((end) => end > least - spread && end < most + spread);
   const [bottom, top] = rangeOf(Math.min(least, ...near) - 0.08 * spread, Math.max(most, ...near) + 0.08 * spread);
-  const x = (at) => LEFT + ((width - LEFT - RIGHT) * (at + 0.5)) / points.length;
-  const y = (value) => TOP + ((HEIGHT - TOP - BOTTOM) * (top - Math.min(Math.max(value, bottom), top))) / (top - bottom);
+  const x = (/** @type {number} */ at) => LEFT + ((width - LEFT - RIGHT) * (at + 0.5)) / points.length;
+  const y = (/** @type {number} */ value) => TOP + ((HEIGHT - TOP - BOTTOM) * (top - Math.min(Math.max(value, bottom), top))) / (top - bottom);
+  /** @param {(number | null)[]} ends @param {string} name */
   const band = ([low, high], name) =>
     svg("rect", { class: `band ${name}`, x: LEFT, width: width - LEFT - RIGHT, y: y(high ?? top), height: y(low ?? bottom) - y(high ?? top) });
-  const newest = points.at(-1);
+  const newest = points[points.length - 1];
   const drifted = points.filter((p) => p.drifted).length;
   const title = titleOf(history);
-  const valueText = (p) => `${measured(p.value, p.std)}${unitText(history.unit)}${p.temperature_c == null ? "" : ` at ${number(p.temperature_c, 3)} °C`}`;
+  const valueText = (/** @type {Point} */ p) => `${measured(p.value, p.std)}${unitText(history.unit)}${p.temperature_c == null ? "" : ` at ${degrees(p.temperature_c)}`}`;
   const summary = `${title} of ${cameraName(history.camera)}: ${points.length} calibrations, the newest ${valueText(newest)}${newest.mark ? `, ${newest.mark}` : ""}, ${drifted || "none"} drifted`;
   const picture = svg("svg", { viewBox: `0 0 ${width} ${HEIGHT}`, role: "img", "aria-label": summary });
   if (bands.length) picture.append(band(bands[1], "warn"), band(bands[0], "good"));
@@ -135,7 +152,7 @@ function drawHistory(history) {
         element("td", {}, element("a", { href: `#/calibrations/${p.calibration_id}`, textContent: p.state })),
         element("td", { textContent: valueText(p) }),
         element("td", { textContent: p.mark ?? "" }),
-        element("td", { textContent: p.drifted ? `drifted, ${number(p.significance_sigma, 3)} sigma` : "" }),
+        element("td", { textContent: p.drifted ? `drifted, ${number(p.significance_sigma ?? NaN, 3)} sigma` : "" }),
       ),
     ),
   );
@@ -143,8 +160,8 @@ function drawHistory(history) {
 
 // --- the view -------------------------------------------------------------------------------------------------------
 
-for (const name of ["search", "attention"]) form[name].addEventListener("input", () => board && draw());
-for (const name of ["camera", "reference_c"]) {
+for (const name of /** @type {const} */ (["search", "attention"])) form[name].addEventListener("input", () => asked && draw());
+for (const name of /** @type {const} */ (["camera", "reference_c"])) {
   form[name].addEventListener("change", told("drift-problem", async () => {
     $("history-part").hidden = true;
     figure = "";
@@ -161,10 +178,11 @@ addView({
     if (!first) return; // a board changes with a fit, not by itself
     const named = [...new Set((await ask("/figures")).map((one) => one.camera))];
     options(form.camera, named, cameraName);
-    if (query().has("camera")) form.camera.value = query().get("camera");
+    const wanted = query().get("camera");
+    if (wanted !== null) form.camera.value = wanted;
     const none = named.length === 0;
     $("no-drift").hidden = !none;
-    for (const id of ["drift-form", "drift-scroll"]) $(id).hidden = none;
+    for (const id of /** @type {const} */ (["drift-form", "drift-scroll"])) $(id).hidden = none;
     if (!none) await showBoard(true);
     if (figure) $("history-part").hidden = false;
   },

@@ -1,17 +1,20 @@
 // What a session's diagnosis found: in words, with the measurements and the frames that prove it, before and after.
 
 import { chart, key, number } from "./charts.js";
-import { $, ask, element } from "./page.js";
+import { $, ask, brushOf, element } from "./page.js";
 
 const CELL = 6; // px of a cell of a residual picture
 let shown = ""; // the source and the diagnosis that stand there
 
-// Blue: darker than predicted, red: brighter; white: as predicted.
+/** Residuals in cells of the frame. Blue: darker than predicted, red: brighter; white: as predicted.
+ * @param {number[][]} cells
+ * @param {number} limit the residual of full colour (sigma)
+ * @param {string} title */
 function residuals(cells, limit, title) {
   const canvas = element("canvas", { width: cells[0].length * CELL, height: cells.length * CELL });
   canvas.setAttribute("role", "img");
   canvas.setAttribute("aria-label", title);
-  const brush = canvas.getContext("2d");
+  const brush = brushOf(canvas);
   cells.forEach((row, y) =>
     row.forEach((value, x) => {
       const part = Math.max(-1, Math.min(1, value / limit)) || 0;
@@ -23,14 +26,17 @@ function residuals(cells, limit, title) {
   return canvas;
 }
 
+/** @param {number[][]} cells */
 const rms = (cells) => Math.sqrt(cells.flat().reduce((sum, value) => sum + value * value, 0) / cells.flat().length);
 
+/** @param {Model<"ResidualPicture">} picture */
 function drawPicture(picture) {
   const limit = Math.max(3, ...[...picture.before, ...picture.after].flat().map((value) => Math.abs(value) || 0));
-  const pair = [
+  const sides = /** @type {const} */ ([
     ["without the effects", picture.before],
     ["with them", picture.after],
-  ].map(([when, cells]) => {
+  ]);
+  const pair = sides.map(([when, cells]) => {
     const title = `${picture.capture}, ${when}: rms ${number(rms(cells), 2)} σ`;
     return element("figure", {}, residuals(cells, limit, `Residuals of ${title}`), element("figcaption", { textContent: title }));
   });
@@ -39,8 +45,9 @@ function drawPicture(picture) {
   return element("div", { className: "residuals" }, words, ...pair);
 }
 
+/** @param {Model<"ProofCurve">} proof */
 function drawProof({ title, caption, curve }) {
-  const points = (values) => curve.x.map((x, at) => [x, values[at]]).sort((a, b) => a[0] - b[0]);
+  const points = (/** @type {number[]} */ values) => curve.x.map((x, at) => [x, values[at]]).sort((a, b) => a[0] - b[0]);
   const series = [
     { name: "measured", colour: 3, points: points(curve.measured) },
     { name: "without the effects", colour: 0, points: points(curve.before), line: true, dashed: true },
@@ -50,7 +57,9 @@ function drawProof({ title, caption, curve }) {
   return element("figure", {}, drawn, element("figcaption", {}, element("strong", { textContent: `${title}. ` }), caption, " ", ...key(series)));
 }
 
-// `source`: {kind, id}; `newest`: the id of its newest diagnosis, if there is one.
+/** Shows what the newest diagnosis of a source found, if there is one.
+ * @param {Source} source
+ * @param {string} newest its id */
 export async function showFindings(source, newest = "") {
   const wanted = `${source.kind}/${source.id} ${newest}`;
   if (shown === wanted) return;

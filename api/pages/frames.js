@@ -3,13 +3,18 @@
 import { $, element, page, show, told } from "./page.js";
 
 const PICTURES_AT_ONCE = 24;
-let source = null;
+const KEYS = /** @type {const} */ (["kind", "side"]);
+/** @type {Source} */
+let source;
 let atOnce = PICTURES_AT_ONCE;
-// The captures that are shown, as they were asked for; a live session adds those after the newest one when somebody asks for them.
+/** @typedef {Model<"StoredCapture"> | Model<"RecordedCapture">} Capture */
+/** The captures that are shown, as they were asked for; a live session adds those after the newest one when somebody asks for them.
+ * @type {Capture[]} */
 let captures = [];
 let total = 0;
 let shownFor = ""; // source and filter that `captures` are of
 
+/** @param {number | null | undefined} seconds */
 export function exposure(seconds) {
   if (seconds == null) return "";
   return seconds < 1 ? ` · ${Number((seconds * 1e3).toPrecision(3))} ms` : ` · ${Number(seconds.toPrecision(3))} s`;
@@ -20,25 +25,28 @@ export function leaveFrames() {
   atOnce = PICTURES_AT_ONCE;
   $("captures").replaceChildren();
   delete $("captures").dataset.shown;
-  for (const key of ["kind", "side"]) $("capture-filter").elements[key].replaceChildren();
+  for (const key of KEYS) $("capture-filter").elements[key].replaceChildren();
 }
 
 const filtered = () => {
   const filter = $("capture-filter").elements;
   const asked = new URLSearchParams({ limit: "200" });
-  for (const key of ["kind", "side"]) if (filter[key].value) asked.set(key, filter[key].value);
+  for (const key of KEYS) if (filter[key].value) asked.set(key, filter[key].value);
   return asked;
 };
 
+/** @param {URLSearchParams} asked
+ * @returns {Promise<Capture[]>} */
 async function capturesOf(asked) {
   const found = await page(`/${source.kind}/${source.id}/captures?${asked}`);
   total = found.total;
   return found.items;
 }
 
+/** @param {Model<"CaptureCount">[]} counts */
 function showFilter(counts) {
   const filter = $("capture-filter").elements;
-  for (const key of ["kind", "side"]) {
+  for (const key of KEYS) {
     const values = ["", ...new Set(counts.map((c) => c[key]))];
     const kept = filter[key].value;
     if (filter[key].options.length !== values.length) {
@@ -48,10 +56,13 @@ function showFilter(counts) {
   }
 }
 
-// `of`: {kind, id}; `one`: what is known of it, with the number of its captures of each kind.
+/** Shows the frames of a source.
+ * @param {Source} of
+ * @param {Model<"SessionDetail"> | Model<"RecordingsDetail">} one what is known of it, with the number of its captures of each kind */
 export async function showFrames(of, one) {
   source = of;
-  showFilter(one.counts ?? one.captures);
+  const counts = "counts" in one ? one.counts : one.captures;
+  showFilter(counts);
   const wanted = `${of.kind}/${of.id} ${filtered()}`;
   if (shownFor !== wanted) {
     const asked = filtered();
@@ -61,15 +72,15 @@ export async function showFrames(of, one) {
     atOnce = PICTURES_AT_ONCE;
   }
   drawCaptures();
-  const there = (one.counts ?? one.captures).reduce((sum, each) => sum + each.captures, 0);
-  $("newer").hidden = !(one.steps_done > 0 && there > total && !filtered().has("kind") && !filtered().has("side"));
+  const there = counts.reduce((sum, each) => sum + each.captures, 0);
+  $("newer").hidden = !("steps_done" in one && one.steps_done > 0 && there > total && !filtered().has("kind") && !filtered().has("side"));
   $("newer").textContent = "Show those taken since";
 }
 
 async function newerCaptures() {
   for (let more = true; more; ) {
     const asked = filtered();
-    if (captures.length) asked.set("after", captures[0].id);
+    if (captures.length) asked.set("after", String(captures[0].id));
     const found = await capturesOf(asked);
     captures = [...found.reverse(), ...captures];
     more = found.length === 200;
@@ -81,7 +92,7 @@ async function newerCaptures() {
 async function olderCaptures() {
   const asked = filtered();
   asked.set("order", "newest");
-  asked.set("after", captures.at(-1).id);
+  asked.set("after", String(captures[captures.length - 1].id));
   captures = [...captures, ...(await capturesOf(asked))];
 }
 

@@ -1,30 +1,37 @@
 // One frame, raw: zoom, readout in DN, a line's profile, the difference of two frames, saturated pixels.
 
-import { chart, key, number } from "./charts.js";
-import { $, addView, api, ask, element, options, reach, told } from "./page.js";
+import { chart, number } from "./charts.js";
+import { $, addView, api, ask, brushOf, element, options, reach, told } from "./page.js";
 import { exposure } from "./frames.js";
 import { drawChannels } from "./watch.js";
 
+/** @typedef {{row: number, col: number}} Spot */
 /** @typedef {{rows: number, cols: number, codes: Uint16Array}} Raw */
 const NPY = { magic: 10, length: 8 }; // where the header of a .npy of version 1 begins, and where its length stands
 const SATURATED = [214, 39, 130];
 const CLICK_PX = 4; // a pointer that moves less hasn't dragged
 
 /** The raw frame of a .npy: uint16, rows by columns.
+ * @param {string} path
  * @returns {Promise<Raw>} */
 async function rawOf(path) {
   const content = await (await reach(path, {}, 120_000)).arrayBuffer();
   const header = new DataView(content).getUint16(NPY.length, true);
   const text = new TextDecoder().decode(content.slice(NPY.magic, NPY.magic + header));
-  const [rows, cols] = /'shape': \((\d+), (\d+)\)/.exec(text).slice(1).map(Number);
+  const [rows, cols] = (/'shape': \((\d+), (\d+)\)/.exec(text) ?? []).slice(1).map(Number);
+  if (!cols) throw new Error("the frame that came isn't one of rows and columns");
   return { rows, cols, codes: new Uint16Array(content, NPY.magic + header, rows * cols) };
 }
 
-let source = null;
-let capture = null; // the one that stands there
-let figures = null;
-/** @type {Raw | null} */
-let raw = null;
+/** @type {Source} */
+let source;
+/** @type {Model<"StoredCapture"> | Model<"RecordedCapture">} */
+let capture; // the one that stands there
+/** @type {Model<"FrameFigures">} */
+let figures;
+/** @type {Raw} */
+let raw;
+let here = false; // whether `raw` is of the frame that stands there
 /** @type {Raw | null} */
 let other = null;
 /** @type {Int32Array | Uint16Array} */
@@ -32,21 +39,25 @@ let values = new Uint16Array(); // what is drawn: the codes, or their difference
 let shown = "";
 let view = { scale: 1, left: 0, top: 0 }; // canvas px a pixel; the frame's place in the corner
 let cross = { row: 0, col: 0 };
+/** @type {Spot | null} */
 let marked = null;
 
 const canvas = $("inspect-canvas");
 const form = $("inspect-form").elements;
 // Of a mosaic, a profile takes the pixels of one channel.
 const step = () => (figures.channels.length > 1 ? 2 : 1);
+/** @param {number} row @param {number} col */
 const at = (row, col) => values[row * raw.cols + col];
+/** @param {number} value @param {number} most */
 const clamp = (value, most) => Math.min(Math.max(Math.round(value), 0), most - 1);
 
 function auto() {
+  /** @type {number[]} */
   const some = [];
   const every = Math.max(1, Math.floor(values.length / 50_000));
   for (let n = 0; n < values.length; n += every) some.push(values[n]);
   some.sort((a, b) => a - b);
-  const part = (share) => some[Math.min(some.length - 1, Math.floor(share * some.length))];
+  const part = (/** @type {number} */ share) => some[Math.min(some.length - 1, Math.floor(share * some.length))];
   const [low, high] = other ? [-1, 1].map((sign) => sign * Math.max(1, Math.abs(part(0.001)), Math.abs(part(0.999)))) : [part(0.001), part(0.999)];
   form.low.value = String(low);
   form.high.value = String(Math.max(high, low + 1));
@@ -58,13 +69,15 @@ function fit() {
   draw();
 }
 
-// Zooms about a place of the canvas, by default about the cross.
+/** Zooms about a place of the canvas, by default about the cross.
+ * @param {number} factor */
 function zoom(factor, x = (cross.col + 0.5 - view.left) * view.scale, y = (cross.row + 0.5 - view.top) * view.scale) {
   const scale = Math.min(Math.max(view.scale * factor, 0.02), 64);
   view = { scale, left: view.left + x / view.scale - x / scale, top: view.top + y / view.scale - y / scale };
   draw();
 }
 
+/** @param {number} value @param {number} low @param {number} high */
 function colourOf(value, low, high) {
   const part = Math.min(Math.max((value - low) / (high - low), 0), 1);
   if (!other) return [255 * part, 255 * part, 255 * part];
@@ -75,7 +88,7 @@ function colourOf(value, low, high) {
 
 function draw() {
   const [low, high] = [Number(form.low.value), Number(form.high.value)];
-  const brush = canvas.getContext("2d");
+  const brush = brushOf(canvas);
   const picture = brush.createImageData(canvas.width, canvas.height);
   const saturation = Math.ceil(figures.saturation_dn);
   const coarse = view.scale < 1 ? step() : 1; // reduced, one channel of the mosaic is seen
@@ -94,15 +107,16 @@ function draw() {
   brush.putImageData(picture, 0, 0);
   brush.strokeStyle = "#e0a400";
   brush.lineWidth = 1;
-  const place = (spot) => [(spot.col + 0.5 - view.left) * view.scale, (spot.row + 0.5 - view.top) * view.scale];
+  const place = (/** @type {Spot} */ spot) => [(spot.col + 0.5 - view.left) * view.scale, (spot.row + 0.5 - view.top) * view.scale];
   const [x, y] = place(cross);
   brush.beginPath();
-  for (const [from, to] of [[[x - 14, y], [x - 4, y]], [[x + 4, y], [x + 14, y]], [[x, y - 14], [x, y - 4]], [[x, y + 4], [x, y + 14]]]) {
-    brush.moveTo(...from);
-    brush.lineTo(...to);
+  for (const [right, down] of [[-1, 0], [1, 0], [0, -1], [0, 1]]) {
+    brush.moveTo(x + 4 * right, y + 4 * down);
+    brush.lineTo(x + 14 * right, y + 14 * down);
   }
   if (marked && form.along.value === "line") {
-    brush.moveTo(...place(marked));
+    const [fromX, fromY] = place(marked);
+    brush.moveTo(fromX, fromY);
     brush.lineTo(x, y);
   }
   brush.stroke();
@@ -127,6 +141,7 @@ function profile() {
     const from = marked ?? { row: 0, col: 0 };
     const [down, right] = [cross.row - from.row, cross.col - from.col];
     const long = Math.max(Math.abs(down), Math.abs(right), 1);
+    /** @param {number} value @param {number} like */
     const same = (value, like) => value - (((value - like) % step()) + step()) % step();
     for (let n = 0; n <= long; n += step()) {
       const [row, col] = [same(Math.round(from.row + (down * n) / long), from.row), same(Math.round(from.col + (right * n) / long), from.col)];
@@ -137,7 +152,7 @@ function profile() {
 }
 
 function drawProfile() {
-  const along = form.along.value;
+  const along = /** @type {"row" | "column" | "line"} */ (form.along.value);
   const points = profile();
   const every = Math.ceil(points.length / 1200);
   const name = { row: `row ${cross.row}`, column: `column ${cross.col}`, line: "the line" }[along];
@@ -151,6 +166,7 @@ function drawProfile() {
 
 // --- pointer and keys -----------------------------------------------------------------------------------------------
 
+/** @param {number} row @param {number} col */
 function crossAt(row, col) {
   cross = { row: clamp(row, raw.rows), col: clamp(col, raw.cols) };
   const [x, y] = [(cross.col + 0.5 - view.left) * view.scale, (cross.row + 0.5 - view.top) * view.scale];
@@ -167,6 +183,7 @@ const mark = () => {
   draw();
 };
 
+/** @type {Record<string, (far: number) => void>} */
 const KEYS = {
   ArrowLeft: (far) => crossAt(cross.row, cross.col - far),
   ArrowRight: (far) => crossAt(cross.row, cross.col + far),
@@ -182,24 +199,27 @@ const KEYS = {
 
 canvas.addEventListener("keydown", (event) => {
   const does = KEYS[event.key];
-  if (!does || !raw || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (!does || !here || event.ctrlKey || event.metaKey || event.altKey) return;
   event.preventDefault();
   does(event.shiftKey ? 10 : 1);
 });
 canvas.addEventListener("wheel", (event) => {
-  if (!raw) return;
+  if (!here) return;
   event.preventDefault();
   const { x, y } = inCanvas(event);
   zoom(event.deltaY < 0 ? 1.25 : 0.8, x, y);
 }, { passive: false });
 
+/** @param {MouseEvent} event */
 const inCanvas = (event) => {
   const box = canvas.getBoundingClientRect();
   return { x: ((event.clientX - box.left) * canvas.width) / box.width, y: ((event.clientY - box.top) * canvas.height) / box.height };
 };
+/** The pointer that is held down: where it was, and where the frame was then.
+ * @type {{x: number, y: number, left: number, top: number, moved: boolean} | null} */
 let held = null;
 canvas.addEventListener("pointerdown", (event) => {
-  if (!raw) return;
+  if (!here) return;
   canvas.setPointerCapture(event.pointerId);
   held = { ...inCanvas(event), left: view.left, top: view.top, moved: false };
 });
@@ -221,14 +241,15 @@ $("inspect-fit").addEventListener("click", () => fit());
 $("inspect-mark").addEventListener("click", mark);
 $("inspect-auto").addEventListener("click", () => (auto(), draw()));
 $("inspect-form").addEventListener("submit", (event) => event.preventDefault());
-for (const name of ["low", "high", "along"]) form[name].addEventListener("change", () => raw && draw());
+for (const field of [form.low, form.high, form.along]) field.addEventListener("change", () => here && draw());
 form.minus.addEventListener("change", told("view-problem", async () => {
   await less(form.minus.value);
   auto();
   draw();
 }));
 
-// Takes another frame away from this one; "" none.
+/** Takes another frame away from this one; "" none.
+ * @param {string} id */
 async function less(id) {
   other = null;
   values = raw.codes;
@@ -241,22 +262,24 @@ async function less(id) {
 
 // --- the view -------------------------------------------------------------------------------------------------------
 
+/** @param {boolean} first @param {Source["kind"]} kind @param {string} id @param {string} number_ */
 async function showFrame(first, kind, id, number_) {
   if (!first && shown === `${kind}/${id}/${number_}`) return; // a frame never changes
   shown = "";
-  raw = null;
+  here = false;
   marked = null;
   source = { kind, id };
-  const here = `/${kind}/${id}/captures/${number_}`;
+  const path = /** @type {const} */ (`/${kind}/${id}/captures/${number_}`);
   $("inspect-title").textContent = "A frame";
   $("inspect-readout").textContent = "The frame is being fetched.";
   $("inspect-back").href = `#/${kind}/${id}/frames`;
-  $("inspect-npy").href = `${api}${here}/frame.npy`;
-  [capture, figures] = await Promise.all([ask(here), ask(`${here}/figures`)]);
+  $("inspect-npy").href = `${api}${path}/frame.npy`;
+  [capture, figures] = await Promise.all([ask(path), ask(`${path}/figures`)]);
   const others = await ask(`/${kind}/${id}/captures?limit=400&order=newest&side=${capture.side}`);
-  const found = await rawOf(`${api}${here}/frame.npy`);
+  const found = await rawOf(`${api}${path}/frame.npy`);
   $("inspect-title").textContent = `${capture.name}, ${capture.side} camera${exposure(capture.exposure_s)}`;
   raw = found;
+  here = true;
   const frames = new Map(others.filter((one) => one.document.frame !== capture.document.frame).map((one) => [one.document.frame, one]));
   const named = new Map([...frames.values()].map((one) => [String(one.id), `${one.name}${exposure(one.exposure_s)}`]));
   options(form.minus, ["", ...named.keys()], (value) => named.get(value) ?? "none");
@@ -274,6 +297,6 @@ async function showFrame(first, kind, id, number_) {
 addView({
   pattern: /^\/(sessions|recordings)\/([0-9A-Za-z-]+)\/frames\/(\d+)$/,
   section: "view-frame",
-  title: (kind, id, number_) => `Frame ${number_} of ${id}`,
+  title: (_kind, id, number_) => `Frame ${number_} of ${id}`,
   show: showFrame,
 });

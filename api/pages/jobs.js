@@ -2,14 +2,21 @@
 
 import { $, Listing, addView, api, ask, element, may, named, post, show, time, told } from "./page.js";
 
+/** @param {{state: string, error?: string | null}} item */
 export function stateCell(item) {
   const cell = element("td", {}, element("span", { className: `state ${item.state}`, textContent: item.state }));
   if (item.error) cell.append(element("div", { className: "reason", textContent: item.error }));
   return cell;
 }
 
+/** @type {Record<string, string[]>} */
 const REPORTS = { report: ["report"], pipeline: ["report", "result"] };
 
+/**
+ * @param {Model<"Job"> & {of: string}} job
+ * @param {keyof Elements} problem
+ * @param {() => unknown} after
+ * @param {...HTMLElement} of */
 function row(job, problem, after, ...of) {
   const actions = element("td");
   const what = `${job.kind} of ${job.of}`;
@@ -25,7 +32,7 @@ function row(job, problem, after, ...of) {
   }
   const state = stateCell(job);
   if (job.state === "running") {
-    const bar = element("progress", { max: 1, value: job.progress, className: "small" });
+    const bar = element("progress", { max: 1, value: job.progress ?? 0, className: "small" });
     bar.setAttribute("aria-label", `progress of ${what}`);
     state.append(" ", bar);
     if (job.message) state.append(element("div", { className: "hint", textContent: job.message }));
@@ -34,12 +41,14 @@ function row(job, problem, after, ...of) {
   return element("tr", {}, kind, ...of, element("td", { className: "when", textContent: time(job.created) }), state, actions);
 }
 
+/** @param {Model<"Job">} job */
 const addressOf = (job) => {
   if (job.challenge_id) return "#/challenges";
   return job.session_id ? `#/sessions/${job.session_id}/jobs` : `#/recordings/${job.recordings_id}/jobs`;
 };
 
 // All jobs, each with what it works on.
+/** @type {Listing<"/jobs", Model<"Job">, Model<"Job"> & {of: string}>} */
 const all = new Listing(
   "jobs",
   "/jobs",
@@ -47,7 +56,10 @@ const all = new Listing(
   (jobs) => jobs.map((job) => ({ ...job, of: nameOf(job) })),
 );
 
-let names = new Map(); // of challenges and sessions, by id
+/** Names of challenges and sessions, by id.
+ * @type {Map<string, string>} */
+let names = new Map();
+/** @param {Model<"Job">} job */
 const nameOf = (job) => {
   if (job.challenge_id) return names.get(job.challenge_id) ?? "a challenge";
   return job.session_id ? (names.get(job.session_id) ?? job.session_id) : `recordings ${job.recordings_id}`;
@@ -64,7 +76,9 @@ addView({
   },
 });
 
-// Those of one source; what `of` is called. Answers the jobs.
+/** Those of one source; what `of` is called. Answers the jobs.
+ * @param {Source} source
+ * @param {string} of */
 export async function showOwnJobs(source, of) {
   const jobs = await ask(`/jobs?limit=50&${source.kind === "sessions" ? "session_id" : "recordings_id"}=${source.id}`);
   show("own-jobs", jobs.map((job) => ({ ...job, of })), (job) => row(job, "session-problem", () => showOwnJobs(source, of)));

@@ -1,8 +1,9 @@
 // Camera models: those of fits and diagnoses, and those that are sent in; fetched, and the sent ones deleted.
 
-import { $, Listing, addView, api, ask, cells, element, may, named, time, told } from "./page.js";
+import { $, Listing, addView, api, cells, element, may, named, remove, time, told } from "./page.js";
 import { takesFiles } from "./send.js";
 
+/** @param {Record<string, {name: string}>} cameras */
 const names = (cameras) => Object.entries(cameras).map(([side, camera]) => `${side} camera ${camera.name}`.trim());
 
 takesFiles("model-drop", "models-problem", {
@@ -11,6 +12,7 @@ takesFiles("model-drop", "models-problem", {
   after: () => list.refresh(),
 });
 
+/** @param {Model<"CameraModels">} one */
 function row(one) {
   const actions = element("td");
   if (one.sides.length) {
@@ -20,7 +22,7 @@ function row(one) {
     const button = named("button", "Delete", `camera model ${one.id}`);
     button.addEventListener("click", told("models-problem", async () => {
       if (!confirm(`Delete camera model ${one.id} for ever?`)) return;
-      await ask(`/camera-models/${one.id}`, { method: "DELETE" });
+      await remove(`/camera-models/${one.id}`);
       await list.refresh();
     }));
     actions.append(button);
@@ -39,6 +41,7 @@ function row(one) {
   return cells(made, "", "Kind", "Of", "Cameras", "Kept");
 }
 
+/** @type {Listing<"/camera-models">} */
 const list = new Listing("models", "/camera-models", row);
 
 addView({

@@ -7,12 +7,13 @@ import "./inspector.js";
 import "./models.js";
 import "./recordings.js";
 import "./source.js";
-import { $, addView, address, ask, element, goTo, halt, may, mayHalt, post, put, query, reach, scopeIs, show, showView, told } from "./page.js";
+import { $, addView, address, ask, element, goTo, halt, may, mayHalt, post, put, query, reach, said, scopeIs, show, showView, told } from "./page.js";
 import { asked as planned, showEstimate, showPlan, take } from "./plan.js";
 import { queueIs, showQueue } from "./queue.js";
 import { leaveStations, placeCards, showStations, stationsAre } from "./stations.js";
 
 const LOOK_MS = 5000;
+const INSIDE = /** @type {const} */ (["desk", "logout", "nav", "strip-bar", "skip"]); // what is there for who has logged in
 const form = $("start-form");
 
 // --- log in ---------------------------------------------------------------------------------------------------------
@@ -22,7 +23,7 @@ document.addEventListener("logged-out", () => showLogin());
 function showLogin() {
   leaveStations();
   $("login").hidden = false;
-  for (const id of ["desk", "logout", "halt", "nav", "strip-bar", "skip"]) $(id).hidden = true;
+  for (const id of [...INSIDE, /** @type {const} */ ("halt")]) $(id).hidden = true;
   $("who").textContent = $("halt-told").textContent = "";
   $("login-form").elements.key.focus();
 }
@@ -32,27 +33,28 @@ async function enter() {
   scopeIs(me.scope);
   $("who").textContent = `${me.name} (${me.scope})`;
   $("login").hidden = true;
-  for (const id of ["desk", "logout", "nav", "strip-bar", "skip"]) $(id).hidden = false;
+  for (const id of INSIDE) $(id).hidden = false;
   $("halt").hidden = !mayHalt();
   $("then").hidden = !may("admin");
   stationsAre(() => refresh().catch(() => {}));
   queueIs(refresh);
   await look();
   await showView(true);
+  heading()?.focus();
 }
 
 $("login-form").addEventListener("submit", async (event) => {
   event.preventDefault();
-  const problem = event.target.querySelector(".problem");
+  const problem = $("login-problem");
   problem.textContent = "";
-  const body = JSON.stringify({ key: event.target.elements.key.value });
-  event.target.reset();
+  const body = JSON.stringify({ key: $("login-form").elements.key.value });
+  $("login-form").reset();
   try {
     const response = await reach("/login", { method: "POST", headers: { "Content-Type": "application/json" }, body });
     if (response.ok) await enter();
     else problem.textContent = (await response.json()).detail;
   } catch (error) {
-    problem.textContent = error.message;
+    problem.textContent = said(error);
   }
 });
 
@@ -78,6 +80,8 @@ document.addEventListener("keydown", (event) => {
 // What stands below the head: a dialog, and a heading that is gone to.
 new ResizeObserver(([{ borderBoxSize }]) => document.body.style.setProperty("--head", `${borderBoxSize[0].blockSize}px`)).observe($("head"));
 
+/** When the connection was lost.
+ * @type {Date | null} */
 let lostAt = null;
 document.addEventListener("connection", (event) => {
   lostAt = event.detail ? null : (lostAt ?? new Date());
@@ -87,10 +91,13 @@ document.addEventListener("connection", (event) => {
   if ($("lost").textContent !== words) $("lost").textContent = words;
 });
 
+/** @typedef {Model<"StationState">} Station */
+
 // --- starting -------------------------------------------------------------------------------------------------------
 
+/** @type {Station[]} */
 let stations = [];
-let editing = null; // the session in the queue whose request is edited
+let editing = ""; // the session in the queue whose request is edited
 
 function showStart() {
   const usable = stations.filter((s) => !s.problem);
@@ -107,15 +114,20 @@ function showStart() {
   form.hidden = usable.length === 0 || !may("operate");
   const chosen = usable.find((s) => s.name === select.value);
   showStartButton(chosen);
-  return showPlan(chosen, form.elements.quick.checked).catch((error) => ($("plan-problem").textContent = error.message));
+  return showPlan(chosen, form.elements.quick.checked).catch((error) => ($("plan-problem").textContent = said(error)));
 }
 
+/** What follows a session, as the form has it.
+ * @typedef {NonNullable<NonNullable<Taken<"post", "/sessions">>["then"]>} Following */
+/** @param {typeof form.elements} fields
+ * @returns {Following | null} */
 const thenOf = (fields) =>
   fields.then.value || fields.webhook.value || fields.compare.checked
-    ? { kind: fields.then.value || null, resolve: fields.resolve.checked, compare: fields.compare.checked, webhook: fields.webhook.value || null }
+    ? { kind: /** @type {Following["kind"]} */ (fields.then.value || null), resolve: fields.resolve.checked, compare: fields.compare.checked, webhook: fields.webhook.value || null }
     : null;
 
-// A station that is busy, or a time, makes it a place in the queue.
+/** A station that is busy, or a time, makes it a place in the queue.
+ * @param {Station | undefined} station */
 function showStartButton(station) {
   const fields = form.elements;
   const waits = station?.busy_with || fields.not_before.value;
@@ -147,25 +159,26 @@ form.addEventListener("submit", told("live-problem", async () => {
 }));
 
 function leaveEdit() {
-  editing = null;
+  editing = "";
   goTo("/");
 }
 $("start-cancel").addEventListener("click", leaveEdit);
 
-// What an earlier session was asked with, into the form: to be edited in the queue, or copied.
+/** What an earlier session was asked with, into the form: to be edited in the queue, or copied.
+ * @param {string} id @param {boolean} edit */
 async function fill(id, edit) {
   const wanted = await ask(`/sessions/${id}/request`);
   const fields = form.elements;
   fields.station.value = wanted.station;
-  for (const key of ["name", "notes"]) fields[key].value = wanted[key];
+  for (const key of /** @type {const} */ (["name", "notes"])) fields[key].value = wanted[key];
   fields.quick.checked = wanted.quick;
   fields.certified.checked = wanted.demands_certified;
   fields.then.value = wanted.then?.kind ?? "";
-  for (const key of ["resolve", "compare"]) fields[key].checked = wanted.then?.[key] ?? false;
+  for (const key of /** @type {const} */ (["resolve", "compare"])) fields[key].checked = wanted.then?.[key] ?? false;
   fields.webhook.value = wanted.then?.webhook ?? "";
-  const local = wanted.not_before && edit ? new Date(new Date(wanted.not_before) - new Date().getTimezoneOffset() * 60_000) : null;
+  const local = wanted.not_before && edit ? new Date(Date.parse(wanted.not_before) - new Date().getTimezoneOffset() * 60_000) : null;
   fields.not_before.value = local ? local.toISOString().slice(0, 16) : "";
-  editing = edit ? id : null;
+  editing = edit ? id : "";
   await showStart();
   take(wanted);
   await showEstimate(wanted.station, wanted.quick);
@@ -182,8 +195,9 @@ addView({
     await Promise.all([showQueue(), showStart()]);
     if (!first) return;
     const [copied, edited] = [query().get("copy"), query().get("edit")];
-    if (copied || edited) await fill(copied ?? edited, Boolean(edited));
-    else editing = null;
+    const source = copied ?? edited;
+    if (source) await fill(source, Boolean(edited));
+    else editing = "";
     showStartButton(stations.find((s) => s.name === form.elements.station.value));
   },
 });
@@ -203,6 +217,10 @@ async function refresh() {
   await showView();
 }
 
+/** The heading of the view that stands there.
+ * @returns {HTMLElement | null} */
+const heading = () => document.querySelector("section.view:not([hidden]) h2");
+
 // A view that is gone to has the focus at its heading; of the parts of a session, the focus stays on their names.
 window.addEventListener("hashchange", async () => {
   if ($("desk").hidden) return;
@@ -210,15 +228,32 @@ window.addEventListener("hashchange", async () => {
   const filled = showView(true);
   if (!inTabs) {
     scrollTo(0, 0);
-    document.querySelector("section.view:not([hidden]) h2").focus({ preventScroll: true });
+    heading()?.focus({ preventScroll: true });
   }
   await filled;
-  if (inTabs) document.querySelector("#session-tabs [aria-current]")?.focus();
+  /** @type {HTMLElement | null} */
+  const tab = document.querySelector("#session-tabs [aria-current]");
+  if (inTabs) tab?.focus();
 });
 $("skip").addEventListener("click", (event) => {
   event.preventDefault();
-  document.querySelector("section.view:not([hidden]) h2")?.focus();
+  heading()?.focus();
 });
+
+// What had the focus, innermost first: a button that is disabled, hidden or gone hands it to the nearest heading.
+/** @type {HTMLElement[]} */
+let held = [];
+document.addEventListener("focusin", (event) => (held = event.composedPath().filter((one) => one instanceof HTMLElement)));
+new MutationObserver(() => {
+  const [last, ...around] = held;
+  if (!last || ![last, document.body].includes(/** @type {HTMLElement} */ (document.activeElement))) return;
+  if (last.isConnected && last.checkVisibility() && !last.matches(":disabled")) return;
+  const near = around.filter((one) => one.isConnected).map((one) => [...one.querySelectorAll("h2, h3")].find((title) => title.checkVisibility()));
+  const title = /** @type {HTMLElement | undefined} */ (near.find(Boolean));
+  if (!title) return;
+  title.tabIndex = -1;
+  title.focus({ preventScroll: true });
+}).observe($("desk"), { subtree: true, childList: true, attributeFilter: ["disabled", "hidden", "open"] });
 
 // What runs tells of itself through its events; the rest is looked at now and then, and not where nobody sees it.
 setInterval(() => document.hidden || refresh().catch(() => {}), LOOK_MS);

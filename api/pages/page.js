@@ -1,21 +1,34 @@
 // What the modules of the operator's page share: requests, elements, lists that change only where their content does.
 
-export const $ = (id) => document.getElementById(id);
+/** The element of an id that the page has.
+ * @template {keyof Elements} Id
+ * @param {Id} id */
+export const $ = (id) => /** @type {Elements[Id]} */ (document.getElementById(id));
 export const api = "/api/v1";
 
 export const LIVE = ["connecting", "running", "pausing", "paused", "packing"];
 
 export class Problem extends Error {}
 
+/** What an error says.
+ * @param {unknown} error */
+export const said = (error) => (error instanceof Error ? error.message : String(error));
+
 // What a key allows, as the service decides it: `wanted` is "operate", "calibrate" or "admin"; anything but reading allows a halt.
+/** @type {Scope} */
 let scope = "read";
+/** @param {Scope} mine */
 export const scopeIs = (mine) => (scope = mine);
+/** @param {Scope} wanted */
 export const may = (wanted) => scope === "admin" || scope === wanted;
 export const mayHalt = () => scope !== "read";
 
 const ANSWER_MS = 20_000;
 
-// Every answer, and every one that didn't come, tells whether the service can be reached: the event "connection", with `detail` true or false.
+/** Asks; every answer, and every one that didn't come, tells whether the service can be reached: the event "connection", with `detail`
+ * true or false.
+ * @param {string} path
+ * @param {RequestInit} options */
 export async function reach(path, options = {}, patience = ANSWER_MS) {
   try {
     const response = await fetch(path, { signal: AbortSignal.timeout(patience), ...options });
@@ -27,18 +40,25 @@ export async function reach(path, options = {}, patience = ANSWER_MS) {
   }
 }
 
-export async function ask(path, options = {}, patience = ANSWER_MS) {
-  return (await asked(path, options, patience)).body;
-}
+/** @type {Get} */
+export const ask = async (path) => (await asked(path)).body;
 
-// A page of a list, and how many items there are on all pages.
+/** A page of a list, and how many items there are on all pages.
+ * @template {string} const Path
+ * @param {Known<"get", Path>} path
+ * @returns {Promise<{items: Answer<"get", Path>, total: number}>} */
 export async function page(path) {
   const { body, response } = await asked(path);
   return { items: body, total: Number(response.headers.get("X-Total-Count")) };
 }
 
+/**
+ * @param {string} path
+ * @param {RequestInit} options
+ * @returns {Promise<{body: any, response: Response}>} */
 async function asked(path, options = {}, patience = ANSWER_MS) {
-  const headers = options.body ? { "Content-Type": "application/json" } : {};
+  /** @type {HeadersInit | undefined} */
+  const headers = options.body ? { "Content-Type": "application/json" } : undefined;
   const response = await reach(api + path, { headers, ...options }, patience);
   if (response.status === 401) {
     document.dispatchEvent(new Event("logged-out"));
@@ -49,80 +69,130 @@ async function asked(path, options = {}, patience = ANSWER_MS) {
   return { body, response };
 }
 
-export const post = (path, body) => ask(path, { method: "POST", body: body === undefined ? undefined : JSON.stringify(body) });
+/**
+ * @template {string} Method
+ * @param {Method} method
+ * @returns {Send<Method>} */
+const sends = (method, patience = ANSWER_MS) => async (path, ...body) =>
+  (await asked(path, { method: method.toUpperCase(), body: JSON.stringify(body[0]) }, patience)).body;
 
-export const change = (path, body) => ask(path, { method: "PATCH", body: JSON.stringify(body) });
+export const post = sends("post");
+export const change = sends("patch");
+export const put = sends("put");
+/** @type {Delete} */
+export const remove = async (path) => (await asked(path, { method: "DELETE" })).body;
 
-export const put = (path, body) => ask(path, { method: "PUT", body: JSON.stringify(body) });
-
+/** An element with properties and children.
+ * @template {keyof HTMLElementTagNameMap} Tag
+ * @param {Tag} tag
+ * @param {Partial<HTMLElementTagNameMap[Tag]>} properties
+ * @param {...(Node | string)} children
+ * @returns {HTMLElementTagNameMap[Tag]} */
 export function element(tag, properties = {}, ...children) {
   const made = Object.assign(document.createElement(tag), properties);
   made.append(...children);
   return made;
 }
 
-// Replaces the rows only where something changed, so that a button doesn't vanish under the pointer. The keyboard's focus stays on
-// what it was on: the same link or button of the row of the same id.
+/** Ids of the items that rows show.
+ * @type {WeakMap<Element, unknown>} */
+const itemIds = new WeakMap();
+
+/** Replaces the rows only where something changed, so that a button doesn't vanish under the pointer. The keyboard's focus stays on
+ * what it was on: the same link or button of the row of the same id.
+ * @template Item
+ * @param {keyof Elements} place
+ * @param {Item[]} items
+ * @param {(item: Item) => HTMLElement} row */
 export function show(place, items, row) {
+  /** @type {HTMLElement} */
   const list = $(place);
   const text = JSON.stringify(items);
   if (list.dataset.shown === text) return;
   list.dataset.shown = text;
   const held = [...list.children].find((one) => one.contains(document.activeElement));
   const label = document.activeElement?.textContent;
-  list.replaceChildren(...items.map((item) => Object.assign(row(item), { itemId: item.id })));
+  const rows = items.map((item) => {
+    const made = row(item);
+    itemIds.set(made, /** @type {{id?: unknown}} */ (item).id);
+    return made;
+  });
+  list.replaceChildren(...rows);
   if (!held) return;
-  const again = [...list.children].find((one) => one.itemId === held.itemId);
-  [...(again?.querySelectorAll("a, button") ?? [])].find((one) => one.textContent === label)?.focus();
+  const again = rows.find((one) => itemIds.get(one) === itemIds.get(held));
+  /** @type {NodeListOf<HTMLElement> | undefined} */
+  const reached = again?.querySelectorAll("a, button");
+  [...(reached ?? [])].find((one) => one.textContent === label)?.focus();
 }
 
+/** @param {number} seconds */
 export function duration(seconds) {
   const s = Math.round(seconds);
   if (s < 90) return `${s} s`;
   return s < 5400 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`;
 }
 
+/** @param {string | null | undefined} text */
 export const time = (text) => (text ? text.replace("T", " ").slice(0, 19) : "");
 
-// A button's or form's action: what goes wrong stands in `place`, an element or the id of one.
+/** A button's or form's action: what goes wrong stands in `place`, an element or the id of one.
+ * @template {Event} E
+ * @param {keyof Elements | HTMLElement} place
+ * @param {(event: E) => unknown} action
+ * @returns {(event: E) => Promise<void>} */
 export const told = (place, action) => async (event) => {
-  event?.preventDefault();
+  event.preventDefault();
+  /** @type {HTMLElement} */
   const problem = typeof place === "string" ? $(place) : place;
   problem.textContent = "";
   try {
     await action(event);
   } catch (error) {
-    problem.textContent = error.message;
+    problem.textContent = said(error);
   }
 };
 
-// The options of a select, with what was chosen kept where it is still there.
-export function options(select, values, text = (value) => value) {
+/** The options of a select, with what was chosen kept where it is still there.
+ * @param {HTMLSelectElement} select
+ * @param {string[]} values */
+export function options(select, values, text = (/** @type {string} */ value) => value) {
   const kept = select.value;
   if (JSON.stringify(values) === JSON.stringify([...select.options].map((one) => one.value))) return;
   select.replaceChildren(...values.map((value) => element("option", { value, textContent: text(value) })));
   if (values.includes(kept)) select.value = kept;
 }
 
-// A button or a link whose name says what it is for, as `Delete nightly`.
+/** A button or a link whose name says what it is for, as `Delete nightly`.
+ * @template {"a" | "button"} Tag
+ * @param {Tag} tag
+ * @param {string} label
+ * @param {string} of
+ * @param {Partial<HTMLElementTagNameMap[Tag]>} properties
+ * @returns {HTMLElementTagNameMap[Tag]} */
 export function named(tag, label, of, properties = {}) {
-  const made = element(tag, { textContent: label, ...properties });
+  const made = element(tag, properties, label);
   made.setAttribute("aria-label", `${label} ${of}`);
   return made;
 }
 
-// Cells whose names stand beside them where a narrow window shows rows as blocks.
+/** Cells whose names stand beside them where a narrow window shows rows as blocks.
+ * @param {HTMLTableRowElement} row
+ * @param {...string} labels */
 export function cells(row, ...labels) {
-  [...row.children].forEach((cell, at) => labels[at] && (cell.dataset.label = labels[at]));
+  [...row.cells].forEach((cell, at) => labels[at] && (cell.dataset.label = labels[at]));
   return row;
 }
+
+/** The brush of a canvas.
+ * @param {HTMLCanvasElement} canvas */
+export const brushOf = (canvas) => /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
 
 // --- views ----------------------------------------------------------------------------------------------------------
 
 /**
  * A view: the section that it shows, its title, and what fills it; `first` where it was gone to just now.
- * @typedef {{pattern: RegExp, section: string, title: (...parts: string[]) => string,
- *   show: (first: boolean, ...parts: string[]) => unknown}} View
+ * @typedef {{pattern: RegExp, section: keyof Elements, title: (...parts: any[]) => string,
+ *   show: (first: boolean, ...parts: any[]) => unknown}} View
  */
 /** @type {View[]} */
 const views = [];
@@ -133,19 +203,24 @@ let current = { view: undefined, parts: [] };
 export const addView = (view) => views.push(view);
 
 export const address = () => decodeURI(location.hash.replace(/^#/, "") || "/");
+/** @param {string} path */
 export const goTo = (path) => (location.hash = `#${encodeURI(path)}`);
 
 // Shows what stands at the page's address, and asks anew what it shows.
 export async function showView(first = false) {
   const path = address().replace(/\?.*$/, "");
   const view = views.find((one) => one.pattern.test(path));
-  const parts = view ? view.pattern.exec(path).slice(1) : [];
+  const parts = view?.pattern.exec(path)?.slice(1) ?? [];
   const section = view?.section ?? "view-none";
   if (first) {
     current = { view, parts };
-    for (const one of document.querySelectorAll("section.view")) one.hidden = one.id !== section;
+    /** @type {NodeListOf<HTMLElement>} */
+    const sections = document.querySelectorAll("section.view");
+    for (const one of sections) one.hidden = one.id !== section;
     document.title = `${view?.title(...parts) ?? "No such view"} · calibench`;
-    for (const link of document.querySelectorAll("#nav a")) {
+    /** @type {NodeListOf<HTMLAnchorElement>} */
+    const links = document.querySelectorAll("#nav a");
+    for (const link of links) {
       const at = decodeURI(link.hash.slice(1));
       const here = at === "/" ? path === "/" : path.startsWith(at) || (at === "/calibrations" && path.startsWith("/calibration"));
       if (here) link.setAttribute("aria-current", "page");
@@ -158,7 +233,7 @@ export async function showView(first = false) {
     await view.show(first, ...parts);
     $("view-problem").textContent = "";
   } catch (error) {
-    if (current.view === view) $("view-problem").textContent = error.message;
+    if (current.view === view) $("view-problem").textContent = said(error);
   }
 }
 
@@ -169,26 +244,46 @@ export const query = () => new URLSearchParams(address().split("?")[1] ?? "");
 
 const PAGE = 50;
 
-// A list in pages. Its table's body is `id`; `no-ID`, `more-ID` and `count-ID` stand where there is none, ask for the next page, and say how many.
+/** @typedef {"sessions" | "jobs" | "recordings" | "calibrations" | "models"} ListId */
+
+/** A list in pages. Its table's body is `id`; `no-ID`, `more-ID` and `count-ID` stand where there is none, ask for the next page, and say how many.
+ * @template {string} Path
+ * @template {{id: string}} [Item=Answer<"get", Path> extends (infer One extends {id: string})[] ? One : never]
+ * @template [Shown=Item] */
 export class Listing {
-  /** @param {string} id @param {string} path @param {(item: any) => HTMLElement} row @param {(items: any[]) => any[]} [shown] */
-  constructor(id, path, row, shown = (items) => items) {
-    Object.assign(this, { id, path, row, shown, items: [], asked: "", total: 0 });
-    $(`more-${id}`)?.addEventListener("click", told("view-problem", () => this.more()));
+  /** @type {Item[]} */
+  items = [];
+  asked = "";
+  total = 0;
+
+  /** `shown`: what the rows show of the items.
+   * @param {ListId} id @param {Known<"get", Path>} path @param {(one: Shown) => HTMLElement} row @param {(items: Item[]) => Shown[]} shown */
+  constructor(id, path, row, shown = (items) => /** @type {any[]} */ (items)) {
+    this.id = id;
+    this.path = path;
+    this.row = row;
+    this.shown = shown;
+    $(`more-${id}`).addEventListener("click", told("view-problem", () => this.more()));
   }
 
-  #address(after) {
+  #address(after = "") {
     const asked = new URLSearchParams(this.asked);
     asked.set("limit", String(PAGE));
     if (after) asked.set("after", after);
     return `${this.path}?${asked}`;
   }
 
+  /** @returns {Promise<{items: Item[], total: number}>} */
+  async #page(after = "") {
+    const { body, response } = await asked(this.#address(after));
+    return { items: body, total: Number(response.headers.get("X-Total-Count")) };
+  }
+
   // The first page anew; older ones that were asked for stay.
   async refresh(asked = this.asked) {
     if (asked !== this.asked) this.items = [];
     this.asked = asked;
-    const { items, total } = await page(this.#address());
+    const { items, total } = await this.#page();
     if (asked !== this.asked) return;
     const last = this.items.findIndex((one) => one.id === items.at(-1)?.id);
     this.items = [...items, ...(items.length < PAGE || last < 0 ? [] : this.items.slice(last + 1))];
@@ -197,7 +292,7 @@ export class Listing {
   }
 
   async more() {
-    const { items, total } = await page(this.#address(this.items.at(-1).id));
+    const { items, total } = await this.#page(this.items.at(-1)?.id);
     this.items = [...this.items, ...items];
     this.total = total;
     this.draw();
@@ -211,16 +306,24 @@ export class Listing {
   }
 }
 
+/** @param {string} text */
 export const clock = (text) => `${time(text).slice(11)} UTC`;
 
 // A halt's answer has to come within this time (ms), or somebody goes to the bench.
 const HALT_MS = 2000;
 
-// The halts that are told, by their places: which station (null: all), and when each had answered last before.
+/** A station whose instruments tell whether light may get out.
+ * @typedef {{name: string, safety: Safety}} Told */
+/** The halts that are told, by their places: which station (null: all), and when each had answered last before.
+ * @type {Map<HTMLElement, {station: string | null, before: Map<string, string | undefined>}>} */
 const halts = new Map();
+/** @type {Model<"StationState">[]} */
 let latest = [];
 
-// Says in `place` what the stations' instruments have answered: NOT CONFIRMED for as long as one hasn't, and no longer.
+/** Says in `place` what the stations' instruments have answered: NOT CONFIRMED for as long as one hasn't, and no longer.
+ * @param {HTMLElement} place
+ * @param {Told[]} stations
+ * @param {string} fallback */
 function sayHalt(place, stations, fallback) {
   const open = stations.filter((one) => one.safety.shutter === "unknown");
   const shut = stations.filter((one) => one.safety.shutter === "closed");
@@ -231,30 +334,38 @@ function sayHalt(place, stations, fallback) {
   if (place.textContent !== text) place.textContent = text;
 }
 
+/** @param {HTMLElement} place */
 export const forgetHalt = (place) => {
   halts.delete(place);
   place.textContent = "";
 };
 
-// Tells every halt anew by what the stations' cards show. A station that hasn't answered since the halt says nothing of it.
+/** Tells every halt anew by what the stations' cards show. A station that hasn't answered since the halt says nothing of it.
+ * @param {Model<"StationState">[]} stations */
 export function tellHalts(stations) {
   latest = stations;
   for (const [place, { station, before }] of halts) {
-    const answered = stations.filter((one) => one.safety && (!station || one.name === station) && one.safety.at !== before.get(one.name));
+    const answered = stations.flatMap(({ name, safety }) =>
+      safety && (!station || name === station) && safety.at !== before.get(name) ? [{ name, safety }] : [],
+    );
     if (answered.length) sayHalt(place, answered, "");
   }
 }
 
-// Halts a station, or all where none is named, and says beside the button in `place` what came of it.
+const haltNow = sends("post", HALT_MS);
+
+/** Halts a station, or all where none is named, and says beside the button in `place` what came of it.
+ * @param {HTMLElement} place
+ * @param {string | null} station */
 export async function halt(place, station = null) {
   place.className = "halted";
   place.textContent = "halting …";
   halts.set(place, { station, before: new Map(latest.map((one) => [one.name, one.safety?.at])) });
   try {
-    const found = await ask("/halt", { method: "POST", body: JSON.stringify({ station }) }, HALT_MS);
+    const found = await haltNow("/halt", { station });
     sayHalt(place, found.stations, "halted; no station here has a shutter");
   } catch (error) {
     place.classList.add("unsafe");
-    place.textContent = `NOT CONFIRMED: go to the bench (${error.message})`;
+    place.textContent = `NOT CONFIRMED: go to the bench (${said(error)})`;
   }
 }

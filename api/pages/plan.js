@@ -1,15 +1,27 @@
 // What a session will take: the sequences of a station with their parameters, and the service's estimate of captures and time.
 
-import { $, ask, duration, element, post } from "./page.js";
+import { $, ask, duration, element, post, said } from "./page.js";
 
+/** @typedef {Model<"SequenceParameter">} Parameter */
+/** A sequence's parts: the box that takes it, what it takes, its fields, and the row that they stand in.
+ * @typedef {{taken: HTMLInputElement, takes: HTMLElement, fields: ReturnType<typeof parameterField>[], whole: HTMLElement}} Part */
+/** @typedef {NonNullable<Taken<"post", "/sessions">>} Asked */
+
+/** @type {Model<"SequenceDescription">[] | null} */
 let catalogue = null;
 let shown = ""; // the station and the mode whose sequences stand there
 let latest = 0; // the newest question: an answer to an older one comes too late
-const rows = new Map(); // sequence -> its parts
+/** Parts of each sequence.
+ * @type {Map<Sequence, Part>} */
+const rows = new Map();
 
+/** @typedef {NonNullable<Asked["sequences"]>[number]} Sequence */
+/** @param {number} seconds @param {boolean} learned */
 const about = (seconds, learned) => `${learned ? "about" : "perhaps"} ${duration(seconds)}`;
+/** @param {number | number[] | null | undefined} value */
 const text = (value) => (value == null ? "not set" : [value].flat().map((one) => Number(one.toPrecision(6))).join(", "));
 
+/** @param {Parameter} parameter */
 function parameterField(parameter) {
   const { name, unit, meaning, lower, upper, several } = parameter;
   const bounds = [lower, upper].map((bound) => bound ?? "").join(" … ");
@@ -17,20 +29,22 @@ function parameterField(parameter) {
   return { field, parameter, label: element("label", {}, element("span", { textContent: `${meaning}${unit === "1" ? "" : `, ${unit}`}`, title: name }), field) };
 }
 
+/** @param {Model<"SequenceDescription">} sequence @param {() => unknown} changed
+ * @returns {Part} */
 function row(sequence, changed) {
   const taken = element("input", { type: "checkbox", checked: true });
   const takes = element("span", { className: "hint" });
   const fields = sequence.parameters.map(parameterField);
-  const part = { taken, takes, fields };
   for (const field of [taken, ...fields.map((one) => one.field)]) field.addEventListener("change", changed);
   const details = element("details", {}, element("summary", { textContent: `${sequence.purpose}` }), element("div", { className: "fields" }, ...fields.map((one) => one.label)));
-  part.whole = element("li", {}, element("label", { className: "check" }, taken, element("strong", { textContent: sequence.name })), takes, details);
-  return part;
+  const whole = element("li", {}, element("label", { className: "check" }, taken, element("strong", { textContent: sequence.name })), takes, details);
+  return { taken, takes, fields, whole };
 }
 
 // What `POST /sessions` takes of the plan.
 export function asked() {
   const chosen = [...rows].filter(([, part]) => part.taken.checked);
+  /** @type {Record<string, Record<string, number | number[]>>} */
   const parameters = {};
   for (const [name, part] of chosen) {
     for (const { field, parameter } of part.fields) {
@@ -42,7 +56,8 @@ export function asked() {
   return { sequences: rows.size && chosen.length < rows.size ? chosen.map(([name]) => name) : null, parameters };
 }
 
-// What an earlier plan took, into the fields that stand there now.
+/** What an earlier plan took, into the fields that stand there now.
+ * @param {Pick<Answer<"get", "/sessions/{id}/request">, "sequences" | "parameters">} of */
 export function take({ sequences, parameters }) {
   for (const [name, part] of rows) {
     part.taken.checked = !sequences || sequences.includes(name);
@@ -50,6 +65,7 @@ export function take({ sequences, parameters }) {
   }
 }
 
+/** @param {string} station @param {boolean} quick */
 export async function showEstimate(station, quick) {
   const number = ++latest;
   const wanted = asked();
@@ -64,7 +80,7 @@ export async function showEstimate(station, quick) {
   } catch (error) {
     if (number !== latest) return;
     $("plan-words").textContent = "Sequences";
-    $("plan-problem").textContent = error.message;
+    $("plan-problem").textContent = said(error);
     return;
   }
   if (number !== latest) return;
@@ -80,7 +96,8 @@ export async function showEstimate(station, quick) {
   }
 }
 
-// The plan of a station, as `quick` or not; drawn anew only where one of them changed.
+/** The plan of a station, as `quick` or not; drawn anew only where one of them changed.
+ * @param {Model<"StationState"> | undefined} station @param {boolean} quick */
 export async function showPlan(station, quick) {
   $("plan").hidden = !station;
   const wanted = station ? JSON.stringify([station.name, station.sequences]) : "";
@@ -92,7 +109,7 @@ export async function showPlan(station, quick) {
   if (!same) {
     rows.clear();
     const changed = () => showEstimate(station.name, $("start-form").elements.quick.checked);
-    for (const one of catalogue.filter((known) => station.sequences.includes(known.name))) rows.set(one.name, row(one, changed));
+    for (const one of catalogue.filter((known) => station.sequences.includes(/** @type {Sequence} */ (known.name)))) rows.set(/** @type {Sequence} */ (one.name), row(one, changed));
     $("plan-rows").replaceChildren(...[...rows.values()].map((part) => part.whole));
   }
   await showEstimate(station.name, quick);

@@ -1,13 +1,17 @@
 // The queue: who waits, in which order, and what is held.
 
-import { $, ask, cells, element, may, put, show, time, told } from "./page.js";
+import { $, ask, cells, element, may, put, remove, show, time, told } from "./page.js";
 
+/** @type {() => void} */
 let after = () => {};
 
+/** @param {() => unknown} changed */
 export const queueIs = (changed) => (after = changed);
 
+/** @param {Model<"QueueEntry"> & {last: boolean}} one */
 function row(one) {
   const actions = element("td");
+  /** @type {(label: string, says: string, action: () => Promise<unknown>, disabled?: boolean) => void} */
   const does = (label, says, action, disabled = false) => {
     if (!may("operate")) return;
     const button = element("button", { textContent: label, disabled });
@@ -15,6 +19,7 @@ function row(one) {
     button.addEventListener("click", told("queue-problem", async () => (await action(), after())));
     actions.append(button, " ");
   };
+  /** @param {Partial<Model<"QueuePlace">>} change */
   const again = (change) => put(`/sessions/${one.id}/queue`, { not_before: one.not_before, ...change });
   if (one.held) does("Release", "Release", () => again({}));
   does("Earlier", "Move forward", () => again({ place: one.place - 1 }), one.place === 1 || Boolean(one.held));
@@ -24,7 +29,7 @@ function row(one) {
     link.setAttribute("aria-label", `${label} ${one.name || one.id}`);
     actions.append(link, " ");
   }
-  does("Remove", "Take out of the queue", () => ask(`/sessions/${one.id}/queue`, { method: "DELETE" }));
+  does("Remove", "Take out of the queue", () => remove(`/sessions/${one.id}/queue`));
   const state = element("td", {}, element("span", { className: one.held ? "state held" : "state", textContent: one.held ? "held" : "waits" }));
   if (one.held) state.append(element("div", { className: "reason", textContent: one.held }));
   const expected = one.expected_start ? `expected ${time(one.expected_start).slice(5, 16)} to ${time(one.expected_end).slice(11, 16)}` : "";

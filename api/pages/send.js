@@ -1,8 +1,12 @@
 // Places where archives are dropped or chosen, and sent to the service one after the other.
 
-import { $, Problem, api, told } from "./page.js";
+import { $, Problem, api, said, told } from "./page.js";
 
-// fetch() tells nothing of how far a body was sent.
+/** Sends a file; fetch() tells nothing of how far a body was sent.
+ * @param {File} file
+ * @param {string} path
+ * @param {(part: number) => void} tell
+ * @returns {Promise<any>} */
 function send(file, path, tell) {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();
@@ -19,13 +23,20 @@ function send(file, path, tell) {
   });
 }
 
-// `id`: of the place; its file chooser, progress bar and line have `-file`, `-bar` and `-told` after it. `path()`: where archives are sent;
-// `words(made)`: what is told of one that was taken in; `after()`: shows the list anew. What goes wrong stands in `problem`.
+/** Takes the files that are dropped on a place or chosen there.
+ * `id`: of the place; its file chooser, progress bar and line have `-file`, `-bar` and `-told` after it. `path()`: where archives are sent;
+ * `words(made)`: what is told of one that was taken in; `after()`: shows the list anew. What goes wrong stands in `problem`.
+ * @template Made
+ * @param {"drop" | "model-drop"} id
+ * @param {keyof Elements} problem
+ * @param {{path: () => string, words: (made: Made) => string, after: () => unknown}} of */
 export function takesFiles(id, problem, { path, words, after }) {
+  /** @type {HTMLElement} */
   const zone = $(id);
   const bar = $(`${id}-bar`);
   const line = $(`${id}-told`);
 
+  /** @param {File[]} files */
   async function sendAll(files) {
     const problems = [];
     line.textContent = "";
@@ -40,7 +51,7 @@ export function takesFiles(id, problem, { path, words, after }) {
         line.textContent = words(made);
       } catch (error) {
         line.textContent = "";
-        problems.push(error.message);
+        problems.push(said(error));
       }
     }
     bar.hidden = true;
@@ -54,14 +65,15 @@ export function takesFiles(id, problem, { path, words, after }) {
       zone.classList.toggle("over", name === "dragover");
     });
   }
-  zone.addEventListener("drop", told(problem, (event) => {
-    const entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry?.());
+  zone.addEventListener("drop", told(problem, (/** @type {DragEvent} */ event) => {
+    const entries = [...(event.dataTransfer?.items ?? [])].map((item) => item.webkitGetAsEntry?.());
     if (entries.some((entry) => entry?.isDirectory)) throw new Problem("pack the folder as a .zip or .tar and drop that");
-    return sendAll([...event.dataTransfer.files]);
+    return sendAll([...(event.dataTransfer?.files ?? [])]);
   }));
-  $(`${id}-file`).addEventListener("change", told(problem, async (event) => {
-    const files = [...event.target.files];
-    event.target.value = "";
+  const chooser = $(`${id}-file`);
+  chooser.addEventListener("change", told(problem, async () => {
+    const files = [...(chooser.files ?? [])];
+    chooser.value = "";
     await sendAll(files);
   }));
 }

@@ -3,22 +3,30 @@
 import { stateCell } from "./jobs.js";
 import { $, Listing, addView, address, api, ask, cells, element, goTo, may, named, post, put, query, time, told } from "./page.js";
 
+/** @param {number} value */
 const number = (value, digits = 3) => Number(value.toPrecision(digits)).toString();
-// One figure of both cameras; the camera is named where there are two.
+/** One figure of both cameras; the camera is named where there are two.
+ * @param {Record<string, number>} of */
 const bySide = (of) => {
   const sides = Object.entries(of);
   return sides.map(([side, value]) => (sides.length > 1 ? `${side[0].toUpperCase()} ${number(value)}` : number(value))).join(" · ");
 };
+/** @param {string | null | undefined} verdict */
 export const verdictWords = (verdict) => (verdict ?? "").replaceAll("_", " ");
 
-// A session that ended early goes on where its station is now: the file of that name may have other addresses.
+/** @typedef {Model<"ListedSession"> | Model<"SessionDetail">} Session */
+
+/** A session that ended early goes on where its station is now: the file of that name may have other addresses.
+ * @param {Session} session */
 async function goOn(session) {
   const [detail, stations] = await Promise.all([ask(`/sessions/${session.id}`), ask("/stations")]);
   const same = stations.filter((s) => !s.problem && s.title === detail.station);
   await post(`/sessions/${session.id}/resume`, { station: same.length === 1 ? same[0].name : null });
 }
 
-// What may be done with a session as it is: label -> action.
+/** What may be done with a session as it is: label, action, title.
+ * @param {Session} session
+ * @returns {[string, () => Promise<unknown>, string][]} */
 export function actionsOf(session) {
   if (!["created", "interrupted", "failed"].includes(session.state) || !may("operate")) return [];
   return [
@@ -29,17 +37,22 @@ export function actionsOf(session) {
 
 // --- two to compare -------------------------------------------------------------------------------------------------
 
-let chosen = []; // ids of sessions
+/** Ids of sessions.
+ * @type {string[]} */
+let chosen = [];
 
 function showChosen() {
   $("compare").disabled = chosen.length !== 2;
   $("compare-told").textContent = ["Choose two sessions that were fitted.", "Choose another one."][chosen.length] ?? "";
-  for (const box of document.querySelectorAll("#sessions input[type=checkbox]")) box.checked = chosen.includes(box.value);
+  /** @type {NodeListOf<HTMLInputElement>} */
+  const boxes = document.querySelectorAll("#sessions input[type=checkbox]");
+  for (const box of boxes) box.checked = chosen.includes(box.value);
 }
 
-function choose(event) {
-  const id = event.target.value;
-  chosen = event.target.checked ? [...chosen, id].slice(-2) : chosen.filter((one) => one !== id);
+/** @param {HTMLInputElement} box */
+function choose(box) {
+  const id = box.value;
+  chosen = box.checked ? [...chosen, id].slice(-2) : chosen.filter((one) => one !== id);
   showChosen();
 }
 
@@ -47,11 +60,12 @@ $("compare").addEventListener("click", () => window.open(`${api}/comparisons/pag
 
 // --- the list -------------------------------------------------------------------------------------------------------
 
+/** @param {Model<"ListedSession">} session */
 function row(session) {
   const name = session.name || session.id;
   const box = element("input", { type: "checkbox", value: session.id, disabled: !session.calibration_id });
   box.setAttribute("aria-label", `compare ${name}`);
-  box.addEventListener("change", choose);
+  box.addEventListener("change", () => choose(box));
   const actions = element("td");
   for (const [label, action, title] of actionsOf(session)) {
     const button = named("button", label, name, { title });
@@ -78,13 +92,15 @@ function row(session) {
   return cells(made, "", "", "Station", "Cameras", "Begun", "", "Verdict", "MTF50, cy/px", "Read noise, e", "Steps");
 }
 
+/** @type {Listing<"/sessions">} */
 const list = new Listing("sessions", "/sessions", row);
 const form = $("sessions-search");
+const KEYS = /** @type {const} */ (["search", "verdict"]);
 
 form.addEventListener("submit", (event) => {
   event.preventDefault();
   const asked = new URLSearchParams();
-  for (const key of ["search", "verdict"]) if (form.elements[key].value.trim()) asked.set(key, form.elements[key].value.trim());
+  for (const key of KEYS) if (form.elements[key].value.trim()) asked.set(key, form.elements[key].value.trim());
   const there = `/sessions${asked.size ? `?${asked}` : ""}`;
   if (address() === there) list.refresh();
   else goTo(there);
@@ -96,7 +112,7 @@ addView({
   title: () => "Sessions",
   async show(first) {
     const asked = query();
-    if (first) for (const key of ["search", "verdict"]) form.elements[key].value = asked.get(key) ?? "";
+    if (first) for (const key of KEYS) form.elements[key].value = asked.get(key) ?? "";
     await list.refresh(asked.toString());
     $("no-sessions").textContent = asked.size ? "None is like that." : "None yet: start one at the desk.";
     showChosen();

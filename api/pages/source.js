@@ -4,39 +4,48 @@ import { showFrames, leaveFrames } from "./frames.js";
 import { showFindings } from "./findings.js";
 import { figureRow, searchIn } from "./figures.js";
 import { showOwnJobs } from "./jobs.js";
-import { $, LIVE, addView, api, ask, change, element, goTo, may, named, post, show, showView, time, told } from "./page.js";
+import { $, LIVE, addView, api, ask, change, element, goTo, may, named, post, remove, show, showView, time, told } from "./page.js";
 import { actionsOf, verdictWords } from "./sessions.js";
 import { showWatched, watch } from "./watch.js";
 
+/** @typedef {"live" | "findings" | "figures" | "frames" | "jobs"} Tab */
+/** @typedef {Model<"SessionDetail"> | Model<"RecordingsDetail">} Detail */
+
+/** @type {Record<Tab, string>} */
 const TABS = { live: "Live", findings: "Findings", figures: "Figures", frames: "Frames", jobs: "Jobs" };
-const tabsOf = (kind) => Object.keys(TABS).filter((tab) => kind === "sessions" || tab !== "live");
+const EVERY = /** @type {Tab[]} */ (Object.keys(TABS));
+/** @param {Source["kind"]} kind */
+const tabsOf = (kind) => EVERY.filter((tab) => kind === "sessions" || tab !== "live");
 
 let shown = ""; // the source that stands there
 let noted = ""; // its name and notes as the form has them
 
+/** @param {string} label @param {string | Node | null | undefined} value */
 const fact = (label, value) => (value ? [element("div", {}, element("dt", { textContent: label }), element("dd", {}, value))] : []);
 
-function showHead(source, one) {
+/** @param {Detail} one */
+function showHead(one) {
+  const session = "state" in one ? one : null;
   const name = one.name || one.id;
   $("session-title").textContent = name;
-  const stations = one.station ? element("a", { href: `#/sessions?search=${encodeURIComponent(one.station)}`, textContent: one.station }) : "";
-  const cameras = Array.isArray(one.cameras) ? one.cameras.join(", ") : Object.values(one.cameras ?? {}).join(", ");
+  const station = session?.station && element("a", { href: `#/sessions?search=${encodeURIComponent(session.station)}`, textContent: session.station });
+  const cameras = Object.values(one.cameras).join(", ");
   const facts = [
     ...fact("Id", one.id),
-    ...fact("State", one.state && element("span", { className: `state ${one.state}`, textContent: one.state })),
-    ...fact("Station", stations),
+    ...fact("State", session && element("span", { className: `state ${session.state}`, textContent: session.state })),
+    ...fact("Station", station),
     ...fact("Cameras", cameras),
-    ...fact("Begun (UTC)", time(one.created)),
-    ...fact("Steps", one.steps === undefined ? "" : `${one.steps_done} of ${one.steps}`),
-    ...fact("Captures", source.kind === "recordings" ? String(one.captures) : String(one.captures.reduce((sum, each) => sum + each.captures, 0))),
+    ...fact("Begun (UTC)", time(session?.created)),
+    ...fact("Steps", session && `${session.steps_done} of ${session.steps}`),
+    ...fact("Captures", String("counts" in one ? one.captures : one.captures.reduce((sum, each) => sum + each.captures, 0))),
     ...fact("Verdict", verdictWords(one.verdict)),
     ...fact("Calibration", one.results?.fit ? element("a", { href: `#/calibrations/${one.results.fit}`, textContent: one.results.fit }) : ""),
   ];
   $("session-facts").replaceChildren(...facts);
-  $("session-error").textContent = one.error ?? "";
-  $("session-then").textContent = one.then ? `Then: ${one.then.words}` : "";
+  $("session-error").textContent = session?.error ?? "";
+  $("session-then").textContent = session?.then ? `Then: ${session.then.words}` : "";
   const form = $("session-notes");
-  form.hidden = source.kind !== "sessions" || !may("operate");
+  form.hidden = !session || !may("operate");
   const now = JSON.stringify([one.id, one.name, one.notes]);
   if (now !== noted && !form.contains(document.activeElement)) {
     noted = now;
@@ -45,51 +54,59 @@ function showHead(source, one) {
   }
 }
 
+/** @type {Record<Source["kind"], Model<"JobStart">["kind"][]>} */
 const JOBS = { sessions: ["fit", "validate", "diagnose", "report", "pipeline"], recordings: ["fit", "validate", "diagnose", "report"] };
 
+/** @param {Source} source @param {Detail} one */
 function showActions(source, one) {
+  const session = "state" in one ? one : null;
+  const lives = Boolean(session && LIVE.includes(session.state));
   const name = one.name || one.id;
   const again = () => showView();
+  /** @type {(HTMLButtonElement | HTMLAnchorElement)[]} */
   const made = [];
+  /** @type {(label: string, action: () => Promise<unknown>, properties?: Partial<HTMLButtonElement>) => void} */
   const does = (label, action, properties = {}) => {
     const button = named("button", label, name, properties);
     button.addEventListener("click", told("session-problem", async () => (await action(), await again())));
     made.push(button);
   };
-  for (const [label, action, title] of source.kind === "sessions" ? actionsOf(one) : []) does(label, action, { title });
-  if (LIVE.includes(one.state) && may("operate")) {
-    does("Pause", () => post(`/sessions/${one.id}/pause`), { disabled: one.state !== "running" });
-    does("Resume", () => post(`/sessions/${one.id}/resume`), { disabled: !["paused", "pausing"].includes(one.state) });
+  for (const [label, action, title] of session ? actionsOf(session) : []) does(label, action, { title });
+  if (session && lives && may("operate")) {
+    does("Pause", () => post(`/sessions/${one.id}/pause`), { disabled: session.state !== "running" });
+    does("Resume", () => post(`/sessions/${one.id}/resume`), { disabled: !["paused", "pausing"].includes(session.state) });
     does("Abort", () => post(`/sessions/${one.id}/abort`), { className: "danger" });
   }
-  if (may("calibrate") && (source.kind === "recordings" || one.state === "finished")) {
+  if (may("calibrate") && (!session || session.state === "finished")) {
     for (const kind of JOBS[source.kind]) does(kind[0].toUpperCase() + kind.slice(1), () => post(`/${source.kind}/${one.id}/jobs`, { kind }));
   }
-  if (may("admin") && one.state === "finished") does("Resolve", () => post(`/sessions/${one.id}/jobs`, { kind: "pipeline", resolve: true }), { title: "The whole pipeline; while rivals are left, take the capture that tells them apart" });
-  if (source.kind === "recordings" || ["finished", "interrupted", "failed"].includes(one.state)) made.push(named("a", "Download", name, { href: `${api}/${source.kind}/${one.id}/archive.zip` }));
-  if (one.can_copy && may("operate")) made.push(named("a", "Copy to the start form", name, { href: `#/?copy=${one.id}` }));
-  if (may(source.kind === "sessions" ? "admin" : "calibrate") && !LIVE.includes(one.state)) {
+  if (may("admin") && session?.state === "finished") does("Resolve", () => post(`/sessions/${one.id}/jobs`, { kind: "pipeline", resolve: true }), { title: "The whole pipeline; while rivals are left, take the capture that tells them apart" });
+  if (!session || ["finished", "interrupted", "failed"].includes(session.state)) made.push(named("a", "Download", name, { href: `${api}/${source.kind}/${one.id}/archive.zip` }));
+  if (session?.can_copy && may("operate")) made.push(named("a", "Copy to the start form", name, { href: `#/?copy=${one.id}` }));
+  if (may(source.kind === "sessions" ? "admin" : "calibrate") && !lives) {
     const away = named("button", "Delete", name, { className: "danger" });
     away.addEventListener("click", told("session-problem", async () => {
       const kept = source.kind === "sessions" ? "and all its captures for ever? Results and calibrations of it stay." : "for ever? Results of it stay.";
       if (!confirm(`Delete ${name} ${kept}`)) return;
-      await ask(`/${source.kind}/${one.id}`, { method: "DELETE" });
+      await remove(`/${source.kind}/${one.id}`);
       goTo(`/${source.kind}`);
     }));
     made.push(away);
   }
-  show("session-actions", [{ id: 0, of: made.map((button) => [button.textContent, button.disabled, one.id]) }], () => element("span", { className: "actions" }, ...made.flatMap((button) => [button, " "])));
+  show("session-actions", [{ id: 0, of: made.map((button) => [button.textContent, "disabled" in button && button.disabled, one.id]) }], () => element("span", { className: "actions" }, ...made.flatMap((button) => [button, " "])));
 }
 
-$("session-notes").addEventListener("submit", told("session-problem", async (event) => {
-  const fields = event.target.elements;
+$("session-notes").addEventListener("submit", told("session-problem", async () => {
+  const fields = $("session-notes").elements;
   await change(`/sessions/${shown.split("/")[1]}`, { name: fields.name.value, notes: fields.notes.value });
-  document.activeElement.blur();
+  noted = ""; // whatever has the focus
+
   await showView();
 }));
 
 // --- figures --------------------------------------------------------------------------------------------------------
 
+/** @type {Model<"FigureOfFit">[]} */
 let figures = [];
 let figuresOf = "";
 
@@ -98,6 +115,7 @@ const drawFigures = searchIn("figures-search", () => figures, (found) => {
   $("no-figures").textContent = found.length ? "" : figures.length ? "None is like that." : "Not fitted yet: start a fit above.";
 });
 
+/** @param {Source} source @param {string | undefined} fit */
 async function showFigures(source, fit) {
   const wanted = `${source.kind}/${source.id} ${fit ?? ""}`;
   if (figuresOf !== wanted) {
@@ -109,13 +127,15 @@ async function showFigures(source, fit) {
 
 // --- the view -------------------------------------------------------------------------------------------------------
 
+/** @param {boolean} first @param {Source["kind"]} kind @param {string} id @param {Tab} tab */
 async function showSource(first, kind, id, tab) {
   const source = { kind, id };
   if (shown !== `${kind}/${id}`) $("session-title").textContent = id;
   const one = await ask(`/${kind}/${id}`);
   const tabs = tabsOf(kind);
-  const usual = kind === "recordings" ? "findings" : LIVE.includes(one.state) ? "live" : one.results.diagnose ? "findings" : "frames";
-  const at = tabs.includes(tab) ? tab : usual;
+  const session = "state" in one ? one : null;
+  const usual = !session || one.results.diagnose ? "findings" : "frames";
+  const at = tabs.includes(tab) ? tab : session && LIVE.includes(session.state) ? "live" : usual;
   if (first || shown !== `${kind}/${id}`) {
     if (shown !== `${kind}/${id}`) leaveFrames();
     shown = `${kind}/${id}`;
@@ -125,10 +145,10 @@ async function showSource(first, kind, id, tab) {
       if (name === at) link.setAttribute("aria-current", "page");
       return link;
     }));
-    for (const name of Object.keys(TABS)) $(`panel-${name}`).hidden = name !== at;
-    watch(at === "live" ? one : null);
+    for (const name of EVERY) $(`panel-${name}`).hidden = name !== at;
+    watch(at === "live" ? session : null);
   }
-  showHead(source, one);
+  showHead(one);
   document.title = `${one.name || one.id} · ${TABS[at]} · calibench`;
   showActions(source, one);
   if (at === "live") await showWatched();
@@ -138,7 +158,7 @@ async function showSource(first, kind, id, tab) {
   else await showOwnJobs(source, one.name || one.id);
 }
 
-for (const kind of ["sessions", "recordings"]) {
+for (const kind of /** @type {const} */ (["sessions", "recordings"])) {
   addView({
     pattern: new RegExp(`^/${kind}/([0-9A-Za-z-]+)(?:/(${tabsOf(kind).join("|")}))?$`),
     section: "view-source",

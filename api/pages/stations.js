@@ -5,12 +5,23 @@ import { $, LIVE, addView, api, ask, cells, clock, duration, element, forgetHalt
 
 // A browser keeps six connections to a service open; the streams leave some of them for requests.
 const STREAMS = 3;
-const cards = new Map(); // key of the card -> its parts
-const streams = new Map(); // session -> its event stream
-const known = new Map(); // session that runs -> what was last told of it
+/** @typedef {Model<"SessionDetail"> | Model<"ListedSession">} Session */
+/** What stands on a card, what it shows, and the station's line on every view.
+ * @typedef {ReturnType<typeof card>} Parts */
+/** Parts by their card's key: a station's name, or the id of a session elsewhere.
+ * @type {Map<string, Parts>} */
+const cards = new Map();
+/** Event streams by their sessions.
+ * @type {Map<string, EventSource>} */
+const streams = new Map();
+/** What was last told of each session that runs.
+ * @type {Map<string, Session>} */
+const known = new Map();
+/** @type {() => void} */
 let follower = () => {};
 let connected = true;
 
+/** @param {() => void} ended */
 export function stationsAre(ended) {
   follower = ended;
 }
@@ -22,32 +33,43 @@ export function leaveStations() {
   streams.clear();
 }
 
+/** @param {number | null | undefined} seconds */
 const left = (seconds) => (seconds == null ? "" : `${duration(seconds)} left`);
 
+/** A station's card; of a session elsewhere where there is no name.
+ * @param {string | null} name @param {string} title */
 function card(name, title) {
-  const at = (tag, className, ...children) => element(tag, { className }, ...children);
   const parts = {
-    title: element("h3", { textContent: title }),
-    state: at("span", "state"),
+    title: element("h3"),
+    state: element("span", { className: "state" }),
     shutter: element("dd"),
     light: element("dd"),
     temperature: element("dd"),
     name: element("strong"),
     bar: element("progress", { max: 1, value: 0 }),
-    step: at("p", "step"),
-    remarks: at("ul", "hint remarks"),
-    problem: at("p", "problem"),
-    buttons: {},
+    step: element("p", { className: "step" }),
+    remarks: element("ul", { className: "hint remarks" }),
+    problem: element("p", { className: "problem" }),
+    byHand: element("p", { className: "problem by-hand" }),
+    halted: element("span", { className: "halted" }),
+    run: element("div", { className: "run" }),
+    whole: element("article", { className: "station" }),
+    buttons: /** @type {Record<string, HTMLButtonElement>} */ ({}),
+    strip: stripItem(name, title),
+    /** What it shows.
+     * @type {{session?: Session, safety?: Safety | null}} */
+    known: {},
+    session: /** @type {string | undefined} */ (undefined), // id of the one that runs
+    seen: Date.now(),
   };
   parts.step.setAttribute("aria-live", "polite");
   parts.problem.setAttribute("role", "alert");
-  parts.byHand = at("p", "problem by-hand");
   parts.byHand.setAttribute("role", "alert");
   parts.bar.setAttribute("aria-label", `progress on ${title}`);
-  const actions = at("p", "actions");
-  const halts = at("p", "actions");
-  parts.halted = at("span", "halted");
+  const actions = element("p", { className: "actions" });
+  const halts = element("p", { className: "actions" });
   parts.halted.setAttribute("role", "alert");
+  /** @type {(label: string, className: string, action: () => Promise<unknown>, into?: HTMLElement) => void} */
   const does = (label, className, action, into = actions) => {
     const button = element("button", { textContent: label, className });
     button.setAttribute("aria-label", `${label}: ${title}`);
@@ -61,60 +83,63 @@ function card(name, title) {
   halts.append(parts.halted);
   halts.hidden = !(name ? mayHalt() : may("operate"));
   actions.hidden = !may("operate");
-  parts.strip = stripItem(name, title, parts);
-  if (name) parts.title.replaceChildren(element("a", { href: `#/stations/${encodeURIComponent(name)}`, textContent: title }));
-  parts.run = at("div", "run", element("p", {}, parts.name), parts.bar, parts.step, parts.remarks, actions);
+  parts.title.append(name ? element("a", { href: `#/stations/${encodeURIComponent(name)}`, textContent: title }) : title);
+  parts.run.append(element("p", {}, parts.name), parts.bar, parts.step, parts.remarks, actions);
+  /** @param {string} label @param {HTMLElement} value */
   const fact = (label, value) => element("div", {}, element("dt", { textContent: label }), value);
   const facts = element("dl", { className: "facts" }, fact("Shutter", parts.shutter), fact("Light", parts.light), fact("Sensor", parts.temperature));
-  parts.whole = element("article", { className: "station" }, element("header", {}, parts.title, parts.state), facts, parts.run, halts, parts.byHand, parts.problem);
+  parts.whole.append(element("header", {}, parts.title, parts.state), facts, parts.run, halts, parts.byHand, parts.problem);
   return parts;
 }
 
-// A station's line on every view.
-function stripItem(name, title, parts) {
-  const strip = { name: element("a", { className: "name", textContent: name ?? title }), state: element("span", { className: "state" }), facts: element("span"), age: element("span", { className: "age" }) };
-  strip.whole = element("li", {}, element("span", {}, strip.name, " ", strip.state, " ", strip.facts, " ", strip.age));
+/** A station's line on every view.
+ * @param {string | null} name @param {string} title */
+function stripItem(name, title) {
+  const strip = { name: element("a", { className: "name", textContent: name ?? title }), state: element("span", { className: "state" }), facts: element("span"), age: element("span", { className: "age" }), whole: element("li") };
+  strip.whole.append(element("span", {}, strip.name, " ", strip.state, " ", strip.facts, " ", strip.age));
   if (mayHalt() && name) {
     const button = named("button", "Halt", `${name}, now`, { className: "danger small" });
     button.addEventListener("click", () => halt($("halt-told"), name));
     strip.whole.append(button);
   }
-  parts.seen = Date.now();
   $("strip").append(strip.whole);
   return strip;
 }
 
-// What the line says, from what the card says.
+/** What the line says, from what the card says.
+ * @param {Parts} parts */
 function showStrip(parts) {
   const { session, safety } = parts.known;
   const { strip } = parts;
-  strip.name.href = session ? `#/sessions/${session.id}/live` : `#/stations/${encodeURIComponent(strip.name.textContent)}`;
+  strip.name.href = session ? `#/sessions/${session.id}/live` : `#/stations/${encodeURIComponent(strip.name.textContent ?? "")}`;
   strip.state.textContent = parts.state.textContent;
   strip.state.className = parts.state.className;
-  const shutter = parts.shutter.textContent.split(" ")[0];
-  const light = parts.light.textContent;
+  const [shutter, light] = [parts.shutter.textContent ?? "", parts.light.textContent];
   const screen = session ? "in use" : safety?.state === "safe" ? "dark" : "not known";
-  const words = [`shutter ${shutter === "–" ? "not known" : parts.shutter.textContent.startsWith("closed") ? "closed" : parts.shutter.textContent}`, light === "–" ? "" : `light ${light}`, `screen ${screen}`];
+  const words = [`shutter ${shutter === "–" ? "not known" : shutter.startsWith("closed") ? "closed" : shutter}`, light === "–" ? "" : `light ${light}`, `screen ${screen}`];
   strip.facts.textContent = words.filter(Boolean).join(" · ");
   strip.facts.className = parts.shutter.className;
   showAge(parts);
 }
 
+/** @param {Parts} parts */
 function showAge(parts) {
   const { session, safety } = parts.known;
   const at = session ? parts.seen : safety ? Date.parse(safety.at) : null;
   const seconds = at === null ? null : Math.max(0, (Date.now() - at) / 1000);
   parts.strip.age.textContent = seconds === null ? "" : `${duration(seconds)} old`;
-  parts.strip.age.classList.toggle("old", Boolean(session) && seconds > 60);
+  parts.strip.age.classList.toggle("old", Boolean(session) && seconds !== null && seconds > 60);
 }
 setInterval(() => document.hidden || cards.forEach(showAge), 1000);
 
+/** @param {Parts} parts */
 function forget(parts) {
   parts.whole.remove();
   parts.strip.whole.remove();
   forgetHalt(parts.halted);
 }
 
+/** @param {Parts} parts @param {Model<"BenchState"> | null} bench @param {Safety | null} [safety] */
 function showBench(parts, bench, safety) {
   const open = bench?.shutter_open;
   parts.shutter.textContent = open == null ? "–" : open ? "open" : "closed";
@@ -126,6 +151,7 @@ function showBench(parts, bench, safety) {
   parts.temperature.textContent = warm.join(", ") || "–";
 }
 
+/** @param {Parts} parts @param {Model<"Progress">} p */
 function showProgress(parts, p) {
   parts.bar.max = p.total || 1;
   parts.bar.value = p.done;
@@ -133,11 +159,12 @@ function showProgress(parts, p) {
   parts.step.textContent = [p.what, step, left(p.left_s)].filter(Boolean).join(" · ");
   if (p.bench) showBench(parts, p.bench);
   parts.seen = Date.now();
-  if (parts.known) showStrip(parts);
-  document.dispatchEvent(new CustomEvent("progress", { detail: { id: p.session, words: parts.step.textContent } }));
+  showStrip(parts);
+  document.dispatchEvent(new CustomEvent("session-progress", { detail: { id: p.session, words: parts.step.textContent } }));
   if (p.remark) parts.remarks.prepend(element("li", { textContent: `${p.what}: ${p.remark}` }));
 }
 
+/** @param {string} id @param {Parts} parts */
 function follow(id, parts) {
   const stream = new EventSource(`${api}/sessions/${id}/events`);
   streams.set(id, stream);
@@ -154,7 +181,8 @@ function follow(id, parts) {
   });
 }
 
-// A station reads as free only where its instruments haven't said otherwise, and only while the service answers.
+/** A station reads as free only where its instruments haven't said otherwise, and only while the service answers.
+ * @param {Parts} parts */
 function showState(parts) {
   const { session, safety } = parts.known;
   const unsafe = safety?.state === "not confirmed";
@@ -174,6 +202,7 @@ document.addEventListener("connection", (event) => {
 });
 
 // What an operator's hand changed and nobody put back: a station that captures so would capture something else.
+/** @param {Parts} parts @param {string} name @param {Model<"LeftChanged">[]} left */
 function showByHand(parts, name, left) {
   const words = left.map((one) => `${one.session}: ${one.words}`).join(" · ");
   if (parts.byHand.dataset.words === words) return;
@@ -185,6 +214,7 @@ function showByHand(parts, name, left) {
   parts.byHand.append(" ", button);
 }
 
+/** @param {Parts} parts @param {Session | undefined} session @param {Safety | null | undefined} safety */
 function showRun(parts, session, safety) {
   parts.known = { session, safety };
   const begun = parts.session !== session?.id;
@@ -208,24 +238,27 @@ function showRun(parts, session, safety) {
   }
   if (streams.has(session.id)) return showStrip(parts);
   if (streams.size < STREAMS) follow(session.id, parts);
-  if (session.progress) showProgress(parts, session.progress);
+  if ("progress" in session && session.progress) showProgress(parts, session.progress);
   showStrip(parts);
 }
 
-// The sessions that run on these stations; those of `sessions` may run elsewhere.
+/** The sessions that run on these stations; those of `sessions` may run elsewhere.
+ * @param {Model<"StationState">[]} stations @param {Model<"ListedSession">[]} sessions */
 async function running(stations, sessions) {
   const live = sessions.filter((s) => LIVE.includes(s.state));
-  const ids = new Set([...stations.map((s) => s.busy_with).filter(Boolean), ...live.map((s) => s.id)]);
+  const ids = new Set([...stations.map((s) => s.busy_with).filter((id) => id != null), ...live.map((s) => s.id)]);
   for (const one of live) known.set(one.id, one);
   for (const id of known.keys()) if (!ids.has(id)) known.delete(id);
   await Promise.all([...ids].filter((id) => !streams.has(id)).map(async (id) => known.set(id, await ask(`/sessions/${id}`))));
-  return [...ids].map((id) => known.get(id)).filter((one) => one && LIVE.includes(one.state));
+  return [...ids].map((id) => known.get(id)).filter((one) => one !== undefined).filter((one) => LIVE.includes(one.state));
 }
 
-// A card and a line for each station, and for each of `sessions` that runs somewhere else.
+/** A card and a line for each station, and for each of `sessions` that runs somewhere else.
+ * @param {Model<"StationState">[]} stations @param {Model<"ListedSession">[]} sessions */
 export async function showStations(stations, sessions) {
   tellHalts(stations);
   const live = await running(stations, sessions);
+  /** @type {Map<string, {title: string, name: string | null, safety?: Safety | null, left?: Model<"LeftChanged">[], session?: Session}>} */
   const wanted = new Map();
   for (const one of stations.filter((s) => !s.problem)) {
     wanted.set(one.name, { title: one.title === one.name ? one.name : `${one.name}: ${one.title}`, name: one.name, safety: one.safety, left: one.left_by_hand, session: live.find((s) => s.id === one.busy_with) });
@@ -238,16 +271,18 @@ export async function showStations(stations, sessions) {
     cards.delete(id);
   }
   for (const [id, one] of wanted) {
+    const parts = cards.get(id) ?? card(one.name, one.title);
     if (!cards.has(id)) {
-      cards.set(id, card(one.name, one.title));
-      $("stations").append(cards.get(id).whole);
+      cards.set(id, parts);
+      $("stations").append(parts.whole);
     }
-    showRun(cards.get(id), one.session, one.safety);
-    showByHand(cards.get(id), one.name, one.session ? [] : (one.left ?? []));
+    showRun(parts, one.session, one.safety);
+    if (one.name) showByHand(parts, one.name, one.session ? [] : (one.left ?? []));
   }
 }
 
-// Cards stand at the desk; a station's own view has its card.
+/** Cards stand at the desk; a station's own view has its card.
+ * @param {string | null} own */
 export function placeCards(own = null) {
   for (const [id, parts] of cards) (id === own ? $("station-run") : $("stations")).append(parts.whole);
 }
@@ -255,18 +290,22 @@ export function placeCards(own = null) {
 // --- a station ------------------------------------------------------------------------------------------------------
 
 const CHECK_MS = 1000; // how often a check that is under way is looked at
-let station = null; // the name of the one that stands there
+let station = ""; // the name of the one that stands there
+/** @type {Record<string, string>} */
+const CLASSES = { works: "finished", fails: "failed" };
 
+/** @param {Model<"DeviceState">} one */
 function deviceRow(one) {
   const actions = element("td");
   if (may("operate")) {
     const button = named("button", "Check", one.name, { disabled: ["checking", "in use"].includes(one.state) });
-    button.addEventListener("click", told("station-problem", () => check(`/${one.name}`)));
+    button.addEventListener("click", told("station-problem", () => check(one.name)));
     actions.append(button, " ");
   }
   if (one.transcript) actions.append(named("a", "Transcript", one.name, { href: one.transcript, target: "_blank", rel: "noopener" }));
-  const state = element("td", {}, element("span", { className: `state ${{ works: "finished", fails: "failed" }[one.state] ?? ""}`, textContent: one.state }));
-  if (one.words) state.append(element("div", { className: one.state === "fails" ? "reason" : "hint", textContent: one.words }));
+  const state = element("td", {}, element("span", { className: `state ${CLASSES[one.state] ?? ""}`, textContent: one.state }));
+  const words = one.words.replace(/^works, and /, ""); // the state above has said so
+  if (words) state.append(element("div", { className: one.state === "fails" ? "reason" : "hint", textContent: words }));
   const made = element(
     "tr",
     {},
@@ -285,7 +324,7 @@ async function showDevices() {
   const found = await ask(`/stations/${encodeURIComponent(name)}/devices`);
   if (name !== station) return false;
   show("devices", found.map((one) => ({ id: one.name, ...one })), deviceRow);
-  const counted = (state) => found.filter((one) => one.state === state).length;
+  const counted = (/** @type {string} */ state) => found.filter((one) => one.state === state).length;
   const works = counted("works");
   const words = [works ? `${works} of ${found.length} work` : "", counted("fails") ? `${counted("fails")} fail` : "", counted("checking") ? `${counted("checking")} being checked` : ""];
   $("devices-told").textContent = words.filter(Boolean).join(", ") || "None was checked yet.";
@@ -293,12 +332,15 @@ async function showDevices() {
   return counted("checking") > 0;
 }
 
+/** Checks a device, or all where none is named.
+ * @param {string | null} device */
 async function check(device) {
-  const transcript = $("keep-transcript").checked;
-  await post(`/stations/${encodeURIComponent(station)}${device ? `/devices${device}` : ""}/check`, { transcript });
+  const asked = { transcript: $("keep-transcript").checked };
+  const here = /** @type {const} */ (`/stations/${encodeURIComponent(station)}`);
+  await (device ? post(`${here}/devices/${device}/check`, asked) : post(`${here}/check`, asked));
   while (await showDevices()) await new Promise((resolve) => setTimeout(resolve, CHECK_MS));
 }
-$("check-all").addEventListener("click", told("station-problem", () => check("")));
+$("check-all").addEventListener("click", told("station-problem", () => check(null)));
 
 addView({
   pattern: /^\/stations\/([^/]+)$/,
@@ -310,11 +352,12 @@ addView({
       $("station-title").textContent = name;
       $("station-problem").textContent = "";
       $("check-all").hidden = !may("operate");
-      $("keep-transcript").parentElement.hidden = !may("operate");
+      $("keep-transcript-label").hidden = !may("operate");
     }
     const one = await ask(`/stations/${encodeURIComponent(name)}`);
     $("station-title").textContent = one.title === name ? name : `${name}: ${one.title}`;
     $("station-problem").textContent = one.problem ?? "";
+    /** @param {string} label @param {string} value */
     const fact = (label, value) => element("div", {}, element("dt", { textContent: label }), element("dd", { textContent: value }));
     $("station-facts").replaceChildren(fact("Cameras", one.cameras.join(", ")), fact("Targets", one.targets.join(", ") || "none"), fact("Sequences", one.sequences.join(", ") || "none"));
     $("station-sessions").href = `#/sessions?search=${encodeURIComponent(one.title)}`;

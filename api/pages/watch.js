@@ -3,11 +3,19 @@
 import { chart, key, number } from "./charts.js";
 import { $, ask, element } from "./page.js";
 
+/** @typedef {import("./charts.js").Series} Series */
+/** @typedef {import("./charts.js").Axis} Axis */
+
+/** @type {Record<string, number>} */
 const CHANNELS = { R: 0, G1: 1, G2: 1, Y: 1, B: 2 };
-let watched = null; // the id of the session
+/** The id of the session.
+ * @type {string | null} */
+let watched = null;
 let drawn = ""; // what stands there
 let busy = false;
+const PLACES = /** @type {const} */ (["watch-frame", "watch-figures", "watch-histogram", "transfer", "sensitivity", "edges"]);
 
+/** @param {Model<"SessionDetail"> | null} session */
 export function watch(session) {
   if (watched === session?.id) return;
   watched = session?.id ?? null;
@@ -15,16 +23,18 @@ export function watch(session) {
   if (!session) return;
   $("watch-none").hidden = false;
   $("watch-step").textContent = $("watch-seen").textContent = "";
-  for (const place of ["watch-frame", "watch-figures", "watch-histogram", "transfer", "sensitivity", "edges"]) $(place).replaceChildren();
+  for (const place of PLACES) $(place).replaceChildren();
 }
 
 // What the session that is shown does now.
-document.addEventListener("progress", ({ detail: { id, words } }) => {
+document.addEventListener("session-progress", ({ detail: { id, words } }) => {
   if (id === watched) $("watch-step").textContent = words;
 });
 
+/** @param {number} value */
 const share = (value) => (value === 0 ? "none" : value < 0.0001 ? "< 0.01 %" : `${number(100 * value, 3)} %`);
 
+/** @param {Model<"StoredCapture">} capture @param {Model<"FrameFigures">} figures */
 function drawFrame(capture, figures) {
   const picture = element("img", { src: `${capture.preview.replace(/png$/, "webp")}?width=640&stretch=true`, alt: `newest frame, ${capture.side} camera: ${capture.name}` });
   $("watch-frame").replaceChildren(picture, element("figcaption", { textContent: capture.name }));
@@ -40,7 +50,8 @@ function drawFrame(capture, figures) {
   drawChannels("watch-figures", figures);
 }
 
-// The mean and the saturated share of each channel, as rows of a table.
+/** The mean and the saturated share of each channel, as rows of a table.
+ * @param {"watch-figures" | "inspect-figures"} place @param {Model<"FrameFigures">} figures */
 export function drawChannels(place, figures) {
   $(place).replaceChildren(
     ...figures.channels.map((one) =>
@@ -55,15 +66,23 @@ export function drawChannels(place, figures) {
   );
 }
 
+/** Points of each channel, as a series.
+ * @template {{channel: string}} Point
+ * @param {Point[]} points
+ * @param {(point: Point) => number[]} pair
+ * @returns {Series[]} */
 const byChannel = (points, pair) =>
-  Object.entries(Object.groupBy(points, (p) => p.channel)).map(([name, of]) => ({ name, colour: CHANNELS[name], points: of.map(pair) }));
+  [...Map.groupBy(points, (p) => p.channel)].map(([name, of]) => ({ name, colour: CHANNELS[name], points: of.map(pair) }));
 
+/** @param {Model<"Curves">} curves @param {string} side */
 function drawCurves(curves, side) {
   const transfer = byChannel(curves.transfer.filter((p) => p.side === side && !p.saturated), (p) => [p.mean_dn, p.variance_dn2]);
   const light = curves.sensitivity.filter((p) => p.side === side);
   const most = Math.max(...light.map((p) => p.dn_per_s_and_radiance));
   const sensitivity = byChannel(light, (p) => [p.wavelength_nm, p.dn_per_s_and_radiance / most]);
+  /** @type {Series[]} */
   const edges = curves.edges.filter((e) => e.side === side).map((e) => ({ name: e.region, colour: 1, line: true, points: e.frequency_cy_per_px.map((f, at) => [f, e.mtf[at]]) }));
+  /** @type {["transfer" | "sensitivity" | "edges", Series[], string, Axis, Axis][]} */
   const parts = [
     ["transfer", transfer, "Photon transfer", { label: "mean above black, DN", log: true }, { label: "temporal variance, DN²", log: true }],
     ["sensitivity", sensitivity, "Relative sensitivity", { label: "wavelength, nm" }, { label: "of the largest", from: 0, to: 1 }],
@@ -84,7 +103,7 @@ export async function showWatched() {
   busy = true;
   try {
     const id = watched;
-    const side = $("watch-side").value;
+    const side = /** @type {Side} */ ($("watch-side").value);
     const [newest, curves] = await Promise.all([ask(`/sessions/${id}/captures?order=newest&limit=1&side=${side}`), ask(`/sessions/${id}/curves`)]);
     const now = `${id} ${side} ${newest[0]?.id} ${curves.looked_at}`;
     if (now === drawn || id !== watched) return;

@@ -164,7 +164,7 @@ def certify_calibration(
     found = _known(service, calibration_id)
     if found.state != "candidate":
         raise Conflict(f"calibration {calibration_id} is {found.state}; only a candidate can be certified")
-    limits = asked.limits or standing_limits(service.store.root)
+    limits = asked.stated() or standing_limits(service.store.root)
     if limits is None:
         raise HTTPException(422, "limits: the data folder has no limits.toml; put one there, or send the limits")
     return life.certify(service.store, calibration_id, key.name, limits, accept_warnings=asked.accept_warnings)

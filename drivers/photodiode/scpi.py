@@ -31,6 +31,11 @@ COLUMNS = ["wavelength_nm", "responsivity_a_per_w"]
 _PIECE = 4096
 #: What SCPI meters report instead of a reading beyond their range.
 _OVERLOAD = 9.8e37
+#: A reading or the number of an error: no identity begins so, a late answer to what was asked before does.
+_NUMBER = re.compile(r"\s*[+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?\s*A?\s*(?:,|$)")
+_MOST_LATE = 3
+#: How long (s) a meter that has told its identity is silent, unless it tells it again to a connection before.
+_QUIET_S = 0.1
 #: What sets a meter to direct current, by what its identity holds; the last one is every other meter's.
 _SETUP: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("MODEL 648", ("*RST", "SYST:ZCH OFF", "RANG:AUTO ON")),  # picoammeters begin with their input shorted
@@ -194,14 +199,21 @@ class ScpiPhotodiode(Photodiode):
             raise
 
     def _first_answer(self) -> str:
-        """Its identity. PyVISA opens a TCP address without looking whether anyone is there."""
+        """Return its identity, and leave nothing behind of what was asked before. PyVISA opens a TCP address without
+        looking whether anyone is there."""
         try:
-            return self._ask("*IDN?")
+            told = self._ask("*IDN?")
+            for _ in range(_MOST_LATE):
+                if not _NUMBER.match(told):
+                    break
+                told = self._heard("*IDN?")
+            self._drain()
         except Disconnected as error:
             reason = str(error.__cause__).partition(":")[0] if error.__cause__ is not None else str(error)
             raise Disconnected(
                 f"{self._who}: can't be reached ({reason}); check the cable, the power and the address"
             ) from error
+        return told
 
     def _currents(self) -> list[float]:
         return [self._current() for _ in range(self.readings)]
@@ -224,6 +236,17 @@ class ScpiPhotodiode(Photodiode):
 
     def _ask(self, query: str) -> str:
         self._say(query)
+        return self._heard(query)
+
+    def _drain(self) -> None:
+        """Discard what comes until the meter is silent."""
+        self._open.timeout = _QUIET_S * 1000.0
+        with contextlib.suppress(NoAnswer):
+            for _ in range(_MOST_LATE):
+                self._heard("*IDN?")
+        self._open.timeout = self.timeout_s * 1000.0
+
+    def _heard(self, query: str) -> str:
         answer: bytes = self._do(query, self._answer)
         self._record("received", answer)
         return answer.decode("latin-1").strip()

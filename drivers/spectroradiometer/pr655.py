@@ -7,7 +7,7 @@ its values (both are told in public), the wavelengths stand beside the values, s
 
 from __future__ import annotations
 
-from drivers.errors import Garbled, Refused
+from drivers.errors import Garbled, NoAnswer, Refused
 from drivers.instrument import Identity, Recorder
 from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiometer
 from drivers.transport import Transport, WireInstrument, shown
@@ -25,6 +25,8 @@ ERRORS = {
 }
 #: A PR-655 loses characters of PHOTO that come in one piece.
 _BETWEEN_CHARACTERS_S = 0.01
+#: Lines that may come before its greeting: late answers to what was asked before the connection was opened anew.
+_MOST_LATE = 3
 
 
 class Pr655(WireInstrument, Spectroradiometer):
@@ -63,9 +65,15 @@ class Pr655(WireInstrument, Spectroradiometer):
             if at:
                 line.pause(_BETWEEN_CHARACTERS_S, "PHOTO")
             line.write(character)
-        greeting = line.read_until(b"\r\n", asked="PHOTO")
-        if b"REMOTE MODE" not in greeting:
-            raise self._strange("PHOTO", greeting)
+        heard = [line.read_until(b"\r\n", asked="PHOTO")]
+        try:
+            while b"REMOTE MODE" not in heard[-1] and len(heard) <= _MOST_LATE:
+                heard.append(line.read_until(b"\r\n", asked="PHOTO"))
+        except NoAnswer:
+            raise self._strange("PHOTO", heard[0]) from None
+        if b"REMOTE MODE" not in heard[-1]:
+            raise self._strange("PHOTO", heard[0])
+        line.drain(quiet_s=0.05)  # a second greeting, to a PHOTO that wasn't heard in time
         model = self._ask("D111")
         if not model.startswith(("PR-655", "PR-670")):
             raise self._strange("D111", model.encode("latin-1"))

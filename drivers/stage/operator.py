@@ -61,6 +61,7 @@ class OperatorStage(WireInstrument, Stage):
                 f"{self._transport.name}: answered 'PLACED?' with {shown(answer.encode())}; check that a stage is at "
                 "this address"
             )
+        self._transport.drain()  # what was asked before the connection was opened anew may be answered now, too
 
     def _make_safe(self) -> None:
         """It emits nothing and moves nothing by itself."""

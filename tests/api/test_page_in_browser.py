@@ -7,7 +7,9 @@ calibration certified.
 from __future__ import annotations
 
 import base64
+import re
 import shutil
+import zipfile
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -150,26 +152,39 @@ class Watched:
         found: int = self.page.evaluate(wider)
         return found
 
-    def focused(self) -> dict[str, str]:
+    def focused(self) -> dict[str, Any]:
         """What has the keyboard's focus, and whether one sees that."""
-        code = """() => { const on = document.activeElement, style = getComputedStyle(on);
-            return {tag: on.tagName, text: on.textContent.trim().slice(0, 40), name: on.name ?? "",
-                    outline: style.outlineStyle + " " + style.outlineWidth} }"""
-        found: dict[str, str] = self.page.evaluate(code)
+        code = """() => { const on = document.activeElement, style = getComputedStyle(on), box = on.getBoundingClientRect();
+            const middle = (from, to, most) => (Math.max(from, 0) + Math.min(to, most)) / 2;
+            const there = document.elementFromPoint(middle(box.left, box.right, innerWidth), middle(box.top, box.bottom, innerHeight));
+            return {tag: on.tagName, text: on.textContent.trim().slice(0, 40), name: on.name ?? "", kind: on.matches("#captures a")
+                    ? "figure" : on.type || on.tagName.toLowerCase(), outline: style.outlineStyle + " " + style.outlineWidth,
+                    seen: Boolean(there) && (on.contains(there) || there.contains(on))} }"""  # noqa: E501
+        found: dict[str, Any] = self.page.evaluate(code)
         return found
 
     def tab_to(self, wanted: str) -> None:
-        """Go on with Tab until the element of that text or name is reached; what is passed shows that it has the
-        focus."""
-        for _ in range(60):
+        """Go on with Tab until the element is reached that has that name, kind or text (a pattern); what is
+        passed shows that it has the focus, and nothing covers it."""
+        for _ in range(90):
             self.page.keyboard.press("Tab")
             on = self.focused()
-            if on["tag"] == "BODY":
+            if on["tag"] == "BODY":  # past the last one: the browser's own
                 continue
             assert on["outline"] not in ("none 0px", "none 3px"), on
-            if wanted in (on["text"], on["name"]):
+            assert on["seen"], on
+            if wanted in (on["name"], on["kind"]) or re.fullmatch(wanted, on["text"]):
                 return
         pytest.fail(f"{wanted!r} can't be reached by the keyboard")
+
+    def press(self, key: str, there: str = "") -> None:
+        """Press a key and wait until its effect is there. Whatever became of the element that had the focus, one has
+        it."""
+        self.page.keyboard.press(key)
+        if there:
+            self.page.wait_for_selector(there)
+        on = self.focused()
+        assert on["tag"] != "BODY", f"{key} lost the focus on the way to {there}"
 
     def can_halt(self) -> bool:
         """Whether a click in the middle of the halt button reaches it."""
@@ -239,49 +254,86 @@ def test_every_view_is_accessible_and_fits(
 
 
 def test_a_session_by_keyboard_alone(browser: Any, lab: Running) -> None:
-    """Started, opened, looked at, halted by the key for it, resumed."""
+    """From the log-in to the exported session: started, paused, halted by the key for it, resumed, its frames and
+    verdict looked at, fetched; then the newest calibration is certified. Nothing but keys; the focus is never lost."""
     watched = Watched(browser, lab)
-    keyboard = watched.page.keyboard
+    page, keyboard = watched.page, watched.page.keyboard
     assert watched.focused()["name"] == "key"
     keyboard.type(lab.keys["admin"])
-    keyboard.press("Enter")
-    watched.page.wait_for_selector("#plan-words:has-text('3 sequences')")
+    watched.press("Enter", "#plan-words:has-text('3 sequences')")
     watched.tab_to("name")
     keyboard.type("by keyboard")
     watched.tab_to("quick")
     keyboard.press("Space")
+    watched.tab_to("3 sequences.*")  # the summary: opened, a sequence is left out and taken again
+    watched.press("Enter", "#plan[open] #plan-rows input")
+    watched.tab_to("checkbox")
+    watched.press("Space", "#plan-words:has-text('2 sequences')")
+    watched.press("Space", "#plan-words:has-text('3 sequences')")
     lab.bench.delay_s = 0.05
     watched.tab_to("Start a session")
-    keyboard.press("Enter")
-    watched.page.wait_for_selector(".station.busy a:has-text('by keyboard')")
-    watched.page.focus("#nav a:has-text('Sessions')")
-    keyboard.press("Enter")
-    watched.page.wait_for_selector("#sessions tr:has-text('by keyboard') .state.running")
+    watched.press("Enter", ".station.busy a:has-text('by keyboard')")
+    watched.tab_to("Pause")
+    watched.press("Enter", ".station.busy .state.paused")
+    watched.tab_to("Resume")
+    watched.press("Enter", ".station.busy .state.running")
+    watched.tab_to("Sessions")
+    watched.press("Enter", "#sessions tr:has-text('by keyboard') .state.running")
     watched.tab_to("by keyboard")
     # The list is drawn anew while the session goes on; the focus stays where it was.
-    steps = watched.page.inner_text("#sessions tr:has-text('by keyboard') .number:nth-last-child(2)")
-    watched.page.wait_for_function(
+    steps = page.inner_text("#sessions tr:has-text('by keyboard') .number:nth-last-child(2)")
+    page.wait_for_function(
         """seen => [...document.querySelectorAll('#sessions tr')].some((row) => row.textContent.includes('by keyboard')
             && row.children[row.children.length - 2].textContent !== seen)""",
         arg=steps,
     )
     assert watched.focused()["text"] == "by keyboard"
-    keyboard.press("Enter")
-    watched.page.wait_for_selector("#panel-live:not([hidden]) #watch-histogram svg .line")
-    watched.page.wait_for_selector("#watch-step:has-text('step')")
+    watched.press("Enter", "#panel-live:not([hidden]) #watch-histogram svg .line")
+    page.wait_for_selector("#watch-step:has-text('step')")
     watched.tab_to("Frames")
-    keyboard.press("Enter")
-    watched.page.wait_for_selector("#captures img")
+    watched.press("Enter", "#captures img")
     assert watched.focused()["text"] == "Frames"
-    keyboard.press("F9")
-    watched.page.wait_for_selector("#halt-told:has-text('shutter closed')")
-    watched.page.wait_for_selector("#session-facts .state.interrupted")
+    watched.press("F9", "#halt-told:has-text('shutter closed')")
+    page.wait_for_selector("#session-facts .state.interrupted")
     lab.bench.delay_s = 0.0
     assert not lab.bench.opened  # the shutter
-    watched.page.focus("#session-title")
     watched.tab_to("Resume")
-    keyboard.press("Enter")
-    watched.page.wait_for_selector("#session-facts .state.finished")
+    watched.press("Enter", "#session-facts .state.finished")
+    # What a fit and a diagnosis by a job leave.
+    session = page.evaluate("location.hash").split("/")[2]
+    lab.store.add_result("fit", session, fitted(2.0).model_dump(mode="json"))
+    lab.store.add_result("diagnose", session, diagnosis().model_dump(mode="json"))
+    watched.tab_to("notes")
+    keyboard.type("#keys")
+    watched.press("Enter", "#session-facts:has-text('explained')")
+    watched.tab_to("Findings")
+    watched.press("Enter", "#findings-headline strong:has-text('explained')")
+    watched.tab_to("Frames")
+    watched.press("Enter", "#captures a")
+    watched.tab_to("figure")
+    watched.press("Enter", "#inspect-profile svg .line")
+    watched.tab_to("canvas")
+    keyboard.press("ArrowRight")
+    before = page.inner_text("#inspect-readout")
+    keyboard.press("Shift+ArrowDown")
+    assert page.inner_text("#inspect-readout") != before
+    watched.tab_to("Back to the frames")
+    watched.press("Enter", "#captures img")
+    watched.tab_to("Download")
+    with page.expect_download() as fetched:
+        watched.press("Enter")
+    assert zipfile.is_zipfile(fetched.value.path())
+    with lab.client() as client:
+        assert client.get(f"/api/v1/sessions/{session}").json()["tags"] == ["keys"]
+    watched.tab_to("Calibrations")
+    watched.press("Enter", "#calibrations tr:has-text('by keyboard')")
+    watched.tab_to("Certify …")
+    watched.press("Enter", "#certify[open] .mark.good")
+    watched.tab_to("Certify")
+    watched.press("Enter", "#calibrations tr:has-text('by keyboard') .state.certified")
+    watched.tab_to("Log out")
+    watched.press("Enter", "#login-form")
+    assert watched.focused()["name"] == "key"
     watched.close()
 
 

@@ -155,6 +155,12 @@ def test_each_kind_of_fault_breaks_the_answer_it_is_told_to() -> None:
     assert set(KINDS) == {"half", "never", "drop", "wrong", "error", "late", "unplug"}
 
 
+def test_an_error_that_no_command_met_is_over_with_its_faults() -> None:
+    line = FaultyLine(Parrot(Lamp().clock), parse_faults("error@1"))
+    line.fail(())
+    assert [output.data for output in line.receive(b"a")] == [b"echo", b"a\r\nmore\r\n"]
+
+
 # --- lines ------------------------------------------------------------------------------------------------------------
 
 

@@ -86,6 +86,9 @@ LONG = {
     "place": ("place_timeout_s",),
     "measure": ("measure_timeout_s", "fetch_timeout_s"),
 }
+#: Drivers whose shutter is a motion: a blank in the filter wheel, or a wavelength that lets nothing through.
+SHUT_BY_MOTION = {"monochromator.sp2150", "monochromator.cm110"}
+MOVES_ITS_SHUTTER = ("open_shutter", "close_shutter", "stop", "close")
 
 
 # --- breaking an answer -----------------------------------------------------------------------------------------------
@@ -262,7 +265,8 @@ class Subject:
 
     def stated_s(self, call: str, connecting: bool = False) -> float:
         """How long a call may take, as the station file states it: its own time-outs, or the one for an answer."""
-        own = [float(self.settings.get(key) or 0.0) for key in LONG.get(call, ())]
+        by_motion = self.driver_name in SHUT_BY_MOTION and call in MOVES_ITS_SHUTTER
+        own = [float(self.settings.get(key) or 0.0) for key in LONG.get("move_nm" if by_motion else call, ())]
         exposure_s = 3 * EXPOSURE_S if self.family == "camera" else 0.0
         connect_s = (
             float(self.settings.get("connect_timeout_s", 0.0)) if connecting or self.family == "display" else 0.0
@@ -308,6 +312,7 @@ class Subject:
         model = driver.identity().model
         opened = self.family == "monochromator" and rng.random() < 0.7
         if opened:
+            driver.move_nm(550.0)  # a CM110 has no shutter and opens at the wavelength that it was told
             driver.open_shutter()
         broken = break_something(self.peer, rng, self.timeout_s)
         what = f"{self.driver_name} {label} with {broken.kind}"

@@ -116,9 +116,13 @@ def test_drift_figures_and_drafted_limits_are_told(running: Running) -> None:
             assert told["mtf edge-1 G mtf50_cy_per_px", "left"]["mark"] is None
         drafted = client.get(f"/api/v1/calibrations/{id}/drafted-limits").json()
         assert {one["title"] for one in drafted["limits"]} >= {"temporal dark noise (read noise)", "MTF50, every edge"}
-        limits = [{key: one[key] for key in ("figure", "side", "place", "good")} for one in drafted["limits"]]
-        done = client.post(f"/api/v1/calibrations/{id}/certify", json={"limits": {"limit": limits}})
+        # What was drafted is taken as it was answered; without a limit, it isn't.
+        refused = client.post(f"/api/v1/calibrations/{id}/certify", json={"limits": drafted | {"limits": []}})
+        assert refused.status_code == 422 and "limit" in refused.json()["detail"]
+        done = client.post(f"/api/v1/calibrations/{id}/certify", json={"limits": drafted | {"valid_days": 30}})
         assert done.status_code == 200, done.text
+        stated = client.get(f"/api/v1/calibrations/{id}").json()["limits"]
+        assert stated["valid_days"] == 30 and len(stated["limit"]) == len(drafted["limits"])
         other = operator.post("/api/v1/sessions", json=asked).json()["id"]
         until_state(client, other, "finished")
         assert client.get(f"/api/v1/sessions/{other}/figures").status_code == 409

@@ -90,6 +90,11 @@ def test_every_device_of_a_station_is_checked_and_that_is_kept(running: Running)
             "monochromator": "works", "spectroradiometer": "fails", "stage": "works",
             "cameras.left": "works", "cameras.right": "works",
         }  # fmt: skip
+        # Its shutter was asked, and the station says so; what only measures may fail.
+        with running.client() as looking:
+            until(looking, "/api/v1/stations", lambda of: of[0]["safety"] is not None)  # type: ignore[index]
+            safety = looking.get("/api/v1/stations").json()[0]["safety"]
+        assert (safety["state"], safety["shutter"]) == ("safe", "closed")
         later = DeviceChecks(running.app.state.service.live, running.bench.drivers, running.store.root / "transcripts")
         kept = {one.name: later.latest("fakes", one.name) for one in checked}
         assert {name: (of.state, of.ended) for name, of in kept.items() if of} == {

@@ -18,7 +18,7 @@ from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Ref
 from drivers.photodiode.scpi import ScpiPhotodiode
 from mocks.lamp import Lamp
 from mocks.scpi_meter import AREA_M2, DARK_A, NOISE_A, MockScpiMeter, calibration_csv
-from mocks.wire import Tcp
+from mocks.wire import Reply, Tcp
 from sim.spectrum import Spectrum
 
 
@@ -180,3 +180,17 @@ def test_a_late_first_answer_fails_one_call_alone(served: Callable[..., str], ca
         diode.connect()
     assert diode.measure(550.0).irradiance_w_m2 > 0
     diode.close()
+
+
+class _Behind(MockScpiMeter):
+    """One that answers what an earlier connection asked before it tells its identity, and tells it that one, too."""
+
+    def receive(self, data: bytes) -> list[bytes]:
+        answers = super().receive(data)
+        return [Reply(b"+1.2E-06A,+0.0,0\n"), *answers, *answers] if b"*IDN?" in data else answers
+
+
+def test_late_answers_to_an_earlier_connection_are_left_out(served: Callable[..., str], calibration: str) -> None:
+    with diode_at(served(_Behind(Line(550.0, 1.0)), Tcp("127.0.0.1", 0)), calibration) as diode:
+        assert diode.identity().model == "MODEL 6485"
+        assert diode.measure(550.0).readings == 10

@@ -13,7 +13,7 @@ from drivers.errors import Garbled, NoAnswer, Refused
 from drivers.spectroradiometer.pr655 import Pr655
 from mocks.lamp import Lamp
 from mocks.pr655 import DIALECTS, PhotoResearch
-from mocks.wire import Pty
+from mocks.wire import Pty, Reply
 
 
 def test_golden_transcript(scripted: Callable[[str], Any]) -> None:
@@ -57,6 +57,20 @@ def test_a_fault_is_one_error_and_then_it_works_again(
     assert "\n" not in str(caught.value)
     assert len(radiometer.measure().radiance_w_sr_m2_nm.value) == 101
     radiometer.close()
+
+
+class _Behind(PhotoResearch):
+    """One that answers what an earlier connection asked before it greets, and greets that one, too."""
+
+    def _listen(self, value: int) -> list[bytes]:
+        greeting = super()._listen(value)
+        return [Reply(b"00000,Normal,1000\r\n"), *greeting, *greeting] if greeting else []
+
+
+def test_late_answers_to_an_earlier_connection_are_left_out(served: Callable[..., str]) -> None:
+    with Pr655(served(_Behind(Lamp()), Pty()), timeout_s=2.0) as radiometer:
+        assert radiometer.identity().serial_number == "65501234"
+        assert len(radiometer.measure().radiance_w_sr_m2_nm.value) == 101
 
 
 def test_too_little_light_is_told_with_its_remedy(served: Callable[..., str]) -> None:

@@ -11,7 +11,7 @@ from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Ref
 from drivers.stage.operator import OperatorStage
 from mocks.bench import Bench
 from mocks.stage import MockStage as Mock
-from mocks.wire import Tcp
+from mocks.wire import Reply, Tcp
 
 
 def test_targets_are_placed_on_the_bench(served: Callable[..., str]) -> None:
@@ -62,3 +62,22 @@ def test_every_fault_is_one_error_and_then_it_works_again(
             time.sleep(0.05)
     assert placed == "edge-2"
     stage.close()
+
+
+class _Behind(Mock):
+    """One that answers what an earlier connection asked before it answers the first question."""
+
+    behind = True
+
+    def receive(self, data: bytes) -> list[bytes]:
+        answers = super().receive(data)
+        late, self.behind = self.behind and bool(answers), self.behind and not answers
+        return [Reply(b"cap\r\n"), *answers] if late else answers
+
+
+def test_late_answers_to_an_earlier_connection_are_left_out(served: Callable[..., str]) -> None:
+    bench = Bench()
+    with OperatorStage(served(_Behind(bench), Tcp("127.0.0.1", 0))) as stage:
+        stage.place("sphere")
+        assert stage.placed() == "sphere"
+        assert stage.targets() == bench.targets
