@@ -103,7 +103,7 @@ def diagnose_side(
     policy = policy or DecisionPolicy()
     report("checking what is stated")
     stated = recordings.camera(side)
-    recordings, misstated = misstatements(recordings, side)
+    recordings, misstated = misstatements(recordings, side, policy)
     wrong = tuple(one.told(side) for one in misstated)
     if fit is not None and recordings.camera(side).cfa != stated.cfa:  # its planes were mixed
         fit = fit.model_copy(update={"cameras": {s: c for s, c in fit.cameras.items() if s != side}})
@@ -130,7 +130,7 @@ def diagnose_side(
     discovered = discover(study, (*model.always, *verdict.effects), policy, left_over)
     report("looking for the next capture")
     laws = tuple(law_of(one, study) for one in discovered)
-    by_laws = described(verdict, discovered, laws)
+    by_laws = described(verdict, discovered, laws, policy)
     smooth = left_to_smooth(verdict, by_laws)
     improved, corrections = improved_model(recordings, side, fit, baseline, model, verdict.effects, smooth)
     corrections = corrected_by_laws(verdict, corrections, by_laws)

@@ -18,6 +18,7 @@ from lab.diagnose.metadata.misstatement import Misstatement
 from lab.diagnose.metadata.mono_sensor import misstated_mosaic
 from lab.diagnose.metadata.mosaic_phase import misstated_mosaic_phase
 from lab.diagnose.metadata.unchecked import unchecked
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
@@ -39,11 +40,13 @@ _CHECKS = (
 )
 
 
-def misstatements(recordings: RecordingSet, side: Side) -> tuple[RecordingSet, tuple[Misstatement, ...]]:
+def misstatements(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> tuple[RecordingSet, tuple[Misstatement, ...]]:
     """Return the recordings with wrong statements of a side replaced by the values that fit, and what was replaced."""
     found: list[Misstatement] = []
     for check in _CHECKS:
-        one = check(recordings, side)
+        one = check(recordings, side, policy)
         if one is not None:
             found.append(one)
             recordings = one.corrected

@@ -6,15 +6,14 @@ import numpy as np
 
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
-LEAST_PILED = 100  # pixels at one code from which on they count as clipped
-LEAST_PILED_SHARE = 1e-3  # the same, as a share of a frame
-LEAST_BITS = 6  # of fewer bits, the highest code is too likely to be any level
 
-
-def misstated_bit_depth(recordings: RecordingSet, side: Side) -> Misstatement | None:
+def misstated_bit_depth(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
     """Return a bit depth that is stated too large: no frame has a code above 2^k - 1, k less than the stated bits, and
     pixels are clipped there.
 
@@ -34,13 +33,13 @@ def misstated_bit_depth(recordings: RecordingSet, side: Side) -> Misstatement | 
         if top > highest:
             highest, piled = top, {}
         count = int(np.count_nonzero(frame == top))
-        if count >= max(LEAST_PILED, LEAST_PILED_SHARE * frame.size):
+        if count >= max(policy.clipped_pixels, policy.clipped_frame_share * frame.size):
             piled[capture.id] = count
     bits = highest.bit_length()
     if (
         not piled
         or highest != 2**bits - 1
-        or not LEAST_BITS <= bits < camera.bit_depth
+        or not policy.least_bit_depth <= bits < camera.bit_depth
         or highest >= camera.saturation_dn
     ):
         return None

@@ -7,19 +7,16 @@ import numpy as np
 from lab.capture_kinds.dark import DarkCapture
 from lab.diagnose.measurements.dark_level import BLACK_LEVEL
 from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
-#: Tolerance of a stated black level, as a share of the converter's range (5 DN of 12 bits): data sheets round it, and
-#: it depends on temperature.
-TOLERANCE = 5.0 / 4096.0
-LEAST_TOLERANCE_DN = 1.0
-SIGMA = 5.0  # standard deviations of the measured black level beyond the tolerance
 
-
-def misstated_black_level(recordings: RecordingSet, side: Side) -> Misstatement | None:
+def misstated_black_level(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
     """Return a black level that differs from the dark frames' mean, extrapolated to zero exposure, by more than
-    `TOLERANCE`.
+    `black_level_tolerance`.
 
     A line is fitted to the means by exposure, of the frames at the gain and temperature of the shortest. With a single
     exposure, dark current can't be told from black level. None where nothing is found.
@@ -40,9 +37,11 @@ def misstated_black_level(recordings: RecordingSet, side: Side) -> Misstatement 
     freedom = max(len(alike) - 2, 1)
     scatter = float(np.sqrt(np.sum(np.square(mean - table @ np.linalg.lstsq(table, mean, rcond=None)[0])) / freedom))
     std = float(np.hypot(scatter, 0.01) * np.sqrt(np.linalg.inv(table.T @ table)[0, 0]))
-    tolerance = max(TOLERANCE * 2.0 ** recordings.camera(side).bit_depth, LEAST_TOLERANCE_DN)
+    tolerance = max(
+        policy.black_level_tolerance * 2.0 ** recordings.camera(side).bit_depth, policy.black_level_least_tolerance_dn
+    )
     off = float(black) - stated
-    if abs(off) < tolerance + SIGMA * std or float(black) < 0.0:
+    if abs(off) < tolerance + policy.black_level_sigma * std or float(black) < 0.0:
         return None
     return Misstatement(
         measurement=BLACK_LEVEL,
@@ -51,7 +50,7 @@ def misstated_black_level(recordings: RecordingSet, side: Side) -> Misstatement 
         check=f"The dark frames of the {side} camera have a black level of {black:.2f} ± {std:.2g} DN, but "
         f"black_level_dn = {stated:g} is stated: "
         f"correct it to {black:.1f}, or the darks are of another camera or setting.",
-        chi2_stated=(off / np.hypot(std, tolerance / SIGMA)) ** 2,
+        chi2_stated=(off / np.hypot(std, tolerance / policy.black_level_sigma)) ** 2,
         chi2_corrected=0.0,
         n=1,
         captures=tuple(c.id for c in alike),

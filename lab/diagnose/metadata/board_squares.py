@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.diagnose.measurements.boards import BOARDS
 from lab.diagnose.metadata.misstatement import Misstatement
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.measure.board_detection import as_grey, luminance
 from sim.camera import Side
@@ -27,17 +28,10 @@ Array = NDArray[np.floating[Any]]
 Grey = NDArray[np.uint8]
 FEWEST_MARKERS = 6  # of a frame: a homography has 8 parameters, and a marker's centre gives two equations
 MOST_COLUMNS = 40
-#: Rms distance of the markers' centres from a homography, over a marker's side: the most of a layout that fits
-#: (distortion gives some hundredths), and the least ratio of any other layout's to it.
-FITS, WORSE = 0.15, 5.0
-FEWEST_ABSENT = 4  # markers that should be in view and aren't found, from which on a stated row counts as missing
 LARGEST_PX = 1000.0  # side of a frame in which a plain board's corners are counted; larger frames are reduced
 SMALLEST_GRID = (3, 3)  # inner corners from which the search for a plain board starts
 
 LOOKED_AT = 6  # most frames of a board that are used
-FEWEST_PICTURES = 2
-#: Tolerance of a marker's side, relative and absolute: detection finds a blurred dark marker up to 7 % too small.
-MARKER_TOLERANCE, MARKER_PX = 0.15, 2.0
 
 
 @dataclass(frozen=True)
@@ -69,7 +63,9 @@ class _Markers:
         return float(np.median(np.linalg.norm(np.roll(self.corners, 1, axis=1) - self.corners, axis=2)))
 
 
-def board_layout(pictures: Sequence[Grey], capture: CharucoCapture) -> BoardLayout | None:
+def board_layout(
+    pictures: Sequence[Grey], capture: CharucoCapture, policy: DecisionPolicy = DEFAULT_POLICY
+) -> BoardLayout | None:
     """Find the layout that frames (rows, cols) of one board fit; None where they don't determine it. `capture`: what is
     stated about it.
     """
@@ -86,14 +82,17 @@ def board_layout(pictures: Sequence[Grey], capture: CharucoCapture) -> BoardLayo
     of_stated = {(stated_cols, parity): _rms(seen, stated_cols, parity) for parity in (0, 1)}
     rms_stated = min(of_stated.values())
     rms = of_stated
-    if rms_stated > FITS:
+    if rms_stated > policy.board_fit:
         rms = {(count, parity): _rms(seen, count, parity) for count in range(2, MOST_COLUMNS + 1) for parity in (0, 1)}
     (cols, parity), best = min(rms.items(), key=lambda item: item[1])
-    if best > FITS or any(other < WORSE * best for (count, _), other in rms.items() if count != cols):
+    if best > policy.board_fit or any(
+        other < policy.board_rival_ratio * best for (count, _), other in rms.items() if count != cols
+    ):
         return None
     rows = 1 + max(int(_places(one.number, cols, parity)[:, 1].max()) for one in seen)
-    if capture.squares[0] > rows and not _lacks_rows(seen, cols, parity, rows, capture.squares[0]):
-        rows = capture.squares[0]
+    stated_rows = capture.squares[0]
+    if stated_rows > rows and _absent(seen, cols, parity, rows, stated_rows) < policy.absent_markers:
+        rows = stated_rows
     return BoardLayout(
         squares=(rows, cols),
         marker_share=float(np.median(np.concatenate([_sides(one, cols, parity) for one in seen]))),
@@ -170,10 +169,9 @@ def _sides(one: _Markers, cols: int, parity: int) -> Array:
     return np.asarray(np.linalg.norm(np.roll(flat, 1, axis=1) - flat, axis=2).mean(axis=1))
 
 
-def _lacks_rows(seen: Sequence[_Markers], cols: int, parity: int, rows: int, stated: int) -> bool:
-    """Tell whether `FEWEST_ABSENT` markers of the rows from `rows` to `stated` should lie inside frames in which they
-    aren't found.
-    """
+def _absent(seen: Sequence[_Markers], cols: int, parity: int, rows: int, stated: int) -> int:
+    """Count the markers of the rows from `rows` to `stated` that should lie inside frames in which they aren't
+    found."""
     row, col = np.nonzero((np.indices((stated, cols)).sum(axis=0) + parity) % 2 == 0)
     beyond = np.column_stack([col, row])[row >= rows].astype(float)
     absent = 0
@@ -184,7 +182,7 @@ def _lacks_rows(seen: Sequence[_Markers], cols: int, parity: int, rows: int, sta
         at = cv2.perspectiveTransform(beyond[:, None], fitted[0])[:, 0]
         margin = 1.5 * one.side_px
         absent += int(np.all((at > margin) & (at < np.array(one.shape[::-1]) - margin), axis=1).sum())
-    return absent >= FEWEST_ABSENT
+    return absent
 
 
 def _plain_layout(pictures: Sequence[Grey]) -> BoardLayout | None:
@@ -213,7 +211,9 @@ def _plain_layout(pictures: Sequence[Grey]) -> BoardLayout | None:
     return BoardLayout(squares, None, None, None, None, counts.count(squares))
 
 
-def misstated_board(recordings: RecordingSet, side: Side) -> Misstatement | None:
+def misstated_board(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
     """Return the boards whose frames fit another number of squares, or another ratio of marker to square, than stated;
     None where all fit.
 
@@ -231,10 +231,10 @@ def misstated_board(recordings: RecordingSet, side: Side) -> Misstatement | None
     for captures in boards.values():
         stated = captures[0]
         spread = captures[:: max(1, len(captures) // LOOKED_AT)][:LOOKED_AT]
-        layout = board_layout([as_grey(luminance(recordings.frame(one), cfa)) for one in spread], stated)
-        if layout is None or layout.pictures < FEWEST_PICTURES:
+        layout = board_layout([as_grey(luminance(recordings.frame(one), cfa)) for one in spread], stated, policy)
+        if layout is None or layout.pictures < policy.board_frames:
             continue
-        update, told = _contradicted(stated, layout)
+        update, told = _contradicted(stated, layout, policy)
         if not update:
             continue
         lines += told
@@ -263,7 +263,9 @@ def misstated_board(recordings: RecordingSet, side: Side) -> Misstatement | None
     )
 
 
-def _contradicted(stated: CharucoCapture, layout: BoardLayout) -> tuple[dict[str, Any], list[str]]:
+def _contradicted(
+    stated: CharucoCapture, layout: BoardLayout, policy: DecisionPolicy
+) -> tuple[dict[str, Any], list[str]]:
     """Return the fields of a board that its frames contradict, and the sentences that say so."""
     update: dict[str, Any] = {}
     told = []
@@ -277,7 +279,9 @@ def _contradicted(stated: CharucoCapture, layout: BoardLayout) -> tuple[dict[str
         )
     if layout.marker_share is not None and layout.marker_px is not None and stated.marker_mm is not None:
         measured = layout.marker_share * stated.square_mm
-        if abs(measured / stated.marker_mm - 1.0) > max(MARKER_TOLERANCE, MARKER_PX / layout.marker_px):
+        if abs(measured / stated.marker_mm - 1.0) > max(
+            policy.marker_tolerance, policy.marker_tolerance_px / layout.marker_px
+        ):
             update["marker_mm"] = round(measured, 2)
             told.append(
                 f"markers are {100 * layout.marker_share:.0f} % of a square's side and not "

@@ -8,17 +8,18 @@ import numpy as np
 
 from lab.diagnose.measurements.pattern_fit import BERNOULLI
 from lab.diagnose.metadata.misstatement import Misstatement
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.measure.screen_registration import ScreenPictures, register, screen_pictures
 from sim.camera import Side
 
-TOLERANCE = 0.05  # relative: the stated size is nominal, and cells of a tilted screen differ over the frame
 
-
-def misstated_cell_size(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Return a `cell_camera_px` that differs by more than `TOLERANCE` from the size of the cells in the middle of the
-    pattern; None where it fits.
+def misstated_cell_size(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
+    """Return a `cell_camera_px` that differs by more than `cell_size_tolerance` from the size of the cells in the
+    middle of the pattern; None where it fits.
 
     The registration finds the size by itself: the stated one is only its start.
     """
@@ -33,9 +34,10 @@ def misstated_cell_size(recordings: RecordingSet, side: Side) -> Misstatement | 
             measured = _cell_px(one, stated)
             if measured is not None:
                 sizes[stated] = measured
-    off = {stated: size for stated, size in sizes.items() if abs(size / stated - 1.0) > TOLERANCE}
+    off = {stated: size for stated, size in sizes.items() if abs(size / stated - 1.0) > policy.cell_size_tolerance}
     if not off:
         return None
+    std = policy.cell_size_tolerance / 5.0
 
     def restated(capture: Any) -> Any:
         screen = getattr(capture, "screen", None)
@@ -52,7 +54,7 @@ def misstated_cell_size(recordings: RecordingSet, side: Side) -> Misstatement | 
         where="cells of the screen",
         shape="the stated size of the screen's cells contradicts the checkerboard's corners",
         check=f"The screen's cells are {told} in the pictures of the {side} camera: correct cell_camera_px.",
-        chi2_stated=float(sum((np.log(size / stated) / (TOLERANCE / 5.0)) ** 2 for stated, size in off.items())),
+        chi2_stated=float(sum((np.log(size / stated) / std) ** 2 for stated, size in off.items())),
         chi2_corrected=0.0,
         n=len(off),
         captures=changed,

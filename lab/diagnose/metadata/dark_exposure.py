@@ -12,6 +12,7 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.diagnose.measurements.dark_frames import TEMPERATURE_STEP_C
 from lab.diagnose.measurements.dark_level import DARK
 from lab.diagnose.metadata.misstatement import Misstatement
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.formats.recording_set.frame_files import Frame
 from lab.measure.rounding import rounding_std_dn
@@ -21,12 +22,6 @@ from sim.spectrum import FloatArray
 LEAST_EXPOSURES, LEAST_REPEATS = 3, 2
 FLOOR_DN = 0.02  # standard deviation of an exposure's mean dark level beside the scatter of its repeats
 ROUNDED_DN2 = 1.0 / 12.0  # variance of a pixel by rounding, its least
-CHANCE = 1e-6  # probability that noise takes one exposure's mean as far off the line of the others
-TOLERANCE = (
-    0.05  # relative: a wrong shutter is off by more, and the dark current of a sensor that warms changes by as much
-)
-MOST_FACTOR = 5.0  # of a wrong exposure; a dark level that is farther off has another cause
-LEAST_PROBABILITY = 1e-3  # of what the others leave, where a wrong exposure is the whole cause
 
 
 @dataclass(frozen=True)
@@ -41,7 +36,9 @@ class _Candidate:
     chi2_left: float
 
 
-def misstated_dark_exposure(recordings: RecordingSet, side: Side) -> Misstatement | None:
+def misstated_dark_exposure(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
     """One exposure of dark frames whose mean level lies off the line of the others, as that of another exposure would.
 
     At one temperature the mean of dark frames is b + r t, beside a drift with time and a dark current that changes with
@@ -60,7 +57,7 @@ def misstated_dark_exposure(recordings: RecordingSet, side: Side) -> Misstatemen
         return None
     mean, noise = np.array([_mean_and_variance(recordings.frame(c)) for c in alike]).T
     table = _drifts(exposure, [c.time.timestamp() if c.time is not None else None for c in alike])
-    found = _candidates(exposure, mean, noise, table, _floor_dn(recordings, alike))
+    found = _candidates(exposure, mean, noise, table, _floor_dn(recordings, alike), policy)
     if not found:
         return None
     nearest = min(found, key=lambda one: abs(np.log(one.factor)))
@@ -121,7 +118,12 @@ def _drifts(exposure: FloatArray, times: list[float | None]) -> FloatArray:
 
 
 def _candidates(
-    exposure: FloatArray, mean: FloatArray, noise: FloatArray, drifts: FloatArray, floor_dn: FloatArray
+    exposure: FloatArray,
+    mean: FloatArray,
+    noise: FloatArray,
+    drifts: FloatArray,
+    floor_dn: FloatArray,
+    policy: DecisionPolicy,
 ) -> list[_Candidate]:
     """Return the exposures that may be the one that is wrong. `noise` (n,): variance of each mean by its pixels' noise;
     `floor_dn` (exposures,). Frames scatter by as much more as their residuals about the means of their exposures and
@@ -136,7 +138,11 @@ def _candidates(
     more = max(float(rest @ rest) / freedom - float(noise.mean()), 0.0)
     # Student's t by the effective degrees of freedom (Welch 1947): few repeats tell their scatter badly
     effective = freedom * ((float(noise.mean()) + more) / more) ** 2 if more > 0.0 else np.inf
-    least = -float(stdtrit(effective, 0.5 * CHANCE) if np.isfinite(effective) else ndtri(0.5 * CHANCE))
+    least = -float(
+        stdtrit(effective, 0.5 * policy.dark_exposure_chance)
+        if np.isfinite(effective)
+        else ndtri(0.5 * policy.dark_exposure_chance)
+    )
     white = np.linalg.cholesky(np.diag(noise + more) + (of * np.square(floor_dn)) @ of.T)
     line = np.column_stack([np.ones(len(mean)), exposure / levels.max(), drifts])
 
@@ -148,6 +154,7 @@ def _candidates(
         return estimate, inverse, float(np.sum(np.square(y - a @ estimate)))
 
     without = left(line)[2]
+    tolerance, most = policy.dark_exposure_tolerance, policy.dark_exposure_most_factor
     found = []
     for k, stated_s in enumerate(levels):
         estimate, inverse, chi2 = left(np.column_stack([line, of[:, k]]))
@@ -155,7 +162,7 @@ def _candidates(
         if stated_s <= 0.0 or signal <= 0.0 or without - chi2 < least**2:
             continue
         factor, std = 1.0 + float(estimate[-1]) / signal, float(np.sqrt(inverse[-1, -1])) / signal
-        agrees = chdtrc(max(len(mean) - line.shape[1] - 1, 1), chi2) > LEAST_PROBABILITY
-        if agrees and 1.0 / MOST_FACTOR < factor < MOST_FACTOR and abs(factor - 1.0) > TOLERANCE + 2.0 * std:
+        agrees = chdtrc(max(len(mean) - line.shape[1] - 1, 1), chi2) > policy.dark_exposure_least_probability
+        if agrees and 1.0 / most < factor < most and abs(factor - 1.0) > tolerance + 2.0 * std:
             found.append(_Candidate(float(stated_s), factor, std, without, chi2))
     return found

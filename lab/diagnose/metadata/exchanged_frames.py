@@ -9,15 +9,16 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.dark_level import DARK
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata.misstatement import Misstatement
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.measure.level_lines import DARKER_SHARE
 from lab.measure.mishaps import exchanged_frames
 from sim.camera import Side
 
-FEWEST = 3  # darks, and flats
 
-
-def misplaced_frames(recordings: RecordingSet, side: Side) -> Misstatement | None:
+def misplaced_frames(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
     """Pairs of darks and flats that hold each other's frames (`lab.measure.mishaps`); None where none is found."""
     found = exchanged_frames(recordings, side)
     if found is None:
@@ -36,12 +37,14 @@ def misplaced_frames(recordings: RecordingSet, side: Side) -> Misstatement | Non
     )
 
 
-def exchanged_kinds(recordings: RecordingSet, side: Side) -> Misstatement | None:
+def exchanged_kinds(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
     """All flats darker than the darks, which grow with their exposure, by more than `DARKER_SHARE` of the range: the
     two kinds are stated for each other. Both are left out, as the light of those that are stated as darks isn't known.
     None where nothing is found."""
     darks, flats = recordings.captures(DarkCapture, side), recordings.captures(FlatCapture, side)
-    if min(len(darks), len(flats)) < FEWEST:
+    if min(len(darks), len(flats)) < policy.least_swapped_frames:
         return None
     exposure, level = (
         np.array(v) for v in zip(*((c.exposure_s, float(recordings.frame(c).mean())) for c in darks), strict=True)

@@ -13,6 +13,7 @@ from lab.diagnose.measurements.chart import CHART
 from lab.diagnose.measurements.narrowband import NARROWBAND
 from lab.diagnose.metadata.lit_planes import LitPlanes, chart_planes, narrowband_planes, predicted
 from lab.diagnose.metadata.misstatement import Misstatement
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from sim.camera import CameraModel, Side
@@ -31,41 +32,39 @@ class ExchangeRule:
     )
 
 
-FEWEST_LIGHTS = 4
 #: Share of a light's brightest channel that is added to all rates: low rates count little, as low sensitivities may
 #: differ by any factor.
 DIM = 0.02
 LEAST_ERROR = 0.005  # of ln(rate)
-SURER = 0.7  # largest ratio of the error of the best exchange to that of the next best
-UNKNOWN_LEVELS = 0.1  # median error from which on the lights' levels count as unknown, as of relative spectra
-CURVES = ExchangeRule(out_of_line=5.0, better=0.25, of_each=True)
-#: Printed patches have errors of some per cent in any light.
-PATCHES = ExchangeRule(out_of_line=1.5, better=0.5, of_each=False)
 CHART_COLUMNS = 6  # of patches, row by row
 CURVE_ORDER = 2  # degree in the wavelength of a channel's departure from the maker's curve
 
 
-def exchanged_lights(recordings: RecordingSet, side: Side) -> Misstatement | None:
+def exchanged_lights(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
     """Two lights whose captures fit each other's statement and not their own: narrowband lights, else lights of a
     chart. None where none is found."""
     if not recordings.captures("narrowband", side) and not recordings.captures("chart", side):
         return None
     camera = camera_model(recordings, side, maker_curves=True)
-    return _narrowband(recordings, side, camera) or _chart(recordings, side, camera)
+    return _narrowband(recordings, side, camera, policy) or _chart(recordings, side, camera, policy)
 
 
-def _narrowband(recordings: RecordingSet, side: Side, camera: CameraModel) -> Misstatement | None:
+def _narrowband(
+    recordings: RecordingSet, side: Side, camera: CameraModel, policy: DecisionPolicy
+) -> Misstatement | None:
     """Two narrowband lights, by the channels' rates against the sensitivity curves. A channel may depart from its curve
     by a polynomial in the wavelength."""
     seen = [one for one in narrowband_planes(recordings, side) if np.any(np.isfinite(one.rate))]
-    if len(seen) < FEWEST_LIGHTS or recordings.camera(side).quantum_efficiency is None:
+    if len(seen) < policy.least_lights or recordings.camera(side).quantum_efficiency is None:
         return None
     expected = np.array(list(predicted(recordings, camera, seen).values())).T
     phases, step = mosaic.phases(camera.cfa), mosaic.step(camera.cfa)
     rate = np.array([[one.rate[[step * r + c for r, c in phases[name]]].mean() for name in phases] for one in seen])
     known = np.isfinite(rate)  # clipped channels are NaN
     usable = known.any(axis=1) & (expected.max(axis=1) > 0)
-    if usable.sum() < FEWEST_LIGHTS:
+    if usable.sum() < policy.least_lights:
         return None
     seen = [one for one, is_usable in zip(seen, usable, strict=True) if is_usable]
     rate, expected, known = rate[usable], expected[usable], known[usable]
@@ -84,16 +83,17 @@ def _narrowband(recordings: RecordingSet, side: Side, camera: CameraModel) -> Mi
         own = moved[every, every]
         curve = np.stack([_smooth(wavelength, own[:, k], order) for k in range(own.shape[1])], axis=-1)
         errors = np.sqrt(np.nanmean(np.square(moved - curve[None]), axis=2))
-        if np.median(np.diag(errors)) < UNKNOWN_LEVELS:
-            return _told(recordings, side, seen, errors, NARROWBAND, CURVES)
+        if np.median(np.diag(errors)) < policy.unknown_level_error:
+            rule = ExchangeRule(policy.exchanged_out_of_line, policy.exchanged_better, of_each=True)
+            return _told(recordings, side, seen, errors, NARROWBAND, rule, policy.exchanged_surer)
     return None
 
 
-def _chart(recordings: RecordingSet, side: Side, camera: CameraModel) -> Misstatement | None:
+def _chart(recordings: RecordingSet, side: Side, camera: CameraModel, policy: DecisionPolicy) -> Misstatement | None:
     """Two lights of a chart, by the ratios of the patches' rates in every channel, which don't depend on the light's
     level or the channel's sensitivity."""
     lights = chart_planes(recordings, side)
-    if len(lights) < FEWEST_LIGHTS:
+    if len(lights) < policy.least_lights:
         return None
     step = mosaic.step(camera.cfa)
     channel_of = {step * r + c: name for name, places in mosaic.phases(camera.cfa).items() for r, c in places}
@@ -118,7 +118,7 @@ def _chart(recordings: RecordingSet, side: Side, camera: CameraModel) -> Misstat
             if found:
                 errors[i, j] = float(np.mean(found))
     usable = np.isfinite(errors).all(axis=1)
-    if usable.sum() < FEWEST_LIGHTS:
+    if usable.sum() < policy.least_lights:
         return None
     return _told(
         recordings,
@@ -126,7 +126,8 @@ def _chart(recordings: RecordingSet, side: Side, camera: CameraModel) -> Misstat
         [p[0] for p, ok in zip(lights, usable, strict=True) if ok],
         errors[np.ix_(usable, usable)],
         CHART,
-        PATCHES,
+        ExchangeRule(policy.exchanged_patches_out_of_line, policy.exchanged_patches_better, of_each=False),
+        policy.exchanged_surer,
     )
 
 
@@ -173,8 +174,10 @@ def _told(
     errors: FloatArray,
     measurement: Measurement,
     rule: ExchangeRule,
+    surer: float,
 ) -> Misstatement | None:
-    """Return the exchange of two lights that fits, None where none passes `rule`. `errors` (n, n): of the captures of
+    """Return the exchange of two lights that fits, None where none passes `rule`, or where another with one of its
+    lights leaves an error that isn't larger by 1 / `surer`. `errors` (n, n): of the captures of
     light i with the statement of light j."""
     typical = max(float(np.median(np.diag(errors))), LEAST_ERROR)
     every = [
@@ -190,7 +193,7 @@ def _told(
         before, after = min(errors[one, one], errors[other, other]), max(errors[one, other], errors[other, one])
     if before < rule.out_of_line * typical or after > rule.better * before:
         return None
-    if any(e.after < best.after / SURER and e.before - e.after > 0.5 * (best.before - best.after) for e in rivals):
+    if any(e.after < best.after / surer and e.before - e.after > 0.5 * (best.before - best.after) for e in rivals):
         return None
     lights = [seen[one], seen[other]]
     names = [_name(light) for light in lights]

@@ -5,16 +5,18 @@ from __future__ import annotations
 from lab.capture_kinds.base import LONGEST_EXPOSURE_S
 from lab.diagnose.measurements.dark_level import DARK
 from lab.diagnose.metadata.misstatement import Misstatement
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
 UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6}
-USUAL_S = 60.0  # longest exposure that is likely in a unit
 
 
-def misstated_exposure_unit(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Exposures above `LONGEST_EXPOSURE_S`, read in the larger unit in which none is above `USUAL_S`. None where they
-    fit.
+def misstated_exposure_unit(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
+    """Return exposures above `LONGEST_EXPOSURE_S`, read in the larger unit in which none is above
+    `longest_usual_exposure_s`; None where they fit.
 
     The times of captures tell nothing of it: they may be those of copying, or of a clock that runs fast, as the mock
     bench's does."""
@@ -22,7 +24,9 @@ def misstated_exposure_unit(recordings: RecordingSet, side: Side) -> Misstatemen
     longest = max((c.exposure_s for c in captures), default=0.0)
     if longest <= LONGEST_EXPOSURE_S:
         return None
-    unit = next((name for name, unit_s in UNITS.items() if unit_s * longest <= USUAL_S), "microseconds")
+    unit = next(
+        (name for name, unit_s in UNITS.items() if unit_s * longest <= policy.longest_usual_exposure_s), "microseconds"
+    )
     scaled = tuple(
         c.model_copy(update={"exposure_s": UNITS[unit] * c.exposure_s})
         if c.side == side and c.exposure_s is not None

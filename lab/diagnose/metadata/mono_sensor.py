@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.measure.mishaps import ALIKE, alike_planes
 from sim.camera import Side
 
 
-def misstated_mosaic(recordings: RecordingSet, side: Side) -> Misstatement | None:
+def misstated_mosaic(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
     """Return a stated mosaic whose planes are alike in every light (`lab.measure.mishaps`); None where they differ. The
     maker's curves are of colours, and are left out."""
     found = alike_planes(recordings, side)

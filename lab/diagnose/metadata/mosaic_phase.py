@@ -9,6 +9,7 @@ from lab.diagnose.measurements.chart import CHART
 from lab.diagnose.measurements.narrowband import NARROWBAND
 from lab.diagnose.metadata.lit_planes import LitPlanes, chart_planes, narrowband_planes, predicted
 from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Cfa, Side
@@ -16,19 +17,15 @@ from sim.spectrum import FloatArray
 
 MOSAICS: tuple[Cfa, ...] = ("RGGB", "BGGR", "GRBG", "GBRG")
 # Errors are rms departures of ln(rate) from its prediction.
-FEWEST_LIGHTS = 3
-BRIGHT = 10.0  # least signal over the uncertainty of the dark level
 #: Share of a light's brightest plane that is added to all rates: low rates count little, as low sensitivities may
 #: differ by any factor.
 DIM = 0.05
-LEAST_ERROR = 0.15  # of the stated mosaic: errors of the curves and crosstalk are smaller
-BETTER = 0.5  # largest ratio of the best mosaic's error to that of the stated one
-SURER = 0.75  # largest ratio of the best mosaic's error to that of the next best
-MOST_GAIN = 0.7  # largest |ln| of a channel's gain against the maker's curve
 ROUNDS = 6
 
 
-def misstated_mosaic_phase(recordings: RecordingSet, side: Side) -> Misstatement | None:
+def misstated_mosaic_phase(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> Misstatement | None:
     """Return a stated mosaic that fits the planes' rates worse than another one; None where it fits.
 
     r = ln(rate of a plane) - ln(predicted rate of its channel) - level of the light - gain of the channel, over
@@ -41,20 +38,20 @@ def misstated_mosaic_phase(recordings: RecordingSet, side: Side) -> Misstatement
     patches = [one for light in chart_planes(recordings, side) for one in light]
     narrow = narrowband_planes(recordings, side)
     seen = [one for one in (*narrow, *patches) if np.isfinite(one.rate).sum() > 1]
-    seen = [one for one in seen if np.nanmax(one.rate) > BRIGHT * one.offset]
-    if len(seen) < FEWEST_LIGHTS:
+    seen = [one for one in seen if np.nanmax(one.rate) > policy.mosaic_bright * one.offset]
+    if len(seen) < policy.mosaic_least_lights:
         return None
     camera = camera_model(recordings, side, maker_curves=True)
     rates = predicted(recordings, camera, seen)
-    errors = {cfa: _error(seen, rates, cfa) for cfa in MOSAICS}
+    errors = {cfa: _error(seen, rates, cfa, policy.mosaic_most_gain) for cfa in MOSAICS}
     best, second = sorted(MOSAICS, key=lambda cfa: errors[cfa])[:2]
-    if best == stated or errors[stated] < LEAST_ERROR:
+    if best == stated or errors[stated] < policy.mosaic_least_error:
         return None
-    if errors[best] > BETTER * errors[stated] or errors[best] > SURER * errors[second]:
+    if errors[best] > min(policy.mosaic_better * errors[stated], policy.mosaic_surer * errors[second]):
         return None
     n = 4 * len(seen)
     # the numbers' standard deviation is estimated by the best mosaic's error
-    std = max(errors[best], LEAST_ERROR / 3.0)
+    std = max(errors[best], policy.mosaic_least_error / 3.0)
     return Misstatement(
         measurement=NARROWBAND if narrow else CHART,
         where="all lights",
@@ -71,8 +68,8 @@ def misstated_mosaic_phase(recordings: RecordingSet, side: Side) -> Misstatement
     )
 
 
-def _error(seen: list[LitPlanes], rates: dict[str, FloatArray], cfa: Cfa) -> float:
-    """Rms of r (see `misstated_mosaic_phase`) for the mosaic `cfa`."""
+def _error(seen: list[LitPlanes], rates: dict[str, FloatArray], cfa: Cfa, most_gain: float) -> float:
+    """Rms of r (see `misstated_mosaic_phase`) for the mosaic `cfa`; logarithms of gains are `most_gain` at most."""
     rate = np.array([one.rate for one in seen])  # NaN where clipped
     expected = np.where(np.isfinite(rate), np.array([rates[channel] for channel in cfa]).T, np.nan)
     expected = expected * (np.nansum(rate, axis=1) / np.maximum(np.nansum(expected, axis=1), 1e-300))[:, None]
@@ -86,7 +83,7 @@ def _error(seen: list[LitPlanes], rates: dict[str, FloatArray], cfa: Cfa) -> flo
         for channel in gain:
             own = moved[:, channels == channel]
             step = float(np.median(own[np.isfinite(own)])) if np.isfinite(own).any() else 0.0
-            gain[channel] = float(np.clip(gain[channel] + 0.5 * step, -MOST_GAIN, MOST_GAIN))
+            gain[channel] = float(np.clip(gain[channel] + 0.5 * step, -most_gain, most_gain))
     final = left - np.array([gain[channel] for channel in cfa])
     final = final - np.nanmean(final, axis=1, keepdims=True)
     return float(np.sqrt(np.nanmean(np.square(final))))

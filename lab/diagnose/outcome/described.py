@@ -15,6 +15,7 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.discrepancy import Discrepancy
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.outcome.settling_capture import settling_sentence
+from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Unexplained
@@ -24,14 +25,13 @@ from sim.effects.empirical_law import EmpiricalLaw
 from sim.effects.library import list_changes
 from sim.spectrum import FloatArray
 
-#: Share of a mismatch's excess of chi2 from which on a law that takes it off describes it.
-DESCRIBED_SHARE = 0.5
 
-
-def described(verdict: Verdict, found: Sequence[PredictiveTable], laws: Sequence[EmpiricalLaw]) -> dict[int, str]:
+def described(
+    verdict: Verdict, found: Sequence[PredictiveTable], laws: Sequence[EmpiricalLaw], policy: DecisionPolicy
+) -> dict[int, str]:
     """Return the indices of the blocks that laws describe, and which do, in words.
 
-    A law describes a mismatch where it takes `DESCRIBED_SHARE` of the excess off its chi2, and where a smooth
+    A law describes a mismatch where it takes `described_share` of the excess off its chi2, and where a smooth
     discrepancy doesn't predict the captures held out better. Steps between the lines of flats are predicted by no
     effect: there the index tells.
     """
@@ -45,7 +45,7 @@ def described(verdict: Verdict, found: Sequence[PredictiveTable], laws: Sequence
         told = ", ".join(dict.fromkeys(f"the law of the {place_in_words(one.look)}" for one in mine))
         before, after = (_chi2(one, model.value, at) for one in (without, beside))
         is_felt = any(block.reads & list_changes(law) for law in laws)
-        takes_off = before - after >= DESCRIBED_SHARE * (before - len(block.value))
+        takes_off = before - after >= policy.described_share * (before - len(block.value))
         if mine and (not is_felt or (takes_off and not _is_smoother(verdict, laws, index))):
             words[index] = told
     return words

@@ -27,8 +27,6 @@ from sim.effects.base import Effect
 WHOLE_AXIS = "along the whole axis"
 #: Rivals that are listed beside a candidate.
 LISTED_RIVALS = 3
-#: Probability from which on a rival is told beside the nearest law.
-LEAST_TOLD = 0.05
 
 
 def located(side: Side, verdict: Verdict) -> list[Mismatch]:
@@ -265,7 +263,11 @@ def _nearest(
     if left > least:
         told = f"chi2 is {left:.0f} with it, {chi2_without:.0f} without, {len(index)} are expected"
         return f"the nearest law is {name}, and it doesn't hold exactly: {told}"
-    rivals = [f"{n} ({100 * p:.0f} %)" for n, p in nearest.rivals[:LISTED_RIVALS] if n != UNKNOWN and p >= LEAST_TOLD]
+    rivals = [
+        f"{n} ({100 * p:.0f} %)"
+        for n, p in nearest.rivals[:LISTED_RIVALS]
+        if n != UNKNOWN and p >= policy.told_rival_probability
+    ]
     if rivals:
         return (
             f"the nearest law is {name} ({100 * nearest.probability:.0f} %), which these recordings can't tell from "

@@ -13,6 +13,7 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
+from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import InstrumentSnapshot, RecordingSet
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
@@ -81,6 +82,8 @@ def test_a_black_level_that_is_not_that_of_the_darks_is_told(off_dn: float) -> N
     assert corrected.camera("left").black_level_dn == pytest.approx(true_dn, abs=0.1)
     assert f"black_level_dn = {true_dn + off_dn:g} is stated" in found.check
     assert told(restated(recordings, black_level_dn=true_dn + 3.0)) == []  # a data sheet's rounding
+    strict = DecisionPolicy(black_level_tolerance=2.0 / 4096.0)
+    assert len(misstatements(restated(recordings, black_level_dn=true_dn + 3.0), "left", strict)[1]) == 1
 
 
 @pytest.mark.parametrize(("exposure_s", "factor"), [(2.0, 0.8), (2.0, 1.25), (0.5, 0.8), (0.5, 1.25)])
