@@ -19,23 +19,31 @@ from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.blocks import measurement_model, study_of
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata import misstatements, unchecked
-from lab.diagnose.outcome.board_departure import board_departure
-from lab.diagnose.outcome.described import (
+from lab.diagnose.outcome.goodness_of_fit import (
+    detectability,
+    held_out,
+    measurement_fits,
+    places,
+    residual_curves,
+    side_models,
+)
+from lab.diagnose.outcome.improved_model import improved_model, residual_pictures
+from lab.diagnose.outcome.mismatches import (
+    board_departure,
     corrected_by_laws,
     described,
+    family_corrections,
     in_light_of_laws,
     left_to_smooth,
+    located,
+    misstated_light,
+    shown_in,
+    unexplained,
+    vetoed_names,
     with_laws,
 )
-from lab.diagnose.outcome.detectability import detectability
-from lab.diagnose.outcome.doubts import names_in_doubt
-from lab.diagnose.outcome.effect_sets import side_models
-from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
-from lab.diagnose.outcome.improved_model import improved_model
-from lab.diagnose.outcome.mismatches import family_corrections, located, shown_in, unexplained, vetoed_names
-from lab.diagnose.outcome.misstated_light import misstated_light
+from lab.diagnose.outcome.model_posterior import names_in_doubt
 from lab.diagnose.outcome.next_capture import Doubt, doubt_of
-from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile

@@ -15,7 +15,7 @@ from lab.calibration.figures import figures_of
 from lab.calibration.limits import CalibrationLimits, judged
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.diagnose.measurements.library import measurement_title
+from lab.diagnose.measurements.block import measurement_title
 from lab.effect_titles import at_beginning, effect_title
 from lab.errors import InputError
 from lab.formats.provenance import Provenance, installed_versions, provenance_of

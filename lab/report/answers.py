@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.library import measurement_title
+from lab.diagnose.measurements.block import measurement_title
 from lab.effect_titles import at_beginning, effect_title
 from lab.formats.results import (
     Check,

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.library import measurement_title
+from lab.diagnose.measurements.block import measurement_title
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Check, DiagnosisResult, NoiseFit, PatchComparison, ResidualCurve, SpectralFit
 from lab.formats.results.in_words import measured, plain_number

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from lab.diagnose.measurements.library import measurement_title
-from lab.diagnose.outcome.detectability import detectable
-from lab.diagnose.outcome.in_dn import told_as
+from lab.diagnose.measurements.block import measurement_title
+from lab.diagnose.outcome.goodness_of_fit import detectable, told_as
 from lab.formats.results import (
     DiagnosisResult,
     DiscoveredLaw,

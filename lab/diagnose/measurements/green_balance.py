@@ -10,7 +10,7 @@ import numpy as np
 
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.even_flats import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
+from lab.diagnose.measurements.flat_field import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
 from lab.errors import NotDetermined
 from lab.measure.noise_figures import BLACK_FLOOR_DN
 from lab.measure.reads import COLLECTED, acting

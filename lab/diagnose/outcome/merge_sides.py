@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.library import measurement_title
-from lab.diagnose.outcome.effect_sets import set_sentences
-from lab.diagnose.outcome.in_dn import told_as
+from lab.diagnose.measurements.block import measurement_title
+from lab.diagnose.outcome.goodness_of_fit import set_sentences, told_as
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings

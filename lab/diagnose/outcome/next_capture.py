@@ -25,7 +25,7 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import displaced, refit
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.curves import freed_curve
+from lab.diagnose.measurements.spectral import freed_curve
 from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
 from lab.diagnose.outcome.expected_information import Forecast
 from lab.diagnose.policy import DecisionPolicy

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.dark_field import dark_field_block
-from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.dark_readout import fixed_line_block
+from lab.diagnose.measurements.darks import dark_field_block, dark_level_block
 from lab.diagnose.measurements.flat_field import shading_block
 from lab.diagnose.measurements.flat_rows import flicker_block
 from lab.formats.recording_set import RecordingSet

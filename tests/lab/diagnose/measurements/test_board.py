@@ -12,8 +12,7 @@ from lab.challenge.recordings import recordings_of, recordings_of_pair
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.boards import board_block, calibration_of
-from lab.diagnose.measurements.stereo_gain import scene_gain_block
-from lab.diagnose.measurements.stereo_time import time_block
+from lab.diagnose.measurements.stereo import scene_gain_block, time_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model

@@ -11,7 +11,7 @@ from scipy.special import erf
 
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.board_colour import board_colour_block
+from lab.diagnose.measurements.boards import board_colour_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.importers import read_dot_grids

@@ -8,7 +8,7 @@ import pytest
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.level_repeats import level_repeats_block
+from lab.diagnose.measurements.linearity import level_repeats_block
 from lab.diagnose.policy import DecisionPolicy
 from mocks.former.laws import ImageLagLaw, LightFlickerLaw, SourceInstabilityLaw
 from sim.effects.base import Effects

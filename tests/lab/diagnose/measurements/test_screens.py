@@ -15,14 +15,10 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
-from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.board_colour import colour_block
-from lab.diagnose.measurements.cell_borders import cell_border_block
-from lab.diagnose.measurements.dark_squares import screen_block
-from lab.diagnose.measurements.ghost import ghost_block
-from lab.diagnose.measurements.library import measurements
-from lab.diagnose.measurements.pattern_fit import contrast_block, patterns
-from lab.diagnose.measurements.screen_grid import grid_block
+from lab.diagnose.measurements.block import Block, measurements
+from lab.diagnose.measurements.boards import colour_block
+from lab.diagnose.measurements.pattern_fit import cell_border_block, contrast_block, ghost_block, patterns
+from lab.diagnose.measurements.screens import grid_block, screen_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model

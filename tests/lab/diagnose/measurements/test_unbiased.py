@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from lab.challenge.recordings import recordings_of
-from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.library import measurements
+from lab.diagnose.measurements.block import Block, measurements
 from lab.diagnose.measurements.line_spectra import Bands, log_mean_bias, log_mean_variance, periodogram
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from lab.diagnose.measurements.chart import chart_block
-from lab.diagnose.measurements.dark_squares import screen_block
+from lab.diagnose.measurements.screens import screen_block
 from lab.diagnose.measurements.slanted_edge import edge_block
+from lab.diagnose.measurements.spectral import chart_block
 from lab.measure.patches import Surroundings, harmonics
 from mocks.former import laws as concealed
 from sim.point import halos

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lab.challenge.recordings import recordings_of
-from lab.diagnose.metadata.board_squares import misstated_board
+from lab.diagnose.metadata.targets import misstated_board
 from lab.formats.importers import read_checkerboard_pairs
 from lab.formats.recording_set import RecordingSet
 from mocks.former import ConcealedCamera, Plan

@@ -12,7 +12,7 @@ from lab.challenge.draw import DrawnFrame
 from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.metadata import misstatements, unchecked
-from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
+from lab.diagnose.metadata.frames import misstated_dark_exposure
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import InstrumentSnapshot, RecordingSet
 from mocks.former import ConcealedCamera, Law, Plan

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from lab.diagnose.metadata import misstatements
-from lab.diagnose.metadata.exposure_unit import misstated_exposure_unit
-from lab.diagnose.metadata.mono_sensor import misstated_mosaic
+from lab.diagnose.metadata.frames import misstated_exposure_unit
+from lab.diagnose.metadata.lights import misstated_mosaic
 from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import RecordingSet, inspect

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lab.diagnose.outcome.detectability import detectability, detectable
+from lab.diagnose.outcome.goodness_of_fit import detectability, detectable
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.defocus import Defocus
 from tests.lab.diagnose.outcome.filtered_edges import NOISE, filtered_edges

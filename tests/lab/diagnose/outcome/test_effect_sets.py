@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lab.diagnose.inference.search import Model, ModelSet
-from lab.diagnose.outcome.effect_sets import set_sentences, side_models
+from lab.diagnose.outcome.goodness_of_fit import set_sentences, side_models
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import NamedEffect, Rival, SideModels, Unexplained
 

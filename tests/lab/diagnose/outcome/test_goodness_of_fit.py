@@ -13,7 +13,7 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.block import Prediction
 from lab.diagnose.measurements.linearity import linearity_block
-from lab.diagnose.measurements.narrowband import narrowband_block
+from lab.diagnose.measurements.spectral import narrowband_block
 from lab.diagnose.outcome.goodness_of_fit import measurement_fits, places, residual_curves
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.infrared_cut_filter import InfraredCutFilter

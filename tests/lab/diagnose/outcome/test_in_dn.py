@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lab.diagnose import diagnose
-from lab.diagnose.outcome.in_dn import told_as
+from lab.diagnose.outcome.goodness_of_fit import told_as
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Visibility
 from lab.report.diagnosis import _visibility

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lab.challenge.recordings import recordings_of
-from lab.diagnose.outcome.residual_pictures import residual_pictures
+from lab.diagnose.outcome.improved_model import residual_pictures
 from lab.formats.camera_file import CameraFile
 from lab.formats.camera_model import camera_model
 from mocks.former import ConcealedCamera, Plan

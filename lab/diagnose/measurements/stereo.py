@@ -1,7 +1,4 @@
-"""The signal ratio of the two cameras in a scene that both see, against their ratio in uniform light.
-
-Dividing by the ratio in uniform light removes the difference of the two sensitivities. The measurement belongs to the
-right side."""
+"""Pairs of cameras: the ratio of their gains, and the delay between them."""
 
 from __future__ import annotations
 
@@ -11,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
@@ -18,16 +16,19 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.boards import views_of
-from lab.diagnose.measurements.dark_squares import screen_block
 from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_variance
+from lab.diagnose.measurements.screens import screen_block
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
+from lab.measure.board_calibration import Calibration, calibrate_robustly
 from lab.measure.board_detection import BoardView
+from lab.measure.bundle_adjustment import board_pose
+from lab.measure.pinhole import project
 from lab.measure.study import Study
 from sim.camera import Side
 from sim.effects.base import Effects
 from sim.effects.veiling_glare import VeilingGlare
-from sim.frame import pair_gain_factor
+from sim.frame import pair_gain_factor, right_delay_s
 from sim.optics.illumination import relative_illumination
 from sim.point import even_share
 from sim.sensor import mosaic
@@ -320,3 +321,119 @@ STEREO_GAIN = Measurement(
     conditions="scene",
     places="scenes",
 )
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Delay between the two cameras of a pair, from where each sees a moving board. Boards that stand still don't tell.
+
+
+LONGEST_GAP_S = 1.0  # between captures from which a board's speed is taken
+SLOWEST_PX_PER_S = 5.0  # speed of the fastest board from which on the delay is measured
+FEWEST_PAIRS = 6
+SHIFT_STD_PX = 0.05  # standard deviation of a pair's displacement beside noise, as the speed varies between captures
+POINTING_STD_PX = 2.0  # prior standard deviation of the displacement by the rig's rotation and the optical axes
+
+
+def time_block(study: Study) -> Block:
+    """Displacement (px) of a moving board in the right image from where the left camera's pose puts it, perpendicular
+    to the rig's baseline.
+
+    A delay t of the right camera displaces it by speed x t. Nuisance parameters: a common displacement, and its
+    gradients over the frame. Raises NotDetermined where the cameras can't be calibrated, and for fewer than
+    `FEWEST_PAIRS` pairs of a moving board."""
+    needs_both_sides(study, "stereo_time")
+    moving = _moving(study)
+    views = [{v.capture.pose: v for v in views_of(study, side)[0]} for side in SIDES]
+    try:
+        left, right = (
+            calibrate_robustly(list(v.values()), (study.camera.rows, study.camera.cols), side)
+            for v, side in zip(views, SIDES, strict=True)
+        )
+    except NotDetermined as refused:
+        raise NotDetermined("stereo_time", refused.reason) from refused
+    pairs = [(pose, views[0][pose], views[1][pose]) for pose in moving if pose in views[0] and pose in views[1]]
+    if len(pairs) < FEWEST_PAIRS:
+        raise NotDetermined("stereo_time", f"{len(pairs)} pairs of a moving board, {FEWEST_PAIRS} needed")
+    gaps, across = _gaps(pairs, left, right)
+    speed = np.array([across @ moving[pose] for pose, *_ in pairs])
+    place = np.array([v.image_px.mean(axis=0) for _, _, v in pairs])
+    place = (place - place.mean(axis=0)) / (0.5 * float(np.hypot(study.camera.rows, study.camera.cols)))
+    noise = np.array([right.solution.noise_px**2 * 2.0 / len(v.index) for _, _, v in pairs])
+    pointing = {
+        "stereo:turn": np.full(len(pairs), POINTING_STD_PX),
+        "stereo:x": POINTING_STD_PX * place[:, 0],
+        "stereo:y": POINTING_STD_PX * place[:, 1],
+    }
+
+    def predict(effects: Effects) -> Prediction:
+        return Prediction(right_delay_s(study.camera, effects) * speed, pointing)
+
+    return Block(
+        measurement=STEREO_TIME, reach=1e9, value=gaps, covariance=np.diag(noise + SHIFT_STD_PX**2),
+        labels=tuple(
+            Label(float(v), "Y", pose, (a.capture.id, b.capture.id), i % 3 == 1) for i, (v, (pose, a,
+            b)) in enumerate(zip(speed, pairs, strict=True))
+        ),
+        reads=frozenset({"light.pair_delay_s"}), predict=predict, scale=np.ones(len(pairs)),
+    )  # fmt: skip
+
+
+def _moving(study: Study) -> dict[str, FloatArray]:
+    """Pose -> speed (x, y) of the board in the right image, px/s, from the captures just before and after it.
+
+    Raises NotDetermined where no board moves.
+    """
+    timed = [(study.elapsed_s(v.capture), v) for v in views_of(study, "right")[0] if v.capture.time is not None]
+    timed.sort(key=lambda one: one[0])
+    found = {}
+    for (start, before), (_, here), (end, after) in zip(timed, timed[1:], timed[2:], strict=False):
+        lasted = end - start
+        index, first, last = np.intersect1d(before.index, after.index, return_indices=True)
+        if not 0.0 < lasted <= 2.0 * LONGEST_GAP_S or len(index) < 4:
+            continue
+        found[here.capture.pose] = np.asarray(
+            (after.image_px[last] - before.image_px[first]).mean(axis=0) / lasted, float
+        )
+    fastest = max((float(np.hypot(*v)) for v in found.values()), default=0.0)
+    if fastest < SLOWEST_PX_PER_S:
+        raise NotDetermined(
+            "stereo_time",
+            f"no board moves between captures less than {LONGEST_GAP_S:g} s apart: only what moves shows whether both "
+            "sides capture at the same time",
+        )
+    return found
+
+
+def _gaps(
+    pairs: Sequence[tuple[str, BoardView, BoardView]], left: Calibration, right: Calibration
+) -> tuple[FloatArray, FloatArray]:
+    """Mean displacement (pairs,), px, of each pair's corners in the right image, perpendicular to the rig's baseline
+    there; and the unit vector (x, y) of that direction. The rig's pose is the median over pairs."""
+    turns, shifts = [], []
+    poses = []
+    for _, one, two in pairs:
+        (turn, shift), (turn_two, shift_two) = board_pose(one, left.intrinsics), board_pose(two, right.intrinsics)
+        between = turn_two @ turn.T
+        turns.append(Rotation.from_matrix(between).as_rotvec())
+        shifts.append(shift_two - between @ shift)
+        poses.append((turn, shift))
+    rotation, translation = Rotation.from_rotvec(np.median(turns, axis=0)).as_matrix(), np.median(shifts, axis=0)
+    along = translation[:2] / max(float(np.hypot(*translation[:2])), 1e-12)
+    across = np.array([-along[1], along[0]])
+    gaps = []
+    for (_, _, two), (turn, shift) in zip(pairs, poses, strict=True):
+        points = (two.board_mm @ turn.T + shift) @ rotation.T + translation
+        gaps.append(float(((two.image_px - project(points, right.intrinsics)) @ across).mean()))
+    return np.array(gaps), across
+
+
+STEREO_TIME = Measurement(
+    "stereo_time",
+    title="capture times of the two cameras",
+    order=610,
+    axis="time",
+    unit="px/s",
+    make=time_block,
+    quantity="displacement, px",
+)
+
