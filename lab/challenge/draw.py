@@ -12,11 +12,45 @@ import numpy as np
 
 from lab.challenge.faults import FAULTS, spoilt
 from lab.challenge.noncentrality import FairStrength, fair_strengths, library_changes, noncentrality, summaries
-from lab.challenge.recordings import recording_set
 from lab.challenge.truth import SIZES, CaseTruth, Concealed, Kind
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.formats.recording_set import RecordingSet
-from mocks.former import BIT_DEPTH, LISTED, OUTSIDE, ConcealedCamera, DrawnSession, Law, Plan, record
+from lab.formats.recording_set import Manifest, RecordingSet
+from mocks.former import (
+    BIT_DEPTH,
+    LISTED,
+    OUTSIDE,
+    WAVELENGTH_NM,
+    WHOLE_SESSION,
+    ConcealedCamera,
+    DrawnSession,
+    Law,
+    Plan,
+    record,
+    record_pair,
+)
+from sim.spectrum import Spectrum
+
+# --- Sessions of the second image former as recording sets ------------------------------------------------------------
+
+
+def recordings_of(camera: ConcealedCamera, plan: Plan = WHOLE_SESSION) -> RecordingSet:
+    """Return the recording set of one camera."""
+    return recording_set(record(camera, plan))
+
+
+def recordings_of_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan) -> RecordingSet:
+    """Return the recording set of a stereo pair."""
+    return recording_set(record_pair(left, right, plan))
+
+
+def recording_set(session: DrawnSession) -> RecordingSet:
+    """Return the recording set of a session; raises ValidationError where its manifest doesn't follow the format."""
+    spectra = {path: Spectrum.of(WAVELENGTH_NM, values) for path, values in session.spectra.items()}
+    manifest = Manifest.model_validate(session.manifest)
+    # every field is written, null where it is unknown
+    manifest = Manifest.model_validate(manifest.model_dump(mode="json"))
+    return RecordingSet(manifest, dict(session.frames), spectra, dict(session.targets), source=manifest.name)
+
 
 #: Of twenty cases: 30 % healthy, 35 % one effect, 15 % two, 20 % outside the library.
 SHARES: tuple[tuple[Kind, int], ...] = (("healthy", 6), ("single", 7), ("compound", 3), ("outside", 4))

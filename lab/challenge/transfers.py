@@ -21,9 +21,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
+from lab.challenge.draw import recordings_of
 from lab.challenge.live import commit
 from lab.challenge.proof import ABSTAINED, RIGHT, WRONG, placed
-from lab.challenge.recordings import recordings_of
 from lab.challenge.truth import load, store
 from lab.diagnose import examine
 from lab.errors import InputError

@@ -14,9 +14,8 @@ from typing import TypeVar
 import numpy as np
 
 from lab.challenge.along_axis import separability_along
-from lab.challenge.draw import Case
+from lab.challenge.draw import Case, recording_set
 from lab.challenge.noncentrality import noncentrality, summaries
-from lab.challenge.recordings import recording_set
 from lab.challenge.truth import SIZES, CaseTruth, Concealed
 from lab.errors import InputError
 from mocks.former import LISTED, UNLISTED, ConcealedCamera, DrawnSession, Law, Plan, UnlistedLaw, record

@@ -16,8 +16,7 @@ from rich.markup import escape
 
 from lab.cli import calibrations, capturing, devices, diagnosis, effects, fitting, kinds, recordings, simulation
 from lab.cli.challenge import commands as challenge
-from lab.cli.console import err, out
-from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated
+from lab.cli.console import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated, err, out
 from lab.cli.twin import commands as twin
 from lab.errors import DeviceError, InputError, failure_of_environment
 

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import check_output, check_writable, out, warn, write_json
+from lab.cli.console import check_output, check_writable, out, progress_bar, warn, write_json
 from lab.cli.exchange import (
     LENSFUN,
     OF_A_CAMERA,
@@ -23,14 +23,13 @@ from lab.cli.exchange import (
     import_spectra,
     import_tiled,
 )
-from lab.cli.progress import progress_bar
 from lab.cli.sources import StoreFolder, store_to_read
 from lab.cli.tables import print_fit
 from lab.errors import InputError
 from lab.pipeline import session_recordings
 
 if TYPE_CHECKING:
-    from lab.formats.importers.import_options import ImportOptions
+    from lab.formats.importers.single_picture import ImportOptions
 
 commands = typer.Typer()
 #: `--from` these: a CSV of channel means and variances by level, or of channel means by wavelength, which becomes a
@@ -102,7 +101,7 @@ def import_(
     """Turn another format into a recording set; spectra into CSV, a lens into a camera file."""
     from lab.formats import recording_set
     from lab.formats.importers import read_foreign
-    from lab.formats.importers.import_options import ImportOptions, chart_corners, grid
+    from lab.formats.importers.single_picture import ImportOptions, chart_corners, grid
 
     if transfer not in ("", "linear", "srgb"):
         raise InputError(f"--transfer {transfer}: give linear or srgb")
@@ -146,7 +145,7 @@ def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> 
     """A table holds no frames: its import is a fit."""
     from lab.fit.noise.level_table import fit_level_table
     from lab.fit.spectral.mean_table import fit_mean_table
-    from lab.formats.foreign_text import read_foreign_csv
+    from lab.formats.cgats import read_foreign_csv
     from lab.formats.importers.images import read_camera_file
     from lab.formats.recording_set import Manifest, RecordingSet
 

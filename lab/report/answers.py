@@ -21,7 +21,7 @@ from lab.formats.results import (
     ResidualCurve,
     ValidationResult,
 )
-from lab.formats.results.in_words import measured, plain_number
+from lab.formats.results.words import measured, plain_number
 from lab.predict.both_models import BothModels
 from lab.report import charts, words
 from lab.report.diagnosis import worst_of_each

@@ -19,7 +19,7 @@ from lab.formats.results import (
     ResidualPicture,
     Visibility,
 )
-from lab.formats.results.in_words import plain_number, shown_unit
+from lab.formats.results.words import plain_number, shown_unit
 from lab.report.charts import AFTER, Figure, Trace, axis, band, layout
 from lab.report.pictures import difference_picture
 from sim.camera import Side

@@ -19,7 +19,7 @@ from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
-from lab.formats.recording_set.frame_files import Frame
+from lab.formats.recording_set.files import Frame
 from lab.formats.results import Skipped
 from lab.measure.level_lines import DARKER_SHARE
 from lab.measure.mishaps import exchanged_frames

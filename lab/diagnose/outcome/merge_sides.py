@@ -23,7 +23,7 @@ from lab.formats.results import (
     ParameterValue,
     Rival,
 )
-from lab.formats.results.in_words import measured
+from lab.formats.results.words import measured
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.families import Family

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from lab.errors import InputError
 from lab.fit.noise.noise_fit import noise_fit
-from lab.formats.foreign_text import TableRow, table_rows
+from lab.formats.cgats import TableRow, table_rows
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, ChannelNoise, Emva1288, FitResult, NoiseFit, Skipped
 from lab.measure.levels import MeasuredLevel, PlaneStatistics

@@ -27,7 +27,7 @@ from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession
 from lab.capture_kinds.dark import DarkSequence
 from lab.cli import bench_process, capturing, diagnosis, entry, fitting
-from lab.cli.exit_codes import EXIT_INPUT
+from lab.cli.console import EXIT_INPUT
 from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
 from lab.diagnose.effect_list import EffectList, effect_list
@@ -720,7 +720,7 @@ def test_a_folder_of_results_is_checked_before_the_work(
 def test_a_frame_that_may_not_be_read_is_not_damaged(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("lab.formats.recording_set.frame_files.os.access", lambda *_: False)
+    monkeypatch.setattr("lab.formats.recording_set.files.os.access", lambda *_: False)
     assert cli.main(["fit", str(folder)]) == 2
     told = capsys.readouterr().err
     assert "can't be read (Permission denied)" in told and "damaged" not in told

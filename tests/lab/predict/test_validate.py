@@ -9,7 +9,7 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.errors import Cancelled
 from lab.fit import fit_recording_set
 from lab.fit.psf.screen_kernel import expected_kernel

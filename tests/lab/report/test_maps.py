@@ -13,8 +13,7 @@ from lab.cli import main
 from lab.errors import InputError
 from lab.fit.noise.pixel_maps import PixelMaps
 from lab.formats.recording_set import Manifest, RecordingSet, write
-from lab.report.maps import write_maps
-from lab.report.pictures import map_picture
+from lab.report.pictures import map_picture, write_maps
 
 SHAPE = (24, 40)
 

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of, recordings_of_pair
+from lab.challenge.draw import recordings_of, recordings_of_pair
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.boards import board_block, calibration_of

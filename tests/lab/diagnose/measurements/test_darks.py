@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements import dark_noise, defective_pixels

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel

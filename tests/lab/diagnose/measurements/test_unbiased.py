@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.measurements.block import Block, measurements
 from lab.diagnose.measurements.line_spectra import Bands, log_mean_bias, log_mean_variance, periodogram
 from lab.errors import NotDetermined

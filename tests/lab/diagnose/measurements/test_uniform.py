@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.darks import added_dark_dn, cell_means, dark_current_map
 from lab.diagnose.measurements.linearity import RADIOMETER_STD, linearity_block

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.metadata.targets import misstated_board
 from lab.formats.importers import read_checkerboard_pairs
 from lab.formats.recording_set import RecordingSet

@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lab.challenge.draw import DrawnFrame
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import DrawnFrame, recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.metadata.frames import misstated_dark_exposure

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose import Diagnosis, examine
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.measurement_model import MeasurementModel, form_name

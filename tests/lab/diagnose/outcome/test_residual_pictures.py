@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.outcome.improved_model import residual_pictures
 from lab.formats.camera_file import CameraFile
 from lab.formats.camera_model import camera_model

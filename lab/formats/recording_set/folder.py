@@ -1,13 +1,16 @@
-"""Writing a recording set as a folder: completely, or not at all."""
+"""A recording set as a folder: read, written, and packed as one archive."""
 
 from __future__ import annotations
 
 import io
 import os
 import shutil
+import tarfile
 import tempfile
-from collections.abc import Callable, Iterator
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
+from typing import Literal
 
 import numpy as np
 import tifffile
@@ -15,10 +18,44 @@ import tifffile
 from lab.capture_kinds.base import Capture, Names, names_in
 from lab.errors import InputError, one_line
 from lab.formats.recording_set.checks import inspect
-from lab.formats.recording_set.frame_files import Frame
-from lab.formats.recording_set.manifest import RecordingError, manifest_json
+from lab.formats.recording_set.files import FolderFiles, Frame, locate
+from lab.formats.recording_set.manifest import RecordingError, manifest_json, parse_manifest
 from lab.formats.recording_set.recordings import RecordingSet
 from lab.formats.spectrum_csv import format_spectrum
+
+
+def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None = None) -> RecordingSet:
+    """Return the recording set in the folder `path`, completely checked.
+
+    Raises RecordingError (an InputError) with one line for everything that can't be used. Unknown keys, skipped kinds
+    and the like stand in `.warnings`.
+    """
+    root = Path(path)
+    if root.name == "manifest.json" and root.is_file():
+        root = root.parent
+    if not root.is_dir():
+        raise RecordingError([f"{root}: no such folder; give the folder of a recording set"])
+    if root.is_dir() and not (root / "manifest.json").exists():
+        raise RecordingError(
+            [f"{root}: no recording set: it has no manifest.json; `calibench import` and `calibench export` write one"]
+        )
+    try:
+        text = locate(root, "manifest.json").read_text(encoding="utf-8-sig")
+    except (InputError, OSError, UnicodeDecodeError) as error:
+        raise RecordingError([f"{root / 'manifest.json'}: {one_line(error)}"]) from error
+    manifest, skipped = parse_manifest(text, str(root / "manifest.json"))
+    recordings = RecordingSet(manifest, source=str(root), files=FolderFiles(root))
+    if progress:
+        progress(f"looking through {len(manifest.captures)} captures")
+    problems, warnings = inspect(recordings)
+    if problems:
+        raise RecordingError([*skipped, *problems])  # a skipped capture may be the cause of a problem
+    recordings.warnings = (*skipped, *warnings)
+    return recordings
+
+
+# --- Writing a recording set as a folder: completely, or not at all ---------------------------------------------------
+
 
 MANIFEST = "manifest.json"
 
@@ -129,3 +166,58 @@ def write(
             f"{folder}: can't be written ({one_line(error)}); make room or choose another folder"
         ) from error
     return folder
+
+
+# --- Files as an archive, made piece by piece while it is sent: unpacked, a recording set's is what `read` takes ------
+
+
+#: A .zip has its list of files at the end; a .tar can be unpacked while it arrives.
+ArchiveForm = Literal["zip", "tar"]
+
+
+class _Sent(io.RawIOBase):
+    """A write-only file whose content is taken away piece by piece."""
+
+    def __init__(self) -> None:
+        self._held = bytearray()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, piece: object) -> int:
+        written = bytes(piece)  # type: ignore[call-overload]
+        self._held += written
+        return len(written)
+
+    def taken(self) -> bytes:
+        """Return what came since the last call."""
+        held, self._held = bytes(self._held), bytearray()
+        return held
+
+
+def packed(files: Iterable[tuple[str, bytes]], form: ArchiveForm = "zip") -> Iterator[bytes]:
+    """Yield the pieces of an archive of files, (path, content) each: one of them in memory at a time, stored without
+    compression. Where `files` raises, the archive has no end (a .zip: no list of files), so nobody takes it for a whole
+    one."""
+    sent = _Sent()
+    if form == "tar":
+        with tarfile.open(fileobj=sent, mode="w|") as tar:
+            for path, content in files:
+                member = tarfile.TarInfo(path)
+                member.size = len(content)
+                tar.addfile(member, io.BytesIO(content))
+                yield sent.taken()
+    else:
+        # Closed after an error, too; what that writes isn't sent.
+        with zipfile.ZipFile(sent, "w", zipfile.ZIP_STORED) as made:
+            for path, content in files:
+                made.writestr(zipfile.ZipInfo(path), content)
+                yield sent.taken()
+    yield sent.taken()
+
+
+def archive(recordings: RecordingSet, form: ArchiveForm = "zip") -> Iterator[bytes]:
+    """Yield the pieces of an archive of the set, as `packed` makes it. Raises InputError where a frame is missing or
+    damaged."""
+    return packed(contents(recordings), form)
+
