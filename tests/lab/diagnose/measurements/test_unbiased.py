@@ -36,7 +36,7 @@ SPECTRAL = (*EVEN, "narrowband")
 EDGES = (*EVEN, "slanted_edge")
 SMALL_SCENES = (*EDGES, "screen")
 SCENES = (*SPECTRAL, "chart", "slanted_edge", "charuco", "screen")
-#: Measurements of two cameras: this contract draws one (test_board.py has pairs).
+#: Measurements of two cameras: this contract draws one (test_boards.py has pairs).
 OF_PAIRS = {"stereo_gain", "stereo_time"}
 
 

@@ -1,4 +1,4 @@
-"""The mock radiometer: what it measures, when it refuses, and the conversations of other people's hosts."""
+"""Spectroradiometers of the bench, byte by byte."""
 
 from __future__ import annotations
 
@@ -8,12 +8,108 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from mocks.cr300 import TOO_HIGH, TOO_LOW, ColorimetryResearch
 from mocks.lamp import Lamp, tristimulus
+from mocks.pr655 import OVERLOAD, WEAK_LIGHT, PhotoResearch
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.wire import Grammar
 from sim.spectrum import Spectrum
 
 Talk = Callable[[Grammar, bytes], bytes]
+
+
+@pytest.mark.parametrize(("model", "step_nm"), [("CR-300", 2.0), ("CR-250", 4.0)])
+def test_a_spectrum_is_announced_and_follows_one_value_a_line(talk: Talk, model: str, step_nm: float) -> None:
+    lamp = Lamp()
+    mock = ColorimetryResearch(lamp, model)
+    assert talk(mock, b"M\n") == b"OK:0:M:No errors\r\n"
+    head, *values = talk(mock, b"RM Spectrum\n").decode().splitlines()
+    kind, code, command, told = head.split(":")
+    first_nm, last_nm, step, count = (float(v) for v in told.split(","))
+    assert (kind, code, command) == ("OK", "0", "RM Spectrum")
+    assert (first_nm, last_nm, step, count) == (380.0, 780.0, step_nm, len(values))
+    wavelength_nm = np.arange(first_nm, last_nm + 0.1, step)
+    np.testing.assert_allclose([float(v) for v in values], lamp.radiance().at(wavelength_nm), rtol=5e-4)
+
+
+@pytest.mark.parametrize(("luminance_cd_m2", "code"), [(1e6, TOO_HIGH), (1e-5, TOO_LOW)])
+def test_light_out_of_range_is_an_error(talk: Talk, luminance_cd_m2: float, code: int) -> None:
+    assert talk(ColorimetryResearch(Lamp(luminance_cd_m2)), b"M\n").startswith(f"ER:{code}:".encode())
+
+
+def test_nothing_is_told_before_a_measurement(talk: Talk) -> None:
+    assert talk(ColorimetryResearch(Lamp()), b"RM XYZ\n").startswith(b"ER:")
+
+
+def test_echo_can_be_switched(talk: Talk) -> None:
+    mock = ColorimetryResearch(Lamp())
+    assert talk(mock, b"E\nRC ID\n") == b"RC ID\nOK:0:RC ID:A00427\r\n"
+    assert talk(mock, b"E\nRC ID\n") == b"E\nOK:0:RC ID:A00427\r\n"
+
+
+def test_settings_keep_to_their_limits(talk: Talk) -> None:
+    mock = ColorimetryResearch(Lamp())
+    assert talk(mock, b"SM Speed 4\n").startswith(b"ER:-519:")
+    assert talk(mock, b"SM ExposureX 5\nRS ExposureX\n").endswith(b"OK:0:RS ExposureX:5\r\n")
+
+
+# --- The mock PR-655 and PR-670: remote mode, spectra, error codes ----------------------------------------------------
+
+
+
+
+@pytest.mark.parametrize("start", [b"PHOTO", b"PHOTO\r", b"PHOTO\n", b"PHOTO\r\n", b"D110\rPHPHOTO"])
+@pytest.mark.parametrize("paced", [True, False])
+def test_remote_mode_begins_with_five_characters(talk: Talk, start: bytes, paced: bool) -> None:
+    mock = PhotoResearch(Lamp())
+    said = b"".join(talk(mock, bytes((b,))) for b in start) if paced else talk(mock, start)
+    assert said == b" REMOTE MODE\r\n"
+    assert talk(mock, b"D110\n") == b"00000,65501234\r\n"
+
+
+@pytest.mark.parametrize(("model", "step_nm", "points"), [("PR-655", 4, 101), ("PR-670", 2, 201)])
+def test_spectrum_lines_follow_two_header_lines(talk: Talk, model: str, step_nm: int, points: int) -> None:
+    lamp = Lamp()
+    mock = PhotoResearch(lamp, model)
+    talk(mock, b"PHOTO\r")
+    assert talk(mock, b"M0\r") == b"00000\r\n"
+    lines = talk(mock, b"D5\r").decode().split("\r\n")
+    assert lines.pop() == ""
+    table = np.array([[float(v) for v in line.split(",")] for line in lines[2:]])
+    np.testing.assert_array_equal(table[:, 0], np.linspace(380, 780, points))
+    assert table[1, 0] - table[0, 0] == step_nm
+    np.testing.assert_allclose(table[:, 1], lamp.radiance().at(table[:, 0]), rtol=5e-4)  # four digits
+    assert talk(mock, b"M5\r").decode().split("\r\n") == [*lines, ""]
+
+
+@pytest.mark.parametrize(("luminance_cd_m2", "code"), [(1e6, OVERLOAD), (1e-5, WEAK_LIGHT)])
+def test_light_out_of_range_is_told_by_its_code(talk: Talk, luminance_cd_m2: float, code: int) -> None:
+    mock = PhotoResearch(Lamp(luminance_cd_m2))
+    talk(mock, b"PHOTO\r")
+    assert int(talk(mock, b"M5\r")) == code
+    assert int(talk(mock, b"D1\r")) == code
+
+
+def test_a_dark_source_takes_minutes() -> None:
+    mock = PhotoResearch(Lamp(0.01))
+    mock.receive(b"PHOTO\rM5\r")
+    assert mock.wait_s is not None
+    assert 60 <= mock.wait_s <= 300
+
+
+def test_colorimetric_answers_of_illuminant_a(talk: Talk) -> None:
+    mock = PhotoResearch(Lamp(100.0))
+    talk(mock, b"PHOTO\rM0\r")
+    status, units, luminance, u, v = talk(mock, b"D3\r").decode().split(",")
+    assert (status, units, float(luminance)) == ("00000", "0", 100.0)
+    assert (float(u), float(v)) == (0.2560, 0.5243)  # CIE 15, illuminant A
+    # McCamy's cubic is good to 2 K here.
+    assert float(talk(mock, b"D4\r").split(b",")[3]) == pytest.approx(2856, abs=2)
+
+
+# --- The mock radiometer: what it measures, when it refuses, and the conversations of other people's hosts ------------
+
+
 
 
 def test_the_spectrum_is_the_lamps(talk: Talk) -> None:
@@ -125,3 +221,4 @@ def test_a_hosts_session_with_probe_setup_and_terminal_counts(talk: Talk) -> Non
 def test_luminance_and_spectrum_agree(talk: Talk) -> None:
     lamp = Lamp(luminance_cd_m2=7.0)
     assert tristimulus(lamp.radiance())[1] == pytest.approx(7.0, rel=1e-9)
+
