@@ -12,8 +12,8 @@ from scipy.signal import savgol_coeffs
 
 from lab.diagnose.discovery.profile import Look, Profile
 from lab.diagnose.measurements.code_density import CodeCounts, counted, prepared, widths
+from lab.diagnose.measurements.dark_frames import dark_frames
 from lab.diagnose.measurements.dark_readout import dark_readout
-from lab.diagnose.measurements.darks import dark_frames
 from lab.diagnose.measurements.flat_field import FlatLevel, flats, without_dark
 from lab.errors import NotDetermined
 from lab.measure.reads import COLLECTED, GAINS, acting

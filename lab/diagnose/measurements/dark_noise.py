@@ -6,7 +6,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.darks import DEFECTS, added_dark_e_per_s, captures_of, dark_frames, too_coarse
+from lab.diagnose.measurements.dark_frames import DEFECTS, captures_of, dark_frames, too_coarse
+from lab.diagnose.measurements.dark_level import added_dark_e_per_s
 from lab.errors import NotDetermined
 from lab.measure.noise_figures import CLIP
 from lab.measure.study import Study

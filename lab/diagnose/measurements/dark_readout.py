@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.darks import (
+from lab.diagnose.measurements.dark_frames import (
     CELL_FLOOR_DN,
     DarkCondition,
     DarkStatistics,

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import betainc, chdtrc, chdtri, gammaln, ndtr, xlogy
 
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.darks import (
+from lab.diagnose.measurements.dark_frames import (
     DEFECTS,
     TAIL_EDGES,
     DarkPattern,

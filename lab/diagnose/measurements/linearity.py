@@ -11,7 +11,7 @@ import numpy as np
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.darks import added_dark_dn
+from lab.diagnose.measurements.dark_level import added_dark_dn
 from lab.diagnose.measurements.line_means import LineMeans
 from lab.diagnose.measurements.row_light import ROW_LIGHT, row_light_variance
 from lab.errors import NotDetermined

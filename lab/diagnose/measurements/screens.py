@@ -352,4 +352,3 @@ SCREEN_GRID = Measurement(
     make=grid_block,
     quantity="strength of the line, sigma",
 )
-

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.darks import added_dark_dn
+from lab.diagnose.measurements.dark_level import added_dark_dn
 from lab.diagnose.measurements.linearity import RADIOMETER_STD, UniformLevels
 from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
 from lab.errors import NotDetermined

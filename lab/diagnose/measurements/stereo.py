@@ -436,4 +436,3 @@ STEREO_TIME = Measurement(
     make=time_block,
     quantity="displacement, px",
 )
-

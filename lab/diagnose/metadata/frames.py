@@ -14,7 +14,8 @@ from lab.capture_kinds.base import LONGEST_EXPOSURE_S
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
-from lab.diagnose.measurements.darks import BLACK_LEVEL, DARK, TEMPERATURE_STEP_C
+from lab.diagnose.measurements.dark_frames import TEMPERATURE_STEP_C
+from lab.diagnose.measurements.dark_level import BLACK_LEVEL, DARK
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy

@@ -352,4 +352,3 @@ def _cell_px(pictures: ScreenPictures, stated: float) -> float | None:
     cells = warp.cells(corner + np.array([cols.mean(), rows.mean()]))
     (ax, ay), (bx, by) = cells[1] - cells[0], cells[2] - cells[0]
     return float(1.0 / np.sqrt(abs(ax * by - ay * bx)))
-

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lab.diagnose.measurements.darks import dark_frames
+from lab.diagnose.measurements.dark_frames import dark_frames
 from lab.diagnose.metadata.frames import misstated_dark_exposure
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet

@@ -12,7 +12,7 @@ from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.outlying import freed, outlying_levels
-from lab.diagnose.measurements.darks import dark_level_block
+from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.outcome.mismatches import located, unexplained

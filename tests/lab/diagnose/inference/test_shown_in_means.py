@@ -9,7 +9,8 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.shown_in_means import is_judged_in_means, must_show_in_means, shown_in_means
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.linearity import linearity_block
-from lab.diagnose.measurements.noise import neighbour_block, variance_block
+from lab.diagnose.measurements.noise import variance_block
+from lab.diagnose.measurements.noise_neighbours import neighbour_block
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.outcome.mismatches import unexplained
 from lab.diagnose.policy import DecisionPolicy

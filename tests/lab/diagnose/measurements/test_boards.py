@@ -162,4 +162,3 @@ def test_scales_of_wavelengths_are_compared_within_a_pose(tmp_path: Path, percen
 def test_pictures_of_other_poses_are_not_compared(tmp_path: Path) -> None:
     with pytest.raises(NotDetermined, match="light of 3 wavelengths, but no pose in two of them"):
         board_colour_block(study_of_colours(tmp_path, 0.38, one_pose=False))
-

@@ -13,7 +13,7 @@ from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.code_density import code_block, widths
-from lab.diagnose.measurements.darks import dark_level_block
+from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.measurements.noise import variance_block
 from lab.diagnose.measurements.spectral import chart_block

@@ -17,7 +17,8 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements import dark_noise, defective_pixels
 from lab.diagnose.measurements.block import Block, measurements
 from lab.diagnose.measurements.blocks import measurement_model
-from lab.diagnose.measurements.darks import TAIL_EDGES, DarkCondition, dark_level_block
+from lab.diagnose.measurements.dark_frames import TAIL_EDGES, DarkCondition
+from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from lab.diagnose.measurements.block import Block
+from lab.diagnose.measurements.dark_field import dark_field_block
+from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.dark_readout import fixed_line_block
-from lab.diagnose.measurements.darks import dark_field_block, dark_level_block
 from lab.diagnose.measurements.flat_field import (
     ALIKE,
     _adjacent,
@@ -141,4 +142,3 @@ def test_its_mean_is_a_part_of_the_black_level() -> None:
     model = measured_model(recorded(), dark_level_block)
     assert abs(sigmas(model)) < 4.0
     np.testing.assert_array_equal(model.mean((RAMP,)), model.mean(()))
-

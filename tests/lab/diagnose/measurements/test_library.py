@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lab.diagnose.measurements import darks
+from lab.diagnose.measurements import dark_level
 from lab.diagnose.measurements.block import measurement_title, measurements
 from tests.lab.diagnose.on_blocks import declared
 
@@ -24,6 +24,6 @@ def test_a_measurement_that_is_gone_is_titled_by_its_name() -> None:
 
 
 def test_two_of_one_name_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(darks, "TWIN", declared("slanted_edge", "field", "1"), raising=False)
+    monkeypatch.setattr(dark_level, "TWIN", declared("slanted_edge", "field", "1"), raising=False)
     with pytest.raises(ValueError, match="two measurements are named 'slanted_edge'"):
         measurements.__wrapped__()

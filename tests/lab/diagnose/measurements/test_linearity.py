@@ -141,4 +141,3 @@ def test_the_law_adds_its_variance() -> None:
         for p in (large, block.predict(()))
     ]
     np.testing.assert_allclose(*wide, rtol=1e-6)
-

@@ -13,15 +13,10 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.linearity import linearity_block
-from lab.diagnose.measurements.noise import (
-    PAIRS,
-    correlations,
-    independent_correlations,
-    neighbour_block,
-    repeats_of,
-    variance_block,
-)
+from lab.diagnose.measurements.noise import variance_block
+from lab.diagnose.measurements.noise_neighbours import correlations, neighbour_block
 from lab.diagnose.measurements.slanted_edge import edge_block
+from lab.diagnose.measurements.temporal_noise import PAIRS, independent_correlations, repeats_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet

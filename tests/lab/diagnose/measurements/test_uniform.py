@@ -10,7 +10,8 @@ import pytest
 
 from lab.challenge.draw import recordings_of
 from lab.diagnose.measurements.blocks import measurement_model
-from lab.diagnose.measurements.darks import added_dark_dn, cell_means, dark_current_map
+from lab.diagnose.measurements.dark_frames import cell_means
+from lab.diagnose.measurements.dark_level import added_dark_dn, dark_current_map
 from lab.diagnose.measurements.linearity import RADIOMETER_STD, linearity_block
 from lab.diagnose.measurements.spectral import (
     MOST_SAMPLE_STD,

@@ -147,4 +147,3 @@ def test_what_both_sides_share_is_no_better_told_by_two() -> None:
     assert "settling_min" not in drift.parameters
     hot = _both(HotPixels(excess_e_per_s=300.0), HOT.std).effects[0]
     assert hot.parameters["excess_e_per_s"].std == pytest.approx(20.0 / np.sqrt(2.0))
-

@@ -1,29 +1,26 @@
-"""Dark frames: their means, the black level, and the dark signal over the field."""
+"""Statistics of dark frames, from which all measurements of dark frames take their numbers. Each frame is read once.
+
+The baseline's dark frame has the mean black level + dark current x exposure at every temperature, and normal noise and
+a normal fixed pattern of independent pixels. The measurements state powers as logarithms and counts as square roots,
+whose variance hardly depends on their size.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
-from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.line_means import LineMeans
 from lab.diagnose.measurements.line_spectra import periodogram, pooled, pooled_along
 from lab.errors import NotDetermined
 from lab.measure.noise_figures import (
-    BLACK_FLOOR_DN,
     CLIP,
     MEDIAN_OF,
     SMOOTH_PX,
-    STATED_BLACK_DN,
-    STATED_BLACK_SHARE,
     Image,
     from_surroundings,
     local_variance,
@@ -31,12 +28,9 @@ from lab.measure.noise_figures import (
     sound_pixels,
     without_lines,
 )
-from lab.measure.reads import ADDED, DARK_CURRENT, LAG, LINES
 from lab.measure.study import Study, held_out_of
-from sim.effects.base import Effects
 from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
-from sim.uniform import Uniform, noise_values
 
 TEMPERATURE_STEP_C = 1.0  # dark frames whose temperatures differ by no more are repeats
 CELLS = 4, 6  # of a frame: rows, columns
@@ -353,227 +347,3 @@ def too_coarse(frames: Sequence[DarkStatistics], limit_dn: float) -> str:
 def captures_of(frames: DarkStatistics, held_out: bool) -> tuple[str, ...]:
     """Ids of a condition's seen or held-out captures."""
     return tuple(c.id for c in (frames.condition.held_out if held_out else frames.condition.seen))
-
-
-# --- The mean of dark frames by exposure, temperature and time; and the measured black level against the stated one ---
-
-
-#: Most points of the grid on which the dark current over the field is evaluated. A grid much coarser than the pixels
-#: moves the laws' origin and the cells' borders: with 50 DN of glow in a corner, a cell's mean is then off by a hundred
-#: standard deviations.
-MOST_POINTS = 1e6
-
-
-def dark_current_map(study: Study, effects: Effects) -> Callable[[float | None], FloatArray]:
-    """Function of the temperature (C) that returns the dark current (rows, cols), e/s: by pixel, or by squares of
-    pixels where the frame has more than `MOST_POINTS` pixels."""
-    camera = study.camera
-    down = math.ceil(math.sqrt(camera.rows * camera.cols / MOST_POINTS))
-    coarse = camera.model_copy(
-        update={
-            "rows": camera.rows // down,
-            "cols": camera.cols // down,
-            "pixel_pitch_um": camera.pixel_pitch_um * down,
-        }
-    )
-    return Uniform(coarse, effects).dark_e_per_s
-
-
-def added_dark_e_per_s(study: Study, effects: Effects) -> Callable[[float | None], float]:
-    """Function of the temperature (C) that returns the change of the mean dark current by effects, without defective
-    pixels, e/s."""
-    if not Uniform(study.camera, effects).changes_dark_current:
-        return lambda temperature_c: 0.0
-    at = dark_current_map(study, effects)
-    return cache(lambda temperature_c: float(at(temperature_c).mean()) - study.camera.dark_current_e_per_s)
-
-
-def added_dark_dn(study: Study, effects: Effects) -> Callable[[Capture], float]:
-    """Function of a capture that returns the change of its mean dark signal by effects, DN."""
-    rate_at = added_dark_e_per_s(study, effects)
-    return lambda capture: study.noise.gain * rate_at(capture.temperature_c) * capture.exposure_s
-
-
-def dark_level_block(study: Study) -> Block:
-    """Mean of every dark frame without defective pixels, DN.
-
-    Nuisance parameters: black level and dark current. Effects may add an offset that drifts with time or temperature,
-    dark current, image lag, and the converter's error at these codes. Raises NotDetermined without dark captures."""
-    frames = study.once(dark_frames)
-    captures = [(c, f.condition, c in f.condition.held_out) for f in frames for c in f.condition.captures]
-    value = np.array([f.means[c.id] for f in frames for c in f.condition.captures])
-    exposures = np.array([c.exposure_s for c, *_ in captures])
-    noise, gain = study.noise, study.noise.gain
-    base = noise.black + noise.dark_dn_per_s * exposures
-    lines = LineMeans(study, [(c, None) for c, *_ in captures])
-
-    def predict(effects: Effects) -> Prediction:
-        offset, more, carried = study.offset(effects), added_dark_dn(study, effects), study.carried_e(effects)
-        mean = base.copy()
-        for i, (capture, _, _) in enumerate(captures):
-            lag_e = np.mean([carried(capture, c) for c in study.channels])
-            mean[i] += offset(capture) + more(capture) + gain * float(lag_e)
-        model = Uniform(study.camera, effects)
-        if not model.has_even_codes:
-            mean = model.codes(mean[:, None] + gain * study.camera.read_noise_e * noise_values(1)).mean(axis=1)
-        return Prediction(mean, study.free_offsets(exposures) | lines.jacobian(effects))
-
-    # noise of less than about half a code doesn't dither: rounding moves the mean, by its place between two codes
-    coarse = np.array([_rounding_dn(f) for f in frames for _ in f.condition.captures])
-    same = np.array([[a[1] is b[1] for b in captures] for a in captures])
-    # the coordinate of smoothness: 10 degrees count as twice the range of exposures
-    reach = float(max(np.ptp(exposures), 1e-3))
-    warmer = np.array(
-        [
-            0.0 if k.temperature_c is None or noise.dark_c is None else k.temperature_c - noise.dark_c
-            for _, k, _ in captures
-        ]
-    )
-    return Block(
-        measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
-        covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse,
-        coarse),
-        labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
-        reads=LAG | DARK_CURRENT | {"signal.offset_dn", "codes.codes"}, scattered_by=LINES, predict=predict,
-        scale=np.ones(len(value)),
-    )  # fmt: skip
-
-
-def _rounding_dn(frames: DarkStatistics) -> float:
-    """Largest shift of a mean by rounding, DN: exp(-2 pi^2 variance) / pi, with the variance before rounding."""
-    changing = next((c.variance_dn2 for c in frames.changing.values()), None)
-    if changing is None:
-        return 0.1
-    return float(np.exp(-2.0 * np.pi**2 * max(changing - 1.0 / 12.0, 0.0)) / np.pi)
-
-
-def black_level_block(study: Study) -> Block:
-    """Return the measured black level against the stated one, DN. No effect changes it: a wrong statement is no effect.
-
-    Raises NotDetermined where none is stated.
-    """
-    stated = study.stated.black_level_dn
-    if stated is None:
-        raise NotDetermined("black_level", "the black level isn't stated: nothing to hold the dark frames against")
-    shortest = min(conditions(study), key=lambda c: c.exposure_s)
-    std = float(np.hypot(STATED_BLACK_SHARE * stated, STATED_BLACK_DN)) + study.noise.black_std
-    return Block(
-        measurement=BLACK_LEVEL, reach=1.0, value=np.array([study.noise.black]),
-        covariance=np.array([[std**2]]),
-        labels=(Label(0.0, "all", "stated level", tuple(c.id for c in shortest.captures), False),),
-        reads=frozenset(), predict=lambda effects: Prediction(np.array([stated]), {}), scale=np.array([max(stated,
-        1.0)]),
-    )  # fmt: skip
-
-
-DARK = Measurement(
-    "dark",
-    title="mean level of dark frames",
-    order=100,
-    axis="exposure",
-    unit="s",
-    make=dark_level_block,
-    quantity="mean level, DN",
-    is_level=True,
-    conditions="exposure and temperature",
-)
-
-
-BLACK_LEVEL = Measurement(
-    "black_level",
-    title="black level against the stated one",
-    order=110,
-    axis="exposure",
-    unit="s",
-    make=black_level_block,
-    quantity="black level, DN",
-)
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# The dark signal by place in the frame: glow of the read-out, other dark current that isn't uniform, and what read-out
-# adds by itself.
-
-
-CELL_PX = 4  # the least side of a cell
-
-
-def dark_field_block(study: Study) -> Block:
-    """Means over 4 x 6 cells of the mean dark frame of each condition, less the frame's mean, DN.
-
-    The level of each mean frame is a nuisance parameter. Raises NotDetermined where cells are narrower than `CELL_PX`.
-    """
-    frames = [f for f in study.once(dark_frames) if f.fixed]
-    points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
-    rows, cols = CELLS
-    count = rows * cols
-    if min(study.camera.rows // rows, study.camera.cols // cols) < CELL_PX:
-        raise NotDetermined(
-            "dark_field",
-            f"frames of {study.camera.rows} x {study.camera.cols} px: too small to be split into cells, which need "
-            f"{rows * CELL_PX} x {cols * CELL_PX} px",
-        )
-    value = np.concatenate([part.cells.ravel() - part.cells.mean() for *_, part in points])
-    row, col = (g.ravel() for g in np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij"))
-    size = study.camera.rows * study.camera.cols / count
-    changing: list[float] = []
-    fixed: list[float] = []
-    line_dn2: dict[Lines, float] = {"rows": 0.0, "columns": 0.0}
-    for f, _, part in points:
-        moving = next(iter(f.changing.values()), None)
-        white = moving.white_dn2 if moving is not None else part.white_dn2
-        cell = max(moving.cells_dn2, white / size) if moving is not None else white / size
-        changing.append(cell / part.frames)
-        fixed.append(max(part.white_dn2 - white / part.frames, 0.0) / size)
-        for lines, most in line_dn2.items():
-            noise = moving.line_dn2[lines] / part.frames if moving is not None else 0.0
-            line_dn2[lines] = max(most, part.line_dn2[lines] - noise)
-    pattern = np.eye(count) * float(np.max(fixed))
-    pattern += (row[:, None] == row) * line_dn2["rows"] * rows / study.camera.rows
-    pattern += (col[:, None] == col) * line_dn2["columns"] * cols / study.camera.cols
-    covariance = np.kron(np.ones((len(points), len(points))), pattern) + np.diag(
-        np.repeat(changing, count) + CELL_FLOOR_DN**2
-    )
-    exposures = np.array([f.condition.exposure_s for f, *_ in points])
-    half = 0.5 * np.hypot(rows, cols)
-    radius = np.hypot(row - (rows - 1) / 2, col - (cols - 1) / 2) / half
-
-    def predict(effects: Effects) -> Prediction:
-        mean = np.zeros(len(value))
-        model = Uniform(study.camera, effects)
-        if model.adds_signal:
-            added = cell_means(model.added_e.astype(np.float32))
-            mean += np.tile((study.noise.gain * (added - added.mean())).ravel(), len(points))
-        if model.changes_dark_current:
-            dark_at = dark_current_map(study, effects)
-            for i, (f, *_) in enumerate(points):
-                cells = cell_means(dark_at(f.condition.temperature_c).astype(np.float32))
-                here = study.noise.gain * f.condition.exposure_s * (cells - cells.mean())
-                mean[i * count : (i + 1) * count] += here.ravel()
-        jacobian = {}
-        for i in range(len(points)):
-            column = np.zeros(len(value))
-            column[i * count : (i + 1) * count] = 1.0
-            jacobian[f"dark_field:{i}"] = column
-        return Prediction(mean, jacobian)
-
-    longest = max(float(exposures.max()), 1e-9)
-    return Block(
-        measurement=DARK_FIELD, reach=0.5, value=value, covariance=np.asarray(covariance, float),
-        labels=tuple(Label(float(radius[k]), "all", f.condition.name, part.captures, out) for f, out,
-        part in points for k in range(count)),
-        reads=DARK_CURRENT | ADDED, predict=predict, scale=np.repeat(np.maximum(exposures / longest, 0.1), count),
-    )  # fmt: skip
-
-
-DARK_FIELD = Measurement(
-    "dark_field",
-    title="dark signal over the field",
-    order=130,
-    axis="field",
-    unit="of half the diagonal",
-    make=dark_field_block,
-    quantity="dark signal less the frame's mean, DN",
-    conditions="exposure and temperature",
-)
-
