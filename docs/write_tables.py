@@ -16,9 +16,8 @@ from pathlib import Path
 import typer.main
 
 from lab.cli.entry import app, attach_service_and_mocks
-from lab.diagnose.effect_list import EffectDescription, effect_list
 from lab.diagnose.policy import DecisionPolicy
-from lab.diagnose.visibility import TABLE, as_toml, derived_visibility
+from lab.diagnose.visibility import TABLE, EffectDescription, as_toml, derived_visibility, effect_list
 from sim.effects.library import effect
 
 REFERENCE = Path(__file__).parent / "reference"

@@ -143,7 +143,7 @@ def import_(
 
 def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> None:
     """A table holds no frames: its import is a fit."""
-    from lab.fit.noise.level_table import fit_level_table
+    from lab.fit.noise.noise_fit import fit_level_table
     from lab.fit.spectral.mean_table import fit_mean_table
     from lab.formats.cgats import read_foreign_csv
     from lab.formats.importers.images import read_camera_file

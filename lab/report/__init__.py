@@ -32,7 +32,7 @@ from lab.formats.results import (
     ValidationResult,
 )
 from lab.formats.results.words import measured
-from lab.predict.both_models import BothModels
+from lab.predict.validate import BothModels
 from lab.report import answers, charts, geometry, words
 from lab.report import diagnosis as diagnosis_page
 from lab.report.charts import ChartData, plotly_base64

@@ -22,7 +22,7 @@ from lab.formats.results import (
     ValidationResult,
 )
 from lab.formats.results.words import measured, plain_number
-from lab.predict.both_models import BothModels
+from lab.predict.validate import BothModels
 from lab.report import charts, words
 from lab.report.diagnosis import worst_of_each
 from lab.report.figures import KeyFigure, camera_figures

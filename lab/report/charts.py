@@ -19,7 +19,7 @@ from lab.diagnose.measurements.block import measurement_title
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Check, DiagnosisResult, NoiseFit, PatchComparison, ResidualCurve, SpectralFit
 from lab.formats.results.words import measured, plain_number
-from lab.predict.both_models import SensitivityCurve
+from lab.predict.validate import SensitivityCurve
 from sim.camera import Side
 
 Figure = dict[str, Any]

@@ -30,7 +30,7 @@ from lab.cli import bench_process, capturing, diagnosis, entry, fitting
 from lab.cli.console import EXIT_INPUT
 from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
-from lab.diagnose.effect_list import EffectList, effect_list
+from lab.diagnose.visibility import EffectList, effect_list
 from lab.errors import DeviceError
 from lab.formats import recording_set as recording
 from lab.formats.recording_set import Manifest, RecordingSet

@@ -5,10 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import lab.diagnose.effect_list
-from lab.diagnose.effect_list import NOT_DERIVED, NOT_SOUGHT, UNSEEN, effect_description, effect_list
+import lab.diagnose.visibility
 from lab.diagnose.inference.rivals import parallel_pairs, symmetric
-from lab.diagnose.visibility import as_toml, derived_visibility, visibility
+from lab.diagnose.visibility import (
+    NOT_DERIVED,
+    NOT_SOUGHT,
+    UNSEEN,
+    as_toml,
+    derived_visibility,
+    effect_description,
+    effect_list,
+    visibility,
+)
 from lab.errors import InputError
 from lab.formats.recording_set import Manifest
 from sim.effects.library import candidates, effects
@@ -40,7 +48,7 @@ def test_every_choice_is_told_with_its_meaning() -> None:
 
 
 def test_an_effect_that_was_just_added_says_what_to_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lab.diagnose.effect_list, "visibility", dict)
+    monkeypatch.setattr(lab.diagnose.visibility, "visibility", dict)
     assert effect_description("coma").remark == NOT_DERIVED
 
 

@@ -33,7 +33,7 @@ from lab.formats.results import (
     Unexplained,
     ValidationResult,
 )
-from lab.predict.both_models import BothModels, SensitivityCurve
+from lab.predict.validate import BothModels, SensitivityCurve
 from lab.report import charts, provenance_of, render_report, write_report
 from lab.report.answers import odds
 from lab.report.charts import figure_json, plotly_base64
