@@ -56,8 +56,6 @@ def test_settings_keep_to_their_limits(talk: Talk) -> None:
 # --- The mock PR-655 and PR-670: remote mode, spectra, error codes ----------------------------------------------------
 
 
-
-
 @pytest.mark.parametrize("start", [b"PHOTO", b"PHOTO\r", b"PHOTO\n", b"PHOTO\r\n", b"D110\rPHPHOTO"])
 @pytest.mark.parametrize("paced", [True, False])
 def test_remote_mode_begins_with_five_characters(talk: Talk, start: bytes, paced: bool) -> None:
@@ -108,8 +106,6 @@ def test_colorimetric_answers_of_illuminant_a(talk: Talk) -> None:
 
 
 # --- The mock radiometer: what it measures, when it refuses, and the conversations of other people's hosts ------------
-
-
 
 
 def test_the_spectrum_is_the_lamps(talk: Talk) -> None:
@@ -221,4 +217,3 @@ def test_a_hosts_session_with_probe_setup_and_terminal_counts(talk: Talk) -> Non
 def test_luminance_and_spectrum_agree(talk: Talk) -> None:
     lamp = Lamp(luminance_cd_m2=7.0)
     assert tristimulus(lamp.radiance())[1] == pytest.approx(7.0, rel=1e-9)
-

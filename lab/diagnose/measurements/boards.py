@@ -28,11 +28,11 @@ from sim.uniform import Uniform
 
 ROWS, COLS = 3, 4  # cells of the frame
 FEWEST_CORNERS = 6  # of a cell
-CELL_FLOOR_PX = 0.006
+CELL_FLOOR_PX = 0.006  # standard deviation of a cell's displacement beside noise
 #: Prior standard deviation of a known distortion, at the frame's corner, of each of its terms.
 CALIBRATED_STD_PX = 0.05
 HELD_OUT_FROM = 6  # views; of as many or more, every third is held out
-REFERENCE_NM = 550.0
+REFERENCE_NM = 550.0  # light in which effects displace corners: green
 
 
 def views_of(study: Study, side: Side) -> tuple[list[BoardView], list[Skipped]]:

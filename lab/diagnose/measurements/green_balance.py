@@ -22,7 +22,7 @@ from sim.spectrum import FloatArray
 
 GREEN_FLOOR = 1e-4  # standard deviation of the ratio of equal greens beside noise
 GREEN_NOISE = 0.02  # ratios of a larger standard deviation aren't used
-CELLS = (3, 4)
+CELLS = (3, 4)  # of the frame: rows, columns
 TILE_ROWS, TILE_COLS = mosaic.PERIOD_PX, 4  # size of the uniform frame by which effects are predicted
 
 

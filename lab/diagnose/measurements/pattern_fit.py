@@ -475,7 +475,7 @@ LEAST_BEYOND = (
     5e-4  # contrast (rms) of the parts beyond the bands from which on they are fitted; weaker ones are taken as drawn
 )
 REFINEMENTS = 3  # Gauss-Newton steps of the registration
-FEWEST_CELLS = 400
+FEWEST_CELLS = 400  # of a random pattern, whose spectrum is then even to 5 %
 MOST_MOVES = 4  # times that a displaced channel is drawn anew: a linear step finds about half of a shift by half a cell
 SCALING = np.array(
     [0.0, 0.0, 1.0, 1.0, 1.0]
@@ -950,7 +950,7 @@ def joint_covariance(places: Sequence[tuple[int, Pattern, int]], study: Study) -
 # --- Excess of light at the borders between lit and dark cells of a random pattern, where grey levels are seen --------
 
 
-BORDER_FLOOR = 0.0015
+BORDER_FLOOR = 0.0015  # standard deviation of the light at borders beside noise
 
 
 def cell_border_block(study: Study) -> Block:
@@ -999,7 +999,7 @@ CELL_BORDERS = Measurement(
 # --- The ghost of a pattern: its image, rotated by 180 degrees about the frame's middle -------------------------------
 
 
-GHOST_FLOOR = 1.5e-4
+GHOST_FLOOR = 1.5e-4  # standard deviation of a ghost's share beside noise
 
 
 def ghost_block(study: Study) -> Block:

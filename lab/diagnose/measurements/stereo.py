@@ -43,7 +43,7 @@ LIGHT_STD = 0.005  # common to all: a change of the uniform light between the tw
 GLARE_STD = 0.02  # prior standard deviation of the share of a camera's light that is scattered evenly over its frame
 SAME_LAMP = 0.02  # largest difference of two normalised spectra of one lamp, summed over wavelengths
 SAME_COLOUR = 0.04  # largest relative difference between channel ratios in one light
-FEWEST_PIXELS = 200
+FEWEST_PIXELS = 200  # of a channel in the region that is compared
 SIDES: tuple[Side, Side] = ("left", "right")
 
 
@@ -329,7 +329,7 @@ STEREO_GAIN = Measurement(
 
 LONGEST_GAP_S = 1.0  # between captures from which a board's speed is taken
 SLOWEST_PX_PER_S = 5.0  # speed of the fastest board from which on the delay is measured
-FEWEST_PAIRS = 6
+FEWEST_PAIRS = 6  # of pictures of a moving board, for one delay and two offsets
 SHIFT_STD_PX = 0.05  # standard deviation of a pair's displacement beside noise, as the speed varies between captures
 POINTING_STD_PX = 2.0  # prior standard deviation of the displacement by the rig's rotation and the optical axes
 

@@ -182,7 +182,7 @@ def misstated_bit_depth(
 # --- A stated exposure that the dark frames of other exposures contradict ---------------------------------------------
 
 
-LEAST_EXPOSURES, LEAST_REPEATS = 3, 2
+LEAST_EXPOSURES, LEAST_REPEATS = 3, 2  # of dark frames: a line has two numbers, and repeats tell the scatter
 FLOOR_DN = 0.02  # standard deviation of an exposure's mean dark level beside the scatter of its repeats
 ROUNDED_DN2 = 1.0 / 12.0  # variance of a pixel by rounding, its least
 

@@ -390,7 +390,7 @@ MOSAICS: tuple[Cfa, ...] = ("RGGB", "BGGR", "GRBG", "GBRG")
 #: Share of a light's brightest plane that is added to all rates: low rates count little, as low sensitivities may
 #: differ by any factor.
 DIM_PLANE = 0.05
-ROUNDS = 6
+ROUNDS = 6  # steps that halve what is left of the channels' gains
 
 
 def misstated_mosaic_phase(

@@ -24,7 +24,7 @@ from sim.camera import Side
 Array = NDArray[np.floating[Any]]
 Grey = NDArray[np.uint8]
 FEWEST_MARKERS = 6  # of a frame: a homography has 8 parameters, and a marker's centre gives two equations
-MOST_COLUMNS = 40
+MOST_COLUMNS = 40  # of a board, squares
 LARGEST_PX = 1000.0  # side of a frame in which a plain board's corners are counted; larger frames are reduced
 SMALLEST_GRID = (3, 3)  # inner corners from which the search for a plain board starts
 

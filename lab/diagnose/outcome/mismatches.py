@@ -439,7 +439,7 @@ def _told_light(side: Side, level: InconsistentLevel) -> Unexplained:
 ACROSS, DOWN = ("left", "middle", "right"), ("top", "middle", "bottom")
 LISTED = 4  # captures, or parts of the frame, that are named
 FLOOR_PX = 1e-3  # of a corner's noise: residuals below this are rounding
-POSE_PARAMETERS = 6
+POSE_PARAMETERS = 6  # of a view: rotation and position
 
 
 @dataclass(frozen=True)

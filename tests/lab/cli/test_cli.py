@@ -33,7 +33,7 @@ from lab.diagnose import Diagnosis
 from lab.diagnose.visibility import EffectList, effect_list
 from lab.errors import DeviceError
 from lab.formats import recording_set as recording
-from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.recording_set import RecordingSet
 from lab.formats.result_file import result_json
 from lab.formats.results import (
     CameraFit,
@@ -65,32 +65,6 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def folder(small_set: Callable[..., RecordingSet], tmp_path: Path) -> Path:
     return recording.write(small_set(), tmp_path / "set")
-
-
-@pytest.fixture
-def flats(tmp_path: Path) -> Path:
-    """A MONO camera of 0.5 DN/e: darks and a series of flats, small and quick to fit."""
-    rng = np.random.default_rng(7)
-    frames, captures = {}, []
-    for number, (kind, photons) in enumerate(
-        [("dark", 0)] * 4 + [("flat", 800 * k) for k in range(1, 8) for _ in range(2)]
-    ):
-        electrons = rng.poisson(photons, (60, 80)) + rng.normal(0, 4, (60, 80))
-        frames[f"frames/{number}.npy"] = np.clip(100 + 0.5 * electrons, 0, 4095).round().astype(np.uint16)
-        light = {"photons_per_pixel": 2 * photons, "wavelength_nm": 530} if kind == "flat" else {}
-        captures.append(
-            {
-                "id": f"{kind}-{number}",
-                "kind": kind,
-                "side": "left",
-                "frame": f"frames/{number}.npy",
-                "exposure_s": 0.01,
-            }
-            | light
-        )
-    camera = {"rows": 60, "cols": 80, "cfa": "MONO", "bit_depth": 12, "black_level_dn": 100}
-    manifest = Manifest.model_validate({"name": "flats", "cameras": {"left": camera}, "captures": captures})
-    return recording.write(RecordingSet(manifest, frames), tmp_path / "flats")
 
 
 def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
