@@ -22,7 +22,7 @@ from drivers.camera.u3v import U3vCamera
 from drivers.camera.u3v_stream import LEADER, LEADER_MAGIC, StreamLayout, U3vStream
 from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Refused
 from mocks.bench import Bench
-from mocks.pixels import pack_12p
+from mocks.ready_frames import pack_12p
 from mocks.u3v import (
     BALANCE_BLUE,
     BALANCE_GREEN,
