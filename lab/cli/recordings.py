@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,13 +24,14 @@ from lab.cli.exchange import (
     import_spectra,
     import_tiled,
 )
-from lab.cli.sources import StoreFolder, store_to_read
+from lab.cli.sources import StoreFolder, recordings_of, store_to_read
 from lab.cli.tables import print_fit
 from lab.errors import InputError
 from lab.pipeline import session_recordings
 
 if TYPE_CHECKING:
     from lab.formats.importers.single_picture import ImportOptions
+
 
 commands = typer.Typer()
 #: `--from` these: a CSV of channel means and variances by level, or of channel means by wavelength, which becomes a
@@ -251,3 +253,31 @@ def backup(
     made = back_up(store_to_read(data), folder)
     mib = made.copied_bytes / (1 << 20)
     out.print(f"{made.sessions} sessions, {made.files} files of them; {made.copied} files copied, {mib:.1f} MiB")
+
+
+# --- `calibench kinds` ------------------------------------------------------------------------------------------------
+
+
+@commands.command()
+def kinds(
+    source: Annotated[
+        str, typer.Argument(metavar="[SOURCE]", help="count the captures in a recording set or a stored session")
+    ] = "",
+    data: StoreFolder = None,
+) -> None:
+    """The kinds of capture: the scene, and the sequence that takes them."""
+    from lab.capture_kinds.base import CAPTURES
+
+    counted = Counter(capture.kind for capture in recordings_of(source, data).captures()) if source else None
+    table = Table(box=None, pad_edge=False)
+    for heading in (
+        "kind",
+        "sequence",
+        "what stands before the camera",
+        *(["captures"] if counted is not None else []),
+    ):
+        table.add_column(heading)
+    for name, kind in CAPTURES.models.items():
+        sequence = kind.sequence.name if kind.sequence else "-"
+        table.add_row(name, sequence, escape(kind.shows), *([str(counted[name])] if counted is not None else []))
+    out.print(table)
