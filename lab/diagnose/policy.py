@@ -80,6 +80,12 @@ class DecisionPolicy(Frozen):
         "printed",
         "twice the 0.11 px that plain boards of public stereo pairs leave beside Brown's distortion "
         "(docs/explanation/accuracy.md)")
+    most_outlying_share: float = rule("significance", 0.3, "1",
+        "largest share of a measurement's captures that may be outlying",
+        "of more, none can be told from the others", most=1.0)
+    alike_outlying_sigma: float = rule("significance", 4.0, "standard deviations",
+        "distance within which outlying captures of one setting are off by the same factor",
+        "two-sided 99.99 % of a normal distribution")
     lone_score_margin: float = rule("significance", 10.0, "score",
         "excess of the best score over the threshold that is a mismatch where neither a slice nor a refit shows "
         "one",
@@ -166,6 +172,9 @@ class DecisionPolicy(Frozen):
     equal_mode_log_odds: float = rule("name", 2.0, "log odds",
         "difference within which two modes of a parameter, both signs for one, count as equally likely",
         "a likelihood ratio of two standard deviations: 2^2 / 2")
+    same_mode_share: float = rule("name", 0.1, "1",
+        "distance of two refits, as a share of the effect's size, within which they found the same mode",
+        "chosen", most=1.0)
 
     # --- budget of the search -----------------------------------------------------------------------------------------
     most_effects: int = rule("budget of the search", 4, "1",
@@ -177,6 +186,12 @@ class DecisionPolicy(Frozen):
     refitted_pairs: int = rule("budget of the search", 5, "1",
         "pairs refitted in the place of one effect, or beside a set, where no single effect betters it",
         "chosen: half of `refitted_sets`, as they come last")
+    added_effects: int = rule("budget of the search", 3, "1",
+        "effects that one step adds to a set, where fewer by themselves aren't seen",
+        "chosen: one less than `most_effects`")
+    search_steps: int = rule("budget of the search", 12, "1",
+        "steps of the search, each of which adds an effect or exchanges one",
+        "chosen: three for each of `most_effects`")
     promised_share: float = rule("budget of the search", 0.4, "1",
         "share of a name's gain that an effect promises in closed form, from which on it is fitted in its place; "
         "and of the best score beside a set, from which on an effect is added",
