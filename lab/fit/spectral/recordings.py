@@ -16,7 +16,7 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
-from lab.fit.spectral.curve_prior import compare_curves, solve_with_maker
+from lab.fit.spectral.maker_curves import compare_curves, solve_with_maker
 from lab.fit.spectral.sensitivity import (
     COVERAGE_FACTOR,
     NEGATIVE_LIGHT,

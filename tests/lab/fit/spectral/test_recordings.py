@@ -11,7 +11,7 @@ import pytest
 
 from lab.errors import NotDetermined
 from lab.fit.noise.noise_fit import fit_noise
-from lab.fit.spectral.curve_prior import compare_curves
+from lab.fit.spectral.maker_curves import compare_curves
 from lab.fit.spectral.recordings import MIN_LIGHTS, fit_spectral
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet, read
 from lab.formats.results import NoiseFit, SpectralFit
