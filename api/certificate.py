@@ -12,13 +12,12 @@ from typing import Any
 import jinja2
 
 from lab.calibration import life
-from lab.calibration.figures import Figure
 from lab.calibration.life import CalibrationRecord
-from lab.calibration.limits import Judgement
+from lab.calibration.limits import Figure, Judgement
 from lab.calibration.overview import verdict_of
 from lab.capture.records import RunRecord
 from lab.capture.store import Store
-from lab.formats.results.in_words import measured
+from lab.formats.results.words import measured
 from lab.report.words import VERDICTS
 from sim.parameters import Frozen
 

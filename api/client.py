@@ -72,10 +72,9 @@ from lab.capture.plan import Parameters
 from lab.capture.session import Progress
 from lab.challenge.score import ChallengeScore
 from lab.challenge.truth import Truths
-from lab.diagnose.effect_list import EffectDescription, ParameterDescription
+from lab.diagnose.visibility import EffectDescription, ParameterDescription
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
-from lab.quick_look.curves import Curves
-from lab.quick_look.frame_figures import FrameFigures
+from lab.quick_look.curves import Curves, FrameFigures
 from lab.report.findings import DiagnosisFindings
 from lab.twin.budget import BudgetResult
 from lab.twin.score import TwinScore

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
-from lab.cli.exit_codes import Terminated
+from lab.cli.console import Terminated
 from lab.cli.sources import open_store, store_to_read
 from lab.errors import InputError
 

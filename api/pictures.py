@@ -12,7 +12,7 @@ from api.preview import Form, preview
 from api.upload import Inbox, is_recordings
 from lab.capture.store import Store
 from lab.formats.recording_set import DataSheet, RecordingSet
-from lab.quick_look.frame_figures import FrameFigures, frame_figures
+from lab.quick_look.curves import FrameFigures, frame_figures
 
 FRAMES, PICTURES, FIGURES, SETS = 4, 256, 1024, 4
 

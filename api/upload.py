@@ -24,7 +24,7 @@ from lab.calibration.camera_models import SIDES
 from lab.errors import InputError
 from lab.formats import recording_set as recording
 from lab.formats.camera_file import CameraFile, read_camera
-from lab.formats.importers.import_options import ImportOptions
+from lab.formats.importers.single_picture import ImportOptions
 from lab.formats.recording_set import FolderFiles, RecordingSet
 from sim.camera import Side
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose import diagnose
 from lab.effect_titles import effect_title
 from lab.formats.recording_set import RecordingSet

@@ -12,7 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.formats.recording_set import RecordingSet, write
 from mocks.former import ConcealedCamera, Plan
 from mocks.former.laws import InfraredCutFilterLaw, OpticalLowPassFilterLaw

@@ -560,7 +560,7 @@ class _Pipeline:
     def _report_step(self) -> None:
         from lab.calibration.limits import standing_limits
         from lab.formats.results import ReportFile
-        from lab.predict.both_models import predict_both
+        from lab.predict.validate import predict_both
         from lab.report import provenance_of, write_report
 
         file = self.request.report_file or self._session_files()

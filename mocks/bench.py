@@ -30,8 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mocks.conceal import SIDES, Concealed
-from mocks.light_path import FILTER_CUT_ON_NM, WAVELENGTH_NM, LightSettings, screen_radiance, sphere_radiance
-from mocks.radiometer import misread
+from mocks.light_path import FILTER_CUT_ON_NM, WAVELENGTH_NM, LightSettings, misread, screen_radiance, sphere_radiance
 from mocks.targets import (
     NOMINAL_STOP,
     SCREEN_BLACK,

@@ -43,7 +43,6 @@ class MockCm110(Grammar):
         self._serial_number = serial_number
         self._late_status, self._ended_echo = late_status, ended_echo
         self._heard = bytearray()
-        self._busy_until: float | None = None
         self._nm = self._wanted_nm = 0.0
         self.units = units
 
@@ -51,21 +50,14 @@ class MockCm110(Grammar):
         self._heard += data[: _LONGEST_WAIT - len(self._heard)]
         return self._run()
 
-    @property
-    def wait_s(self) -> float | None:
-        return None if self._busy_until is None else max(0.0, self._busy_until - self.clock.now())
-
-    def elapse(self) -> list[bytes]:
-        if self._busy_until is None or self.clock.now() < self._busy_until:
-            return []
-        self._busy_until = None
+    def _end(self) -> list[bytes]:
         self._nm = self._wanted_nm
         self._light.set_wavelength(self._nm)
         return [*([self._status()] if self._late_status else []), *self._run()]
 
     def _run(self) -> list[bytes]:
         out: list[bytes] = []
-        while self._heard and self._busy_until is None:
+        while self._heard and self._done_at is None:
             length = 1 + _PARAMETERS.get(self._heard[0], 0)
             if len(self._heard) < length:
                 break
@@ -93,7 +85,7 @@ class MockCm110(Grammar):
         if nm > _UPPER_NM:
             return [self._status(REFUSED)]
         self._wanted_nm = nm
-        self._busy_until = self.clock.now() + 0.05 + abs(nm - self._nm) / _NM_PER_S
+        self._done_at = self.clock.now() + 0.05 + abs(nm - self._nm) / _NM_PER_S
         return [] if self._late_status else [self._status()]
 
     def _tell(self, what: int) -> list[bytes]:

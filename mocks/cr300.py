@@ -47,7 +47,6 @@ class ColorimetryResearch(Grammar):
         self._echo = False
         self._line = bytearray()
         self._waiting: list[str] = []
-        self._done_at: float | None = None
         self._failing: int | None = None
         self._spectrum: FloatArray | None = None
         self._xyz = (0.0, 0.0, 0.0)
@@ -69,14 +68,7 @@ class ColorimetryResearch(Grammar):
                 self._line.append(value)
         return out
 
-    @property
-    def wait_s(self) -> float | None:
-        return None if self._done_at is None else max(0.0, self._done_at - self.clock.now())
-
-    def elapse(self) -> list[bytes]:
-        if self._done_at is None or self.clock.now() < self._done_at:
-            return []
-        self._done_at = None
+    def _end(self) -> list[bytes]:
         code = self._failing
         if code is None:
             radiance = self._light.radiance()

@@ -31,7 +31,6 @@ class MockCs2000(Grammar):
         self._serial_number = serial_number
         self._line = bytearray()
         self._remote = False
-        self._done_at: float | None = None
         self._failing: int | None = None
         self._values: list[str] = []
 
@@ -47,14 +46,7 @@ class MockCs2000(Grammar):
                 self._line.append(value)
         return out
 
-    @property
-    def wait_s(self) -> float | None:
-        return None if self._done_at is None else max(0.0, self._done_at - self.clock.now())
-
-    def elapse(self) -> list[bytes]:
-        if self._done_at is None or self.clock.now() < self._done_at:
-            return []
-        self._done_at = None
+    def _end(self) -> list[bytes]:
         radiance = self._light.radiance()
         code = self._failing
         if code is None and tristimulus(radiance)[1] > 5e5:

@@ -48,7 +48,6 @@ class PhotoResearch(Grammar):
         self._echo = False
         self._line = bytearray()
         self._waiting: list[str] = []
-        self._done_at: float | None = None
         self._wanted = 0
         self._quality = 0
         self._spectrum: FloatArray | None = None
@@ -91,14 +90,7 @@ class PhotoResearch(Grammar):
         self._remote = True
         return [Reply(b" REMOTE MODE\r\n")]
 
-    @property
-    def wait_s(self) -> float | None:
-        return None if self._done_at is None else max(0.0, self._done_at - self.clock.now())
-
-    def elapse(self) -> list[bytes]:
-        if self._done_at is None or self.clock.now() < self._done_at:
-            return []
-        self._done_at = None
+    def _end(self) -> list[bytes]:
         self._look()
         return [Reply(self._data(self._wanted)), *self._run()]
 

@@ -78,7 +78,6 @@ class MockScpiMeter(Grammar):
         self._events, self._events_enabled = _POWER_ON, 0
         self._zero_check = True
         self._waiting: deque[str] = deque()
-        self._done_at: float | None = None
 
     def receive(self, data: bytes) -> list[bytes]:
         for value in data:
@@ -90,14 +89,7 @@ class MockScpiMeter(Grammar):
                 self._line.append(value)
         return self._run()
 
-    @property
-    def wait_s(self) -> float | None:
-        return None if self._done_at is None else max(0.0, self._done_at - self.clock.now())
-
-    def elapse(self) -> list[bytes]:
-        if self._done_at is None or self.clock.now() < self._done_at:
-            return []
-        self._done_at = None
+    def _end(self) -> list[bytes]:
         return [Reply(self._reading()), *self._run()]
 
     def _run(self) -> list[bytes]:

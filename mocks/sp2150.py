@@ -30,7 +30,6 @@ class MockSp2150(Grammar):
         self._echo = echo
         self._line = bytearray()
         self._waiting: deque[str] = deque()
-        self._busy_until: float | None = None
         self._arrive: Callable[[], None] = lambda: None
         self._moving = ""
         self._nm = 0.0
@@ -51,25 +50,18 @@ class MockSp2150(Grammar):
                 self._line.append(value)
         return out
 
-    @property
-    def wait_s(self) -> float | None:
-        return None if self._busy_until is None else max(0.0, self._busy_until - self.clock.now())
-
-    def elapse(self) -> list[bytes]:
-        if self._busy_until is None or self.clock.now() < self._busy_until:
-            return []
-        self._busy_until = None
+    def _end(self) -> list[bytes]:
         self._arrive()
         return [self._said(self._moving, ""), *self._run()]
 
     def _run(self) -> list[bytes]:
         out: list[bytes] = []
-        while self._waiting and self._busy_until is None:
+        while self._waiting and self._done_at is None:
             command = self._waiting.popleft()
             told = self._told(command) if self._failure() is None else None
             if told is not None:
                 out.append(self._said(command, told))
-            elif self._busy_until is None:
+            elif self._done_at is None:
                 out.append(Reply(f"{command if self._echo else ''}  ? \r\n".encode("latin-1", "replace")))
         return out
 
@@ -107,7 +99,7 @@ class MockSp2150(Grammar):
 
     def _go(self, command: str, seconds: float, arrive: Callable[[], None]) -> None:
         self._moving, self._arrive = command, arrive
-        self._busy_until = self.clock.now() + seconds
+        self._done_at = self.clock.now() + seconds
 
     def _stand(self, nm: float) -> None:
         self._nm = nm

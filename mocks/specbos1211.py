@@ -79,7 +79,6 @@ class MockSpecbos1211(Grammar):
         self._settings: dict[str, float] = {}
         self._range_nm = self._whole_range()
         self._default()
-        self._done_at: float | None = None
         self._planned_failure: int | None = None
         self._measured: Spectrum | None = None
         self._measured_tint_ms = 0.0
@@ -109,14 +108,7 @@ class MockSpecbos1211(Grammar):
                 self._line.append(value)
         return out
 
-    @property
-    def wait_s(self) -> float | None:
-        return None if self._done_at is None else max(0.0, self._done_at - self.clock.now())
-
-    def elapse(self) -> list[bytes]:
-        if self._done_at is None or self.clock.now() < self._done_at:
-            return []
-        self._done_at = None
+    def _end(self) -> list[bytes]:
         try:
             self._look()
             answer = Reply(BEL)

@@ -38,8 +38,7 @@ class MockStage(Grammar):
         self._seconds_to_place = seconds_to_place
         self._line = bytearray()
         self._waiting: list[str] = []
-        self._placing: str | None = None
-        self._done_at = 0.0
+        self._placing = ""
 
     def receive(self, data: bytes) -> list[bytes]:
         out: list[bytes] = []
@@ -55,20 +54,13 @@ class MockStage(Grammar):
             out += self._run()
         return out
 
-    @property
-    def wait_s(self) -> float | None:
-        return None if self._placing is None else max(0.0, self._done_at - self.clock.now())
-
-    def elapse(self) -> list[bytes]:
-        if self._placing is None or self.clock.now() < self._done_at:
-            return []
-        name, self._placing = self._placing, None
-        self._targets.place(name)
-        return [_line(f"OK {name}"), *self._run()]
+    def _end(self) -> list[bytes]:
+        self._targets.place(self._placing)
+        return [_line(f"OK {self._placing}"), *self._run()]
 
     def _run(self) -> list[bytes]:
         out: list[bytes] = []
-        while self._waiting and self._placing is None:
+        while self._waiting and self._done_at is None:
             out += self._answer(self._waiting.pop(0))
         return out
 

@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mocks.bench import UInt16Array
-from mocks.pixels import BAYER_RG8, BAYER_RG12, BAYER_RG12P, encode, payload_bytes
-from mocks.ready_frames import BeforeCameras
+from mocks.ready_frames import BAYER_RG8, BAYER_RG12, BAYER_RG12P, BeforeCameras, encode, payload_bytes
 from mocks.usb_device import Cancelled, UsbDevice, UsbEndpoint, UsbIdentity, UsbInterface
 from sim.camera import Side
 

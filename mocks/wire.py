@@ -74,6 +74,7 @@ class Grammar(ABC):
     def __init__(self, clock: MockClock) -> None:
         self.clock = clock
         self._fail_with: int | None = None
+        self._done_at: float | None = None  # when what is under way ends, virtual seconds
 
     @abstractmethod
     def receive(self, data: bytes) -> list[bytes]:
@@ -86,10 +87,17 @@ class Grammar(ABC):
     @property
     def wait_s(self) -> float | None:
         """Virtual seconds until the instrument says something by itself; None if it won't."""
-        return None
+        return None if self._done_at is None else max(0.0, self._done_at - self.clock.now())
 
     def elapse(self) -> list[bytes]:
         """Return what goes out by itself by now."""
+        if self._done_at is None or self.clock.now() < self._done_at:
+            return []
+        self._done_at = None
+        return self._end()
+
+    def _end(self) -> list[bytes]:
+        """End what was under way; return what goes out then."""
         return []
 
     def fail_next(self, code: int | None) -> None:

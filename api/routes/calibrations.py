@@ -16,13 +16,12 @@ from api.schemas import CalibrationDetail, Certify, DraftedLimit, DraftedLimits,
 from api.security import REPORT_POLICY, Demand
 from api.service import READ, Here, HexId, Service, SessionId
 from lab.calibration import camera_models, life
-from lab.calibration.figures import Figure, figures_of
 from lab.calibration.life import CalibrationRecord, DriftBoard, History
-from lab.calibration.limits import judged, standing_limits
+from lab.calibration.limits import Figure, figures_of, judged, standing_limits
 from lab.capture.store import Store
 from lab.errors import InputError
 from lab.formats.results import FitResult
-from lab.formats.results.figure_names import plain_name, unit_of
+from lab.formats.results.words import plain_name, unit_of
 
 router = APIRouter(tags=["calibrations"])
 

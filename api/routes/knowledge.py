@@ -11,7 +11,7 @@ from api.keys import Permission, StoredKey
 from api.schemas import Me
 from api.security import Demand
 from api.service import READ
-from lab.diagnose.effect_list import EffectDescription, ParameterDescription, effect_description, effect_list
+from lab.diagnose.visibility import EffectDescription, ParameterDescription, effect_description, effect_list
 from sim.camera import CameraModel, Lens
 from sim.parameters import read_quantities
 

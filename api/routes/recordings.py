@@ -24,8 +24,8 @@ from api.upload import Foreign
 from lab.calibration.overview import verdict_of
 from lab.capture_kinds.base import Capture
 from lab.errors import InputError
-from lab.formats.importers.import_options import ImportOptions, chart_corners, grid
-from lab.quick_look.frame_figures import FrameFigures
+from lab.formats.importers.single_picture import ImportOptions, chart_corners, grid
+from lab.quick_look.curves import FrameFigures
 from sim.camera import Side
 
 router = APIRouter()

@@ -44,8 +44,7 @@ from lab.capture.session import CaptureSession, Progress
 from lab.capture.station import Station
 from lab.errors import InputError
 from lab.formats.results.diagnosis import DiagnosisVerdict
-from lab.quick_look.curves import Curves
-from lab.quick_look.frame_figures import FrameFigures
+from lab.quick_look.curves import Curves, FrameFigures
 from lab.resolve import read_journal
 from sim.camera import Side
 

@@ -19,8 +19,16 @@ import numpy as np
 import sqlalchemy as sa
 from scipy import special, stats
 
-from lab.calibration.figures import Figure, figures_of
-from lab.calibration.limits import COVERAGE_FACTOR, CalibrationLimits, Judgement, Limit, Mark, judged
+from lab.calibration.limits import (
+    COVERAGE_FACTOR,
+    CalibrationLimits,
+    Figure,
+    Judgement,
+    Limit,
+    Mark,
+    figures_of,
+    judged,
+)
 from lab.capture.records import RunRecord, now
 from lab.capture.station import Station
 from lab.capture.store import Store
@@ -30,7 +38,7 @@ from lab.fit.compare import FALSE_ALARM_RATE, Numbers, sidak_part, sigma_of_prob
 from lab.fit.noise.dark_current import SensorTemperature
 from lab.formats.recording_set import InstrumentSnapshot, Snapshots, differences
 from lab.formats.results import FitResult
-from lab.formats.results.figure_names import plain_name
+from lab.formats.results.words import plain_name
 from sim.camera import Side
 from sim.parameters import Frozen
 

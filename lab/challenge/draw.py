@@ -4,19 +4,137 @@ rig."""
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from lab.challenge.faults import FAULTS, spoilt
 from lab.challenge.noncentrality import FairStrength, fair_strengths, library_changes, noncentrality, summaries
-from lab.challenge.recordings import recording_set
 from lab.challenge.truth import SIZES, CaseTruth, Concealed, Kind
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.formats.recording_set import RecordingSet
-from mocks.former import BIT_DEPTH, LISTED, OUTSIDE, ConcealedCamera, DrawnSession, Law, Plan, record
+from lab.formats.recording_set import Manifest, RecordingSet
+from mocks.former import (
+    BIT_DEPTH,
+    LISTED,
+    OUTSIDE,
+    WAVELENGTH_NM,
+    WHOLE_SESSION,
+    ConcealedCamera,
+    DrawnSession,
+    Law,
+    Plan,
+    record,
+    record_pair,
+)
+from sim.spectrum import Spectrum
+
+# --- Faults of metadata or rig around a healthy camera: mismatches that no effect explains ----------------------------
+
+
+Spoil = Callable[[dict[str, Any], dict[str, Any], dict[str, Any], np.random.Generator], None]
+
+
+@dataclass(frozen=True)
+class CaseFault:
+    """One fault. `spoil` changes manifest, frames and spectra in place; `accepts`: effects whose name is right for
+    it."""
+
+    name: str
+    spoil: Spoil
+    accepts: tuple[str, ...] = ()
+    colour_only: bool = False
+
+
+def spoilt(session: DrawnSession, fault: CaseFault, rng: np.random.Generator) -> DrawnSession:
+    """Return a copy of a session with the fault."""
+    manifest, frames, spectra = deepcopy(session.manifest), dict(session.frames), dict(session.spectra)
+    fault.spoil(manifest, frames, spectra, rng)
+    return replace(session, manifest=manifest, frames=frames, spectra=spectra)
+
+
+def _misstated(key: str, factor: Callable[[np.random.Generator], float]) -> Spoil:
+    def spoil(manifest: dict[str, Any], _frames: Any, _spectra: Any, rng: np.random.Generator) -> None:
+        camera = manifest["cameras"]["left"]
+        camera[key] = float(camera[key] * factor(rng))
+
+    return spoil
+
+
+def _exposure_unit(manifest: dict[str, Any], _frames: Any, _spectra: Any, _rng: np.random.Generator) -> None:
+    for capture in manifest["captures"]:
+        if capture["kind"] == "flat":
+            capture["exposure_s"] *= 1000.0
+
+
+def _cfa_phase(manifest: dict[str, Any], _frames: Any, _spectra: Any, _rng: np.random.Generator) -> None:
+    camera = manifest["cameras"]["left"]
+    camera["cfa"] = {"RGGB": "GRBG", "GRBG": "RGGB", "BGGR": "GBRG", "GBRG": "BGGR"}[camera["cfa"]]
+
+
+def _wavelength_axis(manifest: dict[str, Any], _frames: Any, spectra: dict[str, Any], rng: np.random.Generator) -> None:
+    offset_nm = float(rng.choice([-8.0, 8.0]))
+    for path in manifest["cameras"]["left"]["quantum_efficiency"].values():
+        spectra[path] = np.interp(WAVELENGTH_NM - offset_nm, WAVELENGTH_NM, spectra[path])
+
+
+def _frames_of(manifest: dict[str, Any], kind: str) -> list[str]:
+    return [c["frame"] for c in manifest["captures"] if c["kind"] == kind]
+
+
+def _lamp_out(manifest: dict[str, Any], frames: dict[str, Any], _spectra: Any, rng: np.random.Generator) -> None:
+    flats, darks = _frames_of(manifest, "flat"), _frames_of(manifest, "dark")
+    frames[str(rng.choice(flats[6:]))] = frames[darks[0]].copy()
+
+
+def _frames_swapped(manifest: dict[str, Any], frames: dict[str, Any], _spectra: Any, rng: np.random.Generator) -> None:
+    sweep = _frames_of(manifest, "narrowband")
+    i = int(rng.integers(8, 18))
+    frames[sweep[i]], frames[sweep[i + 2]] = frames[sweep[i + 2]], frames[sweep[i]]
+
+
+def _stale_frame(manifest: dict[str, Any], frames: dict[str, Any], _spectra: Any, rng: np.random.Generator) -> None:
+    sweep = _frames_of(manifest, "narrowband")
+    i = int(rng.integers(6, 20))
+    frames[sweep[i]] = frames[sweep[i - 1]].copy()
+
+
+FAULTS: tuple[CaseFault, ...] = (
+    CaseFault("f_number_misstated", _misstated("f_number", lambda rng: float(rng.choice([0.7, 1.4])))),
+    CaseFault("exposure_unit", _exposure_unit),
+    CaseFault("black_level_misstated", _misstated("black_level_dn", lambda rng: 1.25)),
+    CaseFault("pitch_misstated", _misstated("pixel_pitch_um", lambda rng: float(rng.choice([0.8, 1.25])))),
+    CaseFault("focal_length_misstated", _misstated("focal_length_mm", lambda rng: 0.6), ("vignetting",)),
+    CaseFault("cfa_phase_swapped", _cfa_phase, colour_only=True),
+    CaseFault("wavelength_axis_shifted", _wavelength_axis, ("wavelength_offset",)),
+    CaseFault("lamp_out", _lamp_out),
+    CaseFault("frames_swapped", _frames_swapped),
+    CaseFault("stale_frame", _stale_frame),
+)
+
+
+# --- Sessions of the second image former as recording sets ------------------------------------------------------------
+
+
+def recordings_of(camera: ConcealedCamera, plan: Plan = WHOLE_SESSION) -> RecordingSet:
+    """Return the recording set of one camera."""
+    return recording_set(record(camera, plan))
+
+
+def recordings_of_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan) -> RecordingSet:
+    """Return the recording set of a stereo pair."""
+    return recording_set(record_pair(left, right, plan))
+
+
+def recording_set(session: DrawnSession) -> RecordingSet:
+    """Return the recording set of a session; raises ValidationError where its manifest doesn't follow the format."""
+    spectra = {path: Spectrum.of(WAVELENGTH_NM, values) for path, values in session.spectra.items()}
+    manifest = Manifest.model_validate(session.manifest)
+    # every field is written, null where it is unknown
+    manifest = Manifest.model_validate(manifest.model_dump(mode="json"))
+    return RecordingSet(manifest, dict(session.frames), spectra, dict(session.targets), source=manifest.name)
+
 
 #: Of twenty cases: 30 % healthy, 35 % one effect, 15 % two, 20 % outside the library.
 SHARES: tuple[tuple[Kind, int], ...] = (("healthy", 6), ("single", 7), ("compound", 3), ("outside", 4))

@@ -28,9 +28,8 @@ from typing import Annotated, Literal, get_args
 import numpy as np
 import typer
 
-from lab.challenge.draw import DrawnFrame, draw
+from lab.challenge.draw import DrawnFrame, draw, recordings_of
 from lab.challenge.live import commit, session_of
-from lab.challenge.recordings import recordings_of
 from lab.challenge.score import Rate, families_of
 from lab.challenge.truth import load, store
 from lab.errors import InputError

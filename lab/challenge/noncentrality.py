@@ -19,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.stats import chi2
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.library import measurements
+from lab.diagnose.measurements.block import measurements
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet

@@ -23,9 +23,9 @@ import numpy as np
 import typer
 
 from lab.challenge.budgets import BudgetCheck, budget_lines, check_budget
+from lab.challenge.draw import recordings_of
 from lab.challenge.live import commit
 from lab.challenge.proof import ABSTAINED, RIGHT, WRONG, placed
-from lab.challenge.recordings import recordings_of
 from lab.challenge.truth import load, store
 from lab.diagnose import examine
 from lab.errors import InputError

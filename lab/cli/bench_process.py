@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
-from lab.cli.exit_codes import EXIT_INPUT
+from lab.cli.console import EXIT_INPUT
 from lab.errors import DeviceError, InputError
 
 BENCH_START_S, BENCH_END_S = 60.0, 10.0

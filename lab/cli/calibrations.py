@@ -10,8 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import check_writable, out, write_json
-from lab.cli.exit_codes import EXIT_CHECK
+from lab.cli.console import EXIT_CHECK, check_writable, out, write_json
 from lab.cli.sources import Json, StoreFolder, store_to_read
 from lab.errors import InputError
 
@@ -69,7 +68,7 @@ def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder
     """One calibration: its state, and its figures against the limits. Exit code 4 if a figure is bad or missing."""
     from lab.calibration.life import calibration, figures
     from lab.calibration.limits import judged
-    from lab.formats.results.in_words import shown_unit
+    from lab.formats.results.words import shown_unit
 
     check_writable(json)
     store = store_to_read(data)
@@ -137,8 +136,7 @@ def history(
     drifted."""
     from lab.calibration.life import figure_names
     from lab.calibration.life import history as looked_up
-    from lab.formats.results.figure_names import plain_name, unit_of
-    from lab.formats.results.in_words import shown_unit
+    from lab.formats.results.words import plain_name, shown_unit, unit_of
 
     check_writable(json)
     store = store_to_read(data)

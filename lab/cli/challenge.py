@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lab.cli.console import check_folder, check_writable
-from lab.cli.exit_codes import EXIT_CHECK
+from lab.cli.console import EXIT_CHECK, check_folder, check_writable
 from lab.cli.sources import Scheduler
 from lab.errors import InputError
 

@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from lab.errors import InputError
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
+
+    from lab.pipeline import PipelineProgress
+
+
+# --- What a command's exit code says. `InputError` (2) and `DeviceError` (3) carry theirs -----------------------------
+
+
+EXIT_INTERNAL, EXIT_INPUT, EXIT_CHECK, EXIT_INTERRUPTED = 1, 2, 4, 130
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: ends a command as Ctrl-C does."""
+
 
 # In a file or a pipe, a table keeps its width.
 out = Console(soft_wrap=True, highlight=False, emoji=False, width=None if sys.stdout.isatty() else 200)
@@ -70,3 +86,53 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: can't be made ({error.strerror}); name a folder that is yours") from error
+
+
+# --- The progress bar of long commands, on stderr where that is a terminal --------------------------------------------
+
+
+@contextlib.contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[str, float], None]]:
+    """A bar for one piece of work; yields `advance(text, share)`."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
+        task = progress.add_task(what, total=1.0)
+        yield lambda text, share: progress.update(task, description=f"{what}: {escape(text)}", completed=share)
+
+
+@contextlib.contextmanager
+def pipeline_bar() -> Iterator[Callable[[PipelineProgress], None]]:
+    """A bar for the step of a pipeline that is under way; yields what the pipeline calls. Remarks are printed as they
+    come.
+
+    Where stderr is no terminal, each sequence of a capture is a line on stdout, for a log.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[standing]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
+        task = progress.add_task("", total=1.0, standing="")
+        begun: set[tuple[str, str]] = set()
+
+        def tell(now: PipelineProgress) -> None:
+            standing = ""
+            if (capture := now.capture) is not None:
+                left = "" if capture.left_s is None else f", about {capture.left_s:.0f} s left"
+                standing = f"{capture.done} of {capture.total}{left}"
+                sequence = (capture.session, capture.sequence)
+                if not err.is_terminal and capture.sequence and sequence not in begun:
+                    begun.add(sequence)
+                    out.print(f"{capture.sequence}: from step {capture.done + 1} of {capture.total}")
+            description = ": ".join(part for part in (now.step, escape(now.what)) if part)
+            progress.update(task, description=description, completed=now.share_of_step, standing=standing)
+            if now.remark is not None:
+                warning = now.remark.removeprefix("warning: ")
+                if warning != now.remark:
+                    warn((warning,))
+                else:
+                    err.print(f"calibench: {escape(now.remark)}")
+
+        yield tell

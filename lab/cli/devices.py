@@ -9,8 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import check_writable, err, out
-from lab.cli.exit_codes import EXIT_CHECK
+from lab.cli.console import EXIT_CHECK, check_writable, err, out
 from lab.errors import DeviceError, InputError
 from lab.formats.toml_file import read_toml
 

@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from lab.cli.console import check_output, check_writable, err, make_folder, out, write_json
-from lab.cli.exit_codes import EXIT_CHECK, EXIT_INPUT
+from lab.cli.console import EXIT_CHECK, EXIT_INPUT, check_output, check_writable, err, make_folder, out, write_json
 from lab.cli.sources import (
     FitFile,
     Json,

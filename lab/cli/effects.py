@@ -16,7 +16,7 @@ from lab.errors import InputError
 from lab.pipeline import PipelineRequest
 
 if TYPE_CHECKING:
-    from lab.diagnose.effect_list import EffectDescription
+    from lab.diagnose.visibility import EffectDescription
 
 
 class _ListedByDefault(TyperGroup):
@@ -44,7 +44,7 @@ def list_effects(
 ) -> None:
     """The library of effects: its families, where each effect acts, its parameters, which measurements can show it, and
     its rivals."""
-    from lab.diagnose.effect_list import EffectList, effect_description, effect_list
+    from lab.diagnose.visibility import EffectList, effect_description, effect_list
 
     check_writable(json)
     told = EffectList(effects=(effect_description(name),)) if name else effect_list()

@@ -14,10 +14,9 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from lab.cli import calibrations, capturing, devices, diagnosis, effects, fitting, kinds, recordings, simulation
+from lab.cli import calibrations, capturing, devices, diagnosis, effects, fitting, recordings, simulation
 from lab.cli.challenge import commands as challenge
-from lab.cli.console import err, out
-from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated
+from lab.cli.console import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated, err, out
 from lab.cli.twin import commands as twin
 from lab.errors import DeviceError, InputError, failure_of_environment
 
@@ -30,7 +29,7 @@ app = typer.Typer(
 )
 
 
-for _group in (capturing, fitting, diagnosis, recordings, kinds, simulation):
+for _group in (capturing, fitting, diagnosis, recordings, simulation):
     app.registered_commands += _group.commands.registered_commands
 app.add_typer(effects.commands)
 app.add_typer(challenge)

@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
-from lab.cli.console import out, warn
-from lab.cli.progress import progress_bar
+from lab.cli.console import out, progress_bar, warn
 from lab.cli.sources import recordings_of, store_to_read
 from lab.errors import InputError
 from lab.pipeline import session_recordings
 
 if TYPE_CHECKING:
     from lab.formats.cgats import CgatsSpectra
-    from lab.formats.importers.import_options import ImportOptions
+    from lab.formats.importers.single_picture import ImportOptions
 
 #: `import --from` these, and `export --as` these; the last of a camera file.
 SPECTRA, LENSFUN, TILED = "spectra", "lensfun", "tiled"

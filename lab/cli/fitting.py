@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from lab.cli.console import check_folder, check_writable, err, make_folder, write_json
-from lab.cli.exit_codes import EXIT_CHECK
+from lab.cli.console import EXIT_CHECK, check_folder, check_writable, err, make_folder, write_json
 from lab.cli.sources import Json, Source, StoreFolder, existing_store, recordings_of, run_here
 from lab.cli.tables import print_comparison, print_fit
 from lab.errors import NotDetermined
@@ -64,7 +63,7 @@ def _fit(recordings: RecordingSet) -> FitResult:
 def _write_maps(recordings: RecordingSet, folder: Path) -> None:
     """Write the maps of every side's pixels. A side without darks has none; a line on stderr says so."""
     from lab.fit.noise.pixel_maps import pixel_maps
-    from lab.report.maps import write_maps
+    from lab.report.pictures import write_maps
 
     for side in recordings.sides:
         try:

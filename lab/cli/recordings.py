@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import check_output, check_writable, out, warn, write_json
+from lab.cli.console import check_output, check_writable, out, progress_bar, warn, write_json
 from lab.cli.exchange import (
     LENSFUN,
     OF_A_CAMERA,
@@ -23,14 +24,14 @@ from lab.cli.exchange import (
     import_spectra,
     import_tiled,
 )
-from lab.cli.progress import progress_bar
-from lab.cli.sources import StoreFolder, store_to_read
+from lab.cli.sources import StoreFolder, recordings_of, store_to_read
 from lab.cli.tables import print_fit
 from lab.errors import InputError
 from lab.pipeline import session_recordings
 
 if TYPE_CHECKING:
-    from lab.formats.importers.import_options import ImportOptions
+    from lab.formats.importers.single_picture import ImportOptions
+
 
 commands = typer.Typer()
 #: `--from` these: a CSV of channel means and variances by level, or of channel means by wavelength, which becomes a
@@ -102,7 +103,7 @@ def import_(
     """Turn another format into a recording set; spectra into CSV, a lens into a camera file."""
     from lab.formats import recording_set
     from lab.formats.importers import read_foreign
-    from lab.formats.importers.import_options import ImportOptions, chart_corners, grid
+    from lab.formats.importers.single_picture import ImportOptions, chart_corners, grid
 
     if transfer not in ("", "linear", "srgb"):
         raise InputError(f"--transfer {transfer}: give linear or srgb")
@@ -144,9 +145,9 @@ def import_(
 
 def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> None:
     """A table holds no frames: its import is a fit."""
-    from lab.fit.noise.level_table import fit_level_table
+    from lab.fit.noise.noise_fit import fit_level_table
     from lab.fit.spectral.mean_table import fit_mean_table
-    from lab.formats.foreign_text import read_foreign_csv
+    from lab.formats.cgats import read_foreign_csv
     from lab.formats.importers.images import read_camera_file
     from lab.formats.recording_set import Manifest, RecordingSet
 
@@ -252,3 +253,31 @@ def backup(
     made = back_up(store_to_read(data), folder)
     mib = made.copied_bytes / (1 << 20)
     out.print(f"{made.sessions} sessions, {made.files} files of them; {made.copied} files copied, {mib:.1f} MiB")
+
+
+# --- `calibench kinds` ------------------------------------------------------------------------------------------------
+
+
+@commands.command()
+def kinds(
+    source: Annotated[
+        str, typer.Argument(metavar="[SOURCE]", help="count the captures in a recording set or a stored session")
+    ] = "",
+    data: StoreFolder = None,
+) -> None:
+    """The kinds of capture: the scene, and the sequence that takes them."""
+    from lab.capture_kinds.base import CAPTURES
+
+    counted = Counter(capture.kind for capture in recordings_of(source, data).captures()) if source else None
+    table = Table(box=None, pad_edge=False)
+    for heading in (
+        "kind",
+        "sequence",
+        "what stands before the camera",
+        *(["captures"] if counted is not None else []),
+    ):
+        table.add_column(heading)
+    for name, kind in CAPTURES.models.items():
+        sequence = kind.sequence.name if kind.sequence else "-"
+        table.add_row(name, sequence, escape(kind.shows), *([str(counted[name])] if counted is not None else []))
+    out.print(table)

@@ -9,8 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import check_folder, check_writable, out, warn, write_json
-from lab.cli.progress import progress_bar
+from lab.cli.console import check_folder, check_writable, out, progress_bar, warn, write_json
 from lab.cli.sources import Json, Scheduler
 from lab.errors import InputError
 

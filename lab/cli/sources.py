@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from lab.cli.console import warn
-from lab.cli.progress import pipeline_bar
+from lab.cli.console import pipeline_bar, warn
 from lab.errors import InputError
 from lab.pipeline import Capturer, PipelineRequest, PipelineResult, run_pipeline, source_recordings
 

@@ -183,7 +183,7 @@ def print_resolving(diagnosis: DiagnosisResult) -> None:
 
 
 def print_comparison(comparison: ComparisonResult, every: bool) -> None:
-    from lab.formats.results.in_words import measured, shown_unit
+    from lab.formats.results.words import measured, shown_unit
 
     shown = [row for row in comparison.changes if every or row.changed]
     table = Table(box=None, pad_edge=False)

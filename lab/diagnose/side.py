@@ -19,23 +19,31 @@ from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.blocks import measurement_model, study_of
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata import misstatements, unchecked
-from lab.diagnose.outcome.board_departure import board_departure
-from lab.diagnose.outcome.described import (
+from lab.diagnose.outcome.goodness_of_fit import (
+    detectability,
+    held_out,
+    measurement_fits,
+    places,
+    residual_curves,
+    side_models,
+)
+from lab.diagnose.outcome.improved_model import improved_model, residual_pictures
+from lab.diagnose.outcome.mismatches import (
+    board_departure,
     corrected_by_laws,
     described,
+    family_corrections,
     in_light_of_laws,
     left_to_smooth,
+    located,
+    misstated_light,
+    shown_in,
+    unexplained,
+    vetoed_names,
     with_laws,
 )
-from lab.diagnose.outcome.detectability import detectability
-from lab.diagnose.outcome.doubts import names_in_doubt
-from lab.diagnose.outcome.effect_sets import side_models
-from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
-from lab.diagnose.outcome.improved_model import improved_model
-from lab.diagnose.outcome.mismatches import family_corrections, located, shown_in, unexplained, vetoed_names
-from lab.diagnose.outcome.misstated_light import misstated_light
+from lab.diagnose.outcome.model_posterior import names_in_doubt
 from lab.diagnose.outcome.next_capture import Doubt, doubt_of
-from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
@@ -104,7 +112,7 @@ def diagnose_side(
     policy = policy or DecisionPolicy()
     report("checking what is stated")
     stated = recordings.camera(side)
-    recordings, misstated = misstatements(recordings, side)
+    recordings, misstated = misstatements(recordings, side, policy)
     wrong = tuple(one.told(side) for one in misstated)
     if fit is not None and recordings.camera(side).cfa != stated.cfa:  # its planes were mixed
         fit = fit.model_copy(update={"cameras": {s: c for s, c in fit.cameras.items() if s != side}})
@@ -138,7 +146,7 @@ def diagnose_side(
         discovered = discover(study, (*model.always, *verdict.effects), policy, verdict)
     report("looking for the next capture")
     laws = tuple(law_of(one, study) for one in discovered)
-    by_laws = described(verdict, discovered, laws)
+    by_laws = described(verdict, discovered, laws, policy)
     smooth = left_to_smooth(verdict, by_laws)
     improved, corrections = improved_model(recordings, side, fit, baseline, model, verdict.effects, smooth)
     corrections = corrected_by_laws(verdict, corrections, by_laws)

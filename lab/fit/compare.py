@@ -45,7 +45,7 @@ from lab.formats.results import (
     Skipped,
     StereoFit,
 )
-from lab.formats.results.figure_names import plain_name, unit_of
+from lab.formats.results.words import plain_name, unit_of
 from lab.measure.pinhole import (
     COUNT,
     NAMES,

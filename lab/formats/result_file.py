@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import platform
+from datetime import UTC, datetime
+from importlib import metadata
 from pathlib import Path
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from lab.errors import InputError
+from lab.formats.recording_set import InstrumentSnapshot, RecordingSet, manifest_json
+from sim.parameters import Frozen
 
 Result = TypeVar("Result", bound=BaseModel)
 
@@ -35,3 +41,46 @@ def read_result(model: type[Result], file: Path) -> Result:
         first = error.errors()[0]
         at = ".".join(str(part) for part in first["loc"])
         raise InputError(f"{file}: not what --json wrote: {at} {first['msg']}; write it again") from error
+
+
+# --- Where a report's numbers come from: instruments, versions, and digests of what was evaluated ---------------------
+
+
+#: The distributions whose version can change a number.
+DISTRIBUTIONS = ("calibench", "numpy", "scipy", "opencv-contrib-python-headless", "colour-science", "rawpy")
+
+
+class Provenance(Frozen):
+    """The origin of a calibration: instruments, software, and digests of the recordings."""
+
+    made: datetime
+    instruments: dict[str, InstrumentSnapshot] = {}  # by name, what each said of itself before the first capture
+    versions: dict[str, str] = {}
+    manifest_sha256: str
+    frame_sha256: dict[str, str]  # capture id -> SHA-256 of the frame's values (little-endian uint16, row by row)
+
+
+def installed_versions() -> dict[str, str]:
+    """Versions of calibench, of the libraries that compute, and of Python."""
+    found = {"python": platform.python_version(), "system": platform.platform(terse=True)}
+    for name in DISTRIBUTIONS:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def provenance_of(recordings: RecordingSet, made: datetime | None = None) -> Provenance:
+    """Provenance of an evaluation of `recordings`: reads every frame once. `made`: now, where not given."""
+    digests = {
+        capture.id: hashlib.sha256(recordings.frame(capture).astype("<u2").tobytes()).hexdigest()
+        for capture in recordings.captures()
+    }
+    return Provenance(
+        made=made or datetime.now(UTC),
+        instruments=recordings.manifest.instruments,
+        versions=installed_versions(),
+        manifest_sha256=hashlib.sha256(manifest_json(recordings.manifest).encode()).hexdigest(),
+        frame_sha256=digests,
+    )

@@ -15,7 +15,6 @@ from pydantic import ValidationError
 
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, traced_table
-from lab.formats.provenance import installed_versions
 from lab.formats.raw_file import (
     Frame,
     RawMetadata,
@@ -26,6 +25,7 @@ from lab.formats.raw_file import (
     write_raw,
     writer_of,
 )
+from lab.formats.result_file import installed_versions
 from lab.formats.scene_file import light, scene
 from sim import frame as sim_frame
 from sim.camera import CameraModel, Lens

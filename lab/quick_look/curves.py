@@ -1,7 +1,6 @@
 """Photon transfer, sensitivity and MTF of a session that is still under way, from the captures that are on disk.
 
-Each capture is looked at once, when it is new: the work of a look is that of the captures since the one before.
-"""
+Each capture is looked at once, when it is new: the work of a look is that of the captures since the one before."""
 
 from __future__ import annotations
 
@@ -15,11 +14,55 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import InputError, NotDetermined
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.measure.edges import measure_edge
 from sim.camera import Side
 from sim.parameters import Frozen
 from sim.sensor.mosaic import planes
+
+# --- A frame at a glance: histogram, mean and share of saturated pixels of each channel of the mosaic -----------------
+
+
+BINS = 64
+
+
+class ChannelFigures(Frozen):
+    """One channel of a frame. `counts`: pixels in each of the equal bins between 0 and the saturation;
+    `saturated_share`: of its pixels, those at or above the data sheet's white level."""
+
+    channel: str
+    mean_dn: float
+    saturated_share: float
+    counts: tuple[int, ...]
+
+
+class FrameFigures(Frozen):
+    """A frame's channels: R, G1, G2, B, or Y. The bins are `bin_dn` wide and begin at 0 DN."""
+
+    bin_dn: float
+    black_level_dn: float | None
+    saturation_dn: float
+    channels: tuple[ChannelFigures, ...]
+
+
+def frame_figures(frame: NDArray[np.uint16], camera: DataSheet) -> FrameFigures:
+    """Return the figures of `frame` (rows, cols), from one count of the codes of each channel."""
+    top = camera.saturation_dn
+    bin_dn = (top + 1.0) / BINS
+    found = []
+    for name, plane in planes(frame, camera.cfa).items():
+        codes = np.bincount(plane.ravel(), minlength=int(top) + 1)
+        at = np.minimum((np.arange(codes.size) / bin_dn).astype(int), BINS - 1)
+        found.append(
+            ChannelFigures(
+                channel=name,
+                mean_dn=float(codes @ np.arange(codes.size) / plane.size),
+                saturated_share=float(codes[int(np.ceil(top)) :].sum() / plane.size),
+                counts=tuple(np.bincount(at, codes, BINS).astype(int).tolist()),
+            )
+        )
+    return FrameFigures(bin_dn=bin_dn, black_level_dn=camera.black_level_dn, saturation_dn=top, channels=tuple(found))
+
 
 #: Captures that one look takes at most: a session that is long under way is looked at in several.
 AT_ONCE = 60

@@ -11,17 +11,16 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from lab.calibration.figures import figures_of
-from lab.calibration.limits import CalibrationLimits, judged
+from lab.calibration.limits import CalibrationLimits, figures_of, judged
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.diagnose.measurements.library import measurement_title
+from lab.diagnose.measurements.block import measurement_title
 from lab.effect_titles import at_beginning, effect_title
 from lab.errors import InputError
-from lab.formats.provenance import Provenance, installed_versions, provenance_of
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
-from lab.formats.recording_set.snapshot import told
+from lab.formats.recording_set.manifest import told
+from lab.formats.result_file import Provenance, installed_versions, provenance_of
 from lab.formats.results import (
     Check,
     DiagnosisResult,
@@ -32,11 +31,11 @@ from lab.formats.results import (
     Skipped,
     ValidationResult,
 )
-from lab.formats.results.in_words import measured
-from lab.predict.both_models import BothModels
+from lab.formats.results.words import measured
+from lab.predict.validate import BothModels
 from lab.report import answers, charts, geometry, words
 from lab.report import diagnosis as diagnosis_page
-from lab.report.chart_data import ChartData, plotly_base64
+from lab.report.charts import ChartData, plotly_base64
 from lab.report.emva import data_sheets
 from lab.report.figures import by_side, geometry_figures, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin

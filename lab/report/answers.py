@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.library import measurement_title
+from lab.diagnose.measurements.block import measurement_title
 from lab.effect_titles import at_beginning, effect_title
 from lab.formats.results import (
     Check,
@@ -21,8 +21,8 @@ from lab.formats.results import (
     ResidualCurve,
     ValidationResult,
 )
-from lab.formats.results.in_words import measured, plain_number
-from lab.predict.both_models import BothModels
+from lab.formats.results.words import measured, plain_number
+from lab.predict.validate import BothModels
 from lab.report import charts, words
 from lab.report.diagnosis import worst_of_each
 from lab.report.figures import KeyFigure, camera_figures

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from lab.formats.results import Change, ComparisonResult, ProjectionChange
-from lab.formats.results.in_words import measured
+from lab.formats.results.words import measured
 from lab.report import page_environment, write_page
-from lab.report.chart_data import ChartData, plotly_base64
-from lab.report.charts import AFTER, BEFORE, Figure, axis, layout
+from lab.report.charts import AFTER, BEFORE, ChartData, Figure, axis, layout, plotly_base64
 from lab.report.geometry import frame_layout, lines_of_vectors
 
 SHOWN = 40  # rows of the chart: those that changed, and the most significant of the rest

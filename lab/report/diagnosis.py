@@ -10,9 +10,8 @@ import numpy as np
 from scipy import special
 
 from lab.diagnose.discovery.words import departure_unit
-from lab.diagnose.measurements.library import measurement_title
-from lab.diagnose.outcome.detectability import detectable
-from lab.diagnose.outcome.in_dn import told_as
+from lab.diagnose.measurements.block import measurement_title
+from lab.diagnose.outcome.goodness_of_fit import detectable, told_as
 from lab.formats.results import (
     DiagnosisResult,
     DiscoveredLaw,
@@ -21,7 +20,7 @@ from lab.formats.results import (
     ResidualPicture,
     Visibility,
 )
-from lab.formats.results.in_words import plain_number, shown_unit
+from lab.formats.results.words import plain_number, shown_unit
 from lab.report.charts import AFTER, CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.pictures import difference_picture
 from sim.camera import Side

@@ -3,11 +3,13 @@ spatial stacks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
@@ -15,17 +17,57 @@ from lab.errors import NotDetermined
 from lab.fit.noise.pixel_maps import pixel_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelNoise, Emva1288, Emva1288Points, FitResult, NoiseFit, PixelDefects
-from lab.formats.results.in_words import measured
+from lab.formats.results.words import measured
 from lab.measure.dark_pixels import stack_of
 from lab.measure.stated_light import light_of
-from lab.report.charts import AFTER, BEFORE, CHANNEL, Trace, axis, layout
-from lab.report.emva_plot import EmvaPlot, curve, floats, markers
+from lab.report.charts import AFTER, BEFORE, CHANNEL, Figure, Trace, axis, layout
 from lab.report.figures import NOISE
-from lab.report.maps import MAPS
-from lab.report.pictures import map_picture, photograph_data_uri
+from lab.report.pictures import MAPS, map_picture, photograph_data_uri
 from sim.camera import Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray
+
+# --- Parts of the data sheet's plots: a plot with its caption, markers, lines -----------------------------------------
+
+
+@dataclass(frozen=True)
+class EmvaPlot:
+    """A figure with its title and caption."""
+
+    title: str
+    figure: Figure
+    caption: str
+    of_plane: bool = True  # of the sheet's plotted plane; else of all pixels
+
+
+def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **more: Any) -> Trace:
+    """Return a trace of markers; `more`: further keys of the trace."""
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "name": name,
+        "x": list(x),
+        "y": list(y),
+        "marker": {"color": colour, "size": 5},
+    } | more
+
+
+def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: str = "solid", **more: Any) -> Trace:
+    """Return a trace of lines; `more`: further keys of the trace."""
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "name": name,
+        "x": list(x),
+        "y": list(y),
+        "line": {"color": colour, "width": 1.6, "dash": dash},
+    } | more
+
+
+def floats(values: NDArray[np.floating[Any]]) -> list[float]:
+    """Return an array (n,) as a list."""
+    return [float(value) for value in values]
+
 
 # --- emva spatial ----------------------------------------------------------------------------------------------------
 # The data sheet's spatial plots: spectrograms, histograms and profiles of DSNU and PRNU.

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
-from lab.formats.results.figure_names import plain_name, unit_of
-from lab.formats.results.in_words import measured
+from lab.formats.results.words import measured, plain_name, unit_of
 from sim.camera import Side
 
 #: Fields of `NoiseFit` in the order of the table; the maker's value has the same field name.

@@ -15,7 +15,7 @@ from lab.errors import InputError, NotDetermined
 from lab.fit.stereo import rectification_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
-from lab.formats.results.in_words import measured
+from lab.formats.results.words import measured
 from lab.measure.board_detection import luminance
 from lab.report.charts import CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.pictures import photograph_data_uri

@@ -12,8 +12,7 @@ import numpy as np
 
 from lab.predict.lens import LensResult, TracedPrescription
 from lab.report import page_environment, write_page
-from lab.report.chart_data import ChartData, plotly_base64
-from lab.report.charts import Figure, Trace, axis, layout
+from lab.report.charts import ChartData, Figure, Trace, axis, layout, plotly_base64
 from lab.report.pictures import kernel_picture
 from sim.optics import rays as rt
 from sim.optics.system import OpticalSystem

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lab.formats.results import Check, DiagnosisResult, ParameterValue
-from lab.formats.results.in_words import plain_number
+from lab.formats.results.words import plain_number
 from sim.camera import Side
 
 #: Verdict -> (what stands on the badge, its mood, the headline).

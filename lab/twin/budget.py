@@ -21,8 +21,8 @@ import numpy as np
 from lab.capture.catalogue import StepTimes
 from lab.capture.station import Station
 from lab.diagnose.inference.refit import coordinates, moved
-from lab.diagnose.measurements.curves import freed_curve
 from lab.diagnose.measurements.noise import GAIN_STD, READ_STD
+from lab.diagnose.measurements.spectral import freed_curve
 from lab.diagnose.outcome.model_posterior import STEP, coordinate_name, with_unnamed
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile

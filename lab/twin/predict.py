@@ -18,12 +18,11 @@ from lab.capture_kinds.base import Capture
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import coordinates
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.chart import CHART
 from lab.diagnose.measurements.dark_level import DARK, added_dark_e_per_s
-from lab.diagnose.measurements.flat_light import misstated_levels
-from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
+from lab.diagnose.measurements.linearity import PHOTON_TRANSFER, misstated_levels
 from lab.diagnose.measurements.noise import GAIN_STD, NOISE, READ_STD, shot_variance
 from lab.diagnose.measurements.slanted_edge import ASIDE, SLANTED_EDGE
+from lab.diagnose.measurements.spectral import CHART
 from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian, with_unnamed
 from lab.errors import InputError, NotDetermined
 from lab.fit import Step, fit_recording_set

@@ -19,8 +19,7 @@ import numpy as np
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import coordinates
 from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.flat_light import reading
-from lab.diagnose.measurements.linearity import linearity_block
+from lab.diagnose.measurements.linearity import linearity_block, reading
 from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian, with_unnamed
 from lab.errors import InputError, NotDetermined
 from lab.formats.model_posterior import ModelPosterior

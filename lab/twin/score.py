@@ -10,8 +10,7 @@ import numpy as np
 from scipy.stats import norm
 
 from lab.capture_kinds.base import Capture
-from lab.diagnose.measurements.block import Label
-from lab.diagnose.measurements.library import measurement_title
+from lab.diagnose.measurements.block import Label, measurement_title
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.errors import InputError
 from lab.formats.camera_file import lens_cache, traced_table

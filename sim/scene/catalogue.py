@@ -76,15 +76,6 @@ class View:
         return 1e3 * self.magnification / self.pixel_pitch_um
 
     @property
-    def field_of_view_deg(self) -> tuple[float, float]:
-        """Full angles down and across the frame."""
-        image_mm = self.focal_length_mm * (1.0 + self.magnification)
-        down, across = (
-            2.0 * np.degrees(np.arctan(0.5e-3 * n * self.pixel_pitch_um / image_mm)) for n in (self.rows, self.cols)
-        )
-        return float(down), float(across)
-
-    @property
     def centre(self) -> tuple[float, float]:
         """[row, col] of the frame's centre, on the optical axis."""
         return 0.5 * (self.rows - 1), 0.5 * (self.cols - 1)

@@ -52,11 +52,6 @@ def at_luminance(curve: Spectrum, wanted_cd_m2: float) -> Spectrum:
     return curve.scale(wanted_cd_m2 / has)
 
 
-def illuminant_names() -> tuple[str, ...]:
-    """Names of the illuminants that `illuminant` knows: the CIE's and others of colour-science."""
-    return tuple(colour_science().SDS_ILLUMINANTS)
-
-
 def illuminant(name: str, luminance_cd_m2: float) -> Spectrum:
     """Radiance (W sr^-1 m^-2 nm^-1) of a perfect white diffuser under a named illuminant (D65, A, FL2, LED-B1, ...), at
     the given luminance. Raises ValueError that lists the names for one that isn't known.

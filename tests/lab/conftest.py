@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lab.capture.store import Store
-from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.recording_set import Manifest, RecordingSet, write
 from sim.spectrum import Spectrum
 
 ROWS, COLS = 24, 32
@@ -121,3 +121,29 @@ def store(tmp_path: Path) -> Iterator[Store]:
     opened = Store(tmp_path / "data")
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def flats(tmp_path: Path) -> Path:
+    """A MONO camera of 0.5 DN/e: darks and a series of flats, small and quick to fit."""
+    rng = np.random.default_rng(7)
+    frames, captures = {}, []
+    for number, (kind, photons) in enumerate(
+        [("dark", 0)] * 4 + [("flat", 800 * k) for k in range(1, 8) for _ in range(2)]
+    ):
+        electrons = rng.poisson(photons, (60, 80)) + rng.normal(0, 4, (60, 80))
+        frames[f"frames/{number}.npy"] = np.clip(100 + 0.5 * electrons, 0, 4095).round().astype(np.uint16)
+        light = {"photons_per_pixel": 2 * photons, "wavelength_nm": 530} if kind == "flat" else {}
+        captures.append(
+            {
+                "id": f"{kind}-{number}",
+                "kind": kind,
+                "side": "left",
+                "frame": f"frames/{number}.npy",
+                "exposure_s": 0.01,
+            }
+            | light
+        )
+    camera = {"rows": 60, "cols": 80, "cfa": "MONO", "bit_depth": 12, "black_level_dn": 100}
+    manifest = Manifest.model_validate({"name": "flats", "cameras": {"left": camera}, "captures": captures})
+    return write(RecordingSet(manifest, frames), tmp_path / "flats")

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from distributed import LocalCluster
 
+from lab.challenge.draw import recordings_of
 from lab.challenge.make import make
-from lab.challenge.recordings import recordings_of
 from lab.challenge.run import run_all
 from lab.challenge.truth import FIRST_FRESH_SEED
 from lab.cli import main

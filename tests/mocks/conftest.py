@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
-from mocks.wire import Grammar, Pty, serve
+from mocks.wire import Grammar
 
 Talk = Callable[[Grammar, bytes], bytes]
 
@@ -25,23 +24,3 @@ def talk() -> Talk:
         raise AssertionError(f"{type(grammar).__name__} never comes to rest")
 
     return talk_to
-
-
-@pytest.fixture
-def served() -> Iterator[Callable[[Grammar], str]]:
-    """Serve a grammar on a pseudo-terminal for the test's time; gives its address."""
-    stop = threading.Event()
-    threads: list[threading.Thread] = []
-
-    def start(grammar: Grammar) -> str:
-        endpoint, listening = Pty(), threading.Event()
-        announce = {"announce": lambda address: listening.set()}
-        threads.append(threading.Thread(target=serve, args=(grammar, endpoint, stop), kwargs=announce))
-        threads[-1].start()
-        assert listening.wait(30)
-        return endpoint.address
-
-    yield start
-    stop.set()
-    for thread in threads:
-        thread.join(30)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.fit.mtf import edge_mtf
 from mocks.former import LISTED, OUTSIDE, WAVELENGTH_NM, ConcealedCamera, Law, Plan
 from mocks.former.camera import poisson

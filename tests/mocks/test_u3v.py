@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mocks.bench import Bench
-from mocks.pixels import encode, pack_12p, payload_bytes
+from mocks.ready_frames import encode, pack_12p, payload_bytes
 from mocks.truth import hidden_truth
 from mocks.u3v import FAULTS, TriggerLine, U3vDevice
 from mocks.usb_device import Abandoned, Stalled, Unplugged

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose import diagnose
 from lab.formats.recording_set import read
 from lab.formats.results import DiagnosisResult

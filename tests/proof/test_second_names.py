@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import pytest
 
+from lab.challenge.draw import recordings_of
 from lab.challenge.names import OF_THE_BENCH, NameRun, _judged, run_case, table
-from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.formats.results import DiagnosisResult, NamedEffect
 from mocks.former import ConcealedCamera, Law, Plan

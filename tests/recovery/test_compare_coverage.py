@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recording_set
+from lab.challenge.draw import recording_set
 from lab.fit import fit_recording_set
 from lab.fit.compare import FALSE_ALARM_RATE, compare
 from lab.formats.results import FitResult

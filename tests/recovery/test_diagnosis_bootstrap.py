@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.bootstrap import healthy_draws
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.measurements.blocks import measurement_model

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lab.diagnose.measurements.dark_frames import DarkCondition, conditions
 from lab.diagnose.measurements.dark_readout import MOST_FRAMES, dark_readout
-from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, dark_level_dn, flats
+from lab.diagnose.measurements.flat_field import LEAST_SIGNAL, dark_level_dn, flats
 from lab.errors import NotDetermined
 from lab.measure.noise_figures import CLIP, robust_std
 from lab.measure.study import Study, held_out_flats, held_out_of

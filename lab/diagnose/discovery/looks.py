@@ -15,8 +15,7 @@ from lab.diagnose.discovery.images import DarkImages, Image, dark_images, flat_i
 from lab.diagnose.discovery.profile import Look, Profile
 from lab.diagnose.measurements.code_density import CodeCounts, counted, counted_in_all, prepared, widths
 from lab.diagnose.measurements.dark_readout import dark_readout
-from lab.diagnose.measurements.even_flats import FlatLevel, flats
-from lab.diagnose.measurements.flat_lines import without_dark
+from lab.diagnose.measurements.flat_field import FlatLevel, flats, without_dark
 from lab.errors import NotDetermined
 from lab.measure.reads import CODES, COLLECTED, GAINS, acting
 from lab.measure.study import Study

@@ -248,10 +248,6 @@ def _replaced_by_a_discrepancy(search: Search, fit: Fit) -> list[int]:
 # --- decide ------------------------------------------------------------
 
 
-#: Refits that end within this share of an effect's size of each other found the same mode.
-SAME_MODE = 0.1
-
-
 @dataclass(frozen=True)
 class Verdict:
     """What one side shows.
@@ -489,7 +485,7 @@ def _with_every_mode(
             unsigned_distance = np.minimum(
                 np.linalg.norm(place[1:] - place[0], axis=1), np.linalg.norm(place[1:] + place[0], axis=1)
             )
-            if np.all(unsigned_distance > SAME_MODE * total) and fit.log_likelihood >= least:
+            if np.all(unsigned_distance > policy.same_mode_share * total) and fit.log_likelihood >= least:
                 modes.append(fit.effects[-1])
     turned = effect.replace_fields(**{n: -v for n, v in signed.items()})
     is_unsigned = log_likelihood(model, (*others, turned), policy) >= least

@@ -16,11 +16,6 @@ from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 from sim.uniform import LEVEL
 
-#: Share of a measurement's captures that may be outlying: of more, none can be told from the others.
-MOST_OUTLYING = 0.3
-#: Standard deviations within which captures of one setting count as off by the same factor.
-ALIKE_SIGMA = 4.0
-
 
 @dataclass(frozen=True)
 class OutlyingLevel:
@@ -63,7 +58,7 @@ def outlying_levels(
         if gain.max() < least:
             break
         chosen.append(rest[int(np.argmax(gain))])
-        if len(chosen) > MOST_OUTLYING * len(captures):
+        if len(chosen) > policy.most_outlying_share * len(captures):
             return ()
     if not chosen:
         return ()
@@ -73,7 +68,8 @@ def outlying_levels(
         return ()
     # the measured signal is the factor times what is predicted: shift = 1 - 1 / factor
     factor = 1.0 / (1.0 - shift)
-    return _by_setting(block, [captures[i] for i in chosen], factor, np.sqrt(np.diag(covariance)) * factor**2)
+    std = np.sqrt(np.diag(covariance)) * factor**2
+    return _by_setting(block, [captures[i] for i in chosen], factor, std, policy.alike_outlying_sigma)
 
 
 def freed(model: MeasurementModel, outlying: Mapping[int, Sequence[OutlyingLevel]]) -> MeasurementModel:
@@ -107,15 +103,15 @@ def _agrees(
 
 
 def _by_setting(
-    block: Block, captures: list[tuple[str, ...]], factor: FloatArray, std: FloatArray
+    block: Block, captures: list[tuple[str, ...]], factor: FloatArray, std: FloatArray, alike_sigma: float
 ) -> tuple[OutlyingLevel, ...]:
-    """Captures of one setting that are off by the same factor, together, with its weighted mean."""
+    """Return captures of one setting whose factors agree within `alike_sigma`, together, with their weighted mean."""
     setting = {label.captures: label.condition for label in block.labels}
     groups: list[list[int]] = []
     for i, names in enumerate(captures):
         for group in groups:
             j = group[0]
-            alike = abs(factor[i] - factor[j]) < ALIKE_SIGMA * float(np.hypot(std[i], std[j]))
+            alike = abs(factor[i] - factor[j]) < alike_sigma * float(np.hypot(std[i], std[j]))
             if alike and setting[names] == setting[captures[j]]:
                 group.append(i)
                 break

@@ -19,11 +19,6 @@ from lab.diagnose.inference.score import Changes, Signatures, signatures_of
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect, Effects
 
-#: Largest number of effects that one step adds to a set.
-LARGEST_STEP = 3
-#: Steps of the search: each adds an effect or exchanges one, at least.
-MOST_STEPS = 12
-
 
 @dataclass(frozen=True)
 class Model:
@@ -125,7 +120,7 @@ class Search:
         aren't seen. Of each kind the best in closed form are refitted, about the current set, or about it without the
         member that is exchanged."""
         current = self.fitted((), converged=True)
-        for step in range(MOST_STEPS):
+        for step in range(self.policy.search_steps):
             report(f"looking for {'another' if step else 'an'} effect")
             better = self._refitted(current, wide=False) or self._refitted(current, wide=True)
             if better is None:
@@ -206,7 +201,7 @@ class Search:
         """Two effects more, or three, where fewer aren't seen. What hides a pair is fitted first and exchanged for it
         then, as sets are compared better about a fit that is nearer."""
         seen: list[LinearSet] = []
-        for size in range(1, LARGEST_STEP + 1):
+        for size in range(1, self.policy.added_effects + 1):
             seen = seen or self._seen_sets(current, size)
         return [self._proposal(current, one) for one in seen if len(one.members) > 1]
 

@@ -1,23 +1,28 @@
-"""What a measurement is: its declaration, its numbers with their covariance, and how a camera model predicts them.
+"""What a measurement is: its declaration, its numbers with their covariance, and how a camera model predicts them; and
+the list of all.
 
 A prediction goes through the same estimator as the recording. Nuisance parameters (levels, gain, smooth errors of the
-maker's sensitivity curves) enter by their Jacobian and a normal prior. The measurement model marginalises them.
-"""
+maker's sensitivity curves) enter by their Jacobian and a normal prior. The measurement model marginalises them."""
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+import lab.diagnose.measurements
 from sim.effects.base import Effect, Effects
 from sim.effects.library import may_change
 from sim.spectrum import FloatArray
 
 if TYPE_CHECKING:
     from lab.measure.study import Study
+
 
 #: `Block.reach` of measurements by ln(level): a departure from linearity may change over a factor of exp(0.8) = 2.2 in
 #: level.
@@ -26,7 +31,7 @@ LEVEL_REACH = 0.8
 
 @dataclass(frozen=True)
 class Measurement:
-    """The declaration of a measurement in its module, where `lab.diagnose.measurements.library` finds it.
+    """The declaration of a measurement in its module, where `lab.diagnose.measurements.block` finds it.
 
     `make` takes the `Study` of a side and returns the measured numbers. It raises NotDetermined where the recordings
     don't determine them.
@@ -104,3 +109,23 @@ class Block:
     def scatters_by(self, effect: type[Effect]) -> bool:
         """Return whether the effect may add scatter to the numbers."""
         return not self.scattered_by.isdisjoint(may_change(effect))
+
+
+# --- All measurements: every module of this package is searched for declarations (`Measurement`) ----------------------
+
+
+@cache
+def measurements() -> tuple[Measurement, ...]:
+    """All measurements in the order of the report. Raises ValueError where two have the same name."""
+    found: dict[str, Measurement] = {}
+    for module in pkgutil.iter_modules(lab.diagnose.measurements.__path__):
+        content = importlib.import_module(f"{lab.diagnose.measurements.__name__}.{module.name}")
+        for item in vars(content).values():
+            if isinstance(item, Measurement) and found.setdefault(item.name, item) is not item:
+                raise ValueError(f"two measurements are named {item.name!r}: give one another name")
+    return tuple(sorted(found.values(), key=lambda one: (one.order, one.name)))
+
+
+def measurement_title(name: str) -> str:
+    """Return a measurement's title in reports; its name in words where it no longer exists, as in an older result."""
+    return next((one.title for one in measurements() if one.name == name), name.replace("_", " "))

@@ -8,8 +8,8 @@ import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.flat_light import misstated_levels
-from lab.diagnose.measurements.library import measurements
+from lab.diagnose.measurements.block import measurements
+from lab.diagnose.measurements.linearity import misstated_levels
 from lab.errors import NotDetermined
 from lab.formats.camera_file import CameraFile
 from lab.formats.camera_model import assumptions, camera_model

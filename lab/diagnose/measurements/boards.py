@@ -1,41 +1,38 @@
-"""Boards: reprojection residuals of the corners of boards, averaged over cells of the frame.
-
-Focal length, principal point, the boards' poses and their warp are always fitted, and never a finding. Brown's
-distortion (k1 k2 p1 p2 k3) is fitted, too, where it isn't known: a lens that distorts isn't at fault. Where the camera
-was calibrated before, its distortion is the baseline and isn't fitted. Departures from it are then findings
-(`distortion` along the radius, `decentre` across it).
-
-An effect's shifts of the corners are projected like the residuals: the part that the fitted parameters could take up is
-removed."""
+"""Boards: their corners against the geometry, and the lateral colour of boards and patterns."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg
 
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
+from lab.diagnose.measurements.pattern_fit import ACROSS, RADIAL, RADIAL3, Pattern, patterns
 from lab.errors import NotDetermined
 from lab.formats.results import Skipped
 from lab.measure.board_calibration import MODELS, Calibration, calibrate_robustly, free_intrinsics, observations_of
-from lab.measure.board_detection import BoardView, find_boards
+from lab.measure.board_detection import BoardView, channel_corners, find_boards
 from lab.measure.bundle_adjustment import BundleAdjustment, Solution
 from lab.measure.pinhole import NAMES, intrinsics_of
+from lab.measure.reads import SHIFT
 from lab.measure.study import Study
 from sim.camera import Side
 from sim.effects.base import Effects
 from sim.point import displaced_um
-from sim.spectrum import FloatArray
+from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import Uniform
 
 ROWS, COLS = 3, 4  # cells of the frame
 FEWEST_CORNERS = 6  # of a cell
-CELL_FLOOR_PX = 0.006
+CELL_FLOOR_PX = 0.006  # standard deviation of a cell's displacement beside noise
 #: Prior standard deviation of a known distortion, at the frame's corner, of each of its terms.
 CALIBRATED_STD_PX = 0.05
 HELD_OUT_FROM = 6  # views; of as many or more, every third is held out
-REFERENCE_NM = 550.0
+REFERENCE_NM = 550.0  # light in which effects displace corners: green
 
 
 def views_of(study: Study, side: Side) -> tuple[list[BoardView], list[Skipped]]:
@@ -234,4 +231,300 @@ BOARDS = Measurement(
     quantity="shift of corners, px",
     conditions="direction",
     conditions_words="corners",
+)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Lateral colour of boards: displacement of the corners in red and blue from those in green, and between wavelengths.
+
+
+# --- lateral colour --------------------------------------------------------------------------------------------------
+# Lateral colour of a pattern on a screen: displacement of its red and blue images from the green one.
+
+
+# standard deviation beside noise: where cells are whole pixels, errors of the drawn pattern don't average out
+COLOUR_FLOOR_PX = 0.012
+
+
+def colour_block(study: Study) -> Block:
+    """Displacement (px) of a pattern's red and blue images from the green one: radial at two distances from the frame's
+    middle, and tangential at one.
+
+    Raises NotDetermined for a camera without a green channel, and where no pattern is fitted.
+    """
+    if "G" not in study.channels:
+        raise NotDetermined("lateral_colour", "one channel: nothing to hold it against")
+    points: list[tuple[Pattern, Pattern]] = []
+    for group in patterns(study):
+        for p in group:
+            if p.channel != "G":
+                green = next(q for q in group if q.channel == "G" and q.held_out == p.held_out)
+                points.append((p, green))
+    values, labels, places = [], [], []
+    n = len(points)
+    covariance = np.zeros((3 * n, 3 * n))
+    for i, (p, green) in enumerate(points):
+        near, far = 0.5 * p.reach, p.reach
+        table = np.array([[near, near**3, 0.0], [far, far**3, 0.0], [0.0, 0.0, far]])
+        at = np.array([len(p.bands) + k for k in (RADIAL, RADIAL3, ACROSS)])
+        values.append(table @ (p.value[at] - green.value[at]))
+        for j, (q, other) in enumerate(points):
+            if p.channel != q.channel or p.light is not q.light:
+                continue
+            # only these coefficients: channels may have different numbers of parts beyond the bands
+            own = np.ix_(at, at)
+            both = 0.5 * np.sum([one.common[own] for one in (p, q, green, other)], axis=0)
+            if i == j:
+                both = both + p.shown[own] + green.shown[own]
+            covariance[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = table @ both @ table.T
+        for k, (distance, way) in enumerate(((near, "outwards"), (far, "outwards"), (far, "around"))):
+            labels.append(Label(distance, p.channel, way, p.captures, p.held_out))
+            places.append((p, distance, k < 2))
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.zeros(len(places))
+        if effects:
+            for k, (p, distance, outwards) in enumerate(places):
+                if outwards:
+                    mean[k] = colour_shift_px(study, p.channel, distance, p.light, effects)
+        return Prediction(mean, {})
+
+    return Block(
+        measurement=LATERAL_COLOUR, reach=0.5, value=np.concatenate(values),
+        covariance=covariance + np.diag(np.full(3 * n, COLOUR_FLOOR_PX**2)), labels=tuple(labels),
+        reads=SHIFT, predict=predict, scale=np.ones(3 * n),
+    )  # fmt: skip
+
+
+def colour_shift_px(
+    study: Study, channel: str, distance: float, light: Spectrum | None, effects: Effects, kind: str = "bernoulli"
+) -> float:
+    """Predicted radial displacement of a channel's image from the green one, px, at `distance` (half diagonals) from
+    the middle.
+
+    It is the mean over four directions of the displacement by the effects, weighted over wavelengths by the photons
+    that each channel detects. `light` None: a flat spectrum; `kind`: of the capture.
+    """
+    wavelength = np.arange(400.0, 721.0, 10.0)
+    outwards = outward_shifts_px(study, distance, wavelength, effects)
+    if not outwards.any():
+        return 0.0
+    radiance = np.ones_like(wavelength) if light is None else light.at(wavelength)
+    model = Uniform(study.camera, effects)
+    radiance = model.radiance(wavelength, radiance, kind) * model.transmittance(wavelength)
+    seen = [radiance * wavelength * study.camera.quantum_efficiency[c].at(wavelength) for c in (channel, "G")]
+    own, green = (float(s @ outwards / max(s.sum(), 1e-300)) for s in seen)
+    return own - green
+
+
+def outward_shifts_px(study: Study, distance: float, wavelength_nm: FloatArray, effects: Effects) -> FloatArray:
+    """Predicted displacement outwards (n,), px, of light of n wavelengths at `distance` (half diagonals) from the
+    middle: the mean over four directions."""
+    camera = study.camera
+    turn = np.pi / 4.0 + np.pi / 2.0 * np.arange(4)
+    x, y = (distance * camera.half_diagonal_um * way for way in (np.cos(turn), np.sin(turn)))
+    outwards = np.zeros(len(wavelength_nm))
+    for i, w in enumerate(wavelength_nm):
+        shift = displaced_um(camera, x, y, float(w), effects)
+        if shift is not None:
+            outwards[i] = float(np.mean(shift[0] * np.cos(turn) + shift[1] * np.sin(turn)))
+    return outwards / camera.pixel_pitch_um
+
+
+LATERAL_COLOUR = Measurement(
+    "lateral_colour",
+    title="lateral colour of patterns",
+    order=440,
+    axis="field",
+    unit="half diagonals",
+    make=colour_block,
+    quantity="displacement from green, px",
+    conditions="direction",
+)
+
+
+# --- board colour ------------------------------------------------------------
+
+
+Array = NDArray[np.floating[Any]]
+
+COLOUR_VIEWS = 8  # of more views, evenly spaced ones are used, at least as many: every corner is fitted once a channel
+COLOUR_RINGS = (0.3, 0.6, 1.0)  # outer radii of the rings, half diagonals; the last ring has no end
+
+
+@dataclass(frozen=True)
+class _Shift:
+    """What is displaced from what: `table` of `_rings` of each view, and the captures of each.
+
+    `pair`: wavelength (nm) and the one that it is held against, of pictures of one pose in light of one wavelength
+    each; None: `channel` against green within pictures in white light.
+    """
+
+    channel: str
+    pair: tuple[float, float] | None
+    tables: list[FloatArray]
+    captures: list[tuple[str, ...]]
+
+    @property
+    def condition(self) -> str:
+        """The light in words."""
+        return "white light" if self.pair is None else f"light of {self.pair[0]:g} nm against {self.pair[1]:g} nm"
+
+
+def board_colour_block(study: Study) -> Block:
+    """Radial displacement (px) of corners or dots, by rings about the frame's middle: in red and blue from those in
+    green, and of pictures of one pose in light of single wavelengths from the one nearest `REFERENCE_NM`.
+
+    Raises NotDetermined without boards, where there is neither a green channel nor a pose in light of two wavelengths,
+    and with too few corners.
+    """
+    views, missed = views_of(study, study.side)
+    if not views:
+        raise NotDetermined("board_colour", "no board is found" if missed else "no charuco captures")
+    white = [view for view in views if view.capture.wavelength_nm is None] if "G" in study.channels else []
+    shifts = _within_pictures(study, white) + _between_pictures(study, views)
+    if not shifts:
+        lit = len({view.capture.wavelength_nm for view in views} - {None})
+        raise NotDetermined(
+            "board_colour",
+            f"boards in light of {lit} wavelengths, but no pose in two of them: nothing to hold them against; give the "
+            "pictures of one pose the same `pose`"
+            if lit > 1
+            else "one channel or one wavelength: nothing to hold it against; take a pose in light of two wavelengths, "
+            "under "
+            "one `pose`",
+        )
+    values, variances, labels, pairs = [], [], [], []
+    for shift in shifts:
+        n = len(shift.tables)
+        for held_out in (False, True):
+            use = [i for i in range(n) if (i % 3 == 1 and n >= 3) == held_out]
+            ids = tuple(name for i in use for name in shift.captures[i])
+            for r, value, variance in _rings(np.concatenate([shift.tables[i] for i in use] or [np.zeros((0, 6))])):
+                values.append(value)
+                variances.append(variance + COLOUR_FLOOR_PX**2)
+                labels.append(Label(r, shift.channel, shift.condition, ids, held_out))
+                pairs.append(shift.pair)
+    if not values:
+        raise NotDetermined("board_colour", "too few corners are clear in every colour")
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.zeros(len(labels))
+        for k, (label, pair) in enumerate(zip(labels, pairs, strict=True) if effects else ()):
+            if pair is None:
+                mean[k] = colour_shift_px(study, label.channel, label.x, None, effects, "charuco")
+            else:
+                own, other = outward_shifts_px(study, label.x, np.array(pair), effects)
+                mean[k] = own - other
+        return Prediction(mean, {})
+
+    return Block(
+        measurement=BOARD_COLOUR, reach=0.5, value=np.array(values),
+        covariance=np.diag(variances), labels=tuple(labels), reads=frozenset({"image.shift"}), predict=predict,
+        scale=np.ones(len(values)),
+    )  # fmt: skip
+
+
+def _within_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
+    """Of each channel but green, in pictures in white light."""
+    views = views[:: max(1, len(views) // COLOUR_VIEWS)]
+    found = {c: _Shift(c, None, [], []) for c in study.channels if c != "G"} if views else {}
+    for k, view in enumerate(views):
+        fits = channel_corners(study.recordings.frame(view.capture), study.camera.cfa, view)
+        for channel, shift in found.items():
+            use = fits[channel].trusted & fits["G"].trusted
+            shift.tables.append(_table(study, view.image_px[use], (fits[channel].points - fits["G"].points)[use], k))
+            shift.captures.append((view.capture.id,))
+    return [*found.values()]
+
+
+def _between_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
+    """Of each wavelength but the reference, in pictures of one pose: the first of each wavelength."""
+    poses: dict[str, dict[float, BoardView]] = {}
+    for view in views:
+        if view.capture.wavelength_nm is not None:
+            poses.setdefault(view.capture.pose, {}).setdefault(view.capture.wavelength_nm, view)
+    found: dict[tuple[float, float], _Shift] = {}
+    for by_wavelength in poses.values():
+        reference_nm = min(by_wavelength, key=lambda w: abs(w - REFERENCE_NM))
+        other = by_wavelength[reference_nm]
+        for wavelength_nm, view in sorted(by_wavelength.items()):
+            if wavelength_nm == reference_nm:
+                continue
+            pair = (wavelength_nm, reference_nm)
+            shift = found.setdefault(pair, _Shift("Y", pair, [], []))
+            _, own, of_other = np.intersect1d(view.index, other.index, return_indices=True)
+            gap = view.image_px[own] - other.image_px[of_other]
+            shift.tables.append(_table(study, other.image_px[of_other], gap, len(shift.tables)))
+            shift.captures.append((view.capture.id, other.capture.id))
+    return [*found.values()]
+
+
+def _table(study: Study, place: Array, gap: Array, number: int) -> FloatArray:
+    """Return the `table` of `_rings` of one view, from places and displacements (n, 2), (x, y) px, without those near
+    the middle."""
+    camera = study.camera
+    half = camera.half_diagonal_px
+    away = place - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
+    radius = np.hypot(*away.T)
+    use = radius > 0.05 * half
+    unit = away[use] / radius[use, None]
+    return np.column_stack([radius[use] / half, unit, gap[use], np.full(int(use.sum()), number)])
+
+
+def _rings(table: FloatArray) -> list[tuple[float, float, float]]:
+    """Of each ring with corners enough: mean distance (half diagonals), outward displacement (px) and its variance
+    (px^2).
+
+    `table` (corners, 6): distance, outward unit vector (x, y), displacement (x, y) in px, number of the view. Least
+    squares of displacement = common shift + outward unit vector x displacement of the ring. The common shift, as of a
+    prism, is no lateral colour and isn't returned. Outliers beyond 6 robust standard deviations are left out. The
+    variance is the larger of that of independent corners and of the sandwich estimate clustered by view.
+    """
+    if len(table) < 4 * FEWEST_CORNERS:
+        return []
+    radius, unit, gap, view = table[:, 0], table[:, 1:3], table[:, 3:5], table[:, 5]
+
+    edges = (0.0, *COLOUR_RINGS[:-1], np.inf)
+    which = np.digitize(radius, edges[1:-1])
+    used = [k for k in range(len(COLOUR_RINGS)) if (which == k).sum() >= FEWEST_CORNERS]
+    keep = np.isin(which, used)
+    columns = [
+        np.column_stack([np.ones(len(table)), np.zeros(len(table))]),
+        np.column_stack([np.zeros(len(table)), np.ones(len(table))]),
+    ]
+    columns += [np.where((which == k)[:, None], unit, 0.0) for k in used]
+    design = np.array([c[keep].ravel() for c in columns]).T
+    seen = gap[keep].ravel()
+    solution, *_ = np.linalg.lstsq(design, seen, rcond=None)
+    rest = seen - design @ solution
+    inside = np.abs(rest) < 6.0 * 1.4826 * float(np.median(np.abs(rest))) + 1e-9
+    solution, *_ = np.linalg.lstsq(design[inside], seen[inside], rcond=None)
+    rest = np.where(inside, seen - design @ solution, 0.0)
+    inverse = np.linalg.pinv(design[inside].T @ design[inside])
+    # corners of one view share errors
+    groups = np.repeat(view[keep], 2)
+    meat = np.zeros_like(inverse)
+    for k in np.unique(groups):
+        score = design[groups == k].T @ rest[groups == k]
+        meat += np.outer(score, score)
+    plain = float(np.mean(rest[inside] ** 2)) * inverse
+    spread = inverse @ meat @ inverse
+    found = []
+    for i, k in enumerate(used):
+        at = 2 + i
+        found.append((float(radius[which == k].mean()), float(solution[at]), float(max(spread[at, at], plain[at, at]))))
+    return found
+
+
+BOARD_COLOUR = Measurement(
+    "board_colour",
+    title="lateral colour of boards",
+    order=510,
+    axis="field",
+    unit="half diagonals",
+    make=board_colour_block,
+    quantity="displacement from green, or from the reference wavelength, px",
+    conditions="light",
+    conditions_words="in",
 )

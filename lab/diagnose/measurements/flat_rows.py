@@ -11,7 +11,7 @@ import numpy as np
 
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_readout import DarkRowPower, dark_readout, row_profile
-from lab.diagnose.measurements.even_flats import LEAST_SIGNAL, dark_level_dn
+from lab.diagnose.measurements.flat_field import LEAST_SIGNAL, dark_level_dn
 from lab.diagnose.measurements.row_light import PHASES, ROW_LIGHT
 from lab.errors import NotDetermined
 from lab.measure.reads import ADDED, LEAK

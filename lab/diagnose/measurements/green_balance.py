@@ -10,7 +10,7 @@ import numpy as np
 
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.even_flats import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
+from lab.diagnose.measurements.flat_field import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
 from lab.errors import NotDetermined
 from lab.measure.noise_figures import BLACK_FLOOR_DN
 from lab.measure.reads import COLLECTED, acting
@@ -22,7 +22,7 @@ from sim.spectrum import FloatArray
 
 GREEN_FLOOR = 1e-4  # standard deviation of the ratio of equal greens beside noise
 GREEN_NOISE = 0.02  # ratios of a larger standard deviation aren't used
-CELLS = (3, 4)
+CELLS = (3, 4)  # of the frame: rows, columns
 TILE_ROWS, TILE_COLS = mosaic.PERIOD_PX, 4  # size of the uniform frame by which effects are predicted
 
 

@@ -1,24 +1,125 @@
-"""Linearity of flat fields: the mean level against the exposure, or against the number of photons."""
+"""Levels of uniform light against the light: photon transfer's means, and how well levels repeat."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lab.capture_kinds.base import Capture
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.flat_light import FlatLight, reading, relative_rates
-from lab.diagnose.measurements.uniform_levels import UniformLevels
+from lab.diagnose.measurements.dark_level import added_dark_dn
+from lab.diagnose.measurements.line_means import LineMeans
+from lab.diagnose.measurements.row_light import ROW_LIGHT, row_light_variance
 from lab.errors import NotDetermined
-from lab.measure.noise_figures import level_std, weighted_median
+from lab.formats.results import CameraFit, InconsistentLevel
+from lab.measure.noise_figures import RepeatedMeans, level_std, repeated_levels, steady, weighted_median
 from lab.measure.reads import DARK_CURRENT, LAG, LINES, acting
 from lab.measure.rounding import rounding_std_dn
+from lab.measure.stated_light import stated_light
 from lab.measure.study import Study, held_out_flats
 from sim.effects.base import Effects
-from sim.spectrum import FloatArray
-from sim.uniform import LEVEL, SPECTRAL, electron_rate
+from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import LEVEL, SPECTRAL, Uniform, electron_rate
+
+if TYPE_CHECKING:
+    from lab.measure.study import Study
+
+
+class UniformLevels:
+    """Mean levels of n pairs of capture and channel. `captures` lists each capture once."""
+
+    def __init__(self, study: Study, points: Sequence[tuple[Capture, str]]) -> None:
+        """`points`: n of (capture, channel)."""
+        self._study = study
+        self.captures: tuple[Capture, ...] = tuple({capture.id: capture for capture, _ in points}.values())
+        number = {capture.id: i for i, capture in enumerate(self.captures)}
+        self._of = np.array([number[capture.id] for capture, _ in points])
+        self._points = tuple(points)
+        self._channel = np.array([channel for _, channel in points])
+        self._exposure_s = np.array([capture.exposure_s for capture in self.captures])
+        self._elapsed_s = np.array([study.elapsed_s(capture) for capture in self.captures])
+        self.lines = LineMeans(study, points)
+
+    def of_light_dn(self, effects: Effects, rates: Mapping[str, FloatArray]) -> FloatArray:
+        """DN (n,) by light and the baseline's dark current, after read-out. `rates`: channel -> electrons a second on
+        axis, (captures,)."""
+        model = Uniform(self._study.camera, effects)
+        field = model.field(self._study.field)
+        electrons = model.electrons(rates, self._exposure_s, field=field, elapsed_s=self._elapsed_s)
+        found = np.empty(len(self._of))
+        for channel, dn in model.mean_dn(electrons).items():
+            mine = self._channel == channel
+            found[mine] = dn[self._of[mine]]
+        return found
+
+    def beside_light_dn(self, effects: Effects) -> FloatArray:
+        """DN (n,) by all else: black level, offsets, image lag, and dark current that effects add."""
+        study = self._study
+        offset, dark, carried = study.offset(effects), added_dark_dn(study, effects), study.carried_e(effects)
+        of_capture = np.array([study.noise.black + offset(capture) + dark(capture) for capture in self.captures])
+        lag_e = np.array([carried(capture, channel) for capture, channel in self._points])
+        return np.asarray(of_capture[self._of] + study.noise.gain * lag_e)
+
+
+# --- The stated light of flats: a measured radiance, or a number of photons a pixel -----------------------------------
+
+
+@dataclass(frozen=True)
+class FlatLight:
+    """One statement of the light: a radiometer's reading, or a number of photons in an exposure."""
+
+    name: str
+    lamp: Hashable  # equal for readings of the same lamp
+    path: str | None = None  # of the spectrum that the radiometer read
+    photons_per_s: float = 0.0  # a pixel, where no spectrum is stated
+
+
+def reading(study: Study, flat: FlatCapture) -> FlatLight | None:
+    """Return the stated light of a flat; None where nothing is stated, or where exposure or photon number is 0."""
+    if flat.radiance is not None:
+        return FlatLight(flat.radiance, study.lamps[flat.radiance], flat.radiance)
+    light = stated_light(flat)
+    if light.unit != "photons" or flat.exposure_s <= 0 or light.amount <= 0:
+        return None
+    name = f"{light.amount:.9g} photons in {flat.exposure_s:.9g} s"
+    return FlatLight(name, light.lamp, None, light.amount / flat.exposure_s)
+
+
+def relative_rates(study: Study, readings: Sequence[FlatLight]) -> Mapping[tuple[str, str], float]:
+    """(reading, channel) -> electron rate (photon rate, where photons are stated) over that by the first reading of the
+    same lamp."""
+    first: dict[Hashable, FlatLight] = {}
+    for one in readings:
+        first.setdefault(one.lamp, one)
+    found = {}
+    for channel in study.channels:
+        rate = {one.name: _rate(study, one, channel) for one in readings}
+        for one in readings:
+            found[one.name, channel] = rate[one.name] / max(rate[first[one.lamp].name], 1e-300)
+    return found
+
+
+def _rate(study: Study, one: FlatLight, channel: str) -> float:
+    if one.path is None:
+        return one.photons_per_s
+    spectrum: Spectrum = study.spectrum(one.path)
+    return electron_rate(study.camera, channel, spectrum)
+
+
+def misstated_levels(fit: CameraFit | None) -> tuple[InconsistentLevel, ...]:
+    """Levels whose stated number of photons contradicts the others, as found by the noise fit
+    (`lab.fit.noise.evaluation`)."""
+    if fit is None or fit.noise is None:
+        return ()
+    return tuple(level for level in fit.noise.inconsistent_levels if level.light_unit == "photons" and level.captures)
+
+
+# --- Linearity of flat fields: the mean level against the exposure, or against the number of photons ------------------
+
 
 # Relative standard deviations.
 LEVEL_FLOOR = 1.0e-4  # of a level, common to its repeats: nonlinearity of a linear camera
@@ -177,4 +278,151 @@ PHOTON_TRANSFER = Measurement(
     make=linearity_block,
     quantity="mean level, DN",
     is_level=True,
+)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The scatter of repeated levels beyond that by pixels' noise and a steady lamp: whether the light changes from frame
+# to frame.
+
+
+#: Relative standard deviation of a steady lamp's light from frame to frame: data sheets of regulated halogen sources
+#: and integrating spheres state 0.05 %, twice that at most. No finding by itself.
+STEADY_LAMP = 5.0e-4
+#: Least degrees of freedom of a number, and most numbers, each of settings of neighbouring exposures.
+LEAST_FREEDOM, MOST_NUMBERS = 4, 4
+
+
+def level_repeats_block(study: Study) -> Block:
+    """(S / noise)^(1/3) of flat settings with repeats, pooled over neighbouring exposures.
+
+    S is the variance of a setting's relative levels, with f = n - 1 degrees of freedom; noise its expectation by the
+    noise of pixels. The cube root of chi2_f / f is all but normal, of mean 1 - 2 / (9 f) and variance 2 / (9 f), also
+    for few degrees of freedom, where a logarithm would hide much of a large variance (Wilson and Hilferty, PNAS 17,
+    684, 1931). The means of dark frames scatter, as rows of one frame share noise of low frequencies and black levels
+    jump; by the same DN^2 do those of flats. Nuisance parameters: that variance (`_dark_scatter`); a lamp's usual
+    unsteadiness, whose variance is uncertain by s0^2, s0 = `STEADY_LAMP`; and how much wider S scatters the larger it
+    is. Image lag adds to S what each repeat's predecessor leaves in it. Settings out of line with the others are left
+    out (`steady`): other measurements find those. Raises NotDetermined for fewer than `LEAST_FREEDOM` degrees of
+    freedom."""
+    groups = _by_exposure(_seen(study))
+    if not groups:
+        raise NotDetermined(
+            "level_repeats",
+            f"fewer than {LEAST_FREEDOM + 1} repeats of flat settings: how steady the light is can't be told; repeat "
+            "one setting ten times",
+        )
+    freedom = np.array([sum(len(r.away) - 1 for r in group) for group in groups], float)
+    noise = np.array([_weighted(group, [r.noise for r in group]) for group in groups])
+    square = np.array([sum(float(np.sum(np.square(r.away))) for r in group) for group in groups]) / freedom
+    value = np.cbrt(square / noise)
+    variance = 2.0 / (9.0 * freedom)
+    exposure_s = np.array([_weighted(group, [r.captures[0].exposure_s for r in group]) for group in groups])
+
+    per_dn2 = np.array([_weighted(group, [r.signal_dn**-2 for r in group]) for group in groups])
+    dark_dn2, dark_std_dn2 = _dark_scatter(study)
+
+    def predict(effects: Effects) -> Prediction:
+        model = Uniform(study.camera, effects)
+        more = dark_dn2 * per_dn2 + np.array(
+            [model.unsteadiness**2 + row_light_variance(model, study.camera.rows, float(t)) for t in exposure_s]
+        )
+        if acting(effects, LAG):
+            more = more + np.array([_of_lag(study, effects, group) for group in groups])
+        root = np.cbrt(1.0 + more / noise)
+        usual = np.cbrt(1.0 + (more + STEADY_LAMP**2) / noise) - root
+        darker = np.cbrt(1.0 + (more + dark_std_dn2 * per_dn2) / noise) - root
+        wider = np.diag(np.sqrt(variance * (np.square(root) - 1.0)))
+        scatter = {f"scatter of repeats {number}": column for number, column in enumerate(wider)}
+        usually = {"usual unsteadiness of the lamp": usual, "scatter of dark frames": darker}
+        return Prediction(root * (1.0 - variance), usually | scatter)
+
+    labels = tuple(
+        Label(float(np.log(t)), "all", f"{t:.4g} s", tuple(c.id for r in group for c in r.captures), held_out=False)
+        for t, group in zip(exposure_s, groups, strict=True)
+    )
+    return Block(
+        measurement=LEVEL_REPEATS, reach=1.0, value=value, covariance=np.diag(variance), labels=labels,
+        reads=frozenset({"light.unsteadiness"}) | ROW_LIGHT | LAG, predict=predict, scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+def _seen(study: Study) -> list[RepeatedMeans]:
+    """Return the repeats that aren't held out, of settings in line with each other (`steady`)."""
+    noise, out = study.noise, study.once(held_out_flats)
+    found = []
+    for one in repeated_levels(study, noise.black, noise.gain, noise.read_dn):
+        kept = [i for i, c in enumerate(one.captures) if c.id not in out]
+        if len(kept) > 1:
+            captures, elapsed = tuple(one.captures[i] for i in kept), one.elapsed_s[kept]
+            away = one.away[kept] - one.away[kept].mean()
+            found.append(RepeatedMeans(captures, away, elapsed, one.noise, one.signal_dn))
+    return steady(found)
+
+
+def _dark_scatter(study: Study) -> tuple[float, float]:
+    """Variance of a dark frame's mean beside that by the noise of independent pixels, DN^2, and its standard deviation.
+
+    A variance v of f degrees of freedom stands for a true one of about v f / (f - 2), known to sqrt(2 / f) of it.
+    Without repeated dark frames it may be as large as rows leave whose noise is that of their pixels.
+    """
+    noise, camera = study.noise, study.camera
+    whole = noise.jitter_dn**2
+    if noise.jitter_freedom == 0.0:
+        return 0.0, max(whole, noise.read_dn**2 / camera.rows)
+    pixels = noise.read_dn**2 / (camera.rows * camera.cols)
+    free = noise.jitter_freedom
+    return max(whole - pixels, 0.0), whole * float(np.sqrt(2.0 / free)) * free / max(free - 2.0, 1.0)
+
+
+def _by_exposure(repeats: list[RepeatedMeans]) -> list[list[RepeatedMeans]]:
+    """Settings in the order of their exposure, in at most `MOST_NUMBERS` groups of at least `LEAST_FREEDOM` degrees of
+    freedom."""
+    ordered = sorted(repeats, key=lambda r: (r.captures[0].exposure_s, r.captures[0].id))
+    whole = sum(len(r.away) - 1 for r in ordered)
+    wanted = max(LEAST_FREEDOM, -(-whole // MOST_NUMBERS))
+    groups: list[list[RepeatedMeans]] = []
+    free = wanted
+    for one in ordered:
+        if free >= wanted:
+            groups.append([])
+            free = 0
+        groups[-1].append(one)
+        free += len(one.away) - 1
+    if groups and free < LEAST_FREEDOM:
+        last = groups.pop()
+        if groups:
+            groups[-1].extend(last)
+    return groups
+
+
+def _weighted(group: list[RepeatedMeans], value: list[float]) -> float:
+    """Mean over settings, weighted by their degrees of freedom."""
+    return float(np.average(value, weights=[len(r.away) - 1 for r in group]))
+
+
+def _of_lag(study: Study, effects: Effects, group: list[RepeatedMeans]) -> float:
+    """Variance that image lag adds to the repeats' relative levels about the mean of each setting, as the first repeat
+    often follows another level."""
+    carried, total = study.carried_e(effects), 0.0
+    for repeats in group:
+        signal_e = [
+            sum(max(v - study.noise.black, 1e-9) for v in study.levels(c).whole.values()) / study.noise.gain
+            for c in repeats.captures
+        ]
+        added_e = [sum(carried(c, channel) for channel in study.levels(c).whole) for c in repeats.captures]
+        share = np.array(added_e) / np.array(signal_e)
+        total += float(np.sum(np.square(share - share.mean())))
+    return total / sum(len(r.away) - 1 for r in group)
+
+
+LEVEL_REPEATS = Measurement(
+    "level_repeats",
+    title="scatter of repeated levels",
+    order=205,
+    axis="exposure",
+    unit="log s",
+    make=level_repeats_block,
+    quantity="variance over noise, cube root",
+    of_variances=True,
 )

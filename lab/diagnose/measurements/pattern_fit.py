@@ -9,8 +9,7 @@ subtracted and divided by white less black, is fitted by least squares over the 
 
 T is the recorded image, rotated by 180 degrees about the frame's middle. For the baseline camera every c_b and the
 coefficients of the parts beyond are 1, all others 0. P is sampled at the same pixels as the image, so that both are
-aliased alike. A channel whose image is displaced from the green one is drawn at its own place.
-"""
+aliased alike. A channel whose image is displaced from the green one is drawn at its own place."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.errors import NotDetermined
-from lab.measure.reads import SHOWN, acting
+from lab.measure.reads import REFLECTIONS, SHOWN, acting
 from lab.measure.screen_registration import ScreenWarp, draw_by_area, register
 from lab.measure.study import Study, held_out_of
 from sim.camera import CameraModel
@@ -50,7 +49,7 @@ from sim.point import (
 )
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
-from sim.uniform import electron_rate
+from sim.uniform import Uniform, electron_rate
 
 # --- pattern canvas --------------------------------------------------------------------------------------------------
 # A random pattern on a screen, drawn at the place in the camera's frame where the registration finds it.
@@ -476,7 +475,7 @@ LEAST_BEYOND = (
     5e-4  # contrast (rms) of the parts beyond the bands from which on they are fitted; weaker ones are taken as drawn
 )
 REFINEMENTS = 3  # Gauss-Newton steps of the registration
-FEWEST_CELLS = 400
+FEWEST_CELLS = 400  # of a random pattern, whose spectrum is then even to 5 %
 MOST_MOVES = 4  # times that a displaced channel is drawn anew: a linear step finds about half of a shift by half a cell
 SCALING = np.array(
     [0.0, 0.0, 1.0, 1.0, 1.0]
@@ -946,3 +945,87 @@ def joint_covariance(places: Sequence[tuple[int, Pattern, int]], study: Study) -
             both = p.common[b, c] if p is q else 0.5 * (p.common[b, c] + q.common[b, c])
             table[i, j] = table[j, i] = both + (p.shown[b, c] if p is q else 0.0)
     return table
+
+
+# --- Excess of light at the borders between lit and dark cells of a random pattern, where grey levels are seen --------
+
+
+BORDER_FLOOR = 0.0015  # standard deviation of the light at borders beside noise
+
+
+def cell_border_block(study: Study) -> Block:
+    """Coefficient of P (1 - P) in the fit of the pattern P, which is 0 on dark and 1 on lit cells (`pattern_fit`).
+
+    It is the excess of light where the blurred picture is grey: at borders of cells. A nonlinear response of the camera
+    and the grey levels of the screen change it.
+    """
+    found = patterns(study)
+    points = [(g, p, len(p.bands) + BORDER) for g, group in enumerate(found) for p in group]
+    value = np.array([p.value[b] for _, p, b in points])
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.zeros(len(points))
+        model = Uniform(study.camera, effects)
+        for k, (_, p, b) in enumerate(points):
+            mean[k] = p.shown_by(effects)[b]
+            if not model.is_linear:
+                low, high = p.levels_e
+                out = model.response(np.array([low, 0.5 * (low + high), high]))
+                # a term a y (1 - y) of the response lifts its middle, y = 1/2, by a / 4
+                mean[k] += 4.0 * float((out[1] - out[0]) / (out[2] - out[0]) - 0.5)
+        return Prediction(mean, {})
+
+    return Block(
+        measurement=CELL_BORDERS, reach=1e9, value=value,
+        covariance=joint_covariance(points, study) + np.diag(np.full(len(value), BORDER_FLOOR**2)),
+        labels=tuple(Label(float(i), p.channel, "borders of cells", p.captures, p.held_out) for i, (_, p,
+        _) in enumerate(points)),
+        reads=SHOWN | {"signal.response"}, predict=predict, scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+CELL_BORDERS = Measurement(
+    "cell_borders",
+    title="borders of pattern cells",
+    order=420,
+    axis="level",
+    unit="1",
+    make=cell_border_block,
+    quantity="excess light at borders, share",
+    places="borders",
+)
+
+
+# --- The ghost of a pattern: its image, rotated by 180 degrees about the frame's middle -------------------------------
+
+
+GHOST_FLOOR = 1.5e-4  # standard deviation of a ghost's share beside noise
+
+
+def ghost_block(study: Study) -> Block:
+    """Coefficient of the rotated image in the fit of the pattern: the ghost's share of the light."""
+    points = [(g, p, len(p.bands) + GHOST) for g, group in enumerate(patterns(study)) for p in group]
+    value = np.array([p.value[b] for _, p, b in points])
+
+    def predict(effects: Effects) -> Prediction:
+        reflecting = acting(effects, REFLECTIONS)
+        return Prediction(np.array([p.ghost(effects) if reflecting else 0.0 for _, p, _ in points]), {})
+
+    return Block(
+        measurement=PATTERN_GHOST, reach=1e9, value=value,
+        covariance=joint_covariance(points, study) + np.diag(np.full(len(value), GHOST_FLOOR**2)),
+        labels=tuple(Label(float(i), p.channel, "ghost", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
+        reads=REFLECTIONS, predict=predict, scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+PATTERN_GHOST = Measurement(
+    "ghost",
+    title="ghost of the pattern",
+    order=430,
+    axis="level",
+    unit="1",
+    make=ghost_block,
+    quantity="ghost's share of the light",
+    places="ghosts",
+)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_readout import OFFSETS_STD, dark_readout
-from lab.diagnose.measurements.even_flats import flats
-from lab.diagnose.measurements.flat_lines import LINE_FLOOR, collect_rows, without_dark
+from lab.diagnose.measurements.flat_field import LINE_FLOOR, collect_rows, flats, without_dark
 from lab.errors import NotDetermined
 from lab.measure.reads import COLLECTED, acting
 from lab.measure.study import Study

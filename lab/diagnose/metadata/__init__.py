@@ -6,18 +6,19 @@ value that the recordings fit, and the diagnosis continues with that value.
 
 from __future__ import annotations
 
-from lab.diagnose.metadata.bit_depth import misstated_bit_depth
-from lab.diagnose.metadata.black_level import misstated_black_level
-from lab.diagnose.metadata.board_squares import misstated_board
-from lab.diagnose.metadata.cell_size import misstated_cell_size
-from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
-from lab.diagnose.metadata.exchanged_frames import exchanged_kinds, misplaced_frames
-from lab.diagnose.metadata.exchanged_lights import exchanged_lights
-from lab.diagnose.metadata.exposure_unit import misstated_exposure_unit
+from lab.diagnose.metadata.frames import (
+    exchanged_kinds,
+    misplaced_frames,
+    misstated_bit_depth,
+    misstated_black_level,
+    misstated_dark_exposure,
+    misstated_exposure_unit,
+    unchecked,
+)
+from lab.diagnose.metadata.lights import exchanged_lights, misstated_mosaic, misstated_mosaic_phase
 from lab.diagnose.metadata.misstatement import Misstatement
-from lab.diagnose.metadata.mono_sensor import misstated_mosaic
-from lab.diagnose.metadata.mosaic_phase import misstated_mosaic_phase
-from lab.diagnose.metadata.unchecked import unchecked
+from lab.diagnose.metadata.targets import misstated_board, misstated_cell_size
+from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
@@ -39,11 +40,13 @@ _CHECKS = (
 )
 
 
-def misstatements(recordings: RecordingSet, side: Side) -> tuple[RecordingSet, tuple[Misstatement, ...]]:
+def misstatements(
+    recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
+) -> tuple[RecordingSet, tuple[Misstatement, ...]]:
     """Return the recordings with wrong statements of a side replaced by the values that fit, and what was replaced."""
     found: list[Misstatement] = []
     for check in _CHECKS:
-        one = check(recordings, side)
+        one = check(recordings, side, policy)
         if one is not None:
             found.append(one)
             recordings = one.corrected

@@ -17,8 +17,7 @@ from lab.capture_kinds.screen import ScreenSequence
 from lab.capture_kinds.slanted_edge import EdgeSequence, EdgeTarget, TurnTarget
 from lab.capture_kinds.stopped_edge import ApertureTarget, StoppedEdgeSequence
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.curves import CURVE_ROUGH_STD
-from lab.diagnose.measurements.narrowband import NARROWBAND_FLOOR
+from lab.diagnose.measurements.spectral import CURVE_ROUGH_STD, NARROWBAND_FLOOR
 from lab.diagnose.outcome.expected_information import Forecast
 from lab.diagnose.outcome.settling_capture import FEW_REPEATS, MORE_REPEATS, repeats_of
 from lab.formats.recording_set import RecordingSet

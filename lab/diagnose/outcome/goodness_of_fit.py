@@ -1,21 +1,50 @@
-"""Goodness of fit of each slice and each measurement, with the baseline and with what was found."""
+"""What a result says in numbers: goodness of fit of each slice and measurement, the sets of effects that may hold,
+and the smallest size of each effect that would be seen."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
+from scipy import optimize, special
 
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.held_out import held_out_residual
 from lab.diagnose.inference.locate import chi2_by_slice
+from lab.diagnose.inference.score import signatures
+from lab.diagnose.inference.search import ModelSet
 from lab.diagnose.policy import DecisionPolicy
-from lab.formats.results import ExaminedPlace, HeldOut, MeasurementFit, ResidualCurve
+from lab.formats.results import (
+    EffectSet,
+    ExaminedPlace,
+    HeldOut,
+    IncludedEffect,
+    MeasurementFit,
+    NamedEffect,
+    ResidualCurve,
+    SideModels,
+    Unexplained,
+    Visibility,
+)
 from lab.measure.gaussian import chi2
 from sim.camera import Side
-from sim.effects.base import Effects
-from sim.effects.library import list_changes
+from sim.effects.base import Effect, Effects
+from sim.effects.library import candidates, list_changes
+from sim.effects.library import effects as library
+from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+
+
+def told_as(field: str, quantity: Quantity, *, gain_is_known: bool) -> tuple[str, str]:
+    """Name and unit of an effect's parameter in a result. Without a known gain the baseline has 1 DN/e, so that its
+    electrons are DN."""
+    if gain_is_known or quantity.unit not in ("e", "e/s"):
+        return field, quantity.unit
+    stem, _, more = field.rpartition("_e")
+    return f"{stem}_dn{more}", quantity.unit.replace("e", "DN")
+
+
+# --- Goodness of fit of each slice and each measurement, with the baseline and with what was found --------------------
 
 
 def places(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Iterator[ExaminedPlace]:
@@ -133,3 +162,125 @@ def residual_curves(side: Side, verdict: Verdict) -> Iterator[ResidualCurve]:
                 after=tuple(float(after[at][i]) for i in order),
                 held_out=is_held_out,
             )
+
+
+# --- The smallest detectable size of each effect in these recordings, and the effect that is most like it -------------
+
+
+def detectable(threshold: float, probability: float = DecisionPolicy().detection_probability) -> float:
+    """Return the non-centrality lambda with P(chi2_1(lambda) > threshold) = probability."""
+    return float(
+        optimize.brentq(lambda x: 1.0 - special.chndtr(threshold, 1, x) - probability, 1e-6, 10.0 * threshold + 100.0)
+    )
+
+
+def detectability(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Iterator[Visibility]:
+    """For every effect that acts on what was recorded: the smallest detectable size of each parameter, and the nearest
+    effect.
+
+    The non-centrality |L^-1 dm|^2 of a signature grows as the square of the coordinate u, so that the size follows from
+    one instance. Two effects of cosine rho are told apart with probability Phi(1/2 sqrt(lambda (1 - rho^2))).
+    """
+    model = verdict.model
+    if not np.isfinite(verdict.threshold):
+        return
+    sets: dict[str, list[tuple[tuple[Effect, ...], FloatArray]]] = {}
+    for effect, prototypes, table in signatures(model, model.camera, (), candidates()).columns:
+        sets.setdefault(effect.name, []).append((prototypes, table))
+    unit = {
+        name: np.concatenate([t / np.maximum(np.linalg.norm(t, axis=0), 1e-300) for _, t in members], axis=1)
+        for name, members in sets.items()
+    }
+    needed = detectable(verdict.threshold, policy.detection_probability)
+    for name, members in sets.items():
+        cosines = {other: float(np.abs(unit[name].T @ unit[other]).max()) for other in unit if other != name}
+        nearest = max(cosines, key=lambda other: cosines[other], default=None)
+        cosine = min(cosines[nearest], 1.0) if nearest is not None else 0.0
+        yield Visibility(
+            side=side,
+            effect=name,
+            smallest={
+                told_as(field, library()[name].quantities()[field], gain_is_known=model.gain_is_known)[0]: size
+                for field, size in _smallest(library()[name], members, needed).items()
+            },
+            nearest=nearest,
+            cosine=cosine,
+            told_apart=float(special.ndtr(0.5 * np.sqrt(needed * (1.0 - cosine**2)))),
+        )
+
+
+def _smallest(
+    effect: type[Effect], members: list[tuple[tuple[Effect, ...], FloatArray]], needed: float
+) -> dict[str, float]:
+    """Parameter -> least departure from `absent` at which the non-centrality is `needed`. Empty for effects with
+    prototypes of shape, whose signature isn't a power of the size."""
+    found: dict[str, float] = {}
+    if effect.shapes:
+        return found
+    for prototypes, table in members:
+        for prototype, column in zip(prototypes, table.T, strict=True):
+            size = float(np.linalg.norm(column))
+            moved = {f: q for f, q in effect.quantities().items() if getattr(prototype, f) != (q.absent or 0.0)}
+            if size <= 0 or len(moved) != 1:
+                continue
+            ((field, quantity),) = moved.items()
+            away = abs(float(getattr(prototype, field)) - (quantity.absent or 0.0))
+            least = away * (np.sqrt(needed) / size) ** (1.0 / quantity.linear_power)
+            found[field] = min(found.get(field, np.inf), float(least))
+    return {field: value for field, value in found.items() if np.isfinite(value)}
+
+
+# --- The credible sets of effects that the search found, as a result and in sentences ---------------------------------
+
+
+#: Sets that a sentence lists.
+LISTED_SETS = 5
+
+
+def side_models(side: Side, found: ModelSet, policy: DecisionPolicy) -> SideModels:
+    """Return the sets of effects of one side, as a result."""
+    return SideModels(
+        side=side,
+        share=policy.model_set_share,
+        sets=tuple(EffectSet(effects=m.effects, probability=m.probability, refitted=m.refitted) for m in found.models),
+        inclusion=tuple(IncludedEffect(name=n, probability=p) for n, p in found.inclusion),
+        not_weighed=found.not_weighed,
+    )
+
+
+def set_sentences(
+    models: Sequence[SideModels],
+    effects: Sequence[NamedEffect],
+    unexplained: Sequence[Unexplained],
+    policy: DecisionPolicy,
+) -> Iterator[str]:
+    """Sentences about effects that may be present, though they are neither named nor rivals of a name; and about sets
+    that the budget left unweighed.
+
+    The former are given only where the names explain everything: listed effects fit an unlisted cause badly.
+    """
+    for one in models:
+        named = [e for e in effects if one.side in e.sides]
+        told = {n for e in named for n in (e.name, *e.alternatives)}
+        is_whole = named and all(u.side != one.side for u in unexplained)
+        untold = {n for s in one.sets for n in s.effects} - told
+        if is_whole and any(sum(s.probability for s in one.sets if n in s.effects) > 1.0 - one.share for n in untold):
+            sets = ", ".join(f"{_words(s.effects)} ({100 * s.probability:.0f} %)" for s in one.sets[:LISTED_SETS])
+            more = f" and {len(one.sets) - LISTED_SETS} more" if len(one.sets) > LISTED_SETS else ""
+            yield (
+                f"For the {one.side} camera, if every cause is a listed effect, these sets of effects hold "
+                f"{100 * one.share:.0f} % together: "
+                f"{sets}{more}."
+            )
+        if one.not_weighed:
+            sets = "; ".join(_words(s) for s in one.not_weighed[:LISTED_SETS])
+            more = f"; and {len(one.not_weighed) - LISTED_SETS} more" if len(one.not_weighed) > LISTED_SETS else ""
+            yield (
+                f"The search for the {one.side} camera ended when its {policy.search_cpu_s:g} s of CPU time were "
+                f"spent. Not weighed: {sets}{more}; "
+                "a name may have rivals among these."
+            )
+
+
+def _words(effects: Sequence[str]) -> str:
+    return " with ".join(effects) if effects else "none"

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.library import measurement_title
-from lab.diagnose.outcome.effect_sets import set_sentences
-from lab.diagnose.outcome.in_dn import told_as
+from lab.diagnose.measurements.block import measurement_title
+from lab.diagnose.outcome.goodness_of_fit import set_sentences, told_as
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
@@ -24,7 +23,7 @@ from lab.formats.results import (
     ParameterValue,
     Rival,
 )
-from lab.formats.results.in_words import measured
+from lab.formats.results.words import measured
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.families import Family

@@ -1,12 +1,16 @@
-"""Mismatches in words: where a measurement departs from the baseline, and what is left without a name."""
+"""What is left without a name: where measurements depart, the laws that describe it, and what is stated wrongly."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import special
 from scipy.special import chdtri
 
+from lab.diagnose.discovery.profile import PredictiveTable
+from lab.diagnose.discovery.words import place_in_words
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.discrepancy import Discrepancy
 from lab.diagnose.inference.locate import Slice, describe
@@ -15,20 +19,34 @@ from lab.diagnose.inference.outlying import OutlyingLevel
 from lab.diagnose.inference.shown_in_means import is_judged_in_means, shown_in_means
 from lab.diagnose.inference.weigh import UNKNOWN, Candidate
 from lab.diagnose.measurements.block import Block
+from lab.diagnose.measurements.boards import BOARDS
+from lab.diagnose.measurements.linearity import PHOTON_TRANSFER, RADIOMETER_STD, misstated_levels
 from lab.diagnose.outcome.improved_model import Correction
+from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
+from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import Mismatch, Unexplained, VetoedName
+from lab.formats.results import (
+    CameraFit,
+    GeometryFit,
+    InconsistentLevel,
+    Mismatch,
+    Unexplained,
+    VetoedName,
+    ViewResiduals,
+)
+from lab.measure.board_detection import MIN_CORNERS
 from lab.measure.gaussian import Gaussian, chi2
 from sim.camera import Side
 from sim.effects.base import Effect
+from sim.effects.empirical_law import EmpiricalLaw
+from sim.effects.library import list_changes
+from sim.spectrum import FloatArray
 
 #: Words for a mismatch that no slice shows.
 WHOLE_AXIS = "along the whole axis"
 #: Rivals that are listed beside a candidate.
 LISTED_RIVALS = 3
-#: Probability from which on a rival is told beside the nearest law.
-LEAST_TOLD = 0.05
 
 
 def located(side: Side, verdict: Verdict) -> list[Mismatch]:
@@ -66,7 +84,7 @@ def located(side: Side, verdict: Verdict) -> list[Mismatch]:
                 measurement=name,
                 axis=part.axis,
                 where=f"{where}, in held-out captures",
-                significance_sigma=_sigma(part),
+                significance_sigma=_told_sigma(part),
                 captures=captures,
             )
     return list(found.values())
@@ -177,7 +195,7 @@ def unexplained(
                 shape=_shape(one, verdict, near, before, outlying, policy)
                 if not is_held_out
                 else _held_out_shape(outlying),
-                significance_sigma=_sigma(part),
+                significance_sigma=_told_sigma(part),
                 chi2_before=before,
                 chi2_after=after,
                 n=part.n if is_held_out and part is not None else len(index),
@@ -189,7 +207,7 @@ def unexplained(
     return found
 
 
-def _sigma(part: Slice | None) -> float:
+def _told_sigma(part: Slice | None) -> float:
     return round(part.significance_sigma, 2) if part is not None else 0.0
 
 
@@ -265,7 +283,11 @@ def _nearest(
     if left > least:
         told = f"chi2 is {left:.0f} with it, {chi2_without:.0f} without, {len(index)} are expected"
         return f"the nearest law is {name}, and it doesn't hold exactly: {told}"
-    rivals = [f"{n} ({100 * p:.0f} %)" for n, p in nearest.rivals[:LISTED_RIVALS] if n != UNKNOWN and p >= LEAST_TOLD]
+    rivals = [
+        f"{n} ({100 * p:.0f} %)"
+        for n, p in nearest.rivals[:LISTED_RIVALS]
+        if n != UNKNOWN and p >= policy.told_rival_probability
+    ]
     if rivals:
         return (
             f"the nearest law is {name} ({100 * nearest.probability:.0f} %), which these recordings can't tell from "
@@ -275,3 +297,254 @@ def _nearest(
         f"the nearest law is {name}; what it leaves beside it in the same captures has no name, so that both may be "
         "one unknown cause"
     )
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What discovered laws stand for: the mismatches that they describe, in place of smooth discrepancies; and what would
+# help where nothing predicts a mismatch.
+
+
+def described(
+    verdict: Verdict, found: Sequence[PredictiveTable], laws: Sequence[EmpiricalLaw], policy: DecisionPolicy
+) -> dict[int, str]:
+    """Return the indices of the blocks that laws describe, and which do, in words.
+
+    A law describes a mismatch where it takes `described_share` of the excess off its chi2, and where a smooth
+    discrepancy doesn't predict the captures held out better. Steps between the lines of flats are predicted by no
+    effect: there the index tells.
+    """
+    model, words = verdict.model, {}
+    if not found:
+        return {}
+    without, beside = model.gaussian(verdict.effects), model.gaussian((*verdict.effects, *laws))
+    for index in {d.index for d in verdict.discrepancies}:
+        block, at = model.blocks[index], model.slices[index]
+        mine = [one for one in found if block.measurement.name in one.look.shown_in]
+        told = ", ".join(dict.fromkeys(f"the law of the {place_in_words(one.look)}" for one in mine))
+        before, after = (_block_chi2(one, model.value, at) for one in (without, beside))
+        is_felt = any(block.reads & list_changes(law) for law in laws)
+        takes_off = before - after >= policy.described_share * (before - len(block.value))
+        if mine and (not is_felt or (takes_off and not _is_smoother(verdict, laws, index))):
+            words[index] = told
+    return words
+
+
+def _is_smoother(verdict: Verdict, laws: Sequence[EmpiricalLaw], index: int) -> bool:
+    """Return whether a block's smooth discrepancy predicts its held-out numbers, beyond their noise, better than
+    laws do."""
+    if index not in verdict.kernels:
+        return False
+    model, where = verdict.model, verdict.model.mask(index)
+    smooth, n = model.held_out(verdict.effects, where, verdict.kernels)
+    others = {k: kernel for k, kernel in verdict.kernels.items() if k != index}
+    return n > 0 and model.held_out((*verdict.effects, *laws), where, others)[0] > max(smooth, 2.0 * n)
+
+
+def _block_chi2(gaussian: Gaussian, value: FloatArray, at: slice) -> float:
+    return chi2((value - gaussian.mean)[at], gaussian.covariance[at, at])
+
+
+def left_to_smooth(verdict: Verdict, words: dict[int, str]) -> list[Discrepancy]:
+    """Return the discrepancies as they enter the improved model: those that laws describe don't."""
+    return [
+        replace(one, log_odds=min(one.log_odds, 0.0)) if one.index in words else one for one in verdict.discrepancies
+    ]
+
+
+def with_laws(improved: CameraFile, laws: Sequence[EmpiricalLaw]) -> CameraFile:
+    """Return the improved model with discovered laws; what they add to the dark noise, its read noise loses."""
+    added_e2 = sum(float(np.mean(law.table)) for law in laws if law.stage == "signal" and law.of == "variance")
+    read_e = float(np.sqrt(max(improved.camera.read_noise_e**2 - added_e2, 0.0)))
+    camera = improved.camera.model_copy(update={"read_noise_e": read_e}) if added_e2 else improved.camera
+    return replace(improved, camera=camera, effects=(*improved.effects, *laws))
+
+
+def corrected_by_laws(
+    verdict: Verdict, corrections: Sequence[Correction], words: dict[int, str]
+) -> tuple[Correction, ...]:
+    """Return the corrections of the improved model, discovered laws in the place of those that they describe."""
+    titles = [verdict.model.blocks[one.index].measurement.title for one in verdict.discrepancies]
+    return tuple(
+        replace(one, said=f"{title}: {words[d.index]}, a discovered one") if d.index in words else one
+        for one, title, d in zip(corrections, titles, verdict.discrepancies, strict=True)
+    )
+
+
+def in_light_of_laws(
+    recordings: RecordingSet, side: Side, verdict: Verdict, left: Sequence[Unexplained], words: dict[int, str]
+) -> list[Unexplained]:
+    """Return mismatches without a name: with the law that describes each, or what would help where nothing does."""
+    by_name = {verdict.model.blocks[index].measurement.name: told for index, told in words.items()}
+    smooth = {verdict.model.blocks[index].measurement.name for index in verdict.kernels}
+    found = []
+    for one in left:
+        told = by_name.get(one.measurement)
+        if told is not None:
+            found.append(one.model_copy(update={"shape": f"as {told}, which has no name"}))
+        elif one.measurement in smooth or one.check:
+            found.append(one)
+        else:
+            help_ = settling_sentence(recordings, side, [one]) or ""
+            sentence = f"Nothing that was tried predicts it, neither a law along an index nor a smooth curve. {help_}"
+            found.append(one.model_copy(update={"would_help": sentence.strip()}))
+    return found
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Flat levels whose stated light contradicts the others, which the noise fit left out, reported as misstated metadata.
+
+
+def misstated_light(side: Side, fit: CameraFit | None, *, levels_are_judged: bool) -> tuple[Unexplained, ...]:
+    """One item for each level that the noise fit finds: of a number of photons, and of an exposure where no measurement
+    of levels judges it (`levels_are_judged`). Its significance is against the tolerance of a reading of the light."""
+    exposures = () if levels_are_judged or fit is None or fit.noise is None else fit.noise.inconsistent_levels
+    wrong = (*misstated_levels(fit), *(one for one in exposures if one.light_unit == "s" and one.captures))
+    return tuple(_told_light(side, level) for level in wrong)
+
+
+def _told_light(side: Side, level: InconsistentLevel) -> Unexplained:
+    sigma = abs(level.signal_dn / level.expected_signal_dn - 1.0) / RADIOMETER_STD if level.expected_signal_dn else 0.0
+    first, last = level.captures[0], level.captures[-1]
+    named = f"Captures {first} .. {last}" if first != last else f"Capture {first}"
+    what, unit = ("number of photons", "photons a pixel") if level.light_unit == "photons" else ("exposure", "s")
+    return Unexplained(
+        side=side,
+        measurement=PHOTON_TRANSFER.name,
+        axis=PHOTON_TRANSFER.axis,
+        where=f"{level.signal_dn:.4g} DN above dark, {len(level.captures)} captures",
+        shape=f"the stated {what} contradicts the other levels",
+        significance_sigma=round(sigma, 2),
+        chi2_before=sigma**2,
+        chi2_after=0.0,
+        n=1,
+        captures=level.captures,
+        correction="none: the level is left out",
+        check=f"{named}: stated with {level.light:.6g} {unit}, but the others have this level at "
+        f"{level.expected_light:.6g} "
+        f"{unit.split()[0]}: correct the {what.split()[0]}, or the frames are of another level.",
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Corners of boards that depart from the fitted camera by more than their noise: the geometry fit's own error, as a
+# finding.
+#
+# The fit frees the camera, Brown's distortion, the poses and each board's warp. What its residuals hold beyond noise is
+# then the board's shape or print, motion, or a distortion that these terms don't follow. The noise of a corner doesn't
+# come from the residuals' size, in which such an error would hide, but from the picture about the corner
+# (`fit_corners`, `dot_centres`). Where that isn't known, it is the part of the residuals that neighbouring corners
+# don't share (`fit_correlated_errors`).
+
+
+ACROSS, DOWN = ("left", "middle", "right"), ("top", "middle", "bottom")
+LISTED = 4  # captures, or parts of the frame, that are named
+FLOOR_PX = 1e-3  # of a corner's noise: residuals below this are rounding
+POSE_PARAMETERS = 6  # of a view: rotation and position
+
+
+@dataclass(frozen=True)
+class _Departure:
+    """The corners of a part: standard deviation of a coordinate as found and as noise explains it, px; chi2 of n
+    numbers."""
+
+    found_px: float
+    noise_px: float
+    chi2: float
+    n: float
+
+    @property
+    def departure_px(self) -> float:
+        """Standard deviation of a coordinate beyond noise, px."""
+        return float(np.sqrt(max(self.found_px**2 - self.noise_px**2, 0.0)))
+
+    def sigma(self, slack: float) -> float:
+        """chi2 as a quantile of the normal distribution (Wilson and Hilferty 1931), with standard deviations `slack`
+        too small."""
+        spread = 2.0 / (9.0 * self.n)
+        return float((np.cbrt(self.chi2 / (1.0 + slack) ** 2 / self.n) - 1.0 + spread) / np.sqrt(spread))
+
+
+def board_departure(
+    side: Side, geometry: GeometryFit | None, shape: tuple[int, int], policy: DecisionPolicy
+) -> Unexplained | None:
+    """Return where and by how much the corners of a fit depart from its camera; None where noise and
+    `corner_tolerance_px` explain them.
+
+    All corners, those of each view, and those of each ninth of a frame of `shape` (rows, cols) are tested. A part
+    departs where its chi2 against noise is beyond `slice_false_alarm_rate`, corrected for the number of parts, and its
+    departure beyond noise is larger than both `corner_tolerance_px` and the noise.
+    """
+    if geometry is None or not geometry.residuals:
+        return None
+    views = geometry.residuals
+    place = np.array([at for view in views for at in zip(view.x_px, view.y_px, strict=True)])
+    rest = np.array([at for view in views for at in zip(view.dx_px, view.dy_px, strict=True)])
+    of_view = np.concatenate([np.full(len(view.corner), k) for k, view in enumerate(views)])
+    noise_px = np.array([_noise_px(geometry, view) for view in views])[of_view]
+    share = 1.0 - (len(geometry.parameters) + POSE_PARAMETERS * len(views)) / rest.size
+    if not share > 0.0 or np.isnan(noise_px).any():
+        return None
+    col, row = np.clip((place + 0.5) / shape[::-1] * 3, 0, 2).astype(int).T
+    cells = {
+        " ".join(dict.fromkeys((down, across))): (col == k) & (row == i)
+        for i, down in enumerate(DOWN)
+        for k, across in enumerate(ACROSS)
+    }
+    whole = _part(rest, noise_px, share)
+    by_view = {view.capture: _part(rest[of_view == k], noise_px[of_view == k], share) for k, view in enumerate(views)}
+    by_cell = {name: _part(rest[at], noise_px[at], share) for name, at in cells.items() if at.sum() >= MIN_CORNERS}
+    least_sigma = -float(special.ndtri(policy.slice_false_alarm_rate / (1 + len(by_view) + len(by_cell))))
+
+    def departs(part: _Departure) -> bool:
+        is_large = part.departure_px > max(policy.corner_tolerance_px, part.noise_px)
+        return is_large and part.sigma(policy.covariance_slack) > least_sigma
+
+    bad_views, bad_cells = (
+        {name: part for name, part in parts.items() if departs(part)} for parts in (by_view, by_cell)
+    )
+    departing = [whole] if departs(whole) else [*bad_views.values(), *bad_cells.values()]
+    if not departing:
+        return None
+    worst = max(departing, key=lambda part: part.departure_px)
+    return Unexplained(
+        side=side, measurement=BOARDS.name, axis=BOARDS.axis, where=_where(bad_views, bad_cells, len(views)),
+        shape=f"the corners of boards depart from the camera's geometry by {worst.found_px:.2f} px (standard "
+            "deviation of a "
+        f"coordinate), noise explains {worst.noise_px:.2f} px; a bent board, an unflat print or a distortion beyond "
+        "the "
+        "fitted terms does that",
+        significance_sigma=round(worst.sigma(policy.covariance_slack), 2),
+        chi2_before=worst.chi2, chi2_after=worst.n, n=round(worst.n), captures=tuple(sorted(bad_views or by_view)),
+        correction="none: the geometry's standard deviations hold what neighbouring corners share",
+    )  # fmt: skip
+
+
+def _noise_px(geometry: GeometryFit, view: ViewResiduals) -> float:
+    """Standard deviation of a coordinate by noise, px: of the view's picture, else of what neighbouring corners don't
+    share; NaN where neither is known."""
+    known = view.noise_px
+    if known is None:
+        known = geometry.corner_errors.noise_px if geometry.corner_errors is not None else np.nan
+    return float(np.maximum(known, FLOOR_PX))
+
+
+def _part(rest: FloatArray, noise_px: FloatArray, share: float) -> _Departure:
+    n = share * rest.size
+    chi2 = float(np.sum(np.square(rest / noise_px[:, None])))
+    return _Departure(float(np.sqrt(np.sum(rest**2) / n)), float(np.sqrt(np.mean(noise_px**2))), chi2, n)
+
+
+def _where(views: dict[str, _Departure], cells: dict[str, _Departure], count: int) -> str:
+    """Captures and parts of the frame that depart, in words, the worst first."""
+    words = []
+    if views:
+        more = f" and {len(views) - LISTED} more" if len(views) > LISTED else ""
+        words.append(f"{len(views)} of {count} captures: {_listed(views)}{more}")
+    if cells:
+        words.append(f"in the frame at the {_listed(cells)}")
+    return "; ".join(words) or f"all {count} captures alike"
+
+
+def _listed(parts: dict[str, _Departure]) -> str:
+    worst = sorted(parts.items(), key=lambda item: -item[1].found_px)[:LISTED]
+    return ", ".join(f"{name} ({part.found_px:.2f} px)" for name, part in worst)

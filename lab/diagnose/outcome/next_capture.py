@@ -25,7 +25,7 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import displaced, refit
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.curves import freed_curve
+from lab.diagnose.measurements.spectral import freed_curve
 from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
 from lab.diagnose.outcome.expected_information import Forecast
 from lab.diagnose.policy import DecisionPolicy
@@ -51,8 +51,6 @@ SETTLING: dict[str, tuple[str, str | None]] = {
     "field": ("the same captures at the corners of the field", LIT),
     "time": ("the same captures again, in the reverse order", None),
 }
-#: Distance below which no capture is worth listing beside others: predictions within a fifth of a standard deviation.
-LEAST_DISTANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ class Doubt:
             )
         found.sort(key=lambda item: -item.distance)
         # a capture that neither rival changes tells nothing: an f-number for darks
-        found = [item for item in found if item.distance >= LEAST_DISTANCE] or found[:1]
+        found = [item for item in found if item.distance >= policy.next_capture_least_distance] or found[:1]
         return tuple(found[: policy.next_captures_listed])
 
 

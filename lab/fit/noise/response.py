@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lab.fit.noise.evaluation import Evaluation, in_electrons
-from lab.fit.noise.photon_transfer import CURVE_LIMIT, LINE_LIMIT
+from lab.fit.noise.evaluation import CURVE_LIMIT, LINE_LIMIT, Evaluation, in_electrons
 from lab.measure.levels import MeasuredLevel
 from lab.measure.rounding import QUANTISATION_DN2
 from lab.measure.weighted_lines import Linearity, chi2_factor, least_squares, linearity

@@ -47,10 +47,10 @@ from lab.fit.spectral.sensitivity import (
     solve_sensitivities,
     trapezoid_weights,
 )
-from lab.formats.foreign_text import TableRow, read_foreign_csv, remarks_on, table_rows
+from lab.formats.cgats import TableRow, read_foreign_csv, remarks_on, table_rows
 from lab.formats.recording_set import DataSheet
 from lab.formats.recording_set.checks import OFF_NAME_NM
-from lab.formats.recording_set.frame_files import locate
+from lab.formats.recording_set.files import locate
 from lab.formats.results import CameraFit, FitResult, Skipped, SpectralFit
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.spectrum import FloatArray, Spectrum

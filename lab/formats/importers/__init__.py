@@ -11,10 +11,14 @@ from pathlib import Path
 
 from lab.errors import InputError
 from lab.formats.importers.emva1288 import read_emva1288
-from lab.formats.importers.fits_folder import read_fits_folder
-from lab.formats.importers.import_options import ImportOptions
-from lab.formats.importers.raw_folder import read_boards, read_checkerboard_pairs, read_dot_grids, read_raw_folder
-from lab.formats.importers.single_picture import read_colour_chart, read_slanted_edge
+from lab.formats.importers.raw_folder import (
+    read_boards,
+    read_checkerboard_pairs,
+    read_dot_grids,
+    read_fits_folder,
+    read_raw_folder,
+)
+from lab.formats.importers.single_picture import ImportOptions, read_colour_chart, read_slanted_edge
 from lab.formats.recording_set import Manifest, RecordingSet
 
 __all__ = [

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lab.errors import InputError
-from lab.formats.foreign_text import read_foreign_text
+from lab.formats.cgats import read_foreign_text
 from lab.formats.importers.images import IMAGES, ImageFiles, read_camera_file, read_image
 from lab.formats.importers.stated_settings import held_against_frames
 from lab.formats.recording_set import Manifest, RecordingSet

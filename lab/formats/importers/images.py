@@ -1,31 +1,182 @@
-"""Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, FITS, camera raws, .npy. They are decoded on
-access.
-
-A channel of transparency (RGBA) is dropped, and `has_alpha` says so. Spectra beside them may have semicolons and
-decimal commas."""
+"""Pictures as frames: FITS, TIFF, PNG and raw files, and how a sensor was read out."""
 
 from __future__ import annotations
 
+import gzip
+import io
 import struct
 import tomllib
+import warnings
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from lab.errors import InputError
-from lab.formats.foreign_text import read_foreign_csv, read_foreign_text
-from lab.formats.importers.fits_file import FITS, GZIP, is_fits, load_fits
+from lab.errors import InputError, one_line
+from lab.formats.cgats import read_foreign_csv, read_foreign_text
 from lab.formats.recording_set import RAWS, DataSheet, FolderFiles, Frame, load_frame
-from lab.formats.recording_set.frame_files import locate
+from lab.formats.recording_set.files import locate
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.camera import Side
+from sim.parameters import Frozen
 from sim.spectrum import Spectrum
+
+#: Endings of FITS files, and of what gzip makes of them; bytes that one may hold, at most: 32768 x 32768 pixels of 16
+#: bit.
+FITS = (".fits", ".fit", ".fts")
+GZIP = ".gz"
+LARGEST_BYTES = 2 << 30
+#: Words of IMAGETYP, in small letters, and the kind of capture.
+IMAGE_TYPES = {"dark": "dark", "bias": "dark", "zero": "dark", "flat": "flat"}
+
+
+@dataclass(frozen=True)
+class FitsHeader:
+    """What a header states; None where it has no such keyword.
+
+    `kind` of IMAGETYP or OBSTYPE; `exposure_s` of EXPTIME or EXPOSURE; `temperature_c` of CCD-TEMP; `time` of DATE-OBS
+    (UTC)."""
+
+    image_type: str | None
+    kind: str | None
+    exposure_s: float | None
+    temperature_c: float | None
+    time: datetime | None
+
+
+def is_fits(file: Path) -> bool:
+    """Return whether a file is a FITS file by its ending, `.fits.gz` included."""
+    return file.name.lower().removesuffix(GZIP).endswith(FITS)
+
+
+def load_fits(file: Path) -> Frame:
+    """Return the only image of a FITS file, uint16 (rows, cols) with BZERO and BSCALE applied. InputError without
+    the path."""
+    found, _ = _opened(file)
+    if found.ndim != 2:
+        raise InputError(f"has the shape {found.shape}, not (rows, cols); save one file a frame")
+    if found.dtype.kind not in "iu" and not np.array_equal(found, np.rint(found)):
+        raise InputError(f"its values are {found.dtype} with fractions; save raw DN as integers")
+    if found.size and (found.min() < 0 or found.max() > np.iinfo(np.uint16).max):
+        raise InputError(
+            f"its values are {found.min():g} .. {found.max():g}; raw DN are 0 .. 65535: save them unscaled"
+        )
+    return np.ascontiguousarray(found, dtype=np.uint16)
+
+
+def fits_header(file: Path, *, with_image: bool = True) -> FitsHeader:
+    """Return what the header says; InputError without the path. Without `with_image`, the image isn't read, and damage
+    in it stays unseen."""
+    header = _opened(file)[1] if with_image else _header(file)
+    stated = header.get("IMAGETYP", header.get("OBSTYPE"))
+    words = str(stated).lower() if stated is not None else ""
+    kind = next((kind for word, kind in IMAGE_TYPES.items() if word in words), None)
+    return FitsHeader(
+        str(stated).strip() if stated is not None else None,
+        kind,
+        _number(header, "EXPTIME", "EXPOSURE"),
+        _number(header, "CCD-TEMP"),
+        _time(header.get("DATE-OBS")),
+    )
+
+
+@contextmanager
+def _stream(file: Path) -> Iterator[IO[bytes]]:
+    """The file's bytes, uncompressed. Raises InputError where there are too many of them."""
+    if not file.name.lower().endswith(GZIP):
+        with file.open("rb") as stream:
+            yield stream
+        return
+    held = io.BytesIO()
+    with gzip.open(file) as packed:
+        while part := packed.read(1 << 20):
+            held.write(part)
+            if held.tell() > LARGEST_BYTES:
+                raise InputError(f"holds more than the limit of {LARGEST_BYTES} bytes; save one frame a file")
+    held.seek(0)
+    yield held
+
+
+def _header(file: Path) -> Any:
+    """Return the header of the first image that isn't empty, with that of the file's beginning."""
+    from astropy.io import fits
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with _stream(file) as stream, fits.open(stream, memmap=False, lazy_load_hdus=True) as opened:
+                first = opened[0]
+                image = next((hdu for hdu in opened if getattr(hdu, "is_image", False) and hdu.header["NAXIS"]), first)
+                return first.header if image is first else first.header + image.header
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"damaged FITS ({one_line(error)}); copy it again or recapture") from error
+
+
+def _opened(file: Path) -> tuple[Any, Any]:
+    """Return the image's values and header. A file whose data or checksum is damaged is refused."""
+    from astropy.io import fits
+    from astropy.io.fits.verify import VerifyWarning
+    from astropy.utils.exceptions import AstropyUserWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", AstropyUserWarning)  # truncated, or a wrong checksum
+        warnings.simplefilter("ignore", VerifyWarning)  # a header that is only untidy
+        try:
+            with _stream(file) as stream, fits.open(stream, memmap=False, checksum=True) as opened:
+                images = [hdu for hdu in opened if getattr(hdu, "is_image", False) and hdu.data is not None]
+                first = opened[0]
+                found = [
+                    (np.asarray(hdu.data), hdu.header if hdu is first else first.header + hdu.header) for hdu in images
+                ]
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"damaged FITS ({one_line(error)}); copy it again or recapture") from error
+    if len(found) != 1:
+        raise InputError(f"holds {len(found)} images, not 1; save one file a frame")
+    return found[0]
+
+
+def _number(header: Any, *names: str) -> float | None:
+    for name in names:
+        value = header.get(name)
+        if value is None:
+            continue
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = np.nan
+        if not np.isfinite(number):
+            raise InputError(f"{name} = {value!r} isn't a number; correct the header")
+        return number
+    return None
+
+
+def _time(stated: Any) -> datetime | None:
+    try:
+        time = datetime.fromisoformat(str(stated))
+    except ValueError:
+        return None
+    return time if time.tzinfo is not None else time.replace(tzinfo=UTC)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, FITS, camera raws, .npy. They are decoded on
+# access.
+#
+# A channel of transparency (RGBA) is dropped, and `has_alpha` says so. Spectra beside them may have semicolons and
+# decimal commas.
+
 
 IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
 
@@ -162,3 +313,196 @@ def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> 
             key = ".".join(str(part) for part in first["loc"])
             raise InputError(f"{file}: {side} camera: {key}: {first['msg']}; write it in camera.toml") from error
     return cameras
+
+
+# --- Sensors that are read out by several taps, with overscan: `[[taps]]` of `camera.toml` ----------------------------
+#
+#     [[taps]]
+#     name = "A"
+#     region = [0, 0, 1024, 512]          # what collects light: row0, col0, row1, col1, end excluded
+#     overscan = [0, 1024, 1024, 1056]    # what the same tap reads without pixels: its bias
+#     black_level_dn = 100                # in place of an overscan
+#
+# The regions tile a rectangle once the rows and columns that no region has are cut out: what lies between two taps has
+# to be overscan, that around them may be anything. `rows`, `cols` and `cfa` of the camera are those of the joined
+# frame. Each tap's black level is the mean of its overscan over the frames. Taps are shifted by whole DN to one black
+# level; codes stay codes. What is left, and unequal gains, is in the frames: `--tap NAME` imports one tap alone.
+
+
+#: Frames whose overscan is averaged, at most: evenly over the recording.
+MOST_FRAMES = 32
+#: Change of a tap's bias over the frames that is told, DN.
+DRIFT_DN = 0.5
+
+Region = tuple[int, int, int, int]
+
+
+class Tap(Frozen):
+    """One output of a sensor: the region that it reads, and how its black level is known."""
+
+    name: str
+    region: Region
+    overscan: Region | None = None
+    black_level_dn: float | None = None
+
+
+@dataclass(frozen=True)
+class Readout:
+    """The taps of a sensor as they are imported: the rows and columns of the frame that are kept, and what is added to
+    each tap's codes.
+
+    `black_level_dn`: of the frames that come out. `remarks`: what was measured, in sentences.
+    """
+
+    taps: tuple[Tap, ...]
+    rows: tuple[int, ...]
+    cols: tuple[int, ...]
+    shift_dn: tuple[int, ...]
+    black_level_dn: float
+    remarks: tuple[str, ...]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the frames that come out."""
+        return len(self.rows), len(self.cols)
+
+    def applied(self, frame: Frame) -> Frame:
+        """Return a frame as it is stored, cropped, joined, and with its taps at one black level; codes don't fall
+        below 0."""
+        made = np.zeros(frame.shape, np.int64)
+        for tap, shift in zip(self.taps, self.shift_dn, strict=True):
+            made[_box(tap.region)] = frame[_box(tap.region)].astype(np.int64) + shift
+        joined = made[np.ix_(self.rows, self.cols)]
+        return np.ascontiguousarray(np.clip(joined, 0, np.iinfo(np.uint16).max), dtype=np.uint16)
+
+
+class TapFiles(ImageFiles):
+    """Images whose frames are cropped, joined and levelled as a `Readout` says."""
+
+    def __init__(self, root: Path, images: Mapping[str, Path], readouts: Mapping[str, Readout]) -> None:
+        """`readouts`: by the frame's path in the recording set."""
+        super().__init__(root, images)
+        self.readouts = dict(readouts)
+
+    def frame(self, path: str, camera: DataSheet) -> Frame:
+        frame = super().frame(path, camera)
+        return self.readouts[path].applied(frame) if path in self.readouts else frame
+
+
+def parse_taps(listed: Any, where: str) -> tuple[Tap, ...]:
+    """`[[taps]]` of a camera file."""
+    try:
+        taps = tuple(Tap.model_validate(item) for item in listed)
+    except (ValidationError, TypeError) as error:
+        first = error.errors()[0] if isinstance(error, ValidationError) else {"loc": ("taps",), "msg": "not a list"}
+        key = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{where}: taps: {key}: {first['msg']}; write name, region and overscan of each") from error
+    names = [tap.name for tap in taps]
+    if len(set(names)) < len(names):
+        raise InputError(f"{where}: taps: two have one name ({', '.join(names)}); rename one")
+    return taps
+
+
+def readout(taps: Sequence[Tap], files: Sequence[Path], shape: tuple[int, int], where: str) -> Readout:
+    """Return how frames of `shape` (rows, cols) are cropped and levelled. Raises InputError where a region isn't inside
+    the frame, the regions don't tile a rectangle, or a black level isn't known."""
+    for tap in taps:
+        _check_inside(tap, shape, where)
+    kept_rows, kept_cols, cut = _tiled(taps, shape, where)
+    unknown = [tap.name for tap in taps if tap.overscan is None and tap.black_level_dn is None]
+    if unknown:
+        raise InputError(
+            f"{where}: tap {', '.join(unknown)}: neither overscan nor black_level_dn; write one of them for each tap"
+        )
+    measured = _overscan_means(taps, files)
+    levels = []
+    remarks = [f"{where}: overscan between the taps is cut out and the rest joined: {', '.join(cut)}"] if cut else []
+    for tap in taps:
+        means = measured.get(tap.name)
+        if means is None:
+            levels.append(float(tap.black_level_dn or 0.0))
+            continue
+        levels.append(float(np.mean(means)))
+        std = float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
+        drift = f", which changes by {np.ptp(means):.2g} DN over the frames" if np.ptp(means) > DRIFT_DN else ""
+        remarks.append(
+            f"{where}: tap {tap.name}: overscan of {len(means)} frames {levels[-1]:.2f} +- "
+            f"{std / np.sqrt(len(means)):.2g} DN{drift}"
+        )
+    common = min(levels)
+    shift = tuple(-round(level - common) for level in levels)
+    left = [level + moved for level, moved in zip(levels, shift, strict=True)]
+    if len(taps) > 1:
+        said = ", ".join(f"{tap.name} {moved:+d}" for tap, moved in zip(taps, shift, strict=True))
+        remarks.append(
+            f"{where}: taps shifted by whole DN to one black level ({said}); they still differ by {np.ptp(left):.2g} "
+            "DN, and by their "
+            "gains: --tap NAME imports one alone"
+        )
+    return Readout(tuple(taps), kept_rows, kept_cols, shift, float(np.mean(left)), tuple(remarks))
+
+
+def _box(region: Region) -> tuple[slice, slice]:
+    return slice(region[0], region[2]), slice(region[1], region[3])
+
+
+def _check_inside(tap: Tap, shape: tuple[int, int], where: str) -> None:
+    for name, region in (("region", tap.region), ("overscan", tap.overscan)):
+        if region is None:
+            continue
+        row0, col0, row1, col1 = region
+        if not (0 <= row0 < row1 <= shape[0] and 0 <= col0 < col1 <= shape[1]):
+            raise InputError(
+                f"{where}: tap {tap.name}: {name} {list(region)} isn't inside the frame of {shape[0]} x {shape[1]}; "
+                "give [row0, col0, row1, col1], end excluded"
+            )
+
+
+def _tiled(
+    taps: Sequence[Tap], shape: tuple[int, int], where: str
+) -> tuple[tuple[int, ...], tuple[int, ...], list[str]]:
+    """Return the rows and the columns that the regions tile, and the runs between them that are cut out, in words."""
+    count, overscan = np.zeros(shape, np.uint8), np.zeros(shape, bool)
+    for tap in taps:
+        count[_box(tap.region)] += 1
+        if tap.overscan is not None:
+            overscan[_box(tap.overscan)] = True
+    rows, cols = np.flatnonzero(count.any(axis=1)), np.flatnonzero(count.any(axis=0))
+    for tap in taps:
+        if tap.overscan is not None and count[_box(tap.overscan)].any():
+            raise InputError(
+                f"{where}: tap {tap.name}: overscan {list(tap.overscan)} holds pixels of a tap's region; correct one "
+                "of them"
+            )
+    cut = []
+    for name, kept, blank in (
+        ("row", rows, np.asarray(overscan[:, cols].all(axis=1))),
+        ("column", cols, np.asarray(overscan[rows].all(axis=0))),
+    ):
+        between = np.setdiff1d(np.arange(kept[0], kept[-1] + 1), kept)
+        for run in np.split(between, np.flatnonzero(np.diff(between) > 1) + 1) if between.size else ():
+            if not blank[run].all():
+                raise InputError(
+                    f"{where}: the taps' regions leave gaps: {name} {run[0]}..{run[-1]} belongs to no region, and "
+                    "isn't all overscan; "
+                    "correct the regions, or state the overscan"
+                )
+            cut.append(f"{name} {run[0]}..{run[-1]}")
+    if np.any(count[np.ix_(rows, cols)] != 1):
+        box = [int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1]
+        raise InputError(f"{where}: the taps' regions leave gaps or overlap; they have to tile {box}: correct them")
+    return tuple(rows.tolist()), tuple(cols.tolist()), cut
+
+
+def _overscan_means(taps: Sequence[Tap], files: Sequence[Path]) -> dict[str, list[float]]:
+    """Means of each tap's overscan in some of the frames, DN."""
+    chosen = [files[int(i)] for i in np.unique(np.linspace(0, len(files) - 1, MOST_FRAMES).round())]
+    means: dict[str, list[float]] = {}
+    if all(tap.overscan is None for tap in taps):
+        return means
+    for file in chosen:
+        frame = read_image(file)
+        for tap in taps:
+            if tap.overscan is not None:
+                means.setdefault(tap.name, []).append(float(frame[_box(tap.overscan)].mean()))
+    return means

@@ -1,11 +1,11 @@
 """A folder of camera raws or grey images with an `index.csv` that says what each is, and a `camera.toml`.
 
-`index.csv` is that of `lab.formats.importers.index_file`. `side` may be left out (left), and `id` too (the file's
+`index.csv` has a row for each image (`Index`). `side` may be left out (left), and `id` too (the file's
 name). Spectra (CSV) and targets (.npy) are named as in a recording set, relative to the folder.
 
 `camera.toml` has the keys of a recording set's camera, at the top for one camera, or in `[left]` and `[right]`. Without
 `rows` and `cols` these are taken from the images, and without `bit_depth` where the files themselves have 8 bit. Its
-`[[taps]]` are those of `lab.formats.importers.readout`.
+`[[taps]]` are those of `lab.formats.importers.images`.
 
 `read_checkerboard_pairs` (`calibench import --from raw-folder --checkerboard 6x9 --square-mm 25`) needs neither of the
 two files: it takes a folder of images named `leftNN` and `rightNN` of a plain checkerboard. `read_boards` takes the
@@ -14,35 +14,169 @@ pictures of one camera, of a plain checkerboard or of a grid of dots; an `index.
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
-from lab.capture_kinds.base import Names, names_in
-from lab.errors import InputError
-from lab.formats.foreign_text import read_foreign_text, remarks_on
+from lab.capture_kinds.base import CAPTURES, Capture, Names, Open, names_in
+from lab.errors import InputError, one_line
+from lab.formats.cgats import in_its_unit, nearest_name, read_foreign_csv, read_foreign_text, remarks_on
 from lab.formats.importers.images import (
+    FITS,
+    GZIP,
     IMAGES,
+    FitsHeader,
+    Readout,
+    Tap,
+    TapFiles,
     decoded,
     described_sides,
+    fits_header,
     frame_name,
     grey,
     has_alpha,
+    is_fits,
     is_frame,
+    parse_taps,
     read_camera_file,
     read_image,
+    readout,
 )
-from lab.formats.importers.index_file import Index, capture_of_row, read_index
-from lab.formats.importers.readout import Readout, Tap, TapFiles, parse_taps, readout
 from lab.formats.importers.stated_settings import held_against_frames
 from lab.formats.recording_set import DataSheet, FolderFiles, Manifest, RecordingError, RecordingSet, parse_manifest
 from sim.camera import Side
+
+# ----------------------------------------------------------------------------------------------------------------------
+# `index.csv`: one row a capture, the columns a capture's keys in the recording set, the members of `screen` as
+# `screen.pose`, ...
+#
+# Lists are written with spaces (`region`: `92 156 292 356`; `corners`: eight numbers). An empty cell is an unknown
+# value. A row of kind `checkerboard` that has `squares` and `square_mm` is a printed board without markers, not a
+# pattern on the screen.
+
+
+@dataclass(frozen=True)
+class Index:
+    """The rows of an index, (row number in the file, column -> cell) each, and in sentences what was found in reading
+    it."""
+
+    rows: list[tuple[int, dict[str, str]]]
+    remarks: tuple[str, ...] = ()
+
+
+def read_index(file: Path, needed: tuple[str, ...] = ("frame", "kind")) -> Index:
+    """Return the rows of `file`, whose header has the columns `needed`; cells without blanks, empty ones left out.
+
+    Raises InputError with one line where it can't be read, a column is missing, or one that isn't known is a known one
+    in another unit or misspelled. Other unknown columns are left out with a remark.
+    """
+    wanted = ",".join(dict.fromkeys((*needed, "side", "exposure_s")))
+    if not file.is_file():
+        raise InputError(f"{file}: missing; write one row a capture: {wanted},...")
+    try:
+        found = read_foreign_csv(file)
+        reader = csv.reader(found.text.splitlines())
+        header = [cell.strip() for cell in next(reader, [])]
+        listed = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except csv.Error as error:
+        raise InputError(f"{file}: isn't CSV ({one_line(error)}); write one row a capture: {wanted},...") from error
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    unused = _check_header(file, header, needed)
+    rows = []
+    for number, row in listed:
+        if not any(row):
+            continue
+        if len(row) > len(header):
+            raise InputError(f"{file}: row {number}: {len(row)} cells under {len(header)} columns; correct it")
+        cells = {key: cell for key, cell in zip(header, row, strict=False) if cell and key not in unused}
+        rows.append((number, cells))
+    if not rows:
+        raise InputError(f"{file}: lists no captures; write one row a capture")
+    remarks = [f"{file}: {remark}" for remark in found.remarks]
+    if unused:
+        remarks.append(f"{file}: columns that no capture has are left out: {', '.join(unused)}")
+    return Index(rows, tuple(remarks))
+
+
+def _check_header(file: Path, header: list[str], needed: tuple[str, ...]) -> list[str]:
+    """Return the columns that aren't used. Raises InputError for one that is missing, stands twice, or is meant to be a
+    known one."""
+    known = _columns()
+    unknown = [name for name in header if name and name not in known]
+    meant = [(name, near) for name in unknown if (near := nearest_name(name, known)) is not None and near not in header]
+    if meant:
+        told = "; ".join(f"'{name}': write {in_its_unit(near)}" for name, near in meant)
+        raise InputError(f"{file}: unknown column {told}")
+    missing = [f"'{name}'" for name in needed if name not in header]
+    if missing:
+        raise InputError(
+            f"{file}: the header has no columns {' and '.join(missing)} (it is "
+            f"'{' '.join(','.join(header).split())[:60]}'); "
+            "name the columns as the capture's keys"
+        )
+    if twice := sorted({name for name in header if name and header.count(name) > 1}):
+        raise InputError(f"{file}: the column {', '.join(twice)} stands twice; take one out")
+    return unknown
+
+
+def _columns() -> list[str]:
+    """Return the keys of all kinds of capture, those of objects in them with a dot."""
+    names: dict[str, None] = {}
+    for kind in CAPTURES.models.values():
+        for key, field in kind.model_fields.items():
+            parts = [part for part in (field.annotation, *get_args(field.annotation)) if isinstance(part, type)]
+            inner = next((part for part in parts if issubclass(part, Open)), None)
+            names |= dict.fromkeys([key] if inner is None else [f"{key}.{name}" for name in inner.model_fields])
+    return list(names)
+
+
+def capture_of_row(row: dict[str, str]) -> dict[str, Any]:
+    """Return a row as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`. Raises
+    InputError without the row."""
+    if "frame" not in row or "kind" not in row:
+        raise InputError("the frame or its kind is missing; write both")
+    if row["kind"] == "checkerboard" and "squares" in row and "square_mm" in row:
+        row = row | {"kind": "charuco", "dictionary": "none"}
+    kind = CAPTURES.models.get(row["kind"])
+    sizes = _list_sizes(kind) if kind is not None else {}
+    capture: dict[str, Any] = {}
+    for key, cell in row.items():
+        value: Any = cell
+        if key in sizes:
+            value = _list(key, cell, sizes[key])
+        if key.startswith("screen."):
+            capture.setdefault("screen", {})[key.removeprefix("screen.")] = value
+        else:
+            capture[key] = value
+    return capture
+
+
+def _list_sizes(kind: type[Capture]) -> dict[str, int]:
+    """Keys of a kind that hold several numbers, and how many make a group (0: a flat list)."""
+    sizes = {}
+    for key, field in kind.model_fields.items():
+        parts = [part for part in (field.annotation, *get_args(field.annotation)) if get_origin(part) is tuple]
+        if parts:
+            sizes[key] = len(get_args(get_args(parts[0])[0]))
+    return sizes
+
+
+def _list(key: str, cell: str, size: int) -> list[Any]:
+    try:
+        numbers = [float(word) for word in re.split(r"[\s;]+", cell)]
+    except ValueError:
+        raise InputError(f"{key}: '{cell}' isn't a list of numbers; write them with spaces between") from None
+    whole = [int(number) if number.is_integer() else number for number in numbers]
+    return [whole[k : k + size] for k in range(0, len(whole), size)] if size else whole
+
 
 INDEX, CAMERA = "index.csv", "camera.toml"
 
@@ -250,3 +384,81 @@ def _measured(captures: list[dict[str, Any]], images: dict[str, Path]) -> tuple[
         if image is not None and has_alpha(image):
             remarks.append(f"{first}: has a channel of transparency, which is dropped, as in the others of this side")
     return measured, remarks
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# A folder of FITS frames. The header of each says what it shows, or an `index.csv` beside them, as in a folder of
+# raws.
+#
+# Used of the header: IMAGETYP or OBSTYPE (dark, bias, zero, flat), EXPTIME or EXPOSURE (s), CCD-TEMP, DATE-OBS. An
+# index has one row a frame; its empty cells of exposure, temperature and time are taken from the header. GAIN and
+# BAYERPAT have no common meaning: state these values in `camera.toml`, which has the camera's keys, `cfa` and
+# `bit_depth` at least.
+
+
+def read_fits_folder(path: Path, tap: str = "") -> RecordingSet:
+    """Return the FITS frames in the folder `path` as a recording set. `tap`: that tap of the sensor alone.
+
+    Raises RecordingError with one line for every frame that can't be used: damaged, without an exposure. Frames whose
+    image type is neither dark nor flat need an `index.csv`; without one they are left out with a warning.
+    """
+    if (path / INDEX).is_file():
+        return recordings_of_index(path, _with_headers(path), str(path / INDEX), tap)
+    files = sorted(file for file in path.iterdir() if is_fits(file))
+    if not files:
+        raise InputError(f"{path}: no FITS frames ({', '.join(FITS)}, also with {GZIP}); give their folder")
+    rows: list[tuple[int, dict[str, str]]] = []
+    problems: list[str] = []
+    left_out: dict[str, list[str]] = {}
+    for number, file in enumerate(files, start=1):
+        try:
+            header = fits_header(file)
+        except InputError as error:
+            problems.append(f"{file}: {error}")
+            continue
+        if header.kind is None:
+            left_out.setdefault(header.image_type or "none", []).append(file.name)
+        elif header.exposure_s is None:
+            problems.append(f"{file}: its header has no EXPTIME; write exposure_s into {INDEX}")
+        else:
+            rows.append((number, {"frame": file.name, "kind": header.kind} | _cells(header)))
+    if problems:
+        raise RecordingError(problems)
+    types = "; ".join(f"IMAGETYP {kind}: {names[0]} and {len(names) - 1} more" for kind, names in left_out.items())
+    if not rows:
+        raise InputError(
+            f"{path}: no frame says that it is dark or flat ({types}); write {INDEX}: frame,kind,exposure_s,..."
+        )
+    recordings = recordings_of_index(path, Index(rows), str(path), tap)
+    if left_out:
+        recordings.warnings += (f"{path}: neither dark nor flat and left out: {types}; write {INDEX} to use them",)
+    return recordings
+
+
+def _cells(header: FitsHeader) -> dict[str, str]:
+    """Return what a header states, as cells of an index."""
+    stated = {
+        "exposure_s": None if header.exposure_s is None else f"{header.exposure_s:.12g}",
+        "temperature_c": None if header.temperature_c is None else f"{header.temperature_c:.6g}",
+        "time": None if header.time is None else header.time.isoformat(),
+    }
+    return {key: cell for key, cell in stated.items() if cell is not None}
+
+
+def _with_headers(path: Path) -> Index:
+    """Return the index, with what the headers state in empty cells."""
+    rows: list[tuple[int, dict[str, str]]] = []
+    problems: list[str] = []
+    index = read_index(path / INDEX)
+    for number, row in index.rows:
+        file = path / row.get("frame", "")
+        if is_fits(file) and file.is_file():
+            try:
+                rows.append((number, _cells(fits_header(file)) | row))
+            except InputError as error:
+                problems.append(f"{path / INDEX}: row {number}: {row['frame']}: {error}")
+        else:
+            rows.append((number, row))
+    if problems:
+        raise RecordingError(problems)
+    return replace(index, rows=rows)

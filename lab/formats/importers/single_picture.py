@@ -3,14 +3,15 @@
 `camera.toml` beside it (or `--camera FILE`) has the camera's keys: `cfa`, `bit_depth` and `black_level_dn` have to be
 stated, and everything else that is known helps. A colour picture is no mosaic: of an edge one channel is taken as that
 of a monochrome camera, a chart is sampled like an RGGB mosaic of the same size. Its noise is that of a demosaiced
-picture.
-"""
+picture."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -18,15 +19,71 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from lab.errors import InputError
-from lab.formats.foreign_text import read_foreign_csv
+from lab.formats.cgats import read_foreign_csv
 from lab.formats.importers.images import IMAGES, decoded, described_sides, has_alpha, read_image
-from lab.formats.importers.import_options import ImportOptions
 from lab.formats.importers.stated_settings import held_against_frames
 from lab.formats.recording_set import DataSheet, Frame, Manifest, RecordingSet
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic
 from sim.spectrum import Spectrum
+
+# --- Options of an import: what the user states because a format doesn't hold it --------------------------------------
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """Statements that a format doesn't hold. None: not stated.
+
+    `checkerboard`, `dots`: inner corners or dots (rows, cols), `square_mm` their spacing. `camera`: a camera file, in
+    place of the `camera.toml` beside the picture. `channel`: of a colour picture, R, G or B. `transfer`: what the
+    picture's codes are, proportional to the light or sRGB. `corners`: of a chart's 24 patches, [row, col] of dark skin,
+    bluish green, black, white. `light`, `white_patch`: CSV of the radiance of a perfect diffuser, or of the chart's
+    white patch, in the chart's place. `tap`: one tap of the sensor alone."""
+
+    checkerboard: tuple[int, int] | None = None
+    dots: tuple[int, int] | None = None
+    square_mm: float | None = None
+    camera: Path | None = None
+    exposure_s: float | None = None
+    channel: str | None = None
+    transfer: Literal["linear", "srgb"] | None = None
+    corners: tuple[tuple[float, float], ...] | None = None
+    light: Path | None = None
+    white_patch: Path | None = None
+    tap: str | None = None
+
+    def stated(self) -> tuple[str, ...]:
+        """Names of the options that are stated, as on the command line."""
+        names = (field.name for field in fields(self))
+        return tuple(f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None)
+
+
+def grid(option: str, text: str) -> tuple[int, int] | None:
+    """ROWSxCOLS as two numbers; None where `text` is empty. Raises InputError, with the option's name."""
+    if not text:
+        return None
+    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+    if found is None:
+        raise InputError(f"{option} {text}: give ROWSxCOLS, as in 6x9")
+    return int(found[1]), int(found[2])
+
+
+def chart_corners(option: str, text: str) -> tuple[tuple[float, float], ...] | None:
+    """Eight numbers with commas as four corners (row, col); None where `text` is empty. Raises InputError, with the
+    option's name."""
+    if not text:
+        return None
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 8:
+        raise InputError(
+            f"{option} {text}: give eight numbers, row and column of dark skin, bluish green, black, white"
+        )
+    return tuple(zip(numbers[::2], numbers[1::2], strict=True))
+
 
 CAMERA = "camera.toml"
 #: Highest code of a picture that was decoded from sRGB.

@@ -3,16 +3,20 @@
 `read` checks a whole folder and reports all problems at once, one line each. `write` writes a folder completely or not
 at all. The kinds of capture are in `lab.capture_kinds`."""
 
-from lab.formats.recording_set.archive import ArchiveForm, archive, packed
-from lab.formats.recording_set.checks import inspect
-from lab.formats.recording_set.clipping import clipped_share
-from lab.formats.recording_set.files import FolderFiles, RecordingFiles
-from lab.formats.recording_set.frame_files import RAWS, Frame, Target, load_frame
-from lab.formats.recording_set.manifest import DataSheet, Manifest, RecordingError, manifest_json, parse_manifest
-from lab.formats.recording_set.reading import read
+from lab.formats.recording_set.checks import clipped_share, inspect
+from lab.formats.recording_set.files import RAWS, FolderFiles, Frame, RecordingFiles, Target, load_frame
+from lab.formats.recording_set.folder import ArchiveForm, archive, packed, read, write
+from lab.formats.recording_set.manifest import (
+    DataSheet,
+    InstrumentSnapshot,
+    Manifest,
+    RecordingError,
+    Snapshots,
+    differences,
+    manifest_json,
+    parse_manifest,
+)
 from lab.formats.recording_set.recordings import RecordingSet
-from lab.formats.recording_set.snapshot import InstrumentSnapshot, Snapshots, differences
-from lab.formats.recording_set.writing import write
 
 __all__ = [
     "RAWS",

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from lab.capture_kinds.base import Capture, in_folder
 from lab.errors import InputError
-from lab.formats.recording_set.files import JoinedFiles, MemoryFiles, OverlaidFiles, RecordingFiles
-from lab.formats.recording_set.frame_files import Frame, Target
+from lab.formats.recording_set.files import Frame, JoinedFiles, MemoryFiles, OverlaidFiles, RecordingFiles, Target
 from lab.formats.recording_set.manifest import DataSheet, Manifest
 from sim.camera import Side
 from sim.spectrum import Spectrum

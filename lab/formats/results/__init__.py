@@ -3,8 +3,6 @@
 `None` where the recordings don't determine a number. The reason stands in `skipped` then.
 """
 
-from lab.formats.results.blur import MtfCurve, PsfKernel, PsfSymmetry
-from lab.formats.results.comparison import Change, ComparisonResult, ProjectionChange
 from lab.formats.results.diagnosis import (
     DiagnosisLists,
     DiagnosisResult,
@@ -33,36 +31,48 @@ from lab.formats.results.diagnosis import (
     VetoedName,
     Visibility,
 )
-from lab.formats.results.fit import CameraFit, FitResult
-from lab.formats.results.geometry import (
+from lab.formats.results.fit import (
     BoardWarp,
+    CameraFit,
     ChannelGeometry,
+    ChannelNoise,
     CornerErrors,
     CrossValidation,
-    DepthUncertainty,
-    DistortionModel,
-    GeometryFit,
-    ProjectionUncertainty,
-    Rectification,
-    StereoFit,
-    ViewResiduals,
-)
-from lab.formats.results.noise import (
-    ChannelNoise,
     DarkCurrentLaws,
     Defect,
+    DepthUncertainty,
+    DistortionModel,
     Emva1288,
     Emva1288Points,
+    FitResult,
+    GeometryFit,
     InconsistentLevel,
+    MakerDeparture,
+    MtfCurve,
     NoiseFit,
     PhotonTransfer,
     PixelDefects,
+    ProjectionUncertainty,
+    PsfKernel,
+    PsfSymmetry,
     ReadNoiseDistribution,
+    Rectification,
+    Skipped,
+    SpectralFit,
+    StereoFit,
+    ViewResiduals,
 )
-from lab.formats.results.report_file import ReportFile
-from lab.formats.results.skipped import Skipped
-from lab.formats.results.spectral import MakerDeparture, SpectralFit
-from lab.formats.results.validation import Check, CurveComparison, KernelPair, PatchComparison, ValidationResult
+from lab.formats.results.validation import (
+    Change,
+    Check,
+    ComparisonResult,
+    CurveComparison,
+    KernelPair,
+    PatchComparison,
+    ProjectionChange,
+    ReportFile,
+    ValidationResult,
+)
 
 __all__ = [
     "BoardWarp",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-from lab.formats.results.skipped import Skipped
+from lab.formats.results.fit import Skipped
 from sim.camera import Side
 from sim.parameters import Frozen
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lab.diagnose.effect_list import effect_list
+from lab.diagnose.visibility import effect_list
 from sim.camera import CameraModel
 from sim.parameters import read_quantities
 from tests.api.conftest import Running

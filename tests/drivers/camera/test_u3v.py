@@ -18,11 +18,10 @@ from hypothesis import strategies as st
 from drivers.camera.base import capture_together
 from drivers.camera.gencp import GenCp
 from drivers.camera.pixel_format import PIXEL_FORMATS, PixelFormat
-from drivers.camera.u3v import U3vCamera
-from drivers.camera.u3v_stream import LEADER, LEADER_MAGIC, StreamLayout, U3vStream
+from drivers.camera.u3v import LEADER, LEADER_MAGIC, StreamLayout, U3vCamera, U3vStream
 from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Refused
 from mocks.bench import Bench
-from mocks.pixels import pack_12p
+from mocks.ready_frames import pack_12p
 from mocks.u3v import (
     BALANCE_BLUE,
     BALANCE_GREEN,
@@ -484,7 +483,7 @@ def test_a_stream_ends_while_a_long_exposure_is_waited_for() -> None:
 
 
 def test_a_transfer_that_comes_while_a_wait_ends_is_taken_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.camera.u3v_stream._WAIT_S", 0.01)
+    monkeypatch.setattr("drivers.camera.u3v._WAIT_S", 0.01)
     device = _Slow([b"01234", b"56789abcdef"])
     device.leader = False
     stream = U3vStream.__new__(U3vStream)

@@ -18,8 +18,7 @@ from pydantic import ValidationError
 from scipy import stats
 
 from lab.calibration import life
-from lab.calibration.figures import Figure, figures_of
-from lab.calibration.limits import CalibrationLimits, Limit, judged, read_limits
+from lab.calibration.limits import CalibrationLimits, Figure, Limit, figures_of, judged, read_limits
 from lab.capture.plan import CapturePlan
 from lab.capture.records import RunRecord, now
 from lab.capture.session import CaptureSession
@@ -30,7 +29,7 @@ from lab.cli import main
 from lab.errors import InputError
 from lab.fit.compare import FALSE_ALARM_RATE, NOT_COMPARED, NOT_COMPARED_FIELDS
 from lab.formats.results import CameraFit, FitResult, MtfCurve, NoiseFit, StereoFit
-from lab.formats.results.figure_names import NAMES, plain_name, unit_of
+from lab.formats.results.words import NAMES, plain_name, unit_of
 from sim.parameters import Frozen
 from tests.lab import fake_bench
 

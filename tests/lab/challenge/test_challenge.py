@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from lab.challenge.calibrate import DEFAULT, answers
-from lab.challenge.draw import FOREIGN_BITS, FOREIGN_FRAMES, SHARES, DrawnFrame, draw, kind_of
-from lab.challenge.faults import FAULTS
+from lab.challenge.draw import FAULTS, FOREIGN_BITS, FOREIGN_FRAMES, SHARES, DrawnFrame, draw, kind_of
 from lab.challenge.make import make
 from lab.challenge.run import run_all
 from lab.challenge.score import broken_seals, score

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lab.challenge.budgets import BudgetCheck, check_budget
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.challenge.transfers import (
     DARK_LAW,
     TRANSFERS,

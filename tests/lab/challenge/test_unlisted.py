@@ -11,10 +11,9 @@ import pytest
 
 import lab.challenge.run
 import lab.challenge.truth
-from lab.challenge.along_axis import separability_along
 from lab.challenge.run import CaseRun
 from lab.challenge.truth import CaseTruth, Concealed, Kind, Seals, Truths, load, salted, seal
-from lab.challenge.unlisted import BLOCK, TARGETS, concealed_in, draw_unlisted, sized, target_of
+from lab.challenge.unlisted import BLOCK, TARGETS, concealed_in, draw_unlisted, separability_along, sized, target_of
 from lab.challenge.unlisted_score import (
     UnlistedScore,
     axes_of,

@@ -28,13 +28,13 @@ from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession
 from lab.capture_kinds.dark import DarkSequence
 from lab.cli import bench_process, capturing, diagnosis, entry, fitting
-from lab.cli.exit_codes import EXIT_INPUT
+from lab.cli.console import EXIT_INPUT
 from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
-from lab.diagnose.effect_list import EffectList, effect_list
+from lab.diagnose.visibility import EffectList, effect_list
 from lab.errors import DeviceError
 from lab.formats import recording_set as recording
-from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.recording_set import RecordingSet
 from lab.formats.result_file import result_json
 from lab.formats.results import (
     CameraFit,
@@ -66,32 +66,6 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def folder(small_set: Callable[..., RecordingSet], tmp_path: Path) -> Path:
     return recording.write(small_set(), tmp_path / "set")
-
-
-@pytest.fixture
-def flats(tmp_path: Path) -> Path:
-    """A MONO camera of 0.5 DN/e: darks and a series of flats, small and quick to fit."""
-    rng = np.random.default_rng(7)
-    frames, captures = {}, []
-    for number, (kind, photons) in enumerate(
-        [("dark", 0)] * 4 + [("flat", 800 * k) for k in range(1, 8) for _ in range(2)]
-    ):
-        electrons = rng.poisson(photons, (60, 80)) + rng.normal(0, 4, (60, 80))
-        frames[f"frames/{number}.npy"] = np.clip(100 + 0.5 * electrons, 0, 4095).round().astype(np.uint16)
-        light = {"photons_per_pixel": 2 * photons, "wavelength_nm": 530} if kind == "flat" else {}
-        captures.append(
-            {
-                "id": f"{kind}-{number}",
-                "kind": kind,
-                "side": "left",
-                "frame": f"frames/{number}.npy",
-                "exposure_s": 0.01,
-            }
-            | light
-        )
-    camera = {"rows": 60, "cols": 80, "cfa": "MONO", "bit_depth": 12, "black_level_dn": 100}
-    manifest = Manifest.model_validate({"name": "flats", "cameras": {"left": camera}, "captures": captures})
-    return recording.write(RecordingSet(manifest, frames), tmp_path / "flats")
 
 
 def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
@@ -755,7 +729,7 @@ def test_a_folder_of_results_is_checked_before_the_work(
 def test_a_frame_that_may_not_be_read_is_not_damaged(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("lab.formats.recording_set.frame_files.os.access", lambda *_: False)
+    monkeypatch.setattr("lab.formats.recording_set.files.os.access", lambda *_: False)
     assert cli.main(["fit", str(folder)]) == 2
     told = capsys.readouterr().err
     assert "can't be read (Permission denied)" in told and "damaged" not in told

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose import diagnose
 from lab.formats.recording_set import Manifest, RecordingSet
 from mocks.former import ConcealedCamera, Plan

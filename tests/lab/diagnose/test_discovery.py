@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lab.challenge.recordings import recording_set, recordings_of
+from lab.challenge.draw import recording_set, recordings_of
 from lab.diagnose import diagnose, discovery, examine
 from lab.diagnose.discovery import PredictiveTable, discover, law_of
 from lab.diagnose.discovery.profile import Profile, curve_forms, description_length, fitted, formulas

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lab import cli
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.effect_draft import draft, place_of_test
 from lab.formats.recording_set import write
 from lab.formats.results import DiscoveredLaw
@@ -34,7 +34,7 @@ import json
 import sys
 import sim.effects
 sim.effects.__path__.append(sys.argv[1])
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose import diagnose
 from mocks.former import ConcealedCamera, Law, Plan
 from sim.effects.library import effect

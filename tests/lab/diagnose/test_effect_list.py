@@ -1,14 +1,25 @@
-"""The described library: declarations and what is derived, and plain words for what a diagnosis never names."""
+"""The list of effects, and what shows each."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-import lab.diagnose.effect_list
-from lab.diagnose.effect_list import NOT_DERIVED, NOT_SOUGHT, UNSEEN, effect_description, effect_list
-from lab.diagnose.visibility import visibility
+import lab.diagnose.visibility
+from lab.diagnose.inference.rivals import parallel_pairs, symmetric
+from lab.diagnose.visibility import (
+    NOT_DERIVED,
+    NOT_SOUGHT,
+    UNSEEN,
+    as_toml,
+    derived_visibility,
+    effect_description,
+    effect_list,
+    visibility,
+)
 from lab.errors import InputError
-from sim.effects.library import effects
+from lab.formats.recording_set import Manifest
+from sim.effects.library import candidates, effects
 
 
 def test_each_effect_is_told_with_its_declarations_and_what_is_derived() -> None:
@@ -37,10 +48,56 @@ def test_every_choice_is_told_with_its_meaning() -> None:
 
 
 def test_an_effect_that_was_just_added_says_what_to_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lab.diagnose.effect_list, "visibility", dict)
+    monkeypatch.setattr(lab.diagnose.visibility, "visibility", dict)
     assert effect_description("coma").remark == NOT_DERIVED
 
 
 def test_an_unknown_effect_is_refused() -> None:
     with pytest.raises(InputError, match="no effect named 'glare'; there are: adc_nonlinearity"):
         effect_description("glare")
+
+
+# --- What shows an effect is derived; the kept table is current, and rivals are symmetric -----------------------------
+
+
+def test_the_table_holds_the_library() -> None:
+    """A new effect: `python docs/write_tables.py`."""
+    assert list(visibility()) == list(effects())
+    kinds = {kind for one in visibility().values() for kind in one.capture_kinds}
+    schema = Manifest.model_json_schema()
+    assert all(f'"{kind}"' in str(schema).replace("'", '"') for kind in kinds)
+
+
+def test_rivals_are_symmetric_candidates() -> None:
+    known = {kind.name for kind in candidates()}
+    for name, one in visibility().items():
+        assert set(one.rivals) <= known - {name}
+        for rival in one.rivals:
+            assert name in visibility()[rival].rivals
+
+
+def test_what_shows_an_effect_is_what_its_physics_says() -> None:
+    """Blooming keeps within saturated frames, which no measurement reads. Blurs show on edges and screens, charge in
+    darks."""
+    assert [name for name, one in visibility().items() if not one.measurements] == ["blooming"]
+    assert set(visibility()["defocus"].capture_kinds) == {"slanted_edge", "bernoulli"}
+    assert visibility()["dark_current_temperature"].capture_kinds == ("dark",)
+    assert visibility()["stereo_time_offset"].measurements == ("stereo_time",)
+    assert "defocus" in visibility()["optical_low_pass_filter"].rivals
+    assert "defocus" not in visibility()["row_noise"].rivals
+
+
+def test_parallel_signatures_are_rivals_and_opposite_ones_arent() -> None:
+    """Cosines of 0.8, -0.8 and 0.6; a column below the least norm is not compared."""
+    a, b, c = np.array([1.0, 0.0]), np.array([0.8, 0.6]), np.array([-0.8, 0.6])
+    signatures = {"a": a[:, None], "b": 5.0 * b[:, None], "c": c[:, None], "faint": 0.1 * a[:, None]}
+    assert parallel_pairs(signatures, 0.75) == {("a", "b")}
+    both = np.column_stack([c, -c])  # an effect of either sign
+    assert ("a", "c") in parallel_pairs(signatures | {"c": both}, 0.75)
+    assert symmetric("abc", {("a", "b")}) == {"a": {"b"}, "b": {"a"}, "c": frozenset()}
+
+
+@pytest.mark.slow
+def test_the_kept_table_is_current() -> None:
+    """About a minute: the reference session is drawn and summarised."""
+    assert as_toml(derived_visibility()) == as_toml(visibility())

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from scipy import stats
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose import diagnose, examine
 from lab.formats.importers import read_foreign
 from lab.formats.recording_set import inspect

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lab.diagnose.measurements.dark_frames import dark_frames
-from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
+from lab.diagnose.metadata.frames import misstated_dark_exposure
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.measure.mishaps import exchanged_frames

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.outlying import freed, outlying_levels

@@ -8,8 +8,7 @@ import pytest
 from lab.diagnose import diagnose
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.measurements.blocks import measurement_model
-from lab.diagnose.measurements.flat_light import misstated_levels
-from lab.diagnose.measurements.linearity import linearity_block
+from lab.diagnose.measurements.linearity import linearity_block, misstated_levels
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.fit.noise.noise_fit import fit_noise

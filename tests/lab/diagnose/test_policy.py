@@ -12,7 +12,7 @@ from scipy.special import logit
 from scipy.stats import chi2, norm
 
 from lab.diagnose import DecisionPolicy, diagnose, examine
-from lab.diagnose.outcome.detectability import detectable
+from lab.diagnose.outcome.goodness_of_fit import detectable
 from tests.lab.diagnose.on_blocks import former
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -30,11 +30,14 @@ def test_the_page_is_current() -> None:
     assert (DOCS / "reference" / "decision-policy.md").read_text(encoding="utf-8") == page
 
 
-def test_it_is_frozen_and_knows_its_fields() -> None:
+def test_it_is_frozen_and_knows_its_fields_and_bounds() -> None:
     with pytest.raises(ValidationError):
         DecisionPolicy().most_effects = 3  # type: ignore[misc]
     with pytest.raises(ValidationError):
         DecisionPolicy(most_efects=3)  # type: ignore[call-arg]
+    for outside in (-0.1, 1.1):
+        with pytest.raises(ValidationError):
+            DecisionPolicy(false_alarm_rate=outside)
 
 
 def test_stated_probabilities_follow_from_their_formulas() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.measurements.blocks import measurement_model

@@ -12,9 +12,7 @@ from hypothesis import strategies as st
 
 from lab import cli
 from lab.errors import InputError
-from lab.formats import recording_set as recording
 from lab.formats.camera_file import CameraFile, default_camera, lens_cache, read_camera, said_of, write_camera
-from lab.formats.recording_set import Manifest, RecordingSet
 from sim.camera import CameraModel, Geometry, Lens
 from sim.effects.library import effect
 from sim.optics.imaging import MeasuredOtf, MeasuredPsf, TracedLens, ZernikePupil
@@ -226,29 +224,9 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         read_camera(tmp_path / "none.toml")
 
 
-def test_a_fitted_camera_is_a_camera_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fitted_camera_is_a_camera_file(flats: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """MONO flats of 0.5 DN/e: the file has the fitted gain and its uncertainty, and the assumed values are reported."""
-    rng = np.random.default_rng(7)
-    frames, captures = {}, []
-    levels = [("dark", 0)] * 4 + [("flat", 800 * k) for k in range(1, 8) for _ in range(2)]
-    for number, (kind, photons) in enumerate(levels):
-        electrons = rng.poisson(photons, (60, 80)) + rng.normal(0, 4, (60, 80))
-        frames[f"frames/{number}.npy"] = np.clip(100 + 0.5 * electrons, 0, 4095).round().astype(np.uint16)
-        light = {"photons_per_pixel": 2 * photons, "wavelength_nm": 530} if kind == "flat" else {}
-        captures.append(
-            {
-                "id": f"{kind}-{number}",
-                "kind": kind,
-                "side": "left",
-                "frame": f"frames/{number}.npy",
-                "exposure_s": 0.01,
-            }
-            | light
-        )
-    maker = {"rows": 60, "cols": 80, "cfa": "MONO", "bit_depth": 12, "black_level_dn": 100}
-    manifest = Manifest.model_validate({"name": "flats", "cameras": {"left": maker}, "captures": captures})
-    folder = recording.write(RecordingSet(manifest, frames), tmp_path / "flats")
-    assert cli.main(["fit", str(folder), "--write-cameras", str(tmp_path / "cameras")]) == 0
+    assert cli.main(["fit", str(flats), "--write-cameras", str(tmp_path / "cameras")]) == 0
     said = capsys.readouterr().err
     assert "left.toml (neither fitted nor stated: f_number taken as 8; " in said
     content = read_camera(tmp_path / "cameras" / "left.toml")

@@ -25,10 +25,9 @@ from lab.errors import InputError
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.formats.cgats import CgatsSpectra, Quantity, parse_cgats, read_cgats, write_cgats
 from lab.formats.colour_profile import colour_matrices, energy_sensitivities, write_dcp, write_icc, write_rawtoaces
-from lab.formats.exr_scene import exr_lights
 from lab.formats.lensfun import read_lensfun, with_lens, write_lensfun
 from lab.formats.pyxel_file import VOLT_PER_DN, write_pyxel
-from lab.formats.scene_file import light, read_cube, read_light, scene
+from lab.formats.scene_file import exr_lights, light, read_cube, read_light, scene
 from sim.camera import Geometry
 from sim.effects.lateral_chromatic_aberration import LateralChromaticAberration
 from sim.effects.vignetting import Vignetting

@@ -7,14 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lab.errors import InputError
-from lab.formats.foreign_text import (
-    in_its_unit,
-    nearest_name,
-    plain_csv,
-    read_foreign_csv,
-    read_foreign_text,
-    remarks_on,
-)
+from lab.formats.cgats import in_its_unit, nearest_name, plain_csv, read_foreign_csv, read_foreign_text, remarks_on
 from lab.formats.spectrum_csv import parse_spectrum
 
 COLUMNS = ("frame", "kind", "exposure_s", "temperature_c", "wavelength_nm", "screen.pose")

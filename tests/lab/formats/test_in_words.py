@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lab.formats.results.in_words import measured, plain_number, shown_unit
+from lab.formats.results.words import measured, plain_number, shown_unit
 
 
 @pytest.mark.parametrize(

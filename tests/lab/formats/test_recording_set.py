@@ -317,7 +317,7 @@ def test_a_failure_while_writing_leaves_nothing(
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("lab.formats.recording_set.writing.manifest_json", full)
+    monkeypatch.setattr("lab.formats.recording_set.folder.manifest_json", full)
     with pytest.raises(InputError, match="No space left"):
         write(small_set(), tmp_path / "out")
     assert list(tmp_path.iterdir()) == []

@@ -8,7 +8,7 @@ import pytest
 
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet

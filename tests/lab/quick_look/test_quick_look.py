@@ -12,8 +12,7 @@ from lab.capture.records import CaptureInfo
 from lab.capture.store import Store
 from lab.errors import InputError
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
-from lab.quick_look.curves import GrowingCurves
-from lab.quick_look.frame_figures import BINS, frame_figures
+from lab.quick_look.curves import BINS, GrowingCurves, frame_figures
 from lab.quick_look.process import QuickLook
 from sim.spectrum import Spectrum
 

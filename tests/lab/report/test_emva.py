@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from lab.fit.noise.noise_fit import fit_noise
-from lab.formats.provenance import provenance_of
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
+from lab.formats.result_file import provenance_of
 from lab.formats.results import CameraFit, FitResult
 from lab.report import render_report
 from lab.report.emva import data_sheets, spectrogram

@@ -33,10 +33,10 @@ from lab.formats.results import (
     Unexplained,
     ValidationResult,
 )
-from lab.predict.both_models import BothModels, SensitivityCurve
+from lab.predict.validate import BothModels, SensitivityCurve
 from lab.report import charts, provenance_of, render_report, write_report
 from lab.report.answers import odds
-from lab.report.chart_data import figure_json, plotly_base64
+from lab.report.charts import figure_json, plotly_base64
 from lab.report.diagnosis import context
 from lab.report.figures import KeyFigure, by_side, rotation_vector_mrad
 from lab.report.pictures import (

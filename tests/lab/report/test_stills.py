@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import cv2
+import numpy as np
 import pytest
 
-from lab.report import charts
+from lab.cli import main
+from lab.errors import InputError
+from lab.fit.noise.pixel_maps import PixelMaps
+from lab.formats.recording_set import Manifest, RecordingSet, write
+from lab.report import charts, provenance_of, render_report
 from lab.report.answers import proofs
+from lab.report.pictures import map_picture, write_maps
 from lab.report.stills import LEFT, RIGHT, WIDTH, still
+from tests.peers import missing
 
 
 def numbers(path: str) -> list[float]:
@@ -84,3 +95,153 @@ def test_values_without_a_range_are_drawn_all_the_same(stated: list[float] | Non
     figure = simple(mode="markers", y=values, marker={"color": "@fg", "size": 4}, error_y={"array": [float("nan")] * 4})
     figure["layout"]["yaxis"] = charts.axis("y") | ({"range": stated} if stated is not None else {})
     assert "nan" not in (text := still(figure, 0)) and "inf" not in text
+
+
+# --- Maps of single pixels as files: they hold the fitted values, and undetermined ones are left out ------------------
+
+
+SHAPE = (24, 40)
+
+
+def maps(**changes: object) -> PixelMaps:
+    row, col = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    bad = np.zeros(SHAPE, bool)
+    bad[10, 20] = True
+    known = {
+        "offset_dn": 64.0 + row,
+        "offset_dn_std": np.full(SHAPE, 0.5),
+        "dark_dn_per_s": None,
+        "dark_dn_per_s_std": None,
+        "gain": 1.0 + 0.001 * col,
+        "gain_std": np.full(SHAPE, 0.002),
+        "defective": bad,
+    }
+    return PixelMaps(**(known | changes))  # type: ignore[arg-type]
+
+
+def test_what_is_written_is_what_was_found(tmp_path: Path) -> None:
+    found = maps()
+    names = write_maps(tmp_path / "new" / "left", found)
+    assert set(names) == {path.name for path in (tmp_path / "new" / "left").iterdir()}
+    assert not any("dark" in name for name in names)
+    for name in ("offset_dn", "offset_dn_std", "gain", "gain_std"):
+        stored = np.load(tmp_path / "new" / "left" / f"{name}.npy")
+        assert stored.dtype == np.float32
+        assert np.allclose(stored, getattr(found, name), rtol=1e-6)
+    assert np.array_equal(np.load(tmp_path / "new" / "left" / "defective.npy"), found.defective)
+    said = json.loads((tmp_path / "new" / "left" / "maps.json").read_text())
+    assert said["defective"]["pixels"] == 1 and said["offset_dn"]["unit"] == "DN"
+    dots = cv2.imread(str(tmp_path / "new" / "left" / "defective.png"), cv2.IMREAD_GRAYSCALE)
+    assert dots is not None and dots.shape == SHAPE and np.count_nonzero(dots) == 9
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="can't be written"):
+        write_maps(tmp_path / "file", found)
+
+
+def test_pictures_go_from_dark_to_bright_over_98_percent_of_the_pixels() -> None:
+    values = np.arange(1000.0).reshape(20, 50)
+    picture, low, high = map_picture(values)
+    assert (low, high) == pytest.approx((9.99, 989.01))
+    luminance = picture.astype(int).sum(axis=2)
+    assert picture.shape == (20, 50, 3) and luminance[0, 0] < luminance[-1, -1]
+    assert map_picture(values, 25)[0].shape == (10, 25, 3)
+
+
+def test_the_command_writes_them_and_says_where_there_are_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(1)
+    captures, frames = [], {}
+    for side, kinds in (("left", {0.01: "dark", 1.0: "dark"}), ("right", {0.02: "flat", 0.05: "flat"})):
+        for exposure_s, kind in kinds.items():
+            for _ in range(2):
+                name = f"frames/{len(captures)}.npy"
+                captures.append(
+                    {"id": str(len(captures)), "kind": kind, "side": side, "frame": name, "exposure_s": exposure_s}
+                )
+                frames[name] = np.rint(100.0 + 20.0 * exposure_s + 3.0 * rng.standard_normal(SHAPE)).astype(np.uint16)
+    camera = {"rows": SHAPE[0], "cols": SHAPE[1], "cfa": "MONO", "bit_depth": 12}
+    manifest = Manifest.model_validate({"cameras": {"left": camera, "right": camera}, "captures": captures})
+    folder = write(RecordingSet(manifest, frames), tmp_path / "set")
+    assert main(["fit", str(folder), "--json", "-", "--maps", str(tmp_path / "maps")]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["format"] == "calibench-fit"
+    assert "offset_dn.npy" in said.err and "maps (right): none: no darks" in " ".join(said.err.split())
+    rate = np.load(tmp_path / "maps" / "left" / "dark_dn_per_s.npy")
+    # 3 DN of noise, two frames at either end of 1 s: 3 DN/s a pixel, 0.1 over all; three of these.
+    assert rate.mean() == pytest.approx(20.0, abs=3 * 3.0 / np.sqrt(rate.size))
+    assert not (tmp_path / "maps" / "right").exists()
+
+
+# --- The report on paper, in a real browser ---------------------------------------------------------------------------
+
+
+WIDTHS = """() => [...document.querySelectorAll(".chart")].filter(box => box.querySelector(".main-svg"))
+    .map(box => [box.clientWidth, box.querySelector(".main-svg").clientWidth])"""
+
+
+def test_charts_are_drawn_anew_for_paper(
+    small_set: Callable[..., RecordingSet], made_up: Callable[..., Any], tmp_path: Path
+) -> None:
+    program = shutil.which("chromium") or missing("no Chromium; `make chromium` installs it")
+    from playwright.sync_api import sync_playwright
+
+    recordings = small_set()
+    file = tmp_path / "report.html"
+    file.write_text(render_report(recordings, *made_up(), provenance_of(recordings)))
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
+        # As a print sees it that is made before the script has drawn: the first screen's two charts are there.
+        page = browser.new_page(java_script_enabled=False)
+        page.goto(file.as_uri())
+        stills = [still.bounding_box() for still in page.locator("svg.still").all()]
+        page.close()
+        page = browser.new_page(viewport={"width": 420, "height": 900})
+        page.goto(file.as_uri())
+        page.locator(".chart").first.scroll_into_view_if_needed()
+        page.wait_for_selector(".chart .main-svg")
+        screen = page.evaluate(WIDTHS)
+        page.evaluate("dispatchEvent(new Event('beforeprint'))")
+        paper = page.evaluate(WIDTHS)
+        page.evaluate("dispatchEvent(new Event('afterprint'))")
+        again = page.evaluate(WIDTHS)
+        left = page.evaluate("() => document.querySelectorAll('.chart:has(.main-svg) .still').length")
+        browser.close()
+    assert len(stills) == 2 and all(box is not None and box["width"] > 400 and box["height"] > 200 for box in stills)
+    assert left == 0  # each gave its place to the chart proper
+    assert all(drawn <= box < 420 for box, drawn in screen + again)
+    assert all(drawn <= box and box > 420 for box, drawn in paper)  # paper has the desk's columns
+
+
+def test_axe_finds_nothing_and_a_phone_needs_no_scroll_sideways(
+    small_set: Callable[..., RecordingSet], made_up: Callable[..., Any], tmp_path: Path
+) -> None:
+    program = shutil.which("chromium") or missing("no Chromium; `make chromium` installs it")
+    from axe_playwright_python.sync_playwright import Axe
+    from playwright.sync_api import sync_playwright
+
+    recordings = small_set()
+    file = tmp_path / "report.html"
+    file.write_text(render_report(recordings, *made_up(), provenance_of(recordings)))
+    found: list[Any] = []
+    sideways: list[int] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
+        for scheme in ("light", "dark"):
+            for width in (420, 1440):
+                page = browser.new_page(color_scheme=scheme, viewport={"width": width, "height": 900})
+                page.goto(file.as_uri())
+                page.evaluate("document.querySelectorAll('details').forEach(one => { one.open = true; })")
+                page.wait_for_function(
+                    "[...document.querySelectorAll('.chart')].some(one => one.querySelector('.main-svg'))"
+                )
+                found += [
+                    (scheme, width, one["id"], len(one["nodes"])) for one in Axe().run(page).response["violations"]
+                ]
+                sideways.append(
+                    page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+                )
+                page.close()
+        browser.close()
+    assert found == []
+    assert sideways == [0] * 4

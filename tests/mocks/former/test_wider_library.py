@@ -8,7 +8,7 @@ from functools import cache
 
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose import diagnose
 from lab.formats.results import DiagnosisResult
 from mocks.former import ConcealedCamera, Law, Plan

@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from sim.camera import CameraModel
+from sim.sensor import mosaic
 from sim.sensor.electrons import (
     FixedPattern,
     ReadOut,
@@ -17,6 +18,7 @@ from sim.sensor.electrons import (
     gain_dn_per_e,
     sample_from,
 )
+from sim.sensor.shot import FROM_NORMAL, draw_poisson
 
 
 @pytest.mark.parametrize(("lower", "upper"), [(-np.inf, 1.0), (0.0, np.inf), (-0.5, 0.7), (3.0, 4.0)])
@@ -134,3 +136,75 @@ def test_impossible_electrons_are_named(colour_camera: CameraModel, bad: float) 
             ValueError, match=r"mean electrons of a pixel are .* e, below the limit of 0 e or not finite: check"
         ):
             call()
+
+
+# --- Shot noise is Poisson, at every mean -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.3, 1.0, 2.7, FROM_NORMAL - 0.01, FROM_NORMAL, 10.3, 17.7, 64.2, 300.0, 9000.0])
+def test_counts_are_poisson(mean: float) -> None:
+    """A chi-squared test of all counts that are wanted 20 times and more, at 4.5 standard deviations; 2e6 draws."""
+    n, mean = 2_000_000, float(np.float32(mean))
+    drawn = draw_poisson(np.full(n, mean, np.float32), np.random.default_rng(3)).astype(int)
+    counts = np.bincount(drawn)
+    wanted = stats.poisson(mean).pmf(np.arange(counts.size)) * n
+    often = wanted > 20
+    chi2 = float(np.sum((counts[often] - wanted[often]) ** 2 / wanted[often]))
+    assert chi2 <= often.sum() + 4.5 * np.sqrt(2.0 * often.sum())
+    if mean > 0:
+        assert drawn.mean() == pytest.approx(mean, abs=4.5 * np.sqrt(mean / n))
+
+
+def test_means_may_differ_from_pixel_to_pixel() -> None:
+    mean = np.linspace(0.0, 40.0, 400_000, dtype=np.float32).reshape(400, 1000)
+    drawn = draw_poisson(mean, np.random.default_rng(4))
+    assert drawn.shape == mean.shape and drawn.dtype == np.float32
+    assert np.all(drawn == np.floor(drawn))
+    # Each row of 1000 draws by its own mean: chi-squared with 400 degrees of freedom (the first row's mean is near 0).
+    pull = (drawn.mean(axis=1) - mean.mean(axis=1)) / np.sqrt(mean.mean(axis=1) / 1000)
+    assert np.sum(pull**2) == pytest.approx(400, abs=4.5 * np.sqrt(800))
+
+
+def test_the_means_are_left_as_they_are() -> None:
+    mean = np.full((3, 4), 20.0, np.float32)
+    mean.flags.writeable = False
+    assert draw_poisson(mean, np.random.default_rng(5)).shape == (3, 4)
+    assert draw_poisson(np.empty((0, 4), np.float32), np.random.default_rng(5)).shape == (0, 4)
+
+
+# --- Colour filter mosaics: phases, planes, channels ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_phases_spell_the_mosaic(cfa: str) -> None:
+    places = {place: channel for channel, where in mosaic.phases(cfa).items() for place in where}
+    assert "".join(places[i, j] for i in (0, 1) for j in (0, 1)) == cfa
+    red_row = mosaic.phases(cfa)["R"][0][0]
+    assert [row == red_row for row, _ in mosaic.phases(cfa)["G"]] == [True, False]
+
+
+def test_planes_are_views_and_assemble_puts_them_back() -> None:
+    frame = np.arange(6 * 8).reshape(6, 8)
+    planes = mosaic.planes(frame, "GBRG")
+    assert list(planes) == ["R", "G1", "G2", "B"]
+    assert planes["G2"][0, 0] == 0 and planes["B"][0, 0] == 1 and planes["R"][0, 0] == 8 and planes["G1"][0, 0] == 9
+    assert all(np.shares_memory(plane, frame) for plane in planes.values())
+    images = {"R": frame, "G": frame + 100, "B": frame + 200}
+    together = mosaic.planes(mosaic.assemble(images, "GBRG"), "GBRG")
+    for name, plane in planes.items():
+        np.testing.assert_array_equal(together[name], plane + {"R": 0, "G": 100, "B": 200}[name[0]])
+
+
+def test_mono_has_one_plane() -> None:
+    frame = np.arange(6).reshape(2, 3)
+    assert mosaic.phases("MONO") == {"Y": [(0, 0)]}
+    np.testing.assert_array_equal(mosaic.planes(frame, "MONO")["Y"], frame)
+    np.testing.assert_array_equal(mosaic.assemble({"Y": frame}, "MONO"), frame)
+
+
+def test_missing_or_unequal_channels_are_named() -> None:
+    frame = np.zeros((2, 2))
+    with pytest.raises(ValueError, match="no image came for B"):
+        mosaic.assemble({"R": frame, "G": frame}, "RGGB")
+    with pytest.raises(ValueError, match="differ in shape"):
+        mosaic.assemble({"R": frame, "G": frame, "B": np.zeros((4, 4))}, "RGGB")

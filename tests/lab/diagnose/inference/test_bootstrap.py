@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose import examine
 from lab.diagnose.inference.bootstrap import HealthyDraw, image_threshold
 from lab.diagnose.side import diagnose_side

@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.chart import chart_block
 from lab.diagnose.measurements.code_density import code_block, widths
 from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.measurements.noise import variance_block
+from lab.diagnose.measurements.spectral import chart_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.measure.study import Study

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from lab.diagnose.inference.refit import refit
-from lab.diagnose.measurements.curves import BEYOND_STD, LEAK_STD, CurveJacobian, _last_place
-from lab.diagnose.measurements.narrowband import narrowband_block
+from lab.diagnose.measurements.spectral import BEYOND_STD, LEAK_STD, CurveJacobian, _last_place, narrowband_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from mocks.former import Law

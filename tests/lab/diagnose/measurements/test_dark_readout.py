@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.dark_readout import DarkReadOut
-from lab.diagnose.measurements.flat_lines import line_block
+from lab.diagnose.measurements.flat_field import line_block
 from lab.diagnose.measurements.flat_rows import flicker_block
-from lab.diagnose.measurements.level_repeats import level_repeats_block
+from lab.diagnose.measurements.linearity import level_repeats_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import Manifest, RecordingSet

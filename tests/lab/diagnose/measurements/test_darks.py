@@ -11,16 +11,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements import dark_noise, defective_pixels
-from lab.diagnose.measurements.block import Block
+from lab.diagnose.measurements.block import Block, measurements
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import TAIL_EDGES, DarkCondition
 from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.dark_readout import fixed_line_block
-from lab.diagnose.measurements.library import measurements
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.slanted_edge import (
     ASIDE,

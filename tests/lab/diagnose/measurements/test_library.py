@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lab.diagnose.measurements import dark_level
-from lab.diagnose.measurements.library import measurement_title, measurements
+from lab.diagnose.measurements.block import measurement_title, measurements
 from tests.lab.diagnose.on_blocks import declared
 
 

@@ -8,16 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements import green_balance
 from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.even_flats import flats
-from lab.diagnose.measurements.flat_lines import line_block
+from lab.diagnose.measurements.flat_field import flats, line_block
 from lab.diagnose.measurements.green_balance import green_block
-from lab.diagnose.measurements.narrowband import narrowband_block
+from lab.diagnose.measurements.spectral import narrowband_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model

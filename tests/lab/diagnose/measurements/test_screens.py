@@ -10,23 +10,23 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
-from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.board_colour import colour_block
-from lab.diagnose.measurements.cell_borders import cell_border_block
-from lab.diagnose.measurements.dark_squares import screen_block
-from lab.diagnose.measurements.ghost import ghost_block
-from lab.diagnose.measurements.library import measurements
-from lab.diagnose.measurements.pattern_fit import contrast_block, patterns
-from lab.diagnose.measurements.screen_grid import grid_block
+from lab.diagnose.measurements.block import Block, measurements
+from lab.diagnose.measurements.boards import colour_block
+from lab.diagnose.measurements.pattern_fit import cell_border_block, contrast_block, ghost_block, patterns
+from lab.diagnose.measurements.screens import grid_block, screen_block
+from lab.diagnose.measurements.slanted_edge import edge_block
+from lab.diagnose.measurements.spectral import chart_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
+from lab.measure.patches import Surroundings, harmonics
 from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
@@ -35,6 +35,8 @@ from sim.effects.defocus import Defocus
 from sim.effects.ghost import Ghost
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.effects.screen_gamma import ScreenGamma
+from sim.point import halos
+from tests.lab.diagnose.on_blocks import former, names, verdict
 
 OF_SCREENS = [one for one in measurements() if 400 < one.order < 500]
 PLAN = Plan(kinds=("dark", "flat", "screen"))
@@ -252,3 +254,30 @@ def test_a_displaced_colour_before_an_aligned_screen_keeps_its_contrast() -> Non
         for one in group:
             left = np.abs(one.value[: len(one.bands)] - 1.0)
             assert np.all(left[[band.frequency < 0.3 for band in one.bands]] < 0.03), one.channel
+
+
+# --- Veiling glare: uniform over the frame, or a halo about its source ------------------------------------------------
+
+
+@pytest.mark.parametrize("std_px", [6.0, 20.0, 60.0])
+def test_surroundings_are_what_a_filter_leaves(std_px: float) -> None:
+    rng = np.random.default_rng(3)
+    picture = ndimage.uniform_filter(rng.random((60, 90)), 7)
+    where = np.zeros(picture.shape, bool)
+    where[20:26, 50:58] = True
+    expected = ndimage.gaussian_filter(picture, std_px, mode="reflect", truncate=6.0)[where].mean()
+    low = harmonics(picture)
+    assert Surroundings.of(low, where).mean(std_px) == pytest.approx(expected, abs=1e-6)
+    box = Surroundings.of_box(low, picture.shape, slice(20, 26), slice(50, 58))
+    assert box.mean(std_px) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("variant", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_glare_has_its_name_whatever_its_reach(variant: int) -> None:
+    """Evenly spread; half of it within a halo of a quarter of the frame; fading from the middle."""
+    law = concealed.VeilingGlareLaw(2.0, variant, 9)
+    recordings = former(104, law, cfa="RGGB", kinds=("dark", "flat", "chart", "slanted_edge", "screen"))
+    found = verdict(recordings, edge_block, chart_block, screen_block)
+    assert names(found) == ["veiling_glare"]
+    # of what a lens spreads a halo's share is told apart only where there is one
+    assert bool(halos(found.model.camera, (found.named[0].effect,))) == (variant == 1)

@@ -15,9 +15,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from lab.challenge.recordings import recordings_of
-from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.library import measurements
+from lab.challenge.draw import recordings_of
+from lab.diagnose.measurements.block import Block, measurements
 from lab.diagnose.measurements.line_spectra import Bands, log_mean_bias, log_mean_variance, periodogram
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
@@ -37,7 +36,7 @@ SPECTRAL = (*EVEN, "narrowband")
 EDGES = (*EVEN, "slanted_edge")
 SMALL_SCENES = (*EDGES, "screen")
 SCENES = (*SPECTRAL, "chart", "slanted_edge", "charuco", "screen")
-#: Measurements of two cameras: this contract draws one (test_board.py has pairs).
+#: Measurements of two cameras: this contract draws one (test_boards.py has pairs).
 OF_PAIRS = {"stereo_gain", "stereo_time"}
 
 

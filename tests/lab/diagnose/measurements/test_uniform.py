@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import recordings_of
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import cell_means
 from lab.diagnose.measurements.dark_level import added_dark_dn, dark_current_map
 from lab.diagnose.measurements.linearity import RADIOMETER_STD, linearity_block
-from lab.diagnose.measurements.narrowband import (
+from lab.diagnose.measurements.spectral import (
     MOST_SAMPLE_STD,
     READING_SAMPLE_STD,
     READING_STD,

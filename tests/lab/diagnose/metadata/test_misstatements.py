@@ -3,17 +3,25 @@ reported."""
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from lab.challenge.draw import DrawnFrame
-from lab.challenge.recordings import recordings_of
+from lab.challenge.draw import DrawnFrame, recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.metadata import misstatements, unchecked
-from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
-from lab.formats.recording_set import InstrumentSnapshot, RecordingSet
+from lab.diagnose.metadata.frames import misstated_dark_exposure, misstated_exposure_unit
+from lab.diagnose.metadata.lights import misstated_mosaic
+from lab.diagnose.metadata.targets import misstated_board
+from lab.diagnose.policy import DecisionPolicy
+from lab.fit.noise.noise_fit import fit_noise
+from lab.formats.importers import read_checkerboard_pairs
+from lab.formats.importers.emva1288 import read_emva1288
+from lab.formats.recording_set import InstrumentSnapshot, Manifest, RecordingSet, inspect
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     AdcNonlinearityLaw,
@@ -26,6 +34,9 @@ from mocks.former.laws import (
     StrayLightLaw,
 )
 from tests.lab.diagnose.metadata.lies import restated, told, with_cells, with_dark_exposures, with_exchanged_wavelengths
+from tests.lab.diagnose.on_blocks import former
+from tests.lab.fit.noise.synthetic_sensor import Sensor, recording_set
+from tests.lab.measure.test_exchanged_frames import swapped
 
 MOSAICS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
@@ -81,6 +92,8 @@ def test_a_black_level_that_is_not_that_of_the_darks_is_told(off_dn: float) -> N
     assert corrected.camera("left").black_level_dn == pytest.approx(true_dn, abs=0.1)
     assert f"black_level_dn = {true_dn + off_dn:g} is stated" in found.check
     assert told(restated(recordings, black_level_dn=true_dn + 3.0)) == []  # a data sheet's rounding
+    strict = DecisionPolicy(black_level_tolerance=2.0 / 4096.0)
+    assert len(misstatements(restated(recordings, black_level_dn=true_dn + 3.0), "left", strict)[1]) == 1
 
 
 @pytest.mark.parametrize(("exposure_s", "factor"), [(2.0, 0.8), (2.0, 1.25), (0.5, 0.8), (0.5, 1.25)])
@@ -192,3 +205,182 @@ def test_a_diagnosis_goes_on_with_the_corrected_metadata() -> None:
     assert "exchange the two lights" in one.check
     assert one.check in found.summary
     assert found.next_capture == "Correct what is stated of the captures above, or take them again."
+
+
+# --- Boards whose squares or markers are stated wrongly: told with the numbers that their pictures fit ----------------
+
+
+PAIRS = Path(__file__).parents[4].parent / "shared" / "data" / "opencv_stereo"
+
+
+@cache
+def _boards() -> RecordingSet:
+    """6 x 8 squares of 9 mm, markers of 6 mm, in ten poses; of 13 px a marker."""
+    return recordings_of(ConcealedCamera(41, (), cfa="RGGB", rows=192, cols=256), Plan(kinds=("charuco",)))
+
+
+def _stated(recordings: RecordingSet, **values: Any) -> RecordingSet:
+    captures = tuple(one.model_copy(update=values) for one in recordings.manifest.captures)
+    return recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
+
+
+def test_a_board_that_is_as_stated_is_no_finding() -> None:
+    assert misstated_board(_boards(), "left") is None
+
+
+@pytest.mark.parametrize("squares", [(6, 9), (8, 6), (7, 8), (5, 8), (8, 8), (5, 7)])
+def test_another_number_of_squares_is_told(squares: tuple[int, int]) -> None:
+    found = misstated_board(_stated(_boards(), squares=squares), "left")
+    assert found is not None
+    assert f"6 x 8 squares and not {squares[0]} x {squares[1]}: correct squares to [6, 8]" in found.check
+    assert len(found.captures) == 10
+    assert found.corrected.manifest == _boards().manifest
+
+
+def test_markers_of_another_size_are_told() -> None:
+    """6 mm of 9; a detector finds them up to 7 % too small."""
+    found = misstated_board(_stated(_boards(), marker_mm=4.5), "left")
+    assert found is not None
+    assert "and not 50 %" in found.check
+    (size,) = {one.marker_mm for one in found.corrected.manifest.captures}
+    assert size == pytest.approx(6.0, rel=0.08)
+
+
+def test_the_length_of_a_square_cannot_be_told() -> None:
+    assert misstated_board(_stated(_boards(), square_mm=18.0, marker_mm=12.0), "left") is None
+
+
+@pytest.mark.skipif(not PAIRS.is_dir(), reason="the public stereo pairs aren't here")
+@pytest.mark.parametrize("corners", [(6, 8), (5, 9)])
+def test_public_plain_boards_have_the_squares_that_are_counted(corners: tuple[int, int]) -> None:
+    assert misstated_board(read_checkerboard_pairs(PAIRS, (6, 9), 25.0), "left") is None
+    found = misstated_board(read_checkerboard_pairs(PAIRS, corners, 25.0), "left")
+    assert found is not None
+    assert "7 x 10 squares and not" in found.check
+
+
+# --- Frames that are exchanged in an index are told as metadata, and no physics is made of them -----------------------
+
+
+@cache
+def _recorded_pairs() -> RecordingSet:
+    return former(12, kinds=("dark", "flat"))
+
+
+def test_exchanged_frames_of_two_levels_are_told_and_nothing_else() -> None:
+    """A converter whose codes are unequal explains such means, too."""
+    recordings = _recorded_pairs()
+    flats = recordings.captures("flat")
+    one, other = (next(c.id for c in flats if c.exposure_s == t) for t in sorted({c.exposure_s for c in flats})[2:6:3])
+    wrong = swapped(recordings, [one], [other])
+    corrected, (found,) = misstatements(wrong, "left")
+    assert set(found.captures) == {one, other}
+    assert corrected.manifest == recordings.manifest
+    result = diagnose(wrong)
+    assert (result.verdict, result.effects, result.mismatches) == ("unexplained", (), ())
+    (item,) = result.unexplained
+    assert one in item.check
+    assert other in item.check
+    assert "exchange these frames" in item.check
+
+
+def test_a_dark_and_a_flat_exchanged_are_told() -> None:
+    recordings = _recorded_pairs()
+    one, other = recordings.captures("dark")[1].id, recordings.captures("flat")[9].id
+    (line,) = told(swapped(recordings, [one], [other]))
+    assert one in line
+    assert other in line
+
+
+def test_darks_and_flats_stated_for_each_other_are_told() -> None:
+    recordings = _recorded_pairs()
+    content = recordings.manifest.model_dump(mode="json")
+    for capture in content["captures"]:
+        capture["kind"] = {"dark": "flat", "flat": "dark"}.get(capture["kind"], capture["kind"])
+    corrected, (found,) = misstatements(recordings.under(Manifest.model_validate(content)), "left")
+    assert "darks and flats are stated for each other" in found.check
+    assert not corrected.captures()
+
+
+# --- Exposures in other units than seconds, and a mono sensor that is stated with a mosaic, are told in one line ------
+
+
+CMOS = Path(__file__).resolve().parents[5] / "shared" / "data" / "emva1288_cmos_crop"
+DARKS, LADDER = [(0.001, 2), (2.0, 2)], [(0.1, 2), (0.3, 2), (0.5, 2), (0.7, 2), (0.9, 2)]
+
+
+def _changed(recordings: RecordingSet, **of: Any) -> RecordingSet:
+    """The recordings with keys of each capture from functions of its number and itself."""
+    captures = tuple(
+        c.model_copy(update={key: value(k, c) for key, value in of.items()})
+        for k, c in enumerate(recordings.manifest.captures)
+    )
+    return recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
+
+
+def test_microseconds_given_as_seconds_are_told() -> None:
+    """2 s are 2e6 us, which no plan allows; the corrected exposures are those that were meant."""
+    recordings = recording_set(Sensor(shape=(32, 48), cfa="MONO"), DARKS, LADDER)
+    assert misstated_exposure_unit(recordings, "left") is None
+    wrong = _changed(recordings, exposure_s=lambda _, c: 1e6 * c.exposure_s)
+    found = misstated_exposure_unit(wrong, "left")
+    assert found is not None
+    assert "aren't in seconds: the longest is 2e+06 s, above 3600 s. They are read as microseconds" in found.check
+    for right, one in zip(recordings.captures(), found.corrected.captures(), strict=True):
+        assert one.exposure_s == pytest.approx(right.exposure_s)
+    (warning,) = [w for w in inspect(wrong)[1] if "not in milliseconds or microseconds" in w]
+    assert "12 captures" in warning  # darks of a millisecond are 1000 us
+
+
+def test_captures_without_a_stated_exposure_say_nothing_of_its_unit() -> None:
+    """Imported pictures of boards may state none; the others' exposures are still told and corrected."""
+    recordings = recording_set(Sensor(shape=(32, 48), cfa="MONO"), DARKS, LADDER)
+    assert misstated_exposure_unit(_changed(recordings, exposure_s=lambda _, c: None), "left") is None
+    found = misstated_exposure_unit(
+        _changed(recordings, exposure_s=lambda k, c: 1e6 * c.exposure_s if k else None), "left"
+    )
+    assert found is not None
+    for k, (right, one) in enumerate(zip(recordings.captures(), found.corrected.captures(), strict=True)):
+        assert one.exposure_s == (pytest.approx(right.exposure_s) if k else None)
+
+
+def test_times_of_copying_say_nothing_of_the_unit() -> None:
+    """A ladder up to seconds whose files were written within a tenth of a second."""
+    begin = datetime(2026, 3, 2, tzinfo=UTC)
+    recordings = _changed(
+        recording_set(Sensor(shape=(32, 48), cfa="MONO"), DARKS, LADDER),
+        time=lambda k, _: begin + timedelta(milliseconds=k),
+    )
+    assert misstated_exposure_unit(recordings, "left") is None
+
+
+def test_a_mono_sensor_stated_with_a_mosaic_is_told() -> None:
+    recordings = former(5, kinds=("dark", "flat", "narrowband"))
+    assert misstated_mosaic(recordings, "left") is None
+    wrong = restated(recordings, cfa="RGGB", quantum_efficiency=None)
+    corrected, (found,) = misstatements(wrong, "left")
+    assert "but cfa = RGGB is stated: correct cfa to MONO" in found.check
+    assert corrected.camera("left").cfa == "MONO"
+    assert any("correct cfa to MONO" in remark for remark in fit_noise(wrong, "left").remarks)
+
+
+def test_colours_that_differ_are_a_mosaic() -> None:
+    """Also those that analogue gains make alike under one lamp: their variances differ."""
+    assert misstated_mosaic(former(5, cfa="GRBG", kinds=("dark", "flat", "narrowband")), "left") is None
+    sensor = Sensor(shape=(64, 96))
+    recordings = recording_set(sensor, DARKS, LADDER)
+    frames = {c.frame: recordings.frame(c) for c in recordings.captures("dark")}
+    for flat in recordings.captures("flat"):
+        frame = (recordings.frame(flat) - sensor.black).astype(float)
+        for (row, col), share in (((0, 0), 0.7), ((1, 1), 0.5)):
+            frame[row::2, col::2] /= share
+        frames[flat.frame] = np.clip(np.rint(frame + sensor.black), 0, 4095).astype(np.uint16)
+    balanced = RecordingSet(recordings.manifest, frames)
+    assert misstated_mosaic(balanced, "left") is None
+
+
+@pytest.mark.skipif(not CMOS.is_dir(), reason="the shared recordings aren't here")
+def test_a_real_mono_camera_stated_with_a_mosaic_is_told() -> None:
+    found = misstated_mosaic(restated(read_emva1288(CMOS), cfa="RGGB"), "left")
+    assert found is not None
+    assert "answer 1 light alike within 0.0" in found.check

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lab.diagnose import diagnose, examine
-from lab.diagnose.outcome.board_departure import board_departure
+from lab.diagnose.outcome.mismatches import board_departure
 from lab.diagnose.policy import DecisionPolicy
 from lab.fit.geometry import fit_geometry, geometry_result
 from lab.formats.importers import read_checkerboard_pairs

@@ -1,9 +1,11 @@
 """The estimated kernel against known ones, its parts against direct sums and whole matrices, targets that are
-refused.
-"""
+refused."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from scipy.signal import fftconvolve
@@ -12,6 +14,7 @@ from benchmarks.peers.mosleh import mosleh_kernel
 from lab.errors import NotDetermined
 from lab.fit.psf import estimate_kernel
 from lab.fit.psf.kernel import KernelPrior, displacement, log_likelihood, normal_equations, on_simplex
+from lab.fit.psf.photograph import estimate_from_photograph
 from tests.lab.fit.psf.drawn_targets import (
     KERNELS,
     blurred_target,
@@ -223,3 +226,23 @@ def test_a_clipped_an_unlit_and_an_unlevelled_target_are_refused():
 def test_too_small_or_empty_targets_are_not_determined(size):
     with pytest.raises(NotDetermined):
         estimate_kernel(np.zeros((size, size)), np.zeros((size, size)), 7)
+
+
+# --- The kernel of a real photograph of a pattern ---------------------------------------------------------------------
+
+
+PHOTO = Path(__file__).parents[5] / "shared/data/delbracio_noise_target"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PHOTO.is_dir(), reason="the photograph of Delbracio's noise target isn't there")
+def test_the_kernel_of_a_real_photograph_explains_it():
+    photo = cv2.imread(str(PHOTO / "img_example.pgm"), cv2.IMREAD_UNCHANGED).astype(float)
+    pattern = (cv2.imread(str(PHOTO / "pattern_noise.pgm"), cv2.IMREAD_UNCHANGED) > 127).astype(np.uint8)
+    found = estimate_from_photograph(photo, pattern)
+    # homography and pixel box explain 93 % at best
+    assert 0.90 < found.explained_by_box < 0.94
+    assert found.explained >= 0.96
+    assert found.kernel.sum() == pytest.approx(1)
+    with pytest.raises(NotDetermined, match="doesn't show the pattern"):
+        estimate_from_photograph(photo, np.random.default_rng(0).integers(0, 2, pattern.shape).astype(np.uint8))

@@ -15,8 +15,7 @@ from lab.fit.geometry import fit_geometry
 from lab.fit.stereo import fit_stereo
 from lab.formats import recording_set as recording
 from lab.formats.importers import ImportOptions, read_foreign
-from lab.formats.importers.index_file import capture_of_row, read_index
-from lab.formats.importers.raw_folder import read_checkerboard_pairs, read_raw_folder
+from lab.formats.importers.raw_folder import capture_of_row, read_checkerboard_pairs, read_index, read_raw_folder
 
 DATA = Path(__file__).resolve().parents[5] / "shared" / "data" / "opencv_stereo"
 HEADER = (

@@ -15,8 +15,8 @@ from astropy.io import fits
 from lab.errors import InputError
 from lab.formats import recording_set as recording
 from lab.formats.importers import read_foreign, read_raw_folder
-from lab.formats.importers.frame_header import frame_header
-from lab.formats.importers.import_options import ImportOptions
+from lab.formats.importers.single_picture import ImportOptions
+from lab.formats.importers.stated_settings import frame_header
 
 EXPOSURE, F_NUMBER, ISO, EXIF_IFD = 33434, 33437, 34855, 34665
 

@@ -1,0 +1,171 @@
+"""Figures and findings in words: names of figures, and sentences of parameters."""
+
+from __future__ import annotations
+
+import math
+
+#: Field -> plain name.
+NAMES = {
+    "conversion_gain_dn_per_e": "system gain K",
+    "read_noise_e": "temporal dark noise (read noise)",
+    "black_level_dn": "black level",
+    "dark_current_e_per_s": "dark current",
+    "full_well_e": "saturation capacity (full well)",
+    "dsnu_e": "DSNU",
+    "prnu_percent": "PRNU",
+    "linearity_error_percent": "linearity error",
+    "response_bend_percent": "response curvature at saturation",
+    "brighter_fatter_percent": "variance loss at saturation",
+    "neighbour_covariance_percent": "noise covariance with neighbours",
+    "quantum_efficiency": "quantum efficiency",
+    "integrated_efficiency_nm": "quantum efficiency, integrated over wavelength",
+    "conversion_gain_at_zero_dn_per_e": "system gain K at zero signal",
+    "variance_bend_percent": "variance curvature at saturation",
+    "dark_current_from_variance_e_per_s": "dark current, from variances",
+    "spread_percent": "spread of the pixels' read noise",
+    "doubling_temperature_c": "rise in temperature that doubles the dark current",
+    "activation_energy_ev": "activation energy of the dark current",
+    "relative_sensitivity": "relative sensitivity",
+    "mtf": "MTF",
+    "mtf50_cy_per_px": "MTF50",
+    "mtf10_cy_per_px": "MTF10",
+    "psf": "PSF",
+    "camera_matrix": "camera matrix",
+    "distortion": "distortion",
+    "centre_shift_px": "shift of the centre from green",
+    "radial_shift_px": "radial shift from green",
+    "bend_x_mm": "bend of the board along x",
+    "bend_y_mm": "bend of the board along y",
+    "twist_mm": "twist of the board",
+    "translation_mm": "stereo translation",
+    "rotation_mrad": "stereo rotation",
+    "baseline_mm": "stereo baseline",
+}
+#: (field, place) -> plain name of one number of several.
+PLACES = {
+    ("camera_matrix", "fx"): "focal length x",
+    ("camera_matrix", "fy"): "focal length y",
+    ("camera_matrix", "cx"): "principal point x",
+    ("camera_matrix", "cy"): "principal point y",
+    ("distortion", "k1"): "radial distortion k1",
+    ("distortion", "k2"): "radial distortion k2",
+    ("distortion", "p1"): "tangential distortion p1",
+    ("distortion", "p2"): "tangential distortion p2",
+    ("distortion", "k3"): "radial distortion k3",
+}
+#: End of a field's name -> unit.
+_UNITS = {
+    "_dn_per_e": "DN/e",
+    "_e_per_s": "e/s",
+    "_cy_per_px": "cy/px",
+    "_percent": "%",
+    "_mrad": "mrad",
+    "_nm": "nm",
+    "_dn": "DN",
+    "_ev": "eV",
+    "_mm": "mm",
+    "_px": "px",
+    "_c": "C",
+    "_e": "e",
+    "camera_matrix": "px",
+}
+#: Words of a path that only say where a field stands.
+_SECTIONS = {"noise", "spectral", "mtf", "psf", "geometry", "stereo", "channels", "board_warp",
+"read_noise_distribution"} | {
+    "dark_current_temperature"
+}  # fmt: skip
+
+
+def _parts(figure: str) -> tuple[str, list[str]]:
+    """Return the field of a figure (empty where its path has none that is declared), and what tells it from others of
+    that field."""
+    words = figure.split()
+    at = max((k for k, word in enumerate(words) if word in NAMES), default=-1)
+    if at < 0:
+        return "", []
+    first = next((k for k, word in enumerate(words[:at]) if word not in _SECTIONS), at)
+    return words[at], [*words[first:at], *words[at + 1 :]]
+
+
+def plain_name(figure: str, place: str = "") -> str:
+    """Return the plain name of a figure: `MTF50, edge-1 G`, `focal length x`. A path without a declared field is its
+    own name.
+
+    `place`: which number, of a figure of several.
+    """
+    field, of = _parts(figure)
+    if not field:
+        return " ".join(part for part in (figure.replace("_", " "), place) if part)
+    one = PLACES.get((field, place))
+    if one is None:
+        one = f"{NAMES[field]} {place}".rstrip()
+    return ", ".join(part for part in (one, " ".join(of)) if part)
+
+
+def unit_of(figure: str) -> str:
+    """Return the unit of a figure, "1" for a ratio."""
+    field = _parts(figure)[0]
+    return next((unit for end, unit in _UNITS.items() if field.endswith(end)), "1")
+
+
+# --- Quantities in words: a number with its uncertainty and its unit, as every statement, page and table writes it ----
+
+
+#: Units whose printed form differs from their form in names.
+SHOWN_UNITS = {"um": "µm", "us": "µs", "deg": "°", "C": "°C", "percent": "%", "1": ""}
+#: From this size on, numbers are written with a power of ten, and from this one on with commas.
+POWER_FROM, COMMAS_FROM = 1e6, 1e4
+MOST_DECIMALS = 9
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def shown_unit(unit: str) -> str:
+    """Return a unit as it is printed; empty for a ratio."""
+    return SHOWN_UNITS.get(unit, unit)
+
+
+def plain_number(value: float, digits: int) -> str:
+    """Return a number with `digits` significant digits at most, and without a power of ten where it is from 1e-9 to
+    1e6."""
+    if value == 0.0 or not math.isfinite(value):
+        return f"{value:g}"
+    size = float(f"{abs(value):.{digits - 1}e}")
+    decimals = digits - 1 - math.floor(math.log10(size))
+    if size >= POWER_FROM or decimals > MOST_DECIMALS + digits:
+        power = math.floor(math.log10(size))
+        return f"{float(f'{value / 10.0**power:.{digits - 1}f}'):g}{_ten_to(power)}"
+    text = f"{_to_place(value, decimals):{',' if size >= COMMAS_FROM else ''}.{max(decimals, 0)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def measured(
+    value: float, std: float | None = None, unit: str = "", interval: tuple[float, float] | None = None
+) -> str:
+    """Return `value ± std unit`, the standard deviation to two digits and the value to the same place.
+
+    Without a standard deviation the value has four digits. With an `interval` it reads `value (low to high) unit`.
+    """
+    if interval is not None:
+        low, high = (plain_number(end, 3) for end in interval)
+        return f"{plain_number(value, 3)} ({low} to {high}) {shown_unit(unit)}".rstrip()
+    if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
+        number = plain_number(value, 4)
+    else:
+        place = 1 - math.floor(math.log10(float(f"{std:.1e}")))
+        if abs(value) < POWER_FROM and place <= MOST_DECIMALS:
+            decimals, commas = max(place, 0), "," if abs(value) >= COMMAS_FROM else ""
+            number = f"{_to_place(value, place):{commas}.{decimals}f} ± {_to_place(std, place):{commas}.{decimals}f}"
+        else:
+            power = math.floor(math.log10(max(abs(value), std)))
+            decimals = max(place + power, 0)
+            number = f"({value / 10.0**power:.{decimals}f} ± {std / 10.0**power:.{decimals}f}){_ten_to(power)}"
+    return f"{number} {shown_unit(unit)}".rstrip()
+
+
+def _to_place(value: float, place: int) -> float:
+    """Round to a decimal place; a negative one is left of the point."""
+    return round(value, place) + 0.0
+
+
+def _ten_to(power: int) -> str:
+    return f" × 10{str(power).translate(_SUPERSCRIPTS)}"
