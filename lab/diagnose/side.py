@@ -142,7 +142,8 @@ def diagnose_side(
         if not lost:
             break
         withdrawn |= lost
-        verdict = decide(model, rng, policy, report, least_threshold=least, without=tuple(withdrawn))
+        names = tuple(name for one in withdrawn.values() for name in one.names)
+        verdict = decide(model, rng, policy, report, least_threshold=least, without=names)
         discovered = discover(study, (*model.always, *verdict.effects), policy, verdict)
     report("looking for the next capture")
     laws = tuple(law_of(one, study) for one in discovered)

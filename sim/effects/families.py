@@ -123,7 +123,11 @@ _TOLD = {
         "flat pairs from dark to full: coupling shares noise in proportion at every level, repelled charge the more "
         "the fuller the pixels are",
     ),
-    Family.FRAME_MEMORY: _Told("memory of the last frame", "A frame holds a part of the one before."),
+    Family.FRAME_MEMORY: _Told(
+        "memory of the last frame",
+        "A frame holds a part of those before.",
+        "dark frames seconds and minutes after bright ones",
+    ),
     Family.ON_CHIP_PROCESSING: _Told(
         "processing on the chip",
         "The camera filters its raw data, signal and noise alike.",

@@ -26,7 +26,6 @@ class Fringes(Effect):
     """
 
     name: ClassVar[str] = "fringes"
-    title: ClassVar[str] = "interference fringes"
     family: ClassVar[Family] = Family.SPECTRAL_FILTER
     reference: ClassVar[str] = "M. Born and E. Wolf, Principles of Optics, chapter 7.6, multiple-beam interference"
     form_tolerance: ClassVar[float] = 0.1

@@ -63,7 +63,9 @@ from lab.measure.study import Study
 from sim.camera import Side
 from sim.effects.base import Effects
 from sim.effects.empirical_law import PLACES, EmpiricalLaw
+from sim.effects.library import effects as library
 from sim.effects.library import list_changes
+from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 LEAST_WIDTH = 0.02  # of a code: a missing code's
@@ -78,6 +80,8 @@ LEAST_GAIN, PREDICTED_SHARE = 4.0, 0.5
 OTHER_HALF_SHARE = 0.15
 LEAST_SAID = 1.0  # expected fall of chi2 below which captures say nothing of a law
 MOST_BY_CODE = 4096  # entries of a table by code
+#: Relative difference of even and odd lines by which its slope is found, and the chi2 from which on it is told.
+PARITY, LEAST_PARITY_CHI2 = 1e-3, 9.0
 MOST_LAWS = 6  # along indices, one after the other
 MOST_CURVES = 2  # laws along coordinates, one after the other
 #: Description length by which a form of fewer numbers may be longer and is told, and another place in the chain told
@@ -111,8 +115,31 @@ def discover(
             break
         found.append(min(beside, key=lambda one: one.log_probability))
     if left is not None:
+        found = [_with_parity(study, left.model, left.effects, one) for one in found]
         found += _curves(study, left, found, every, policy)
     return tuple(sorted(found, key=lambda one: one.log_probability))
+
+
+def _with_parity(study: Study, model: MeasurementModel, effects: Effects, one: PredictiveTable) -> PredictiveTable:
+    """Return a table of sensitivities by lines of a mosaic with the difference of even and odd lines that the two
+    greens tell, where they do. Within a plane of the mosaic it can't be seen, as all its pixels have one parity."""
+    look = one.look
+    count = look.columns or one.period
+    if look.stage != "charge" or mosaic.step(study.camera.cfa) == 1 or not one.period or count % 2 or one.form.first:
+        return one
+    parity = np.resize([1.0, -1.0], one.period)
+    even, odd = (
+        model.gaussian((*effects, law_of(replace(one, departure=one.departure + size * parity), study)))
+        for size in (0.0, PARITY)
+    )
+    seen = model.seen
+    slope = (odd.mean - even.mean)[seen] / PARITY
+    weighted = np.linalg.solve(even.covariance[np.ix_(seen, seen)], slope)
+    total = float(weighted @ slope)
+    size = float(weighted @ (model.value - even.mean)[seen]) / max(total, 1e-300)
+    if size**2 * total < LEAST_PARITY_CHI2:
+        return one
+    return replace(one, departure=one.departure + size * parity)
 
 
 def _exceeds_tolerance(one: PredictiveTable, policy: DecisionPolicy) -> bool:
@@ -417,11 +444,12 @@ def _curve_forms(look: Look) -> Iterator[Form]:
 
 @dataclass(frozen=True)
 class Superseded:
-    """A name in whose place a law stands: chi2 of the seen and of the held-out numbers, with the name and with the
-    law."""
+    """A name in whose place a law stands. `names`: the effect's, or those of all effects of its family. `with_name`,
+    `with_law`: chi2 of the seen and of the held-out numbers."""
 
     candidate: Candidate
     law: PredictiveTable
+    names: tuple[str, ...]
     with_name: tuple[float, float]
     with_law: tuple[float, float]
 
@@ -447,19 +475,21 @@ def superseded(
 ) -> dict[str, Superseded]:
     """Return the named effects in whose place a discovered law predicts more, by name.
 
-    A law of another quantity of the chain supersedes a name where, in its place, chi2 of all captures is lower by
-    `superseding_chi2` and twice its numbers, and that of the held-out ones isn't higher. A law of the same quantity is
-    no rival of a listed one, but where it was found beside it, too, and makes it needless.
+    A law of another quantity of the chain, or of codes, supersedes a name where, in its place, chi2 of all captures is
+    lower by `superseding_chi2` and twice its numbers, and that of the held-out ones isn't higher. A law of the same
+    quantity is no rival of a listed one, but where it was found beside it, too, and makes it needless: the name doesn't
+    take `parameter_log_odds` more off. In the place of a family, of which no law has to hold, stands a table that
+    repeats, of codes, which takes as much more off as one of another quantity.
     """
     model, effects = verdict.model, verdict.effects
     lost: dict[str, Superseded] = {}
     for candidate in verdict.named:
-        if candidate.members:
-            continue
         name, others = candidate.effect.name, tuple(e for e in effects if e is not candidate.effect)
         changed = list_changes(candidate.effect)
         rivals = [one for one in found if changed & list_changes(law_of(one, study))]
-        if not rivals and candidate.probability > policy.unrivalled_probability:
+        if candidate.members:
+            rivals = [one for one in rivals if one.look.stage == "codes" and one.period]
+        if not rivals and (candidate.members or candidate.probability > policy.unrivalled_probability):
             continue
         left = replace(verdict, named=tuple(c for c in verdict.named if c is not candidate), after=(), held_out=())
         again = discover(study, (*model.always, *others), policy)
@@ -469,14 +499,18 @@ def superseded(
             one
             for one in elsewhere
             if not any(_is_at(one.look, other.look) for other in found)
-            and not changed & list_changes(law_of(one, study))
+            and (one.look.stage == "codes" or not changed & list_changes(law_of(one, study)))
         ]
-        for law in (*beside, *elsewhere):
+        for law in (*(_with_parity(study, model, others, one) for one in beside), *elsewhere):
             with_law = (*others, law_of(law, study))
-            least = policy.superseding_chi2 + 2.0 * law.form.numbers if law in elsewhere else 0.0
+            # a law that is there anyway: the name has to earn its own number
+            allowed = policy.parameter_log_odds if rivals and not candidate.members else 0.0
+            least = -allowed if allowed else policy.superseding_chi2 + 2.0 * law.form.numbers
             named, instead = (_chi2_of(model, one) for one in (effects, with_law))
-            if instead[1] <= named[1] and sum(instead) <= sum(named) - least:
-                lost[name] = Superseded(candidate, law, named, instead)
+            if instead[1] <= named[1] + allowed and sum(instead) <= sum(named) - least:
+                family = type(candidate.effect).family
+                names = tuple(n for n, kind in library().items() if kind.family is family)
+                lost[name] = Superseded(candidate, law, names if candidate.members else (name,), named, instead)
                 break
     return lost
 

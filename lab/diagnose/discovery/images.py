@@ -78,6 +78,7 @@ class _Sums:
 def _pixels_alone(away: Image) -> Image:
     """Return a difference of frames with outlying pixels at `CLIP` standard deviations, less what rows and columns
     share."""
+    away = away - np.float32(away.mean(dtype=float))  # the light may be another
     std = robust_std(away)
     clipped = np.clip(away, -CLIP * std, CLIP * std)
     clipped -= clipped.mean(axis=1, keepdims=True)
@@ -228,9 +229,11 @@ def _regressed(
 
 
 def _slope(x: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the weights by which values (n,) give their slope by x."""
+    """Return the weights by which values (n,) give their slope by x; none where x is the same of all."""
+    if np.ptp(x) == 0.0:
+        return np.zeros(len(x))
     away = weight * (x - np.average(x, weights=weight))
-    return np.asarray(away / max(float(away @ x), 1e-300))
+    return np.asarray(away / float(away @ x))
 
 
 # --- noise by time ---------------------------------------------------------------------------------------------------

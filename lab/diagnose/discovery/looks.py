@@ -201,10 +201,11 @@ def _lines_of(
             yield Look(stage, along, seen, rough.get(True), of=of, step=step, shown_in=shown, least=least)
         if not times:
             whole = {out: _whole_lines(image, line, bent=stage == "charge") for out, image in images.items()}
-            yield Look(
-                stage, along, whole[False], whole.get(True), of=of, step=step, shown_in=shown, least=least,
-                is_whole=True,
-            )  # fmt: skip
+            seen = whole[False]
+            if seen is not None:
+                yield Look(
+                    stage, along, seen, whole.get(True), of=of, step=step, shown_in=shown, least=least, is_whole=True
+                )
 
 
 def _cells_of(study: Study, stage: Stage, images: Mapping[bool, Image]) -> Iterator[Look]:
@@ -339,8 +340,9 @@ def _pixel_variance(plane: Image) -> float:
     return float(np.mean(np.square(twice))) / 4.0
 
 
-def _whole_lines(image: Image, along: str, *, bent: bool) -> Profile:
-    """Return the profile of the means of rows or columns less their mean, in at most `MOST_LINES` groups.
+def _whole_lines(image: Image, along: str, *, bent: bool) -> Profile | None:
+    """Return the profile of the means of rows or columns less their mean, in at most `MOST_LINES` groups; None where
+    they are smooth to the last bit.
 
     bent : whether light may change them along the frame: beside the lines may stand a curve of fourth degree
     """
@@ -353,7 +355,9 @@ def _whole_lines(image: Image, along: str, *, bent: bool) -> Profile:
     share /= share.sum(axis=1, keepdims=True)
     mean, place = share @ line, np.linspace(-1.0, 1.0, len(share))
     spread = ROBUST * float(np.median(np.abs(np.diff(mean, 2)))) / np.sqrt(6.0)
-    variance = np.full(len(mean), max(spread**2, 1e-300))
+    if spread == 0.0:
+        return None
+    variance = np.full(len(mean), spread**2)
     beside = np.stack([place**k for k in range(5 if bent else 1)], axis=1)
     noise = np.full(len(mean), _pixel_variance(image) / image.shape[1 - axis] / (count / len(share)))
     return Profile(np.arange(len(mean)) % 2, mean, variance, share, noise).beside(beside)

@@ -92,8 +92,14 @@ def dark_level_dn(study: Study, capture: Any) -> float:
 
 
 def _green_dark(study: Study) -> float:
-    """Difference of the two greens in dark frames, DN, by fixed patterns of the read-out; 0 without dark captures."""
-    captures = study.recordings.captures(DarkCapture, study.side)[:16]
+    """Difference of the two greens in dark frames, DN, by fixed patterns of the read-out; 0 without dark captures.
+
+    In longer exposures than a flat's, hot pixels make it another.
+    """
+    every = study.recordings.captures(DarkCapture, study.side)
+    longest_s = max((g[0].exposure_s for g in study.flat_levels()), default=0.0)
+    longest_s = max(longest_s, min((c.exposure_s for c in every), default=0.0))
+    captures = [c for c in every if c.exposure_s <= longest_s][:16]
     pairs = [green_planes(study, np.asarray(study.recordings.frame(c), np.float32)) for c in captures]
     return float(np.mean([float(a.mean(dtype=float)) - float(b.mean(dtype=float)) for a, b in pairs])) if pairs else 0.0
 

@@ -85,7 +85,7 @@ def test_recordings_are_taken_in_and_worked_on(
         until(client, job.headers["location"], lambda now: now["state"] == "done")
         for asked in ({"kind": "pipeline", "resolve": True}, {"kind": "pipeline", "station": "fakes"}):
             refused = client.post(f"{path}/jobs", json=asked)
-            assert refused.status_code == 422 and "leave" in refused.json()["detail"]
+            assert refused.status_code == 422 and "give both, or none" in refused.json()["detail"]
 
 
 def test_a_streamed_archive_is_taken_in(running: Running, folder: Path) -> None:

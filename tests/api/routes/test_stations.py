@@ -203,7 +203,9 @@ def test_a_session_takes_what_was_estimated(running: Running) -> None:
         told = client.post("/api/v1/stations/fakes/estimate", json=asked).json()
         assert (told["steps"], told["captures"]) == (6, 12)
         assert not told["sequences"][0]["learned"]
-        assert told["sequences"][0]["parameters"] == {"exposures_s": [0.001, 0.002], "frames": 3}
+        assert told["sequences"][0]["parameters"] == {
+            "exposures_s": [0.001, 0.002], "frames": 3, "sensor_c": None
+        }  # fmt: skip
         session = client.post("/api/v1/sessions", json=asked | {"station": "fakes"}).json()
         assert until_state(client, session["id"], "finished")["captures"] == [
             {"kind": "dark", "side": side, "captures": 6} for side in ("left", "right")

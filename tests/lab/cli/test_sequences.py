@@ -32,7 +32,9 @@ def test_a_station_is_told_its_captures_and_time(
     asked = ["sequences", "--station", str(station), "--data", str(tmp_path / "data"), "--only", "dark"]
     assert main([*asked, "--set", "dark.exposures_s=0.01,0.1", "--set", "dark.frames=3", "--json", "-"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["captures"] == 12 and found["sequences"][0]["parameters"] == {"exposures_s": [0.01, 0.1], "frames": 3}
+    assert found["captures"] == 12 and found["sequences"][0]["parameters"] == {
+        "exposures_s": [0.01, 0.1], "frames": 3, "sensor_c": None
+    }  # fmt: skip
     assert main([*asked, "--quick"]) == 0
     told = capsys.readouterr().out
     assert "32 captures in 16 steps, perhaps" in told and "0.0005, 0.5, 2, 5" in told

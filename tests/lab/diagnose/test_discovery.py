@@ -31,6 +31,7 @@ from mocks.former.laws import (
 from mocks.former.unlisted import (
     BankNoiseLaw,
     CoarseTopLaw,
+    ColumnAmplifiersLaw,
     FirstRowsLaw,
     LeafShutterLaw,
     RingCodesLaw,
@@ -370,3 +371,27 @@ def test_noise_that_grows_with_the_time_is_found() -> None:
     slope = (law.table[-1] - law.table[0]) / (law.at[-1] - law.at[0])
     std = 4.0 * float(one.std.max()) / study_of(recordings, "left").noise.gain ** 2 / (law.at[-1] - law.at[0])
     assert slope == pytest.approx(16.0 / 600.0, abs=max(std, 0.1 * 16.0 / 600.0))
+
+
+def test_unequal_columns_of_a_mosaic_tell_the_greens_difference_too() -> None:
+    """Four amplifiers in turn, each within 0.1 % by flats of a shot noise below 0.05 % a class: the difference of even
+    and odd columns shows in the two greens alone, and one law tells both.
+    """
+    camera = ConcealedCamera(772302, (ColumnAmplifiersLaw(1.0),), cfa="RGGB", rows=96, cols=128)
+    found = diagnose(recordings_of(camera, LIT_AND_DARK), None)
+    assert not found.effects
+    (law,) = [one for one in found.discovered if one.stage == "charge"]
+    assert (law.along, law.period) == ("column", 4)
+    (hidden,) = camera.laws
+    assert isinstance(hidden, ColumnAmplifiersLaw)
+    assert np.array(law.table) == pytest.approx(1.0 + 0.01 * hidden.balanced(4), abs=1e-3)
+
+
+def test_a_table_of_codes_stands_in_the_place_of_a_family_that_fits_worse() -> None:
+    """A gain after the converter is none of its listed laws: the family, named for the nearest one, gives way."""
+    recordings = recordings_of(ConcealedCamera(772302, (DigitalGainLaw(10.0),), rows=96, cols=128), LIT_AND_DARK)
+    found = diagnose(recordings, None)
+    assert "converter" not in {effect.name for effect in found.effects}
+    withdrawn = [one for one in found.vetoed if "in its place" in one.statement]
+    assert [one.name for one in withdrawn] == ["converter"]
+    assert withdrawn[0].chi2_before < withdrawn[0].chi2_after
