@@ -105,14 +105,18 @@ def _law_chart(law: DiscoveredLaw) -> Figure:
 
 
 def _by_channel(law: DiscoveredLaw) -> Figure:
-    """Draw the curves of the channels over the time."""
-    curves = 100.0 * np.array(law.shown_departure).reshape(-1, len(law.at))
-    names = ("R", "G", "B") if len(curves) == 3 else ("Y",)
-    data: list[Trace] = [
-        {"type": "scatter", "mode": "lines", "x": list(law.at), "y": own.tolist(), "name": name,
-         "line": {"color": CHANNEL[name], "width": 2}}
-        for own, name in zip(curves, names, strict=True)
-    ]  # fmt: skip
+    """Draw the curves of the channels over the time, with two standard deviations."""
+    curves, half = (
+        factor * np.array(one).reshape(-1, len(law.at))
+        for factor, one in ((100.0, law.shown_departure), (200.0, law.shown_std))
+    )
+    data: list[Trace] = []
+    for own, std, name in zip(curves, half, ("R", "G", "B") if len(curves) == 3 else ("Y",), strict=True):
+        data.append(band(list(law.at), own, std, CHANNEL[name]))
+        data.append({
+            "type": "scatter", "mode": "lines", "x": list(law.at), "y": own.tolist(), "name": name,
+            "line": {"color": CHANNEL[name], "width": 2},
+        })  # fmt: skip
     return {"data": data, "layout": layout(220, xaxis=axis("time, s"), yaxis=axis("factor less 1, %"))}
 
 
