@@ -112,7 +112,7 @@ def _by_channel(law: DiscoveredLaw) -> Figure:
     )
     data: list[Trace] = []
     for own, std, name in zip(curves, half, ("R", "G", "B") if len(curves) == 3 else ("Y",), strict=True):
-        data.append(band(list(law.at), own, std, CHANNEL[name]))
+        data.append(band(list(law.at), own, std, CHANNEL[name], mode="lines"))
         data.append({
             "type": "scatter", "mode": "lines", "x": list(law.at), "y": own.tolist(), "name": name,
             "line": {"color": CHANNEL[name], "width": 2},
