@@ -95,7 +95,7 @@ def test_a_frozen_adapter_is_given_up_and_started_anew(peer: DemoCamera, camera:
 
 
 def test_a_stop_ends_an_exposure(camera: MicroManagerCamera) -> None:
-    camera.configure(3.0)
+    camera.configure(1.5)
     camera.arm()
     camera.fire()
     camera._stopped.set()
