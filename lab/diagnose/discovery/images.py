@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.diagnose.measurements.dark_frames import DarkCondition, conditions
+from lab.diagnose.measurements.dark_frames import DarkCondition, conditions, usual_conditions
 from lab.diagnose.measurements.dark_readout import MOST_FRAMES, dark_readout
 from lab.diagnose.measurements.flat_field import LEAST_SIGNAL, dark_level_dn, flats
 from lab.errors import NotDetermined
@@ -92,19 +92,13 @@ def dark_images(study: Study) -> dict[bool, DarkImages]:
         every = conditions(study)
     except NotDetermined:
         return {}
-    usual = [c for c in every if _is_usual(study, c)] or every
-    sums = [(condition.exposure_s, _summed(study, condition)) for condition in usual]
+    sums = [(one.exposure_s, _summed(study, one)) for one in usual_conditions(study, every)]
     found = {}
     for out in (False, True):
         mine = [(exposure_s, own[out]) for exposure_s, own in sums if own[out].frames]
         if mine:
             found[out] = _joined(study, mine)
     return found
-
-
-def _is_usual(study: Study, condition: DarkCondition) -> bool:
-    warm = condition.temperature_c
-    return study.temperature_c is None or warm is None or abs(warm - study.temperature_c) < 2.0
 
 
 def _summed(study: Study, condition: DarkCondition) -> dict[bool, _Sums]:

@@ -14,6 +14,7 @@ from scipy.signal import savgol_coeffs
 from lab.diagnose.discovery.images import DarkImages, Image, dark_images, flat_images, noise_by_time
 from lab.diagnose.discovery.profile import Look, Profile
 from lab.diagnose.measurements.code_density import CodeCounts, counted, counted_in_all, prepared, widths
+from lab.diagnose.measurements.dark_frames import cell_means
 from lab.diagnose.measurements.dark_readout import dark_readout
 from lab.diagnose.measurements.flat_field import FlatLevel, flats, without_dark
 from lab.errors import NotDetermined
@@ -257,7 +258,7 @@ def _places_of(
     half = np.indices((PLACES_A_SIDE, PLACES_A_SIDE)).sum(axis=0).ravel() % 2
     found = {}
     for out, image in images.items():
-        cells = _place_means(image)
+        cells = cell_means(image, (PLACES_A_SIDE, PLACES_A_SIDE))
         bends = np.concatenate([np.diff(cells, 2, axis=axis).ravel() for axis in (0, 1)])
         variance = (ROBUST * float(np.median(np.abs(bends)))) ** 2 / 6.0
         if variance == 0.0:
@@ -296,13 +297,6 @@ def _noise_times(study: Study) -> Iterator[Look]:
             "signal", "time", found[False], found.get(True), of="variance", at=points, known=points, is_whole=True,
             shown_in=frozenset({"dark_noise", "temporal_noise"}),
         )  # fmt: skip
-
-
-def _place_means(image: Image) -> FloatArray:
-    """Return the means over `PLACES_A_SIDE` x `PLACES_A_SIDE` parts of an image."""
-    row, col = (np.linspace(0, n, PLACES_A_SIDE + 1).astype(int) for n in image.shape)
-    total = np.add.reduceat(np.add.reduceat(image.astype(float), row[:-1], 0), col[:-1], 1)
-    return np.asarray(total / np.outer(np.diff(row), np.diff(col)))
 
 
 def _rough_lines(image: Image, along: str, cfa: Cfa) -> Profile | None:

@@ -157,6 +157,15 @@ def conditions(study: Study) -> list[DarkCondition]:
     return found
 
 
+def usual_conditions(study: Study, every: Sequence[DarkCondition]) -> Sequence[DarkCondition]:
+    """Return the conditions at the usual temperature; all where none is."""
+    return [
+        c
+        for c in every
+        if study.temperature_c is None or c.temperature_c is None or abs(c.temperature_c - study.temperature_c) < 2.0
+    ] or every
+
+
 def dark_frames(study: Study) -> list[DarkStatistics]:
     """Return the statistics of all dark captures by condition. Raises NotDetermined where there are none, or where the
     frames are too small to be split into cells."""
@@ -166,11 +175,7 @@ def dark_frames(study: Study) -> list[DarkStatistics]:
         raise NotDetermined(
             "dark", f"frames of {study.camera.rows} x {study.camera.cols} px: their cells need {least_px} px a side"
         )
-    usual = [
-        c
-        for c in every
-        if study.temperature_c is None or c.temperature_c is None or abs(c.temperature_c - study.temperature_c) < 2.0
-    ] or every
+    usual = usual_conditions(study, every)
     warmest = max(every, key=lambda c: (c.temperature_c or 0.0, c.exposure_s))
     picked = list(dict.fromkeys([usual[0].name, usual[-1].name, warmest.name]))[:MOST_CONDITIONS]
     sound = study.once(sound_pixels)
@@ -304,10 +309,10 @@ def _pattern(mean: Image, part: list[Image], captures: tuple[str, ...]) -> DarkP
     )
 
 
-def cell_means(image: Image) -> FloatArray:
-    """Means over `CELLS` of an image, (4, 6)."""
-    r = np.linspace(0, image.shape[0], CELLS[0] + 1).astype(int)
-    c = np.linspace(0, image.shape[1], CELLS[1] + 1).astype(int)
+def cell_means(image: Image, cells: tuple[int, int] = CELLS) -> FloatArray:
+    """Return the means of an image over `cells`, rows and columns of equal parts."""
+    r = np.linspace(0, image.shape[0], cells[0] + 1).astype(int)
+    c = np.linspace(0, image.shape[1], cells[1] + 1).astype(int)
     total = np.add.reduceat(np.add.reduceat(image.astype(float), r[:-1], 0), c[:-1], 1)
     return np.asarray(total / np.outer(np.diff(r), np.diff(c)))
 
