@@ -311,7 +311,7 @@ def test_a_session_by_keyboard_alone(browser: Any, lab: Running) -> None:
     watched.tab_to("Frames")
     watched.press("Enter", "#captures a")
     watched.tab_to("figure")
-    watched.press("Enter", "#inspect-profile svg .line")
+    watched.press("Enter", "#inspect-profile svg")
     watched.tab_to("canvas")
     keyboard.press("ArrowRight")
     before = page.inner_text("#inspect-readout")
