@@ -692,7 +692,7 @@ def _ghost_by(
     """Function of effects: change of the ghost's coefficient by their reflections. They act on the pattern's and on the
     lit screen's image, whose ratio is fitted."""
     picture, lit = np.nan_to_num(seen), np.isfinite(seen).astype(float)
-    weight = (design.inverse[len(design.bands) + GHOST] @ design.columns).astype(np.float32)
+    weight = design.weights[len(design.bands) + GHOST].astype(np.float32)
     before = picture[window][design.mask]
 
     def coefficient(effects: Effects) -> float:
@@ -707,12 +707,12 @@ def _ghost_by(
 def _shown_by(study: Study, design: _LinearModel, canvas: Canvas) -> Callable[[Effects], FloatArray]:
     """Function of effects: change (k,) of a pattern's coefficients by those on the screen's light. The pattern is drawn
     as such a screen shows it, over the lit screen."""
-    none = np.zeros(len(design.inverse))
+    none = np.zeros(len(design.weights))
 
     @lru_cache(maxsize=8)
     def changed(showing: tuple[Effect, ...]) -> FloatArray:
         change = canvas.picture((canvas.as_shown(showing, study.camera) - canvas.low) * design.passed)
-        return np.asarray(design.inverse @ (design.columns @ change[design.mask]))
+        return np.asarray(design.weights @ change[design.mask])
 
     def coefficients(effects: Effects) -> FloatArray:
         showing = acting(effects, SHOWN)
@@ -779,7 +779,7 @@ class _LinearModel:
     bands: tuple[Band, ...]
     columns: FloatArray  # (k, pixels)
     fixed: FloatArray  # (pixels,): weak parts beyond the bands, which have no coefficient
-    inverse: FloatArray  # (k, k): of the normal matrix
+    weights: FloatArray  # (k, pixels): from pixels to coefficients
     #: (bands, EVEN_TERMS + 4 bands + parts): coefficients of the bands in least squares fits of even powers of the
     #: frequency times P, of the halves of the bands, of these with a phase of 90 degrees, and of the parts beyond the
     #: bands.
@@ -851,12 +851,19 @@ class _LinearModel:
         fixed = sum((part[mask] for part in beyond if not np.std(part[mask]) > LEAST_BEYOND), np.zeros(len(u)))
         table = np.array(columns + more + strong)
         scale = np.sqrt(np.mean(table**2, axis=1))
-        normal = (table / scale[:, None]) @ (table / scale[:, None]).T
-        inverse = np.linalg.inv(normal) / np.outer(scale, scale)
+        unit = table / scale[:, None]
+        weights = np.linalg.solve(unit @ unit.T, unit) / scale[:, None]
+        # An odd change of the OTF (coma) isn't fitted, as the registration takes up most of it. What is left would look
+        # like a weak ghost, whose coefficient is therefore that of a fit with it.
+        ghost = len(bands) + GHOST
+        odd = np.array(turned_halves)
+        unit = np.concatenate([unit, odd / np.sqrt(np.mean(odd**2, axis=1))[:, None]])
+        alone = np.eye(len(unit))[ghost]
+        weights[ghost] = np.linalg.lstsq(unit @ unit.T, alone, rcond=1e-10)[0] @ unit / scale[ghost]
         pieces = [*smooth, *halves, *turned_halves, *(part.picture[mask] for part in outside)]
-        mix = (inverse @ (table @ np.array(pieces).T))[: len(bands)]
+        mix = weights[: len(bands)] @ np.array(pieces).T
         beyond_f = np.array([part.fx + part.fy for part in outside]).reshape(len(outside), 2, 2)
-        return _LinearModel(mask, tuple(bands), table, fixed, inverse, mix, beyond_f, passed, float(np.sqrt(r2.max())))
+        return _LinearModel(mask, tuple(bands), table, fixed, weights, mix, beyond_f, passed, float(np.sqrt(r2.max())))
 
     @property
     def shifts(self) -> slice:
@@ -865,7 +872,7 @@ class _LinearModel:
 
     def coefficients(self, seen: FloatArray) -> FloatArray:
         """Least squares coefficients (k,) for the values `seen` (pixels,)."""
-        return np.asarray(self.inverse @ (self.columns @ (seen - self.fixed)))
+        return np.asarray(self.weights @ (seen - self.fixed))
 
     def left_rms(self, picture: FloatArray) -> float:
         """Root mean square residual of the fit to an image (rows, cols) of the window."""
@@ -881,8 +888,8 @@ class _LinearModel:
         """
         value = self.coefficients(seen)
         left = seen - self.fixed - value @ self.columns
-        spread = self.inverse @ ((self.columns * left**2) @ self.columns.T) @ self.inverse
-        shown = self.inverse @ ((self.columns * temporal) @ self.columns.T) @ self.inverse
+        spread = (self.weights * left**2) @ self.weights.T
+        shown = (self.weights * temporal) @ self.weights.T
         share = max(1.0 - float(temporal.mean() / np.mean(left**2)), 0.0)
         return value, shown, share * spread
 

@@ -7,6 +7,7 @@ import gc
 import weakref
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
+from lab.diagnose.measurements import pattern_fit
 from lab.diagnose.measurements.block import Block, measurements
 from lab.diagnose.measurements.boards import colour_block
 from lab.diagnose.measurements.pattern_fit import cell_border_block, contrast_block, ghost_block, patterns
@@ -124,6 +126,27 @@ def test_a_ghost_brightens_dark_squares() -> None:
     more = block.predict((Ghost(share_percent=1.0),)).mean - block.predict(()).mean
     assert np.all(more > 0.0)
     assert np.all(more < 0.011 * block.scale)
+
+
+def test_lopsided_points_are_no_ghost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An odd change of the OTF in rings of the fit, along rows, doesn't move the ghost's coefficient."""
+    fits: list[tuple[Any, Any]] = []
+    made = pattern_fit._LinearModel.of
+
+    def of(study: Study, canvas: Any, *rest: Any) -> Any:
+        fits.append((canvas, made(study, canvas, *rest)))
+        return fits[-1][1]
+
+    monkeypatch.setattr(pattern_fit._LinearModel, "of", of)
+    pattern_fit.patterns(study_of(recorded(seed=64)))
+    assert fits
+    for canvas, fit in fits:
+        fy, fx = canvas.frequencies
+        ring, along_rows = np.hypot(fx, fy), np.abs(np.arctan2(fy, fx + 0.0 * fy)) < np.pi / 8
+        odd = np.where(along_rows & (ring >= 0.08) & (ring < 0.42), 0.1j * canvas.low * fit.passed, 0.0)
+        change = canvas.picture(odd)[fit.mask]
+        assert np.std(change) > 1e-3
+        assert abs(fit.weights[len(fit.bands) + pattern_fit.GHOST] @ change) < 1e-8
 
 
 def test_a_steep_gamma_over_wide_borders_is_predicted() -> None:
