@@ -444,6 +444,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         charge.neighbour_correlation if charge.correlation else None,
         signal.filter_kernel(),
         signal.gain_map(shape),
+        signal.read_kernel(),
     )
 
 

@@ -435,6 +435,10 @@ class SharedNoise:
         return np.broadcast_to(line[:, None] if self.axis == 0 else line[None, :], shape)
 
 
+#: Pixels along a row to either side of which read noise depends on each other, and the grid of its spectrum.
+READ_REACH, READ_GRID = 12, 256
+
+
 @dataclass(frozen=True)
 class Signal(State):
     """State of the electrons' read-out, up to the converter.
@@ -445,6 +449,8 @@ class Signal(State):
     elapsed_s -> variance of every pixel beside the read noise's. `lines`: noise that rows or columns share.
     `telegraph`: pixels that jump between two levels. `disturbances`: signals that are added at random. `filters`:
     kernels (odd, odd) of sum 1 that the chip runs over each colour's plane, signal and noise alike, before rounding.
+    `read_spectrum`: frequency along the row in cycles per pixel, 0 to 0.5 -> factor on the read noise's power, of mean
+    1, as the camera states its variance.
     """
 
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
@@ -456,6 +462,7 @@ class Signal(State):
     telegraph: tuple[Jumps, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     filters: tuple[FloatArray, ...] = ()
+    read_spectrum: tuple[Callable[[FloatArray], FloatArray], ...] = ()
 
     def read(self, electrons: FloatArray) -> FloatArray:
         """Apply the read-out's responses to signals in electrons, point by point."""
@@ -485,6 +492,22 @@ class Signal(State):
     def random_at(self, elapsed_s: float) -> tuple[Disturbance, ...]:
         """Everything that is drawn anew in the frame taken at a time after the first capture."""
         return (*self.random, PatternNoise(0.0, self.changing_e2(elapsed_s))) if self.noise_e2 else self.random
+
+    def read_power(self, frequency_cy_per_px: FloatArray) -> FloatArray:
+        """Factor on the read noise's power at frequencies along the row."""
+        return reduce(
+            lambda value, law: value * law(frequency_cy_per_px),
+            self.read_spectrum,
+            np.ones(np.shape(frequency_cy_per_px)),
+        )
+
+    def read_kernel(self) -> FloatArray | None:
+        """Kernel (2 `READ_REACH` + 1,) along the row that makes read noise of white noise; None for none."""
+        if not self.read_spectrum:
+            return None
+        power = self.read_power(np.fft.rfftfreq(READ_GRID))
+        kernel = np.roll(np.fft.irfft(np.sqrt(np.maximum(power, 0.0)), READ_GRID), READ_REACH)[: 2 * READ_REACH + 1]
+        return np.asarray(kernel / np.sqrt(np.sum(np.square(kernel))))
 
     def filter_kernel(self) -> FloatArray | None:
         """Kernel of all filters, one after the other; None for none."""

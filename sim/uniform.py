@@ -377,6 +377,14 @@ class Uniform:
         """Pixels that jump between two levels, sizes in e."""
         return self._signal.telegraph
 
+    def read_kernel(self) -> FloatArray | None:
+        """Kernel (odd,) along the row that makes read noise of white noise; None for none."""
+        return self._signal.read_kernel()
+
+    def read_power(self, frequency_cy_per_px: FloatArray) -> FloatArray:
+        """Factor on the read noise's power at frequencies along the row."""
+        return self._signal.read_power(frequency_cy_per_px)
+
     def filter_kernel(self) -> FloatArray | None:
         """Kernel (odd, odd) of all filters that the chip runs over each colour's plane; None for none."""
         return self._signal.filter_kernel()

@@ -180,6 +180,7 @@ SIZES: dict[str, str] = {
     "brighter_fatter": "left:loss_percent=10,shared_percent=10",
     "charge_diffusion": "left:length_um=1.2",
     "coloured_line_noise": "left:noise_e=5,exponent=1",
+    "coloured_read_noise": "left:correlation=-0.1",
     "column_noise": "left:offset_e=2",
     "coma": "left:w131_x_um=0.25",
     "cover_glass": "left:thickness_mm=15",

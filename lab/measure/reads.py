@@ -21,6 +21,8 @@ LEAK = frozenset({"charge.leak_s"})
 GAINS = frozenset({"signal.gains"})
 #: Row and column noise.
 LINES = frozenset({"signal.lines"})
+#: Spectrum of the read noise along a row.
+READ_SPECTRUM = frozenset({"signal.read_spectrum"})
 #: The light of a screen for the picture that it is given.
 SHOWN = frozenset({"light.screen"})
 #: Displaced, scaled or rotated copies of the image.

@@ -20,6 +20,7 @@ class Family(StrEnum):
     CONVERTER = "converter"
     DEFECTIVE_PIXELS = "defective_pixels"
     LINE_NOISE = "line_noise"
+    READ_NOISE = "read_noise"
     READ_OUT_AREAS = "areas_of_read_out"
     DARK_SIGNAL = "dark_signal"
     CHARGE_BETWEEN_NEIGHBOURS = "charge_between_neighbours"
@@ -106,6 +107,11 @@ _TOLD = {
         "line noise",
         "Pixels of a row or a column share a part of their noise or offset.",
         "more repeats of the dark frames: what stays is the columns' pattern, what changes is noise",
+    ),
+    Family.READ_NOISE: _Told(
+        "read noise",
+        "The noise of the read-out isn't alike and independent from pixel to pixel.",
+        "dark frames with many repeats, and flats: shot noise hides what read-out does the more, the brighter they are",
     ),
     Family.READ_OUT_AREAS: _Told(
         "areas of the read-out",

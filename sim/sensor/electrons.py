@@ -17,7 +17,7 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve
+from scipy.ndimage import convolve, convolve1d
 from scipy.special import ndtr, ndtri
 
 from sim.camera import CameraModel, Cfa
@@ -42,6 +42,7 @@ class ReadOut:
     processing    kernel of a filter of each colour's DN before rounding
     offset_dn     added to the black level
     gain          factor (rows, cols) on what is read of every pixel, its noise alike, before `added`
+    read_kernel   kernel (odd,) along the row that makes read noise of white noise
     """
 
     response: Callable[[FloatArray], FloatArray] | None = None
@@ -54,6 +55,7 @@ class ReadOut:
     neighbours: Callable[[FloatArray], FloatArray] | None = None
     processing: FloatArray | None = None
     gain: FloatArray | None = None
+    read_kernel: FloatArray | None = None
 
 
 LINEAR = ReadOut()
@@ -379,6 +381,8 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
     if camera.read_noise_e > 0:
         noise = rng.standard_normal(mean.shape, dtype=np.float32)
         noise *= np.float32(camera.read_noise_e)
+        if read_out.read_kernel is not None:
+            noise = convolve1d(noise, read_out.read_kernel, axis=-1, mode="wrap")
         charge += noise
     return charge
 

@@ -131,9 +131,14 @@ CASES = (
 )
 
 
+#: What changes neither means nor variances of pixels.
+BETWEEN_PIXELS = frozenset({"coloured_read_noise"})
+SHORT_S = 0.001  # without dark current
+
+
 def every_case() -> tuple[Case, ...]:
     """`CASES`, and each effect that they lack at its typical size, in all usual frames."""
-    tried = {case.spec.split(":")[1] for case in CASES}
+    tried = {case.spec.split(":")[1] for case in CASES} | BETWEEN_PIXELS
     rest = sorted(set(library()) - tried - set(NOT_SHOWN))
     return (*CASES, *(Case(typical_spec(name), (FLAT, SWEPT, RED, EDGE, SCREEN, CHART, DARK)) for name in rest))
 
@@ -232,6 +237,23 @@ def test_the_bench_shows_what_the_forward_model_predicts(case: Case) -> None:
     # 12 288 pixels: one standard deviation is 0.013, more where rows or neighbours have noise in common
     for take, frame, moments in zip(case.takes, frames, told, strict=True):
         assert chi2(frame, moments) == pytest.approx(1.0, abs=case.tolerance), (take, departures)
+
+
+@pytest.mark.parametrize(("correlation", "decay"), [(-0.3, 0.0), (0.4, 0.4)])
+def test_read_noise_of_neighbours_is_correlated_as_stated(correlation: float, decay: float) -> None:
+    """12 288 pixels: one standard deviation is 0.009, and 0.02 with what neighbours have in common."""
+    concealed = parse([f"left:coloured_read_noise:correlation={correlation},decay={decay}"])
+    bench = Bench(1, concealed=concealed, shape=SHAPE)
+    set_up(bench, DARK)
+    camera = bench._truth.cameras["left"]
+    exposure = Exposure(Darkness(), SHORT_S, temperature_c=camera.model.dark_current_reference_c)
+    mean, variance = predicted(camera, [exposure], camera.effects, [1.0])[0]
+    away = (bench.expose("left", SHORT_S) - mean) / np.sqrt(variance)
+    share = (camera.model.read_noise_e * camera.model.conversion_gain_dn_per_e) ** 2 / float(np.median(variance))
+    assert share > 0.5
+    for distance, stated in ((1, correlation), (2, correlation * decay)):
+        found = float(np.mean(away[:, distance:] * away[:, :-distance]))
+        assert found == pytest.approx(share * stated, abs=0.06)
 
 
 @pytest.mark.parametrize("name", ["stray_light:share_percent=20", "source_drift:drift_percent_per_min=10"])

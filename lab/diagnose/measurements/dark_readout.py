@@ -26,7 +26,7 @@ from lab.diagnose.measurements.dark_frames import (
 )
 from lab.diagnose.measurements.line_spectra import LEVEL_BAND, Bands, log_mean_bias, log_mean_variance
 from lab.errors import NotDetermined
-from lab.measure.reads import ADDED, LINES
+from lab.measure.reads import ADDED, LINES, READ_SPECTRUM
 from lab.measure.study import Study
 from sim.effects.base import Effects
 from sim.sensor import mosaic
@@ -68,22 +68,35 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
         inverse.append(np.full(len(modes), float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))))
         ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
         labels += [Label(float(x), "all", "temporal", ids, out) for x in bands.middle]
-    over = np.concatenate(inverse) * study.noise.gain**2 * length
-    sets = len(parts)
+    over = np.concatenate(inverse)
+    sets, whites = len(parts), [1.0 / float(one[0]) for one in inverse]
 
     def predict(effects: Effects) -> Prediction:
-        total = np.zeros(len(frequency))
-        for one in Uniform(study.camera, effects).lines:
+        model, total = Uniform(study.camera, effects), np.zeros(len(frequency))
+        for one in model.lines:
             if one.lines == lines:
                 total += one.spectrum_e2(frequency, fixed=False)
-        return Prediction(np.log1p(over * np.tile(bands.mean(total), sets)), {})
+        shared = over * np.tile(study.noise.gain**2 * length * bands.mean(total), sets)
+        # the means of rows hold the read noise's power at frequency 0, those of columns its spectrum
+        along = frequency if lines == "columns" else np.zeros(len(frequency))
+        own = np.concatenate([bands.mean(_coloured_power(study, model, along, white)) for white in whites])
+        return Prediction(np.log1p(shared + own), {})
 
     n = len(labels)
     return Block(
         measurement=ROW_NOISE if lines == "rows" else COLUMN_NOISE, reach=0.1, value=np.concatenate(value),
-        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES,
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES | READ_SPECTRUM,
         predict=predict, scale=np.ones(n),
     )  # fmt: skip
+
+
+def _coloured_power(study: Study, model: Uniform, frequency_cy_per_px: FloatArray, white_dn2: float) -> FloatArray:
+    """Power of a pixel's noise at frequencies along the row over `white_dn2`, the power in `LEVEL_BAND`, less 1. Read
+    noise is a part of it, the rest is white."""
+    read_dn2 = study.noise.read_dn**2
+    level_dn2 = read_dn2 * float(np.mean(model.read_power(np.linspace(*LEVEL_BAND, 33))))
+    found_dn2 = max(white_dn2 - level_dn2, 0.0) + read_dn2 * model.read_power(frequency_cy_per_px)
+    return np.asarray(found_dn2 / max(white_dn2, level_dn2) - 1.0)
 
 
 def fixed_line_block(lines: Lines, study: Study) -> Block:
@@ -177,6 +190,7 @@ def correlation_block(study: Study) -> Block:
     """
     fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN)
     value, variance, labels = [], [], []
+    along: list[tuple[str, Bands, FloatArray, float]] = []  # lines, bands, frequencies, DN^2 of white noise
     for out, part in by_part(fine).items():
         ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
         weight = np.array([min(c.contrasts, 6) for c in part], float)
@@ -192,18 +206,31 @@ def correlation_block(study: Study) -> Block:
             value.append(np.log(bands.mean(power)) - log_mean_bias(total) - log_mean_bias(level))
             variance.append(1.0 / total + 1.0 / level + POWER_FLOOR**2)
             labels += [Label(float(x), "all", f"along {lines}", ids, out) for x in bands.middle]
+            white_dn2 = 1.0 / float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))
+            along.append((lines, bands, frequency, white_dn2))
     if not labels:
         raise NotDetermined(
             "dark_correlation",
             f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share is measured from "
             f"{int(np.ceil(1.0 / LEVEL_BAND[0]))} px a side on",
         )
-    n = len(labels)
-    # no effect predicts an excess: row and column noise has no spectrum along its lines
+
+    def predict(effects: Effects) -> Prediction:
+        # row and column noise has no spectrum along its lines; that of read noise along columns is its mean over rows
+        model, means = Uniform(study.camera, effects), []
+        for lines, bands, frequency, white_dn2 in along:
+            if lines == "rows":
+                power = bands.mean(_coloured_power(study, model, frequency, white_dn2))
+            else:
+                every = _coloured_power(study, model, np.linspace(0.0, 0.5, 257), white_dn2)
+                power = np.full(len(bands.middle), every.mean())
+            means.append(np.log1p(power))
+        return Prediction(np.concatenate(means), {})
+
     return Block(
         measurement=DARK_CORRELATION, reach=0.03, value=np.concatenate(value),
-        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES,
-        predict=lambda effects: Prediction(np.zeros(n), {}), scale=np.ones(n),
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES | READ_SPECTRUM,
+        predict=predict, scale=np.ones(len(labels)),
     )  # fmt: skip
 
 

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.ndimage import convolve1d
 
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Label, Measurement, Prediction
 from lab.diagnose.measurements.temporal_noise import PAIRS, dark_repeats, flat_repeats
 from lab.errors import NotDetermined
+from lab.measure.reads import READ_SPECTRUM
 from lab.measure.study import Study
 from sim.camera import Cfa
 from sim.effects.base import Effects
@@ -41,8 +43,8 @@ def neighbour_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         model = Uniform(camera, effects)
-        kernel = model.filter_kernel()
-        if kernel is None and not model.shares_shot_noise:
+        kernel, read_kernel = model.filter_kernel(), model.read_kernel()
+        if kernel is None and read_kernel is None and not model.shares_shot_noise:
             return Prediction(np.zeros(len(value)), {})
         parts = []
         for r in points:
@@ -58,6 +60,7 @@ def neighbour_block(study: Study) -> Block:
                     read,
                     1.0 / 12.0 / gain**2,
                     kernel,
+                    read_kernel,
                 )
             )
         return Prediction(np.concatenate(parts), {})
@@ -67,7 +70,8 @@ def neighbour_block(study: Study) -> Block:
         value=value, covariance=covariance + CORRELATION_FLOOR**2 * np.eye(len(value)),
         labels=tuple(Label(r.level if bright else 0.0, name, f"{r.exposure_s:.4g} s" if bright else f"dark, {r.exposure_s:.4g} s", r.captures, r.held_out)  # noqa: E501
                      for r, bright in zip(points, lit, strict=True) for name in names),
-        reads=frozenset({"signal.filters", "charge.correlation"}), predict=predict, scale=np.ones(len(value)),
+        reads=frozenset({"signal.filters", "charge.correlation"}) | READ_SPECTRUM, predict=predict,
+        scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -106,12 +110,14 @@ def correlations(
     read_e2: float,
     rounding_e2: float,
     kernel: FloatArray | None,
+    read_kernel: FloatArray | None = None,
 ) -> FloatArray:
     """Predicted correlations by `PAIRS` in uniform light, (6,): means over the phases of the mosaic.
 
     `shot_e2` (planes,): variance of the shot noise; `share` (2, planes): share of the departure from its mean of each
-    neighbour in the row, and of each in the column, that a pixel takes over. Read noise (`read_e2`) is independent.
-    `kernel` filters both within a plane. Rounding (`rounding_e2`) is added last and is independent.
+    neighbour in the row, and of each in the column, that a pixel takes over. Read noise (`read_e2`) is independent, or
+    made of such noise by `read_kernel` (odd,) along the row. `kernel` filters both within a plane. Rounding
+    (`rounding_e2`) is added last and is independent.
     """
     period = 1 if cfa == "MONO" else 2
     at = dict.fromkeys(planes, (0, 0)) if period == 1 else _phase_of(cfa)
@@ -120,7 +126,7 @@ def correlations(
         variance[at[name]], taken[:, *at[name]] = v, g
     taps = np.ones((1, 1)) if kernel is None else kernel
     half = taps.shape[0] // 2 * period + 1
-    reach = half + 2
+    reach = half + 2 + (0 if read_kernel is None else len(read_kernel) // 2)
     size = 2 * reach + 1
     offset = np.arange(size) - reach
     found = np.zeros(len(PAIRS))
@@ -136,6 +142,8 @@ def correlations(
             read[reach + (i - middle) * period, reach + (j - middle) * period] = tap
         shot = read * norm
         shot = shot + sum(_neighbours(read * norm * g, axis) for g, axis in zip(shares, (1, 0), strict=True))
+        if read_kernel is not None:
+            read = convolve1d(read, read_kernel, axis=1, mode="constant")
         weights[phase] = np.stack([shot * np.sqrt(own), read * np.sqrt(read_e2)])
     total = {p: float(np.vdot(w, w)) + rounding_e2 for p, w in weights.items()}
     for k, lags in enumerate(PAIRS.values()):

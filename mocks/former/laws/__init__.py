@@ -65,6 +65,7 @@ from mocks.former.laws.readout import (
     BlackLevelDriftLaw,
     BlackLevelTemperatureLaw,
     ColouredLineNoiseLaw,
+    ColouredReadNoiseLaw,
     ColumnNoiseLaw,
     DefectInterpolationLaw,
     DigitalGainLaw,
@@ -147,6 +148,7 @@ LISTED: tuple[type[Law], ...] = (
     LeakyShutterLaw,
     AnisotropicBrighterFatterLaw,
     CoverGlassFringeLaw,
+    ColouredReadNoiseLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single

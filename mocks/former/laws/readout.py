@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 from scipy.ndimage import convolve, shift
+from scipy.signal import lfilter
 
 from mocks.former.law import DARK, OPTICAL, Array, Law
 
@@ -218,6 +219,33 @@ class ColouredLineNoiseLaw(Law):
 
     def library_parameters(self) -> dict[str, float]:
         return {"noise_e": self.strength} if self.variant < 2 else {}
+
+
+class ColouredReadNoiseLaw(Law):
+    """Noise of the video amplifier beside the pixels' own, along the rows as they are read. Variants: one pole, which
+    keeps half of it a pixel further; double sampling that takes a pixel's reset from the one before; two such poles."""
+
+    name = effect = "coloured_read_noise"
+    variants, unit, nominal, limits, power, shown_by = 3, "e", 1.0, (0.1, 20.0), 2.0, DARK
+    keep = 0.5
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        white = self.rng(19, k).standard_normal((shape[0], shape[1] + 64))  # settled before the frame begins
+        if self.variant == 1:
+            noise = (white[:, 1:] - white[:, :-1]) / np.sqrt(2.0)
+        else:
+            noise = white
+            for _ in range(1 if self.variant == 0 else 2):
+                noise = lfilter([1.0], [1.0, -self.keep], noise, axis=1)
+            keep2 = self.keep**2
+            noise = noise * np.sqrt((1.0 - keep2) ** 3 / (1.0 + keep2) if self.variant == 2 else 1.0 - keep2)
+        return self.strength * noise[:, -shape[1] :]
+
+    def library_parameters(self) -> dict[str, float]:
+        if self.variant == 2:
+            return {}
+        share = self.strength**2 / (self.strength**2 + self.camera.read_noise_e**2)
+        return {"correlation": share * (self.keep if self.variant == 0 else -0.5)}
 
 
 class PeriodicBandingLaw(Law):

@@ -25,6 +25,7 @@ from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     AnisotropicBrighterFatterLaw,
     BrighterFatterLaw,
+    ColouredReadNoiseLaw,
     InterPixelCapacitanceLaw,
     OnChipSharpeningLaw,
     OnChipSmoothingLaw,
@@ -164,6 +165,8 @@ def test_tones_of_the_read_out_are_told_and_leave_no_correlation() -> None:
         effect("brighter_fatter")(loss_percent=12.0, shared_percent=10.0, row_excess=0.6),
         effect("on_chip_smoothing")(strength=0.06),
         effect("on_chip_sharpening")(strength=0.06),
+        effect("coloured_read_noise")(correlation=-0.15),
+        effect("coloured_read_noise")(correlation=0.25, decay=0.5),
     ],
     ids=lambda e: e.name,
 )
@@ -189,6 +192,9 @@ def test_what_sim_renders_is_predicted_and_named(one: Effect, cfa: str) -> None:
         (OnChipSmoothingLaw(0.06, 1), "on_chip_smoothing"),
         (OnChipSharpeningLaw(0.06, 1), "on_chip_sharpening"),
         (InterPixelCapacitanceLaw(1.0), "inter_pixel_capacitance"),
+        (ColouredReadNoiseLaw(3.0, 0), "coloured_read_noise"),
+        (ColouredReadNoiseLaw(3.0, 1), "coloured_read_noise"),
+        (ColouredReadNoiseLaw(3.0, 2), "coloured_read_noise"),
     ],
     ids=lambda v: v if isinstance(v, str) else f"{v.strength:g}-{v.variant}",
 )
