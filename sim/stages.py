@@ -505,7 +505,7 @@ class Signal(State):
         """Kernel (2 `READ_REACH` + 1,) along the row that makes read noise of white noise; None for none."""
         if not self.read_spectrum:
             return None
-        power = self.read_power(np.fft.rfftfreq(READ_GRID))
+        power = self.read_power(np.asarray(np.fft.rfftfreq(READ_GRID), float))
         kernel = np.roll(np.fft.irfft(np.sqrt(np.maximum(power, 0.0)), READ_GRID), READ_REACH)[: 2 * READ_REACH + 1]
         return np.asarray(kernel / np.sqrt(np.sum(np.square(kernel))))
 

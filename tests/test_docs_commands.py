@@ -188,16 +188,10 @@ def desk(tmp_path: Path) -> dict[str, str]:
     return os.environ | {"PATH": path, "PYTHONPATH": str(ROOT), "CALIBENCH_DATA": str(tmp_path / "data")}
 
 
-#: The page's own picture: the importer finds no chart in it without --corners.
-CHART = pytest.mark.xfail(reason="chart.tif: no ColorChecker of 24 patches found", strict=False)
-
-
 @pytest.mark.parametrize(
     ("page", "block"),
     [
-        pytest.param(
-            page, block, id=f"{Path(page).stem}-{number}", marks=CHART if "simulate colorchecker24" in block else ()
-        )
+        pytest.param(page, block, id=f"{Path(page).stem}-{number}")
         for page, words in RUN.items()
         for number, block in enumerate(blocks(ROOT / page))
         if any(word in block for word in words)

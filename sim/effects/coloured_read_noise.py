@@ -55,7 +55,7 @@ class ColouredReadNoise(Effect):
         if self.correlation == 0.0:
             return signal
         # of mean 1 over frequencies, where nothing is cut off
-        whole = float(np.mean(self._cut(np.fft.fftfreq(512))))
+        whole = float(np.mean(self._cut(np.asarray(np.fft.fftfreq(512), float))))
         return signal.add_laws(read_spectrum=lambda frequency_cy_per_px: self._cut(frequency_cy_per_px) / whole)
 
     def _cut(self, frequency_cy_per_px: FloatArray) -> FloatArray:

@@ -155,9 +155,8 @@ def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
         rim = round(pad * min(picture.shape[:2]))
         padded = cv2.copyMakeBorder(picture, rim, rim, rim, rim, cv2.BORDER_CONSTANT, value=(RIM_CODE,) * 3)
         larger = cv2.resize(padded, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        cv2.setRNGSeed(0)  # the detector clusters colours from random starts
         detector = cv2.mcc.CCheckerDetector.create()
-        if detector.process(larger, 1):
+        if _detects_alike(detector, larger):
             charts = np.asarray(detector.getBestColorChecker().getColorCharts(), float).reshape(-1, 4, 2)
             if len(charts) == PATCH_ROWS * PATCH_COLS:
                 break
@@ -171,6 +170,18 @@ def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
     found = cv2.perspectiveTransform(square, homography)[:, 0] * step + 0.5 * (step - 1)
     corners = tuple((float(y), float(x)) for x, y in found)
     return _upright(frame, camera, corners)
+
+
+def _detects_alike(detector: Any, picture: NDArray[np.uint8]) -> bool:
+    """Return whether a detector finds a chart, alike at every call: it clusters colours from random starts, and each
+    thread draws its own."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        cv2.setRNGSeed(0)
+        return bool(detector.process(picture, 1))
+    finally:
+        cv2.setNumThreads(threads)
 
 
 def _upright(frame: Frame, camera: DataSheet, corners: Corners) -> Corners:
