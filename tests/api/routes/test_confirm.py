@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,14 @@ from typer.testing import CliRunner
 
 from api.client import ServiceClient
 from lab.capture.by_hand import left_by_session
+from lab.capture.plan import CapturePlan
 from lab.capture.questions import question_of
+from lab.capture.session import CaptureSession, Progress
+from lab.capture.station import read_station
+from lab.capture_kinds.dark import DarkSequence
 from lab.cli.entry import app
+from lab.errors import Cancelled
+from lab.pipeline import CaptureRequest
 from tests.api.conftest import STATION, Running, events, serving, until, until_state
 
 WARM = """
@@ -111,6 +118,33 @@ def test_what_a_hand_changes_and_puts_back_is_asked_for_in_turn(desk: Running) -
             assert confirm(client, id, question["target"], since=question["since"]).status_code == 200
     assert seen == [("35 C", True), ("cap", True), ("usual temperature", True)]
     assert left_by_session(desk.store.root, id) is None
+
+
+def test_a_job_that_captures_asks_too(desk: Running) -> None:
+    """As resolving does: a session is registered, and captured by a job. Cancelling the job ends the wait."""
+    station = read_station(desk.store.root / "stations" / "fakes.toml")
+    plan = CapturePlan((DarkSequence(exposures_s=(0.001,), frames=1, sensor_c=35.0),))
+    id = CaptureSession.start(desk.store, station, plan, name="resolves a doubt").id
+    seen: list[str] = []
+    cancelled = threading.Event()
+
+    def tell(progress: Progress) -> None:
+        if cancelled.is_set():
+            raise Cancelled
+
+    with desk.client("operate") as client, ThreadPoolExecutor() as pool:
+        captured = pool.submit(desk.app.state.service.live.capturer(station), CaptureRequest(session=id), tell)
+        asked(client, id)
+        cancelled.set()
+        assert isinstance(captured.exception(30.0), Cancelled)
+        cancelled.clear()
+        captured = pool.submit(desk.app.state.service.live.capturer(station), CaptureRequest(session=id), tell)
+        for _ in range(3):
+            question = asked(client, id)
+            seen.append(question["target"])
+            assert confirm(client, id, question["target"], since=question["since"]).status_code == 200
+        assert captured.result(30.0) == id
+    assert seen == ["35 C", "cap", "usual temperature"]
 
 
 def test_a_halt_while_it_waits_is_confirmed_and_the_session_asks_again(desk: Running) -> None:
