@@ -243,8 +243,10 @@ def put_back(
 
 @commands.command("confirm")
 def confirm_step(
-    session: Annotated[str, typer.Argument(metavar="[SESSION TARGET]", help="say that TARGET is there")] = "",
-    target: Annotated[str, typer.Argument(hidden=True)] = "",
+    session: Annotated[str, typer.Argument(metavar="[SESSION]", help="the session that waits")] = "",
+    target: Annotated[
+        str, typer.Argument(metavar="[TARGET]", help="what is there now, by the name it is asked by")
+    ] = "",
     data: StoreFolder = None,
 ) -> None:
     """What sessions that the service runs wait for an operator to do; with SESSION and TARGET: it is done."""
