@@ -69,5 +69,5 @@ def test_who_runs_the_session_may_ask_elsewhere(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("place_timeout_s", [0.0, -1.0, float("nan")])
 def test_a_time_out_that_is_none_is_refused(place_timeout_s: float) -> None:
-    with pytest.raises(InstrumentError, match="place_timeout_s is .*above 0 s"):
+    with pytest.raises(InstrumentError, match=r"place_timeout_s is .*above 0 s"):
         PromptStage(place_timeout_s=place_timeout_s)
