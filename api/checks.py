@@ -121,6 +121,8 @@ class DeviceChecks:
             self._live.safety.note(station, StationSafety(state="safe", shutter=shutter, at=now()))
 
     def _test(self, name: str, station: Station, device: str, keep_transcript: bool) -> SelfTest:
+        if not station.devices[device].address:
+            return SelfTest(device, "a person", True, "is asked on the operator's page while a session runs")
         try:
             if not keep_transcript:
                 return self_test(station, device, self._connect)

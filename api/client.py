@@ -13,6 +13,7 @@ import io
 import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
@@ -61,6 +62,7 @@ from api.schemas import (
     SessionWords,
     SetAsked,
     StationState,
+    StepDone,
     StoredCapture,
     StoredPrediction,
     StoredSession,
@@ -333,6 +335,10 @@ class ServiceClient:
         """Take a session out of the queue; the queue then."""
         response = self.request("DELETE", f"/sessions/{session_id}/queue")
         return TypeAdapter(list[QueueEntry]).validate_json(response.content)
+
+    def confirm(self, session_id: str, target: str, since: datetime | None = None) -> StoredSession:
+        """Say that what a session waits for an operator to do (its `asks`) is done."""
+        return self._post(StoredSession, f"/sessions/{session_id}/confirm", StepDone(target=target, since=since))
 
     def halt(self, station: str | None = None) -> tuple[str, ...]:
         """End every session now, or those on one station, and hold the queue; the ids of the sessions that ran."""

@@ -103,11 +103,14 @@ class LiveSession:
     def _changed(self, progress: Progress | None = None, ended: bool = False) -> None:
         with self._lock:
             was = self._latest.state if self._latest is not None else None
+            asked = self._latest.asks if self._latest is not None else None
             self._latest = progress or self._latest
             self._number += 1
             self._ended = self._ended or ended
             followers = list(self._followers)
-        if progress is None or progress.state != was:  # before the followers hear of it and ask
+        if (
+            progress is None or progress.state != was or progress.asks != asked
+        ):  # before the followers hear of it and ask
             self._on_change()
         for loop in {loop for loop, _ in followers}:  # one call into a loop, however many follow there
             mine = [wake for of, wake in followers if of is loop]
@@ -213,6 +216,7 @@ class LiveSessions:
                 demands_certified=demands_certified,
                 on_progress=live.tell,
                 connect=self._connect,
+                asks_on_page=True,
             )
             self._live[capture.id] = live
             live.begin(capture)
@@ -244,7 +248,12 @@ class LiveSessions:
                     raise Conflict(f"session {session_id} is {info.state} now: {info.error}")
             live = LiveSession(station, self._changed, self.safety)
             capture = CaptureSession(
-                self._store, session_id, station=station, on_progress=live.tell, connect=self._connect
+                self._store,
+                session_id,
+                station=station,
+                on_progress=live.tell,
+                connect=self._connect,
+                asks_on_page=True,
             )
             self._live[session_id] = live
             live.begin(capture)

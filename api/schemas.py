@@ -16,6 +16,7 @@ from lab.calibration.camera_models import ModelOfCamera
 from lab.calibration.life import CalibrationRecord
 from lab.calibration.limits import CalibrationLimits, Limit, Mark
 from lab.capture.plan import CapturePlan, full_plan
+from lab.capture.questions import Question
 from lab.capture.queue import QueuedSession
 from lab.capture.records import RunRecord
 from lab.capture.session import Progress
@@ -125,6 +126,9 @@ class StationState(Schema):
     left_by_hand: tuple[LeftChanged, ...] = Field(
         default=(),
         description="what was changed by hand and not put back; the next session asks for it before all else",
+    )
+    asks: Question | None = Field(
+        default=None, description="what the session that runs on it waits for an operator to do"
     )
     problem: str | None = None
 
@@ -457,6 +461,18 @@ class SessionWords(Asked):
     notes: str | None = Field(default=None, max_length=4000, description="a word that begins with # is a tag")
 
 
+class StepDone(Asked):
+    """What an operator has done, as `asks` of the session named it."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"target": "edge-1"}})
+
+    target: str = Field(max_length=200)
+    since: AwareDatetime | None = Field(
+        default=None,
+        description="that of `asks`: a question for the same target that was asked at another time isn't meant",
+    )
+
+
 class CaptureCount(Schema):
     """How many captures a session has of a kind and a side."""
 
@@ -471,6 +487,10 @@ class SessionDetail(ListedSession):
     can_copy: bool = Field(default=False, description="whether `GET /sessions/ID/request` has what it was asked with")
     then: ThenState | None = Field(default=None, description="how far that is which follows its end")
     progress: Progress | None = Field(description="null unless this service runs it now")
+    asks: Question | None = Field(
+        default=None,
+        description="what it waits for an operator to do; `POST /sessions/ID/confirm` says that it is done",
+    )
     runs: tuple[RunRecord, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
     captures: tuple[CaptureCount, ...] = Field(description="how many there are of each kind and side")
     results: dict[str, str] = Field(

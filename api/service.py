@@ -25,6 +25,7 @@ from api.upload import Inbox
 from api.waiting import QueueRunner
 from lab.calibration import camera_models
 from lab.calibration.camera_models import CameraModelRecord
+from lab.capture.questions import Question, question_of
 from lab.capture.records import RunRecord, SessionInfo
 from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
@@ -142,8 +143,19 @@ class Service:
 
     def told(self, progress: Progress) -> Progress:
         """Return a session's progress as an answer may have it."""
-        texts = {"what": self.public(progress.what), "remark": self.public.or_none(progress.remark)}
+        texts = {
+            "what": self.public(progress.what),
+            "remark": self.public.or_none(progress.remark),
+            "asks": self._public_question(progress.asks),
+        }
         return progress.model_copy(update=texts)
+
+    def asks(self, session_id: str | None) -> Question | None:
+        """Return what a session waits for an operator to do, as an answer may have it; None: nothing."""
+        return self._public_question(question_of(self.store, session_id)) if session_id else None
+
+    def _public_question(self, question: Question | None) -> Question | None:
+        return question and question.model_copy(update={"instruction": self.public(question.instruction)})
 
     def public_runs(self, runs: Iterable[RunRecord]) -> tuple[RunRecord, ...]:
         """Return the provenance of a session. An address that is a folder of the server is only its name."""

@@ -1,5 +1,6 @@
 // One session, or one recording set that was sent in: live, findings, figures, frames and jobs, each at its own address.
 
+import { asksBanner } from "./asks.js";
 import { showFrames, leaveFrames } from "./frames.js";
 import { showFindings } from "./findings.js";
 import { figureRow, searchIn } from "./figures.js";
@@ -19,6 +20,12 @@ const tabsOf = (kind) => EVERY.filter((tab) => kind === "sessions" || tab !== "l
 
 let shown = ""; // the source that stands there
 let noted = ""; // its name and notes as the form has them
+
+const asks = asksBanner(() => $("session-title"), () => showView());
+$("session-asks").append(asks.whole);
+document.addEventListener("session-progress", ({ detail }) => {
+  if (shown === `sessions/${detail.id}`) asks.show(detail.id, detail.asks);
+});
 
 /** @param {string} label @param {string | Node | null | undefined} value */
 const fact = (label, value) => (value ? [element("div", {}, element("dt", { textContent: label }), element("dd", {}, value))] : []);
@@ -42,6 +49,7 @@ function showHead(one) {
     ...fact("Calibration", one.results?.fit ? element("a", { href: `#/calibrations/${one.results.fit}`, textContent: one.results.fit }) : ""),
   ];
   $("session-facts").replaceChildren(...facts);
+  asks.show(one.id, session?.asks);
   $("session-error").textContent = session?.error ?? "";
   $("session-then").textContent = session?.then ? `Then: ${session.then.words}` : "";
   const form = $("session-notes");

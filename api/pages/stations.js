@@ -1,6 +1,7 @@
 // Stations at a glance: on every view a line each with shutter, light, screen and the age of that; at the desk a card each, with what runs
 // there and a halt; and a view each, with its instruments' health.
 
+import { asksBanner } from "./asks.js";
 import { $, LIVE, addView, api, ask, cells, clock, duration, element, forgetHalt, halt, may, mayHalt, named, post, show, tellHalts, time, told } from "./page.js";
 
 // A browser keeps six connections to a service open; the streams leave some of them for requests.
@@ -95,13 +96,15 @@ function card(name, title) {
 /** A station's line on every view.
  * @param {string | null} name @param {string} title */
 function stripItem(name, title) {
-  const strip = { name: element("a", { className: "name", textContent: name ?? title }), state: element("span", { className: "state" }), facts: element("span"), age: element("span", { className: "age" }), whole: element("li") };
+  const link = element("a", { className: "name", textContent: name ?? title });
+  const strip = { name: link, state: element("span", { className: "state" }), facts: element("span"), age: element("span", { className: "age" }), asks: asksBanner(() => link, () => follower(), name ?? title), whole: element("li") };
   strip.whole.append(element("span", {}, strip.name, " ", strip.state, " ", strip.facts, " ", strip.age));
   if (mayHalt() && name) {
     const button = named("button", "Halt", `${name}, now`, { className: "danger small" });
     button.addEventListener("click", () => halt($("halt-told"), name));
     strip.whole.append(button);
   }
+  strip.whole.append(strip.asks.whole);
   $("strip").append(strip.whole);
   return strip;
 }
@@ -136,6 +139,7 @@ setInterval(() => document.hidden || cards.forEach(showAge), 1000);
 function forget(parts) {
   parts.whole.remove();
   parts.strip.whole.remove();
+  parts.strip.asks.leave();
   forgetHalt(parts.halted);
 }
 
@@ -160,7 +164,8 @@ function showProgress(parts, p) {
   if (p.bench) showBench(parts, p.bench);
   parts.seen = Date.now();
   showStrip(parts);
-  document.dispatchEvent(new CustomEvent("session-progress", { detail: { id: p.session, words: parts.step.textContent } }));
+  parts.strip.asks.show(p.session, p.asks);
+  document.dispatchEvent(new CustomEvent("session-progress", { detail: { id: p.session, words: parts.step.textContent, asks: p.asks } }));
   if (p.remark) parts.remarks.prepend(element("li", { textContent: `${p.what}: ${p.remark}` }));
 }
 
@@ -214,8 +219,9 @@ function showByHand(parts, name, left) {
   parts.byHand.append(" ", button);
 }
 
-/** @param {Parts} parts @param {Session | undefined} session @param {Safety | null | undefined} safety */
-function showRun(parts, session, safety) {
+/** @param {Parts} parts @param {Session | undefined} session @param {Safety | null | undefined} safety @param {Model<"Question"> | null | undefined} asks */
+function showRun(parts, session, safety, asks) {
+  parts.strip.asks.show(session?.id, session && asks);
   parts.known = { session, safety };
   const begun = parts.session !== session?.id;
   parts.session = session?.id;
@@ -258,13 +264,13 @@ async function running(stations, sessions) {
 export async function showStations(stations, sessions) {
   tellHalts(stations);
   const live = await running(stations, sessions);
-  /** @type {Map<string, {title: string, name: string | null, safety?: Safety | null, left?: Model<"LeftChanged">[], session?: Session}>} */
+  /** @type {Map<string, {title: string, name: string | null, safety?: Safety | null, left?: Model<"LeftChanged">[], session?: Session, asks?: Model<"Question"> | null}>} */
   const wanted = new Map();
   for (const one of stations.filter((s) => !s.problem)) {
-    wanted.set(one.name, { title: one.title === one.name ? one.name : `${one.name}: ${one.title}`, name: one.name, safety: one.safety, left: one.left_by_hand, session: live.find((s) => s.id === one.busy_with) });
+    wanted.set(one.name, { title: one.title === one.name ? one.name : `${one.name}: ${one.title}`, name: one.name, safety: one.safety, left: one.left_by_hand, session: live.find((s) => s.id === one.busy_with), asks: one.asks });
   }
   const shown = new Set([...wanted.values()].map((one) => one.session?.id));
-  for (const session of live) if (!shown.has(session.id)) wanted.set(session.id, { title: "elsewhere", name: null, session });
+  for (const session of live) if (!shown.has(session.id)) wanted.set(session.id, { title: "elsewhere", name: null, session, asks: "asks" in session ? session.asks : null });
   for (const [id, parts] of cards) {
     if (wanted.has(id)) continue;
     forget(parts);
@@ -276,7 +282,7 @@ export async function showStations(stations, sessions) {
       cards.set(id, parts);
       $("stations").append(parts.whole);
     }
-    showRun(parts, one.session, one.safety);
+    showRun(parts, one.session, one.safety, one.asks);
     if (one.name) showByHand(parts, one.name, one.session ? [] : (one.left ?? []));
   }
 }

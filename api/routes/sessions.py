@@ -7,16 +7,16 @@ from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 
 import anyio
-from fastapi import APIRouter, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
 
 from api.archives import ARCHIVE, Form, Packed
-from api.errors import answers, known
+from api.errors import Conflict, answers, known
 from api.events import described, event, stream, watched
 from api.frames import FOR_EVER, Npy, Picture, Stretch, Width, npy_of, picture_of
 from api.kept_sets import session_set
-from api.keys import Permission
+from api.keys import Permission, StoredKey
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers
 from api.preview import Form as PictureForm
 from api.schemas import (
@@ -29,6 +29,7 @@ from api.schemas import (
     SessionStart,
     SessionWords,
     StationState,
+    StepDone,
     StoredCapture,
     StoredSession,
 )
@@ -38,6 +39,7 @@ from api.then import check_webhook, keep_request, kept_request, then_of
 from lab.calibration.overview import SessionOverview, overviews, sessions_of_verdict, tags_of
 from lab.capture.by_hand import left_by_hand
 from lab.capture.plan import full_plan
+from lab.capture.questions import confirm
 from lab.capture.queue import put_into_queue
 from lab.capture.records import CaptureInfo, SessionInfo
 from lab.capture.session import CaptureSession, Progress
@@ -67,7 +69,8 @@ def station_state(service: Service, name: str) -> StationState:
         instruments={name: entry.driver for name, entry in station.devices.items() if not name.startswith("cameras.")},
         targets=tuple(station.targets),
         sequences=full_plan(station).names,
-        busy_with=service.live.busy(station),
+        busy_with=(busy := service.live.busy(station)),
+        asks=service.asks(busy),
         safety=service.safety(station),
         left_by_hand=tuple(
             LeftChanged(session=left.session, words=service.public(left.words))
@@ -202,6 +205,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
         can_copy=kept_request(service.store, session_id) is not None,
         then=then_of(service.store, session_id),
         progress=service.progress(session_id) if found.info.closed is None else None,
+        asks=service.asks(session_id),
         runs=service.public_runs(found.runs),
         captures=tuple(
             CaptureCount(kind=kind, side=side, captures=n)  # type: ignore[arg-type]
@@ -290,6 +294,28 @@ def abort_session(service: Here, session_id: SessionId) -> StoredSession:
     """End the run now. The present step is dropped, finished steps are kept, and the session can be resumed."""
     service.session(session_id)
     service.live.abort(session_id, "aborted over the network")
+    return stored_session(service, session_id)
+
+
+@router.post(
+    "/sessions/{session_id}/confirm",
+    tags=["sessions"],
+    responses=answers(401, 403, 404, 409, 422),
+)
+def confirm_step(
+    service: Here,
+    key: Annotated[StoredKey, Depends(Demand(Permission.OPERATE))],
+    session_id: SessionId,
+    done: StepDone,
+) -> StoredSession:
+    """Say that what a session waits for (`asks`) is done: the target is there, the chart turned, the aperture set, or
+    put back. 409 where it doesn't wait for that now: it asks for another target, somebody confirmed it already, or the
+    session has ended."""
+    service.session(session_id)
+    try:
+        confirm(service.store, session_id, done.target, key.name, done.since)
+    except InputError as error:
+        raise Conflict(str(error)) from None
     return stored_session(service, session_id)
 
 

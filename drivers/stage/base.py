@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from drivers.instrument import Instrument
 
 
 class Stage(Instrument):
-    """A device or a person that places targets."""
+    """A device or a person that places targets. `place_timeout_s`: longest time to place one."""
+
+    place_timeout_s: float = 600.0
 
     @abstractmethod
     def place(self, target: str) -> None:
@@ -25,3 +27,7 @@ class Stage(Instrument):
 
     def instruct(self, instructions: Mapping[str, str]) -> None:
         """Tell what an operator does for each target. A stage that moves by itself needs no instruction."""
+
+    def ask_by(self, ask: Callable[[str, str], None]) -> None:
+        """Have a person asked by `ask(target, instruction)`, which returns once it is done. A stage that asks nobody on
+        a terminal needs nobody to ask for it."""

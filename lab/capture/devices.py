@@ -35,10 +35,10 @@ from sim.spectrum import Spectrum
 WriteFrame = Callable[[str, Side, NDArray[np.uint16]], StoredFile]
 WriteSpectrum = Callable[[str, Spectrum], StoredFile]
 
-#: Time-outs (s) of a move, of placing a target (a person may do it), of a measurement of light, and of what a camera
-#: does beside the exposures and the readouts, whose own time-outs (`Camera.readout_s`) come on top: the drivers'
-#: messages say more.
-MOVE_S, PLACE_S, MEASURE_S, READOUT_S = 90.0, 660.0, 180.0, 30.0
+#: Time-outs (s) of a move, of what placing a target takes beside the stage's own time-out (`Stage.place_timeout_s`), of
+#: a measurement of light, and of what a camera does beside the exposures and the readouts, whose own time-outs
+#: (`Camera.readout_s`) come on top: the drivers' messages say more.
+MOVE_S, PLACE_S, MEASURE_S, READOUT_S = 90.0, 60.0, 180.0, 30.0
 
 
 class Device:
@@ -80,7 +80,7 @@ class TargetDevice(Device):
             self.stage.place(target)
             self.value = target
 
-        return Status("stage", place, PLACE_S)
+        return Status("stage", place, self.stage.place_timeout_s + PLACE_S)
 
     async def stop(self, success: bool = True) -> None:
         await bounded("stage", self.stage.stop)
@@ -105,7 +105,7 @@ class HandDevice(TargetDevice):
             self.by_hand.note_done(target)
             self.value = target
 
-        return Status("stage", change, PLACE_S)
+        return Status("stage", change, self.stage.place_timeout_s + PLACE_S)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from datetime import timedelta
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -31,6 +33,7 @@ from lab.capture.blocking_calls import STOP_S, in_thread
 from lab.capture.by_hand import ByHand, left_by_session, note_put_back
 from lab.capture.instruments import BenchState, Instruments, SafeState
 from lab.capture.plan import CapturePlan, full_plan
+from lab.capture.questions import Question, put_question, wait_for_answer, withdraw
 from lab.capture.records import JournalEntry, RunRecord, SessionInfo, now
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
@@ -57,7 +60,7 @@ PACKAGES = ("calibench", "numpy", "bluesky", "pyserial", "pyusb", "h5py")
 
 class Progress(Frozen):
     """Progress of a session: `done` of `total` steps are finished, `what` is the current one; times in s. `bench`:
-    state of the instruments after the previous step."""
+    state of the instruments after the previous step. `asks`: what an operator is asked to do now, over the service."""
 
     session: str
     state: Literal["connecting", "running", "paused", "packing", "interrupted", "failed", "finished"]
@@ -69,6 +72,7 @@ class Progress(Frozen):
     left_s: float | None = None
     remark: str | None = None
     bench: BenchState | None = None
+    asks: Question | None = None
 
 
 class _Pace:
@@ -130,7 +134,8 @@ class CaptureSession:
     """One session on its station. `run` blocks; `pause`, `resume` and `abort` may be called from other threads.
 
     `station`: None for the station of its last run, or that it was registered with; another one where instruments have
-    new addresses. `on_progress` is called from a thread of the run. An exception that it raises ends the run."""
+    new addresses. `on_progress` is called from a thread of the run. An exception that it raises ends the run.
+    `asks_on_page`: a person as stage is asked by `lab.capture.questions`, not on the terminal."""
 
     def __init__(
         self,
@@ -140,11 +145,15 @@ class CaptureSession:
         station: Station | None = None,
         on_progress: Callable[[Progress], None] | None = None,
         connect: Callable[[Station], Drivers] = drivers_of,
+        asks_on_page: bool = False,
     ) -> None:
         self.store, self.id = store, session_id
         self.station = station or store.station(session_id)
         self._on_progress = on_progress
         self._connect = connect
+        self._asks_on_page = asks_on_page
+        self._told: Progress | None = None
+        self._asks: Question | None = None
         self._engine: RunEngine | None = None
         self._instruments: Instruments | None = None
         self._control = threading.Condition()
@@ -172,6 +181,7 @@ class CaptureSession:
         demands_certified: bool = False,
         on_progress: Callable[[Progress], None] | None = None,
         connect: Callable[[Station], Drivers] = drivers_of,
+        asks_on_page: bool = False,
     ) -> CaptureSession:
         """Register a new session, by default of everything that the station can do. `run` starts it.
 
@@ -190,7 +200,7 @@ class CaptureSession:
             notes=notes,
             demands_certified=demands_certified,
         )
-        return cls(store, session_id, on_progress=on_progress, connect=connect)
+        return cls(store, session_id, on_progress=on_progress, connect=connect, asks_on_page=asks_on_page)
 
     # --- from other threads -------------------------------------------------------------------------------------------
 
@@ -261,6 +271,7 @@ class CaptureSession:
 
     def _run(self) -> None:
         self._began_s = time.monotonic()
+        withdraw(self.store.folder(self.id))  # what a killed run asked
         swept = self.store.sweep(self.id)
         if swept:
             log.info("session %s: took away %d files of steps that weren't finished", self.id, len(swept))
@@ -304,9 +315,12 @@ class CaptureSession:
         self._writes = _Writes()
         by_hand = ByHand(self.store.root, self.id, self.station)
         by_hand.check_can_put_back()
+        drivers = self._connect(self.station)
+        if self._asks_on_page and drivers.stage is not None:
+            drivers.stage.ask_by(partial(self._ask, drivers.stage.place_timeout_s))
         instruments = Instruments(
             self.station,
-            self._connect(self.station),
+            drivers,
             write_frame=lambda path, side, frame: self._writes.do(
                 lambda: self.store.write_frame(self.id, path, side, frame)
             ),
@@ -334,6 +348,8 @@ class CaptureSession:
         except BaseException as error:
             failure = error
         self._writes.close()
+        self._asks = None
+        withdraw(self.store.folder(self.id))
         self.safe = instruments.make_safe()
         mine = self._held.acquire(timeout=STOP_S)  # no driver that hangs holds the run up
         try:
@@ -468,6 +484,33 @@ class CaptureSession:
                 yield from adjust(change.back, instruments)
                 note_put_back(self.store.root, left.session, change.changes)
 
+    def _ask(self, timeout_s: float, target: str, instruction: str) -> None:
+        """Ask an operator, wherever he is, and wait until it is confirmed. Where nobody does so within `timeout_s`, the
+        run is ended: it can be resumed, and asks again."""
+        since = now()
+        question = Question(
+            target=target, instruction=instruction, since=since, until=since + timedelta(seconds=timeout_s)
+        )
+        folder = self.store.folder(self.id)
+        self._writes.do(lambda: put_question(folder, question))
+        self._tell_asks(question)
+        by = wait_for_answer(folder, question, timeout_s, self._check_goes_on)
+        if not by:
+            self.abort(
+                f"nobody confirmed {target} within {timeout_s:g} s (place_timeout_s under [stage] of the station "
+                "file); resume the session, and it asks again"
+            )
+            self._check_goes_on()
+        log.info("session %s: %s is there, said %s", self.id, target, by)
+        self._tell_asks(None, f"{target} is there, said {by}")
+
+    def _tell_asks(self, question: Question | None, remark: str | None = None) -> None:
+        self._asks = question
+        if self._told is not None and self._on_progress is not None:
+            elapsed_s = time.monotonic() - self._began_s
+            changes = {"asks": question, "remark": remark, "elapsed_s": elapsed_s}
+            self._on_progress(self._told.model_copy(update=changes))
+
     def _keep(self, step: Step, taken: Taken, started: Any) -> None:
         self._writes.do(
             lambda: self.store.finish_step(self.id, step.id, started, taken.result, taken.files, taken.captures)
@@ -495,7 +538,9 @@ class CaptureSession:
             left_s=self._pace.left_s(to_do) if to_do else None,
             remark=remark,
             bench=self._instruments.state() if self._instruments is not None else None,
+            asks=self._asks,
         )
+        self._told = progress
         try:
             self._on_progress(progress)
         except Exception:

@@ -241,6 +241,32 @@ def put_back(
         out.print("nothing is left changed by hand")
 
 
+@commands.command("confirm")
+def confirm_step(
+    session: Annotated[str, typer.Argument(metavar="[SESSION]", help="the session that waits")] = "",
+    target: Annotated[
+        str, typer.Argument(metavar="[TARGET]", help="what is there now, by the name it is asked by")
+    ] = "",
+    data: StoreFolder = None,
+) -> None:
+    """What sessions that the service runs wait for an operator to do; with SESSION and TARGET: it is done."""
+    from lab.capture.questions import confirm, question_of
+
+    store = store_to_read(data)
+    if session:
+        if not target:
+            raise InputError(f"session {session}: give the target, too, as `calibench confirm` lists it")
+        confirm(store, session, target, "the command line")
+        out.print(f"session {escape(session)}: {escape(target)} is there")
+        return
+    asked = {one: question for one in store.under_way() if (question := question_of(store, one)) is not None}
+    for one, question in asked.items():
+        since = f"{question.since:%Y-%m-%d %H:%M:%S} UTC"
+        out.print(f"session {escape(one)}: {escape(question.target)}: {escape(question.instruction)} (since {since})")
+    if not asked:
+        out.print("no session waits for an operator")
+
+
 def _carried_out(
     request: PipelineRequest, store: Store, station_file: Path | None, conceal: list[str] | None, verb: list[str]
 ) -> PipelineResult:

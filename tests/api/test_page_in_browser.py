@@ -24,6 +24,7 @@ from lab.capture.station import read_station
 from lab.formats.camera_file import CameraFile, default_camera, write_camera
 from lab.formats.recording_set import packed
 from tests.api.conftest import STATION, Running, serving, until_state
+from tests.api.routes.test_confirm import PERSON, begun, confirm
 from tests.api.routes.test_findings import diagnosis
 from tests.lab.calibration.test_life import fitted
 from tests.peers import missing
@@ -775,6 +776,35 @@ def test_what_a_hand_changed_is_told_until_somebody_says_that_it_is_put_back(bro
         watched.page.wait_for_selector("#stations .by-hand:empty", state="attached")
         assert left_by_hand(running.store.root) == ()
         watched.close()
+
+
+def test_an_operators_step_is_confirmed_on_the_page(browser: Any, tmp_path: Path) -> None:
+    """On the station's line by the keyboard, in the session's view by a click; who may only read sees the question."""
+    with serving(tmp_path) as running, running.client("operate") as client:
+        (running.store.root / "stations" / "fakes.toml").write_text(PERSON)
+        session = begun(client, parameters={"dark": {"sensor_c": 35.0}})
+        reading, watched = Watched(browser, running), Watched(browser, running, "dark", PHONE)
+        reading.log_in(running, "read")
+        told = reading.page.wait_for_selector("#strip .asks:has-text('bring the sensors to 35 C')")
+        assert told.query_selector("button:visible") is None
+        watched.log_in(running, "operate")
+        watched.page.wait_for_selector("#strip .asks button:has-text('Done: 35 C is there')")
+        assert watched.faults() == [] and watched.sideways_px() == 0 and watched.can_halt()
+        watched.tab_to("Done: 35 C is there")
+        watched.press("Enter", "#strip .asks:has-text('(cap)')")
+        reading.page.wait_for_selector("#strip .asks:has-text('(cap)')")
+        reading.go(f"/sessions/{session}/live", "#session-asks .asks:has-text('(cap)')")
+        assert reading.faults() == [] and not reading.page.is_visible("#session-asks button")
+        watched.go(f"/sessions/{session}/live", "#session-asks .asks:has-text('(cap)')")
+        assert watched.faults() == [] and watched.sideways_px() == 0 and watched.can_halt()
+        watched.page.click("#session-asks button:has-text('Done: cap is there')")
+        watched.page.wait_for_selector("#session-asks .asks:has-text('(usual temperature)')")
+        assert confirm(client, session, "usual temperature").status_code == 200  # by somebody else
+        watched.page.wait_for_selector("#session-facts .state.finished")
+        for page in (watched.page, reading.page):
+            page.wait_for_selector(".asks:not([hidden])", state="detached")
+        watched.close()
+        reading.close()
 
 
 def test_what_was_chosen_stays_chosen(browser: Any, lab: Running) -> None:

@@ -20,6 +20,7 @@ from drivers.instrument import Identity, Setting
 from drivers.monochromator.base import Monochromator
 from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiometer
 from drivers.stage.base import Stage
+from drivers.stage.prompt import PromptStage
 from lab.capture.station import Drivers, Station
 from sim.spectrum import Spectrum
 
@@ -99,11 +100,19 @@ class Bench:
     def drivers(self, asked: Station | None = None) -> Drivers:
         return Drivers(
             cameras={"left": FakeCamera(self, "left"), "right": FakeCamera(self, "right")},
-            stage=FakeStage(self),
+            stage=self._person(asked) or FakeStage(self),
             monochromator=FakeMonochromator(self),
             spectroradiometer=FakeRadiometer(self),
             display=FakeDisplay(self),
         )
+
+    def _person(self, asked: Station | None) -> Stage | None:
+        """A person as stage, where the station file has one."""
+        if asked is None or asked.stage is None or asked.stage.driver != "prompt":
+            return None
+        person = PromptStage(**asked.stage.settings)
+        person.instruct({name: target.instruction for name, target in asked.targets.items()})
+        return person
 
 
 class _Fake:

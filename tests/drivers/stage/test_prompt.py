@@ -53,3 +53,21 @@ def test_without_a_terminal_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(InstrumentError, match="the input is no terminal"):
         PromptStage().connect()
+
+
+def test_who_runs_the_session_may_ask_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", None)
+    asked: list[tuple[str, str]] = []
+    stage = PromptStage(instructions={"cap": "put the caps on"})
+    stage.ask_by(lambda target, instruction: asked.append((target, instruction)))
+    stage.connect()
+    for target in ("cap", "cap", "sphere"):
+        stage.place(target)
+        assert stage.placed() == target
+    assert asked == [("cap", "put the caps on"), ("sphere", "put sphere in front of the cameras")]
+
+
+@pytest.mark.parametrize("place_timeout_s", [0.0, -1.0, float("nan")])
+def test_a_time_out_that_is_none_is_refused(place_timeout_s: float) -> None:
+    with pytest.raises(InstrumentError, match=r"place_timeout_s is .*above 0 s"):
+        PromptStage(place_timeout_s=place_timeout_s)
