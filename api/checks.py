@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -97,25 +97,31 @@ class DeviceChecks:
     def _work(
         self, name: str, station: Station, devices: Sequence[str], keep_transcript: bool, let_go: Callable[[], None]
     ) -> None:
+        found: dict[str, Checked | None] = {}
         try:
             for device in devices:
-                if self._closed:
-                    self._latest[name, device] = self._kept(name, device)
-                    continue
-                checked = Checked(self._test(name, station, device, keep_transcript), now())
-                try:
-                    write_durably(self._folder / name / f"{device}.json", _CHECKED.dump_json(checked))
-                except (OSError, InputError) as error:
-                    log.warning("check of %s, %s: isn't kept: %s", name, device, error)
-                self._latest[name, device] = checked
-            self._note_safety(name, station, devices)
+                self._latest.update({(name, checked): one for checked, one in found.items()})
+                found[device] = self._checked(name, station, device, keep_transcript)
+            self._note_safety(station, found)
         finally:
             let_go()
+            # who reads that the last one's check has ended may use the instruments
+            self._latest.update({(name, device): found.get(device, self._kept(name, device)) for device in devices})
 
-    def _note_safety(self, name: str, station: Station, devices: Sequence[str]) -> None:
+    def _checked(self, name: str, station: Station, device: str, keep_transcript: bool) -> Checked | None:
+        if self._closed:
+            return self._kept(name, device)
+        checked = Checked(self._test(name, station, device, keep_transcript), now())
+        try:
+            write_durably(self._folder / name / f"{device}.json", _CHECKED.dump_json(checked))
+        except (OSError, InputError) as error:
+            log.warning("check of %s, %s: isn't kept: %s", name, device, error)
+        return checked
+
+    def _note_safety(self, station: Station, found: Mapping[str, Checked | None]) -> None:
         """Keep that the station is safe where each of its instruments that may let light out was checked now and is."""
         may_shine = {device for device in station.devices if not device.startswith(NO_LIGHT)}
-        works = {device for device in devices if (one := self._latest.get((name, device))) and one.state == "works"}
+        works = {device for device, one in found.items() if one is not None and one.state == "works"}
         if may_shine and may_shine <= works:
             shutter: Shutter = "none" if station.monochromator is None else "closed"
             self._live.safety.note(station, StationSafety(state="safe", shutter=shutter, at=now()))

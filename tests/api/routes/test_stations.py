@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +124,10 @@ def test_nothing_else_uses_the_instruments_during_a_check(running: Running, monk
             assert conflict.value.status == 409
         may_end.set()
         monkeypatch.undo()
-        assert client.capture("fakes", quick=True, sequences=("dark",)).state == "finished"
+        until = time.monotonic() + 30.0
+        while client.device("fakes", "monochromator").state == "checking":
+            assert time.monotonic() < until
+        assert client.capture("fakes", quick=True, sequences=("dark",)).state == "finished"  # at once
 
 
 def test_no_check_while_a_session_runs(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
