@@ -31,6 +31,7 @@ from mocks.cr300 import ColorimetryResearch
 from mocks.cs2000 import MockCs2000
 from mocks.display import Page, browse
 from mocks.lamp import Lamp, LampClock
+from mocks.pe4000 import MockPe4000
 from mocks.pr655 import PhotoResearch
 from mocks.scpi_meter import AREA_M2, MockScpiMeter
 from mocks.scpi_meter import calibration_csv as diode_calibration
@@ -654,6 +655,10 @@ def alpaca_lamp() -> Peer:
 
 def indi_lamp() -> Peer:
     return IndiSimulator("Light Panel Simulator")
+
+
+def pe4000() -> Peer:
+    return LinePeer(MockPe4000, slowness=0.0, timeout_s=0.5, load_timeout_s=10.0)
 
 
 def micromanager() -> Peer:
