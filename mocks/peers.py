@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from http.client import HTTPConnection
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -378,11 +379,6 @@ def _free_port() -> int:
         return found
 
 
-def _listens(port: int) -> bool:
-    with socket.create_connection(("127.0.0.1", port), 1.0):
-        return True
-
-
 #: What the Alpaca simulators are like, as somebody left them: binned.
 ALPACA_DEVICES = """devices:
   camera:
@@ -415,7 +411,12 @@ class AlpacaSimulator(ProcessPeer):
         super().__init__("alpaca", [sys.executable, "-m", "mocks.alpaca_simulator", str(self._port), str(file)])
 
     def _answers(self) -> bool:
-        return _listens(self._port)
+        for path in ("camera/0/connected", "covercalibrator/0/calibratorstate"):  # it loads what they need: seconds
+            connection = HTTPConnection("127.0.0.1", self._port, timeout=30.0)
+            connection.request("GET", f"/api/v1/{path}")
+            connection.getresponse().read()
+            connection.close()
+        return True
 
     def close(self) -> None:
         super().close()
