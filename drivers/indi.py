@@ -64,6 +64,7 @@ class IndiDevice:
         self._vectors: dict[str, _Vector] = {}
         self._others: set[str] = set()
         self._said = ""
+        self._begun = "", ""  # a property that was set, and the pictures that come before the device has heard it
 
     # --- the connection -----------------------------------------------------------------------------------------------
 
@@ -162,6 +163,10 @@ class IndiDevice:
         vector.state = told.get("state", vector.state)
         vector.updates += 1
         vector.changes += tag.startswith("set")
+        if tag.startswith("set") and name == self._begun[0]:
+            if self._begun[1]:
+                self.forget_blob(self._begun[1])
+            self._begun = "", ""
         for one in told:
             element, text = one.get("name", ""), (one.text or "").strip()
             if tag == "setBLOBVector":
@@ -194,12 +199,29 @@ class IndiDevice:
 
     def _vector(self, name: str) -> _Vector:
         if name not in self._vectors:
+            if name != "CONNECTION" and self.get("CONNECTION") == "DISCONNECT":
+                raise Disconnected(
+                    f"{self._who}: another client disconnected it; end that one, the next call reconnects"
+                )
             raise InstrumentError(f"{self._who}: it has no property {name}; is it the right device?")
         return self._vectors[name]
 
-    def await_property(self, name: str) -> None:
-        """Return once it has a property: most come when it is connected."""
-        self._await(name, lambda: name in self._vectors)
+    def connect(self, *names: str) -> None:
+        """Connect the device, and return once it has these properties: most come when it is connected.
+
+        A server that was busy hears only now that a client before disconnected it: it is connected again then.
+        """
+
+        def are_there() -> bool:
+            return all(name in self._vectors for name in names)
+
+        def is_on() -> bool:
+            return self.get("CONNECTION") == "CONNECT"
+
+        while not (is_on() and are_there()):
+            if not is_on():
+                self.set("CONNECTION", "CONNECT")
+            self._await("CONNECTION", lambda: are_there() or not is_on())
 
     def await_number(self, name: str, element: str) -> None:
         """Return once a number is above 0: some are told when it is connected, and are 0 before."""
@@ -251,11 +273,18 @@ class IndiDevice:
         self._await(name, lambda: self.state(name) != "Busy")
         self._refuse_alert(name)
 
-    def begin(self, name: str, value: Setting) -> None:
-        """Set a property and wait until the device has heard it: until it tells the property's new value."""
+    def catch_up(self) -> None:
+        """Take in what was told until now."""
         until = time.monotonic() + self._left_s()
         while self._pump(0.0) and time.monotonic() < until:
-            continue  # what was told before isn't the answer
+            continue
+
+    def begin(self, name: str, value: Setting, picture: str = "") -> None:
+        """Set a property and wait until the device has heard it: until it tells the property's new value.
+
+        A `picture` that comes before that belongs to an exposure before, and is forgotten; one may come at once after.
+        """
+        self.catch_up()  # what was told before isn't the answer
         vector = self._vector(name)
         if vector.kind == "Switch":
             if value not in vector.values:
@@ -267,6 +296,7 @@ class IndiDevice:
         else:
             given = dict(part.partition("=")[::2] for part in str(value).split(";"))
         before, kind = vector.changes, vector.kind
+        self._begun = name, picture
         parts = "".join(f"<one{kind} name={quoteattr(one)}>{text}</one{kind}>" for one, text in given.items())
         self._send(f"<new{kind}Vector device={quoteattr(self.name)} name={quoteattr(name)}>{parts}</new{kind}Vector>")
         self._await(name, lambda: name not in self._vectors or self._vectors[name].changes > before)

@@ -78,6 +78,7 @@ INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
     "cr300": _mock("cr300", "ColorimetryResearch", "CR-300"),
     "cs2000": _mock("cs2000", "MockCs2000"),
     "scpi-meter": _mock("scpi_meter", "MockScpiMeter"),
+    "pe4000": _mock("pe4000", "MockPe4000"),
     "stage": _mock("stage", "MockStage"),
 }
 

@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from http.client import HTTPConnection
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from mocks.cr300 import ColorimetryResearch
 from mocks.cs2000 import MockCs2000
 from mocks.display import Page, browse
 from mocks.lamp import Lamp, LampClock
+from mocks.pe4000 import MockPe4000
 from mocks.pr655 import PhotoResearch
 from mocks.scpi_meter import AREA_M2, MockScpiMeter
 from mocks.scpi_meter import calibration_csv as diode_calibration
@@ -377,11 +379,6 @@ def _free_port() -> int:
         return found
 
 
-def _listens(port: int) -> bool:
-    with socket.create_connection(("127.0.0.1", port), 1.0):
-        return True
-
-
 #: What the Alpaca simulators are like, as somebody left them: binned.
 ALPACA_DEVICES = """devices:
   camera:
@@ -414,7 +411,12 @@ class AlpacaSimulator(ProcessPeer):
         super().__init__("alpaca", [sys.executable, "-m", "mocks.alpaca_simulator", str(self._port), str(file)])
 
     def _answers(self) -> bool:
-        return _listens(self._port)
+        for path in ("camera/0/connected", "covercalibrator/0/calibratorstate"):  # it loads what they need: seconds
+            connection = HTTPConnection("127.0.0.1", self._port, timeout=30.0)
+            connection.request("GET", f"/api/v1/{path}")
+            connection.getresponse().read()
+            connection.close()
+        return True
 
     def close(self) -> None:
         super().close()
@@ -654,6 +656,10 @@ def alpaca_lamp() -> Peer:
 
 def indi_lamp() -> Peer:
     return IndiSimulator("Light Panel Simulator")
+
+
+def pe4000() -> Peer:
+    return LinePeer(MockPe4000, slowness=0.0, timeout_s=0.5, load_timeout_s=10.0)
 
 
 def micromanager() -> Peer:

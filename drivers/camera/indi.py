@@ -56,10 +56,7 @@ class IndiCamera(SingleFrameCamera):
         return self._device, self._device.identity()
 
     def _connect(self) -> None:
-        if self._device.get("CONNECTION") != "CONNECT":
-            self._device.set("CONNECTION", "CONNECT")
-        for name in (_EXPOSURE, "CCD_FRAME", "CCD_INFO", "CCD_BINNING", _PICTURE):
-            self._device.await_property(name)
+        self._device.connect(_EXPOSURE, "CCD_FRAME", "CCD_INFO", "CCD_BINNING", _PICTURE)
         self._device.await_number("CCD_INFO", "CCD_MAX_X")
 
     def _prepare(self, features: CameraFeatures) -> None:
@@ -122,10 +119,10 @@ class IndiCamera(SingleFrameCamera):
         return exposure_s
 
     def _expose(self, exposure_s: float) -> None:
-        self._device.forget_blob(_PICTURE)
-        self._device.begin(_EXPOSURE, f"CCD_EXPOSURE_VALUE={exposure_s!r}")
-        if self._device.state(_EXPOSURE) == "Busy":
-            self._device.forget_blob(_PICTURE)  # one that came until now is of an exposure before
+        self._device.catch_up()
+        if self._device.state(_EXPOSURE) == "Busy":  # it heard late of an exposure that was given up
+            self._abort()
+        self._device.begin(_EXPOSURE, f"CCD_EXPOSURE_VALUE={exposure_s!r}", picture=_PICTURE)
 
     def _exposed(self) -> bool:
         if self._device.blob(_PICTURE, 0.02) is not None:

@@ -138,7 +138,14 @@ class Core:
         )
 
     def expose(self) -> None:
-        """Begin one exposure; the core opens and closes the shutter where that is automatic."""
+        """Begin one exposure; the core opens and closes the shutter where that is automatic.
+
+        The core allocates its buffer with the first one: 250 MB unless told otherwise, which takes a busy computer
+        seconds. Two pictures are enough.
+        """
+        buffer_mb = 1 + 2 * self._core.getImageBufferSize() // 2**20
+        if self._core.getCircularBufferMemoryFootprint() != buffer_mb:
+            self._core.setCircularBufferMemoryFootprint(buffer_mb)
         self._core.clearCircularBuffer()
         self._core.startSequenceAcquisition(self._camera, 1, 0.0, True)
 

@@ -188,6 +188,9 @@ class BrowserDisplay(Display):
                 page.send(header)
                 page.send(cells.tobytes())
             except (OSError, WebSocketException) as error:
+                with self._change:
+                    if self._page is page:  # its own thread may not have noticed yet
+                        self._page = None
                 raise self._gone() from error
             self._record("sent", header.encode() + f" + {cells.size} cells".encode())
             return self._await_answer(number, int(cell_px))

@@ -20,10 +20,7 @@ class IndiLamp(SteppedLamp):
 
     def _open(self) -> tuple[Identity, float]:
         self._device.open()
-        if self._device.get("CONNECTION") != "CONNECT":
-            self._device.set("CONNECTION", "CONNECT")
-        for name in (_SWITCH, _INTENSITY):
-            self._device.await_property(name)
+        self._device.connect(_SWITCH, _INTENSITY)
         return self._device.identity(), self._device.limits(f"{_INTENSITY}.{_VALUE}")[1]
 
     def _read(self) -> float:

@@ -98,13 +98,12 @@ class Monochromator(Instrument):
         """Close the shutter and read it back, a second time where that fails. Returns why it can't be said to be
         closed, or None."""
         failure: InstrumentError | None = None
-        for _ in range(SHUT_ATTEMPTS):
+        for attempt in range(SHUT_ATTEMPTS):
             try:
-                self.stop()
-                if not self.shutter_is_open():
+                if self._is_shut(again=attempt > 0):
                     self._may_shine = False
                     return None
-                failure = InstrumentError(
+                failure = failure or InstrumentError(
                     "monochromator: its shutter is open though it was told to close; block the light by hand"
                 )
                 self._may_shine = True
@@ -113,6 +112,11 @@ class Monochromator(Instrument):
                 if not self._may_shine:
                     return None  # it can't be asked, and wasn't opened
         return InstrumentError(f"monochromator: its shutter may be open ({failure}); block the light by hand")
+
+    def _is_shut(self, again: bool) -> bool:
+        """Close the shutter and return whether the instrument says that it is closed; `again`: after a failure."""
+        self.stop()
+        return not self.shutter_is_open()
 
     def shut_at_once(self) -> bool:
         """Close the shutter before anything else is said: the first thing after a crash, and in a halt.

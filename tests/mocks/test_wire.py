@@ -36,7 +36,7 @@ GOLDEN = Path(__file__).parent.parent / "wire"
 
 
 def conversations() -> Iterator[tuple[str, int]]:
-    for name in ("cornerstone260", "specbos1211", "pr655", "cr300", "cs2000", "sp2150", "cm110", "stage"):
+    for name in ("cornerstone260", "specbos1211", "pr655", "cr300", "cs2000", "sp2150", "cm110", "pe4000", "stage"):
         for number, _ in enumerate(parse((GOLDEN / f"{name}.txt").read_text(encoding="ascii"))):
             yield name, number
 
@@ -79,6 +79,7 @@ FRAGMENTS = [
         b"D601",
     ),
     *(b"SS1", b"E", b"M", b"RM Spectrum", b"RM XYZ", b"SM ExposureX 50", b"SM Speed 9", b"PLACE ", b"sphere", b"LIST?"),
+    *(b"CSSASN050", b"CSS", b"CSSA", b"LOAD:385", b"LOAD:", b"LAMS", b"PORT:P=OFF"),
     *(b"\r", b"\n", b"\r\n", b" ", b"\x00", b"\xff", b"\xb2", b";D024\r\n", b"x" * 600),
 ]
 
@@ -105,6 +106,7 @@ def test_no_input_upsets_a_mock(name: str, talk: Callable[[Grammar, bytes], byte
         "cs2000": (b"\n", b"IDDR\n", b"OK00,CS-2000,0,10004711\r\n"),
         "cm110": (b"\x1b" * 5, b"8\x0d", b"\x18"),
         "sp2150": (b"\r", b"SERIAL\r", b"SERIAL 21500427  ok\r\n"),
+        "pe4000": (b"\r", b"XMODEL\r", b"XMODEL=pE-4000\r\n"),
         "stage": (b"\n", b"LIST?\n", b"cap,sphere,colorchecker,screen\r\n"),
     }[name]
     talk(mock, start_over)

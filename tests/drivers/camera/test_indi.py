@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from base64 import b64encode
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
@@ -45,9 +46,8 @@ def stranger(peer: IndiSimulator) -> Iterator[IndiDevice]:
     """Another client, who left the camera set to what it wanted."""
     device = IndiDevice(peer.address, lambda: 10.0, lambda direction, data: None)
     device.open()
-    device.set("CONNECTION", "CONNECT")
+    device.connect(*FOUND)
     for name, value in FOUND.items():
-        device.await_property(name)
         device.set(name, value)
     yield device
     device.close()
@@ -55,8 +55,7 @@ def stranger(peer: IndiSimulator) -> Iterator[IndiDevice]:
 
 def _seen_by(device: IndiDevice) -> dict[str, object]:
     device.open()
-    for name in FOUND:
-        device.await_property(name)
+    device.connect(*FOUND)
     return {name: device.get(name) for name in FOUND}
 
 
@@ -160,39 +159,89 @@ def answering() -> Iterator[Callable[[bytes], IndiDevice]]:
         one.close()
 
 
-def test_a_definition_for_another_client_is_no_answer() -> None:
+@pytest.fixture
+def heard() -> Iterator[Callable[..., IndiDevice]]:
+    """A server that says each of several things once it has heard what comes before it."""
+    threads: list[threading.Thread] = []
+
+    def start(*steps: tuple[bytes, str]) -> IndiDevice:
+        def serve() -> None:
+            with server, server.accept()[0] as line:
+                asked = b""
+                for awaited, said in steps:
+                    while awaited not in asked:
+                        asked += line.recv(1 << 16)
+                    line.sendall(said.encode())
+                    time.sleep(0.2)
+                line.recv(1 << 16)
+
+        server = socket.create_server(("127.0.0.1", 0))
+        threads.append(threading.Thread(target=serve, daemon=True))
+        threads[-1].start()
+        device = IndiDevice(f"127.0.0.1:{server.getsockname()[1]}/C", lambda: 5.0, lambda direction, data: None)
+        device.open()
+        return device
+
+    yield start
+    for thread in threads:
+        thread.join(30.0)
+
+
+def _connection(kind: str, on: str) -> str:
+    """Return the property CONNECTION as it is defined (`def`) or set (`one`), with one of its switches on."""
+    ones = "".join(
+        f"<{kind}Switch name='{name}'>{'On' if name == on else 'Off'}</{kind}Switch>"
+        for name in ("CONNECT", "DISCONNECT")
+    )
+    tag = "defSwitchVector" if kind == "def" else "setSwitchVector"
+    return f"<{tag} device='C' name='CONNECTION'>{ones}</{tag}>"
+
+
+def _number(name: str) -> str:
+    return f"<defNumberVector device='C' name='{name}'><defNumber name='V'>0</defNumber></defNumberVector>"
+
+
+def test_a_definition_for_another_client_is_no_answer(heard: Callable[..., IndiDevice]) -> None:
     """A server tells definitions to all clients when one of them asks: one with the old value comes before the new
     one."""
-    both = "<{kind}Switch name='CONNECT'>{on}</{kind}Switch><{kind}Switch name='DISCONNECT'>{off}</{kind}Switch>"
-    old = (
-        f"<defSwitchVector device='C' name='CONNECTION'>{both.format(kind='def', on='On', off='Off')}</defSwitchVector>"
-    )
-    new = (
-        f"<setSwitchVector device='C' name='CONNECTION'>{both.format(kind='one', on='Off', off='On')}</setSwitchVector>"
-    )
-
-    def serve() -> None:
-        with server, server.accept()[0] as line:
-            line.recv(1 << 16)
-            line.sendall(old.encode())
-            asked = b""
-            while b"newSwitchVector" not in asked:
-                asked += line.recv(1 << 16)
-            line.sendall(old.encode())
-            time.sleep(0.2)
-            line.sendall(new.encode())
-            line.recv(1 << 16)
-
-    server = socket.create_server(("127.0.0.1", 0))
-    thread = threading.Thread(target=serve)
-    thread.start()
-    device = IndiDevice(f"127.0.0.1:{server.getsockname()[1]}/C", lambda: 5.0, lambda direction, data: None)
-    device.open()
+    old = _connection("def", "CONNECT")
+    device = heard((b"getProperties", old), (b"newSwitchVector", old), (b"", _connection("one", "DISCONNECT")))
     device.set("CONNECTION", "DISCONNECT")
     told = device.get("CONNECTION")
     device.close()
-    thread.join(5.0)
     assert told == "DISCONNECT"
+
+
+def test_an_order_to_disconnect_may_be_heard_after_the_next_client_came(heard: Callable[..., IndiDevice]) -> None:
+    """A server that was busy heard the next client first, and then what the one before had told it."""
+    taken = "".join(f"<delProperty device='C' name='{name}'/>" for name in ("E", "F"))
+    device = heard(
+        (b"getProperties", _connection("def", "CONNECT") + _number("E")),
+        (b"", _number("F") + _connection("one", "DISCONNECT") + taken),
+        (b"newSwitchVector", _connection("one", "CONNECT") + _number("E") + _number("F")),
+    )
+    device.connect("E", "F")
+    assert device.get("F") == "V=0"
+    device.close()
+
+
+def test_a_picture_may_come_with_the_first_word_of_its_exposure(heard: Callable[..., IndiDevice]) -> None:
+    """A short exposure is over before a busy computer reads that it has begun; one before it ended meanwhile."""
+    defined = "<defBLOBVector device='C' name='P'><defBLOB name='P'/></defBLOBVector>"
+    busy = "<setNumberVector device='C' name='E' state='Busy'><oneNumber name='V'>1</oneNumber></setNumberVector>"
+    earlier, its = (
+        "<setBLOBVector device='C' name='P'><oneBLOB name='P' format='.x'>"
+        f"{b64encode(data).decode()}</oneBLOB></setBLOBVector>"
+        for data in (b"earlier", b"its")
+    )
+    device = heard(
+        (b"getProperties", _connection("def", "CONNECT") + _number("E") + defined),
+        (b"newNumberVector", earlier + busy + its),
+    )
+    device.connect("P")
+    device.begin("E", "V=1", picture="P")
+    assert device.blob("P", 5.0) == b"its"
+    device.close()
 
 
 DEFINED = b"<defSwitchVector device='C' name='CONNECTION'><defSwitch name='CONNECT'>On</defSwitch></defSwitchVector>"
@@ -217,7 +266,7 @@ def test_answers_that_are_none(
     device = answering(said)
     with pytest.raises(raised, match=message) as found:
         device.open()
-        device.await_property("CCD1")
+        device.connect("CCD1")
     device.close()
     assert "\n" not in str(found.value)
 

@@ -192,6 +192,22 @@ def test_a_taken_port_is_one_error(address: str) -> None:
         BrowserDisplay(address).connect()
 
 
+def test_a_page_that_has_left_is_not_asked_twice(address: str, browsing: Callable[..., None]) -> None:
+    """Its own thread may notice later than who sends to it."""
+
+    class Left:
+        def send(self, message: object) -> None:
+            raise OSError("closed")
+
+    display = BrowserDisplay(address, connect_timeout_s=30.0)
+    display._page = Left()  # type: ignore[assignment]
+    with pytest.raises(Disconnected, match="the browser left"):
+        display.show(np.ones((2, 2), np.uint8), 4)
+    browsing(Page(Screen()))
+    assert display.show(np.ones((2, 2), np.uint8), 4).cell_px == 4
+    display.close()
+
+
 def test_files_are_served_to_this_page_alone(address: str) -> None:
     display = BrowserDisplay(address, connect_timeout_s=0.05)
     with pytest.raises(NoAnswer):

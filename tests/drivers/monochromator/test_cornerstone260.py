@@ -22,6 +22,7 @@ from mocks.cornerstone260 import MockCornerstone260, _Cs260Refusal
 from mocks.cornerstone260 import MockCornerstone260 as Mock
 from mocks.cornerstone260b_serial import MockCornerstone260BSerial
 from mocks.lamp import Lamp
+from mocks.peers import cornerstone260
 from mocks.wire import Grammar, Pty, Tcp
 
 
@@ -272,6 +273,21 @@ def test_closing_leaves_the_shutter_closed_or_says_so(served: Callable[..., str]
         mono.open_shutter()
     mono.close()
     assert not bench.light.shutter_open
+
+
+def test_a_silent_instrument_is_told_to_close_again_without_meeting_it_anew() -> None:
+    """A second first contact would take the close beyond twice its time-out."""
+    sent: list[bytes] = []
+    with cornerstone260() as peer:
+        mono = Cornerstone260(peer.address, **peer.settings, recorder=lambda way, data: sent.append(data))
+        mono.open_shutter()
+        peer.mute(True)
+        sent.clear()
+        with pytest.raises(InstrumentError, match=r"its shutter may be open \(.*no answer"):
+            mono.close()
+    said = b"".join(sent)
+    assert said.count(b"SHUTTER C\r\n") == 1 + said.count(b"ABORT\r\nSHUTTER C\r\n") == 2
+    assert b"INFO?" not in said
 
 
 def test_a_shutter_that_sticks_is_told_on_closing(served: Callable[..., str]) -> None:
