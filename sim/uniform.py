@@ -30,6 +30,7 @@ LEVEL = SHADING | {
     "light.level_by_channel",
     "charge.exposure_s",
     "charge.leak_s",
+    "charge.strays",
     "light.ambient_e_per_s",
     "charge.kernels",
     "charge.exchange",
@@ -229,7 +230,7 @@ class Uniform:
         typical_s = source_s * float(np.mean(field.light))
         mixed = self._mix_captures({c: np.asarray(rates.get(c, 1.0)) * typical_s for c in self.camera.channels})
         dark = self.camera.dark_current_e_per_s * np.asarray(exposure_s)[..., None]
-        found = {}
+        lit = {}
         for channel, rate in rates.items():
             ambient = (self._light.ambient(channel) * collected_s)[..., None]
             seen = rate * _of_each(partial(self._light.colour, channel), elapsed_s)
@@ -237,8 +238,22 @@ class Uniform:
             if self.leaks:
                 leaked = self.leaked_s(field) * field.light
                 light = light + (seen * _of_each(self._light.source, elapsed_s))[..., None] * leaked
-            found[channel] = (light + ambient) * mixed.get(channel, np.ones(()))[..., None] + dark
-        return found
+            lit[channel] = light + ambient
+        strayed = self.stray_light(lit, field)
+        return {c: light * mixed.get(c, np.ones(()))[..., None] + dark for c, light in strayed.items()}
+
+    def stray_light(self, electrons: Mapping[str, FloatArray], points: FieldPoints) -> Mapping[str, FloatArray]:
+        """Electrons of light (..., points) by channel after what misses its pixel fell on the next ones."""
+        return self._charge.stray_channels(electrons, points.x_um, points.y_um)
+
+    def part_greens(self, electrons: Mapping[str, FloatArray], points: FieldPoints) -> FloatArray:
+        """Return by how much green pixels on red rows have more electrons than those on blue rows, (..., points)."""
+        return np.asarray(self._charge.part_greens(electrons, points.x_um, points.y_um) * np.ones(points.x_um.size))
+
+    @property
+    def strays(self) -> bool:
+        """Return whether light falls on other pixels than its own."""
+        return bool(self._charge.strays)
 
     def _mix_captures(self, electrons: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """`mixing_factors` of every capture."""

@@ -363,7 +363,8 @@ def shading_block(study: Study) -> Block:
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures),
         p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT,
+        reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | {"charge.strays", "signal.response", "image.veils"},
+        scattered_by=ROW_LIGHT,
         predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
@@ -513,14 +514,24 @@ def _shaded(
     gains = model.gain_map()
     leaked_s = _cell_means(model.leaked_s(place))
     gain = 1.0 if gains is None else _cells(gains).ravel()
+    strayed = {out: _strayed([p for p in planes if p.held_out == out], place, model) for out in (False, True)}
     found = []
     for plane in planes:
-        own = light * collected.get(plane.channel, 1.0)
+        own = light * strayed[plane.held_out].get(plane.channel, 1.0) * collected.get(plane.channel, 1.0)
         if model.leaks:
             own = own * (1.0 + leaked_s * float(np.mean([1.0 / c.exposure_s for c in plane.captures])))
         electrons = model.response(own / own.mean() * plane.level_e) * gain
         found.append(electrons / electrons.mean() + added * plane.inverse_per_e)
     return np.concatenate(found)
+
+
+def _strayed(planes: Sequence[_ChannelCells], place: FieldPoints, model: Uniform) -> dict[str, FloatArray]:
+    """Factor on the cells (cells,) of each channel by light that falls on the next pixels, which are of other channels.
+    `planes`: those of one set of frames."""
+    if not model.strays:
+        return {}
+    after = model.stray_light({p.channel: p.level_e * np.ones(place.x_um.size) for p in planes}, place)
+    return {p.channel: _cell_means(after[p.channel]) / p.level_e for p in planes}
 
 
 def _collected(study: Study, effects: Effects) -> dict[str, FloatArray]:

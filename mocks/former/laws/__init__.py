@@ -86,6 +86,7 @@ from mocks.former.laws.transmission import (
     DustShadowLaw,
     GhostLaw,
     InfraredCutFilterLaw,
+    MicrolensAngleLaw,
     RedLeakLaw,
     VeilingGlareLaw,
     VignettingDecentreLaw,
@@ -147,6 +148,7 @@ LISTED: tuple[type[Law], ...] = (
     LeakyShutterLaw,
     AnisotropicBrighterFatterLaw,
     CoverGlassFringeLaw,
+    MicrolensAngleLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
