@@ -21,9 +21,9 @@ USUAL_RATIO = 0.25
 
 class MicrolensAngle(Effect):
     """As the angle's error grows with the radius: light x (1 - l r^2), r the radius over that of the corner, and
-    of what is left c x^2 falls on the next pixels in the row and c y^2 on those in the column, r^2 = x^2 + y^2; (1 + e) times
-    that of red light and (1 - e) of blue. Colours mix towards the corners, and none does on the axis. The two greens
-    have other neighbours along the angle, and part.
+    of what is left c x^2 falls on the next pixels in the row and c y^2 on those in the column, r^2 = x^2 + y^2; (1 + e)
+    times that of red light and (1 - e) of blue. Colours mix towards the corners, and none does on the axis. The two
+    greens have other neighbours along the angle, and part.
 
     Without a mosaic nothing but vignetting is seen, and this is absent.
     """

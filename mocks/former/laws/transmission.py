@@ -154,8 +154,8 @@ class GhostLaw(Law):
 
 class MicrolensAngleLaw(Law):
     """Microlenses for other chief rays than the lens's: light misses its diode, and 45 % of that falls on the next one
-    outwards. Variants: along rows and columns in proportion to the squares of the place; by a spot of normal profile that
-    leaves a square diode, wider in red; towards the nearer axis alone."""
+    outwards. Variants: along rows and columns in proportion to the squares of the place; by a spot of normal profile
+    that leaves a square diode, wider in red; towards the nearer axis alone."""
 
     name = effect = "microlens_angle"
     variants, unit, nominal, limits, needs = 3, "%", 6.0, (0.1, 60.0), "bayer"

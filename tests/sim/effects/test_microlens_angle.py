@@ -19,7 +19,9 @@ WAVELENGTH = np.arange(400.0, 701.0)
 COLOURED = CAMERA.model_copy(
     update={
         "dark_current_e_per_s": 0.0,
-        "quantum_efficiency": {c: Spectrum.of(WAVELENGTH, np.full(301, q)) for c, q in zip("RGB", (0.2, 0.5, 0.3))},
+        "quantum_efficiency": {
+            c: Spectrum.of(WAVELENGTH, np.full(301, q)) for c, q in {"R": 0.2, "G": 0.5, "B": 0.3}.items()
+        },
     }
 )
 LIGHT = Spectrum.of(WAVELENGTH, np.full(301, 0.02))
@@ -27,7 +29,7 @@ MIXED = MicrolensAngle(crosstalk_percent=4.0, red_excess=0.5)
 
 
 def test_the_corner_loses_light_and_mixes_its_colours() -> None:
-    """In the corner, of R, G and B in the ratio 2 : 5 : 3: R (1 - 1.5 c) + c G, and G (1 - c) + c (1.5 R + 0.5 B) / 2."""
+    """In the corner, of R : G : B = 2 : 5 : 3: R (1 - 1.5 c) + c G, and G (1 - c) + c (1.5 R + 0.5 B) / 2."""
     one = Uniform(COLOURED, (MIXED, MicrolensAngle(loss_percent=10.0)))
     corner = FieldPoints(np.array([0.0, 80.0]), np.array([0.0, 60.0]), np.ones(2))
     found = one.stray_light({"R": 2.0 * np.ones(2), "G": 5.0 * np.ones(2), "B": 3.0 * np.ones(2)}, corner)
