@@ -22,7 +22,7 @@ from sim.frame import collected_mosaic
 from sim.point import even_share
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.uniform import SHADING, FieldPoints, Uniform
+from sim.uniform import SHADING, STRAYS, FieldPoints, Uniform
 
 LEAST_SIGNAL = 10.0  # of a frame that is a part of the mean image, in standard deviations of the read noise
 
@@ -363,7 +363,7 @@ def shading_block(study: Study) -> Block:
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures),
         p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | {"charge.strays", "signal.response", "image.veils"},
+        reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | STRAYS | {"signal.response", "image.veils"},
         scattered_by=ROW_LIGHT,
         predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),

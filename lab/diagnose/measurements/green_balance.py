@@ -19,7 +19,7 @@ from sim.effects.base import Effects
 from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.uniform import FieldPoints, Uniform
+from sim.uniform import STRAYS, FieldPoints, Uniform
 
 GREEN_FLOOR = 1e-4  # standard deviation of the ratio of equal greens beside noise
 GREEN_NOISE = 0.02  # ratios of a larger standard deviation aren't used
@@ -104,7 +104,7 @@ def green_block(study: Study) -> Block:
 
     return Block(
         measurement=GREEN_BALANCE, reach=25.0, value=value, covariance=covariance, labels=tuple(labels),
-        reads=GREENS | {"charge.strays"}, predict=predict, scale=np.ones(len(value)),
+        reads=GREENS | STRAYS, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
