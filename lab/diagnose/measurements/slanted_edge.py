@@ -742,8 +742,8 @@ class _Edges:
         channel = {place: c for c, mine in places.items() for place in mine}
         found = []
         for edge, lighting, (squares, scale) in zip(self.edges, self._lighting, self._squares, strict=True):
-            at = np.array([lighting[0].mean()]), np.array([lighting[1].mean()])
-            shares = {c: [float(s[0]) for s in model.stray_shares(c, *at)] for c in self._camera.channels}
+            # their mean along the edge
+            shares = {c: [float(s.mean()) for s in model.stray_shares(c, *lighting[:2])] for c in self._camera.channels}
             mine = places[edge.channel]
             change = np.zeros(count)
             for (row, col), square in zip(mine, squares.reshape(len(mine), count, 3, 3), strict=True):

@@ -183,12 +183,16 @@ class MicrolensAngleLaw(Law):
     def colours(self, images: dict[str, Array]) -> dict[str, Array]:
         along, down = ({c: self._missing(c)[axis] * image for c, image in images.items()} for axis in (0, 1))
         red_row = (np.arange(self.camera.rows) % 2 == self.camera.cfa.index("R") // 2)[:, None]
-        found = {
-            "R": along["G"] + down["G"],
-            "B": along["G"] + down["G"],
-            "G": np.where(red_row, along["R"] + down["B"], along["B"] + down["R"]),
-        }
+        inner = {c: (self._from_inside(along[c], 1), self._from_inside(down[c], 0)) for c in images}
+        green = inner["G"][0] + inner["G"][1]
+        red_rows, blue_rows = inner["R"][0] + inner["B"][1], inner["B"][0] + inner["R"][1]
+        found = {"R": green, "B": green, "G": np.where(red_row, red_rows, blue_rows)}
         return {c: image - along[c] - down[c] + self.kept * found[c] for c, image in images.items()}
+
+    def _from_inside(self, light: Array, axis: int) -> Array:
+        """Return the light of the next pixel towards the centre along an axis."""
+        ahead, behind = (np.roll(light, step, axis=axis) for step in (1, -1))
+        return np.where(self.camera.field_position[1 - axis] > 0, ahead, behind)
 
     def library_parameters(self) -> dict[str, float]:
         if self.variant != 0:
