@@ -153,7 +153,7 @@ def collected_electrons(
         mean += light.room
     down, across = np.linspace(0.0, 1.0, camera.rows)[:, None], np.linspace(0.0, 1.0, camera.cols)[None, :]
     mean *= charge.collected_s(exposure.exposure_s) + charge.leaked_s(down, across)
-    np.add(charge.collect_light(mean), dark_electrons(camera, exposure, effects), out=mean)
+    np.add(charge.collect_light(charge.stray_pixels(mean)), dark_electrons(camera, exposure, effects), out=mean)
     return charge.overflow_wells(charge.move_charge(mean))
 
 

@@ -14,7 +14,7 @@ same axes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import reduce
 from typing import Any, Protocol, Self
@@ -26,6 +26,7 @@ from scipy.ndimage import convolve
 from sim.camera import CameraModel
 from sim.optics.filters import veil_otf
 from sim.optics.pupil import Wavefront, pupil_ratio
+from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineNoise
 from sim.spectrum import FloatArray
@@ -276,6 +277,49 @@ class Traps:
         return held - left, left
 
 
+#: The colours of the four next pixels in the mosaic, half of them each where there are two.
+NEXT = {"R": ("G",), "G": ("R", "B"), "B": ("G",), "Y": ("Y",)}
+#: A half for each of the next pixels in the row.
+BESIDE = np.array([[0.5, 0.0, 0.5]])
+
+
+@dataclass(frozen=True)
+class Stray:
+    """Light that misses its pixel and falls on the next ones. `shares`: (channel, x_um, y_um) -> shares of a pixel's
+    light that fall, half each, on the two next pixels in its row and on those in its column. They change little from a
+    pixel to the next.
+    """
+
+    shares: Callable[[str, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+
+    def exchange_pixels(self, electrons: FloatArray, camera: CameraModel) -> FloatArray:
+        """Return the electrons of a whole frame (rows, cols), mirrored about the outermost pixels' centres."""
+        row, col = (np.arange(float(n)) - 0.5 * (n - 1) for n in electrons.shape)
+        x_um, y_um = (v * camera.pixel_pitch_um for v in np.meshgrid(col, row))
+        by_channel = {c: self.shares(c, x_um, y_um) for c in camera.channels}
+        found = electrons
+        for axis, kernel in enumerate((BESIDE, BESIDE.T)):
+            stray = electrons * mosaic.assemble({c: both[axis] for c, both in by_channel.items()}, camera.cfa)
+            found = found - stray + convolve(stray, kernel, mode="mirror")
+        return np.asarray(found)
+
+    def exchange_channels(
+        self, electrons: Mapping[str, FloatArray], x_um: FloatArray, y_um: FloatArray
+    ) -> dict[str, FloatArray]:
+        """Return the electrons of each channel in light that is even over neighbours, (..., places), of G the mean of
+        both greens. A channel that isn't given is taken as bright as the one beside it.
+        """
+        stray = {c: sum(self.shares(c, x_um, y_um)) * e for c, e in electrons.items()}
+        return {
+            c: e - stray[c] + sum(stray.get(n, stray[c]) for n in NEXT[c]) / len(NEXT[c]) for c, e in electrons.items()
+        }
+
+    def part_greens(self, electrons: Mapping[str, FloatArray], x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+        """Return by how much green pixels on red rows have more electrons than those on blue rows (..., places)."""
+        red, blue = ((along - down) * electrons[c] for c in "RB" for along, down in (self.shares(c, x_um, y_um),))
+        return np.asarray(red - blue)
+
+
 @dataclass(frozen=True)
 class Charge(State):
     """Electrons in the pixels: where they come from and where they end up.
@@ -284,7 +328,8 @@ class Charge(State):
     first line .. 1 last -> time in which light is collected besides, whatever is asked for. `collected`: electrons of
     light (rows, cols) -> electrons, pixel by pixel and in proportion; it depends on the place by a short period alone,
     a part of `mosaic.PERIOD_PX`, as measurements ask it on small tiles, and keeps each colour's mean, as levels don't
-    ask it at all. `dark_current`: (e/s, sensor temperature) -> e/s, of all pixels or of each (rows, cols). `defects`:
+    ask it at all. `strays`: light that falls on the next pixels instead, by channel and place: none is lost.
+    `dark_current`: (e/s, sensor temperature) -> e/s, of all pixels or of each (rows, cols). `defects`:
     pixels with additional dark current. `transfer`: (fx, fy in cy/um, wavelength_nm) -> factor on the transfer
     function, 1 at zero frequency, alike for all colours. `kernels`: where the charge of a pixel ends up, (odd, odd) of
     sum 1, so that none is lost: they act on whole frames, and on transfer functions (`sim.point.mix_channels` for a
@@ -299,6 +344,7 @@ class Charge(State):
     exposure_s: tuple[Callable[[float], float], ...] = ()
     leak_s: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     collected: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    strays: tuple[Stray, ...] = ()
     dark_current: tuple[Callable[[FloatArray | float, float | None], FloatArray | float], ...] = ()
     defects: tuple[Defects, ...] = ()
     transfer: tuple[Callable[[FloatArray, FloatArray, float], FloatArray], ...] = ()
@@ -322,6 +368,16 @@ class Charge(State):
     def collect_light(self, electrons: FloatArray) -> FloatArray:
         """Mean electrons of light (rows, cols) as the pixels collect them."""
         return reduce(lambda value, law: law(value), self.collected, electrons)
+
+    def stray_pixels(self, electrons: FloatArray) -> FloatArray:
+        """Mean electrons of light of a whole frame (rows, cols) after what misses its pixel fell on the next ones."""
+        return reduce(lambda value, law: law.exchange_pixels(value, self.camera), self.strays, electrons)
+
+    def stray_channels(
+        self, electrons: Mapping[str, FloatArray], x_um: FloatArray, y_um: FloatArray
+    ) -> Mapping[str, FloatArray]:
+        """Return the same of each channel at places (..., places) where the light is even over neighbours."""
+        return reduce(lambda value, law: law.exchange_channels(value, x_um, y_um), self.strays, electrons)
 
     def even_dark_e_per_s(self, e_per_s: FloatArray | float, temperature_c: float | None) -> FloatArray | float:
         """Dark current of pixels that aren't defective, given what the camera model says for that temperature."""
@@ -353,6 +409,10 @@ class Charge(State):
     def mixes(self) -> bool:
         """Return whether charge moves between neighbouring pixels."""
         return bool(self.kernels or self.exchange)
+
+    def part_greens(self, electrons: Mapping[str, FloatArray], x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+        """By how much green pixels on red rows have more light than those on blue rows (..., places)."""
+        return sum((law.part_greens(electrons, x_um, y_um) for law in self.strays), np.zeros(1))
 
     def overflow_wells(self, electrons: FloatArray) -> FloatArray:
         """Mean electrons of a whole frame after what is above the full well has run over."""

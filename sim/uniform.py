@@ -24,20 +24,26 @@ from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, cod
 SPECTRAL = frozenset({"light.spectrum", "image.transmittance", "image.ripple"})
 #: Those that shade the light by place.
 SHADING = frozenset({"light.shading", "image.shading"})
+#: Light that falls on other pixels than its own.
+STRAYS = frozenset({"charge.strays"})
 #: Those that levels of uniform light depend on, at given rates.
-LEVEL = SHADING | {
-    "light.level",
-    "light.level_by_channel",
-    "charge.exposure_s",
-    "charge.leak_s",
-    "light.ambient_e_per_s",
-    "charge.kernels",
-    "charge.exchange",
-    "signal.response",
-    "signal.offset_dn",
-    "signal.exposure_offset_dn",
-    "codes.codes",
-}
+LEVEL = (
+    SHADING
+    | STRAYS
+    | {
+        "light.level",
+        "light.level_by_channel",
+        "charge.exposure_s",
+        "charge.leak_s",
+        "light.ambient_e_per_s",
+        "charge.kernels",
+        "charge.exchange",
+        "signal.response",
+        "signal.offset_dn",
+        "signal.exposure_offset_dn",
+        "codes.codes",
+    }
+)
 
 #: Values that stand for the noise of a level: over all its points, and the most and the least at one point.
 NOISE_VALUES, MOST_AT_A_POINT, LEAST_AT_A_POINT = 480, 48, 6
@@ -229,7 +235,7 @@ class Uniform:
         typical_s = source_s * float(np.mean(field.light))
         mixed = self._mix_captures({c: np.asarray(rates.get(c, 1.0)) * typical_s for c in self.camera.channels})
         dark = self.camera.dark_current_e_per_s * np.asarray(exposure_s)[..., None]
-        found = {}
+        lit = {}
         for channel, rate in rates.items():
             ambient = (self._light.ambient(channel) * collected_s)[..., None]
             seen = rate * _of_each(partial(self._light.colour, channel), elapsed_s)
@@ -237,8 +243,27 @@ class Uniform:
             if self.leaks:
                 leaked = self.leaked_s(field) * field.light
                 light = light + (seen * _of_each(self._light.source, elapsed_s))[..., None] * leaked
-            found[channel] = (light + ambient) * mixed.get(channel, np.ones(()))[..., None] + dark
-        return found
+            lit[channel] = light + ambient
+        strayed = self.stray_light(lit, field)
+        return {c: light * mixed.get(c, np.ones(()))[..., None] + dark for c, light in strayed.items()}
+
+    def stray_light(self, electrons: Mapping[str, FloatArray], points: FieldPoints) -> Mapping[str, FloatArray]:
+        """Electrons of light (..., points) by channel after what misses its pixel fell on the next ones."""
+        return self._charge.stray_channels(electrons, points.x_um, points.y_um)
+
+    def stray_shares(self, channel: str, x_um: FloatArray, y_um: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Shares of a channel's light that fall on the next pixels in the row, and in the column, at places."""
+        both = [law.shares(channel, x_um, y_um) for law in self._charge.strays]
+        return np.sum([along for along, _ in both], axis=0), np.sum([down for _, down in both], axis=0)
+
+    def part_greens(self, electrons: Mapping[str, FloatArray], points: FieldPoints) -> FloatArray:
+        """Return by how much green pixels on red rows have more electrons than those on blue rows, (..., points)."""
+        return np.asarray(self._charge.part_greens(electrons, points.x_um, points.y_um) * np.ones(points.x_um.size))
+
+    @property
+    def strays(self) -> bool:
+        """Return whether light falls on other pixels than its own."""
+        return bool(self._charge.strays)
 
     def _mix_captures(self, electrons: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """`mixing_factors` of every capture."""

@@ -201,6 +201,7 @@ SIZES: dict[str, str] = {
     "inter_pixel_capacitance": "left:share_percent=2",
     "lateral_chromatic_aberration": "left:slope_um=2.5",
     "light_flicker": "both:modulation_percent=8,frequency_hz=100,line_time_us=20",
+    "microlens_angle": "left:crosstalk_percent=3,loss_percent=4",
     "model_discrepancy": "left:strength=1",
     "non_uniform_illumination": "both:gradient_x_percent=4",
     "nonlinearity": "left:quadratic_percent=3",

@@ -192,6 +192,8 @@ class ConcealedCamera:
             shaded[c] = image * self.shading
             for law in self.laws:
                 shaded[c] = law.image(shaded[c]) + law.ambient_e_per_s(c)
+        for law in self.laws:
+            shaded = law.colours(shaded)
         rate = self._mosaic(shaded) * self.prnu_map
         time_s = exposure_s
         for law in self.laws:

@@ -145,6 +145,10 @@ class Law:
         """Relative signal of the pixels at (x, y) half diagonals from the centre."""
         return 1.0
 
+    def colours(self, images: dict[str, Array]) -> dict[str, Array]:
+        """Return what pixels of each channel see of the images on the sensor (e-/s, by channel)."""
+        return images
+
     def image(self, image: Array) -> Array:
         """Return the image on the sensor (e-/s, one channel)."""
         return image

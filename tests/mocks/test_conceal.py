@@ -101,6 +101,7 @@ CASES = (
     Case("left:inter_pixel_capacitance:share_percent=4", (SCREEN, FLAT)),
     Case("left:lateral_chromatic_aberration:slope_um=12", (EDGE, BOARD)),
     Case("both:light_flicker:modulation_percent=20,frequency_hz=100,line_time_us=80", (FLAT, SCREEN)),
+    Case("left:microlens_angle:crosstalk_percent=20,loss_percent=20,red_excess=0.3", (FLAT, SWEPT, CHART)),
     Case("left:model_discrepancy:strength=1", (SCREEN, EDGE)),
     Case("both:non_uniform_illumination:gradient_x_percent=8,gradient_y_percent=4", (FLAT, SWEPT)),
     Case("left:nonlinearity:quadratic_percent=10", (FLAT, CHART)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from sim.frame import collected_mosaic
 from sim.point import even_share
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.uniform import SHADING, FieldPoints, Uniform
+from sim.uniform import SHADING, STRAYS, FieldPoints, Uniform
 
 LEAST_SIGNAL = 10.0  # of a frame that is a part of the mean image, in standard deviations of the read noise
 
@@ -351,9 +351,10 @@ def shading_block(study: Study) -> Block:
     x_mm, y_mm = (_cell_means(v) * 1e-3 for v in (place.x_um, place.y_um))
 
     def predict(effects: Effects) -> Prediction:
-        collected = _collected(study, effects)
-        base = _shaded(planes, place, effects, study, collected)
-        axis = {name: _shaded(planes, off, effects, study, collected) - base for name, off in moved.items()}
+        # what pixels do stays where it is if the lens's axis moves
+        own = _own_factors(planes, place, effects, study)
+        base = _shaded(planes, place, effects, study, own)
+        axis = {name: _shaded(planes, off, effects, study, own) - base for name, off in moved.items()}
         return Prediction(base, axis | _row_light(planes, base, Uniform(camera, effects), camera.rows))
 
     radius = np.hypot(x_mm, y_mm)
@@ -363,7 +364,8 @@ def shading_block(study: Study) -> Block:
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures),
         p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT,
+        reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | STRAYS | {"signal.response", "image.veils"},
+        scattered_by=ROW_LIGHT,
         predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
@@ -501,9 +503,9 @@ def _shaded(
     place: FieldPoints,
     effects: Effects,
     study: Study,
-    collected: Mapping[str, FloatArray],
+    factors: Sequence[FloatArray | float],
 ) -> FloatArray:
-    """Predicted cells of all planes, each relative to its mean, (planes x cells,); `collected` of `_collected`."""
+    """Predicted cells of all planes, each relative to its mean, (planes x cells,); `factors` of `_own_factors`."""
     model = Uniform(study.camera, effects)
     light = _cell_means(model.field(place).light)
     # a veil of scattered light reduces the contrast of the fall-off
@@ -514,13 +516,31 @@ def _shaded(
     leaked_s = _cell_means(model.leaked_s(place))
     gain = 1.0 if gains is None else _cells(gains).ravel()
     found = []
-    for plane in planes:
-        own = light * collected.get(plane.channel, 1.0)
+    for plane, factor in zip(planes, factors, strict=True):
+        own = light * factor
         if model.leaks:
             own = own * (1.0 + leaked_s * float(np.mean([1.0 / c.exposure_s for c in plane.captures])))
         electrons = model.response(own / own.mean() * plane.level_e) * gain
         found.append(electrons / electrons.mean() + added * plane.inverse_per_e)
     return np.concatenate(found)
+
+
+def _own_factors(
+    planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effects, study: Study
+) -> list[FloatArray | float]:
+    """Factor on the cells (cells,) of each plane by what tells its pixels from others."""
+    model, collected = Uniform(study.camera, effects), _collected(study, effects)
+    strayed = {out: _strayed([p for p in planes if p.held_out == out], place, model) for out in (False, True)}
+    return [strayed[p.held_out].get(p.channel, 1.0) * collected.get(p.channel, 1.0) for p in planes]
+
+
+def _strayed(planes: Sequence[_ChannelCells], place: FieldPoints, model: Uniform) -> dict[str, FloatArray]:
+    """Factor on the cells (cells,) of each channel by light that falls on the next pixels, which are of other channels.
+    `planes`: those of one set of frames."""
+    if not model.strays:
+        return {}
+    after = model.stray_light({p.channel: p.level_e * np.ones(place.x_um.size) for p in planes}, place)
+    return {p.channel: _cell_means(after[p.channel]) / p.level_e for p in planes}
 
 
 def _collected(study: Study, effects: Effects) -> dict[str, FloatArray]:

@@ -19,6 +19,7 @@ from sim.effects.base import Effects
 from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
+from sim.uniform import STRAYS, FieldPoints, Uniform
 
 GREEN_FLOOR = 1e-4  # standard deviation of the ratio of equal greens beside noise
 GREEN_NOISE = 0.02  # ratios of a larger standard deviation aren't used
@@ -92,11 +93,18 @@ def green_block(study: Study) -> Block:
             found = [_predicted_ratio(r, differing, study) for r in ratios]
         else:
             found = [_predicted_ratio(ratios[0], differing, study) if differing else 0.0] * len(ratios)
-        return Prediction(np.concatenate([found, np.zeros(cells)]), {})
+        model = Uniform(study.camera, effects)
+        placed = np.zeros(cells)
+        if model.strays:
+            parted = np.array([_parted(r, study, model) for r in ratios])
+            found = [ratio + float(own.mean()) for ratio, own in zip(found, parted, strict=True)]
+            of_flats = parted[[r.x == 0.0 for r in ratios]].mean(0)
+            placed = np.tile(of_flats - of_flats.mean(), cells // number)
+        return Prediction(np.concatenate([found, placed]), {})
 
     return Block(
         measurement=GREEN_BALANCE, reach=25.0, value=value, covariance=covariance, labels=tuple(labels),
-        reads=GREENS, predict=predict, scale=np.ones(len(value)),
+        reads=GREENS | STRAYS, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -199,6 +207,14 @@ def _predicted_ratio(ratio: _Ratio, effects: Effects, study: Study) -> float:
     tile = collected_mosaic(study.camera, tile, effects, exposure_s=ratio.exposure_s, elapsed_s=ratio.elapsed_s)
     planes = mosaic.planes(tile, study.camera.cfa)
     return float(planes["G1"].mean() / max(float(planes["G2"].mean()), 1e-9)) - 1.0
+
+
+def _parted(ratio: _Ratio, study: Study, model: Uniform) -> FloatArray:
+    """Return by how much the greens' ratio grows in each cell (cells,) by light that falls on the next pixels."""
+    rows, cols = CELLS
+    place = FieldPoints.of(study.camera, 4 * rows, 4 * cols)
+    more = model.part_greens({c: np.array(m) for c, m in ratio.mean.items()}, place) / max(ratio.mean["G"], 1e-9)
+    return np.asarray(more.reshape(rows, 4, cols, 4).mean((1, 3)).ravel())
 
 
 def _cell_means(plane: FloatArray) -> FloatArray:

@@ -48,7 +48,7 @@ from sim.point import (
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
 from sim.stop_down import at_f_number, effects_at_f_number
-from sim.uniform import SHADING, SPECTRAL, Uniform, electron_rate
+from sim.uniform import SHADING, SPECTRAL, STRAYS, FieldPoints, Uniform, electron_rate
 
 # --- edge estimator --------------------------------------------------------------------------------------------------
 # The slanted-edge estimator of the diagnosis, as a linear operator on the values of an edge's pixels.
@@ -387,7 +387,7 @@ WAVELENGTHS, FINE_WAVELENGTHS, FINE_NM = 10, 48, 2.0
 HIGHEST_CY_PER_PX = 10.0  # of the quadrature
 KEPT = 64  # most entries of each cache
 #: Quantities of the stages that change an edge's profile otherwise than by the OTF.
-CHANGING = SHADING | {"signal.response", "image.veils", "charge.exchange"}
+CHANGING = SHADING | STRAYS | {"signal.response", "image.veils", "charge.exchange"}
 KERNELS = frozenset({"charge.kernels"})
 K = TypeVar("K")
 V = TypeVar("V")
@@ -701,7 +701,7 @@ class _Edges:
 
     def _changed(self, effects: tuple[Effect, ...]) -> FloatArray | None:
         model = Uniform(self._camera, effects)
-        shading = acting(effects, SHADING)
+        shading = acting(effects, SHADING | STRAYS)
         spread = halos(self._camera, effects)
         if not shading and model.is_linear and not spread and not model.exchanges_charge:
             return None
@@ -715,6 +715,8 @@ class _Edges:
                 change[i] += np.interp(light[i], level, bent / scale) - light[i]
         if model.exchanges_charge:
             change += self._exchanged(model)
+        if model.strays:
+            change += self._strayed(model)
         if shading:
             for i in range(len(self.edges)):
                 ratio = self._shade(i, operators.distance, shading) / operators.shade[i]
@@ -731,6 +733,29 @@ class _Edges:
             for squares, scale in self._squares
         ]
         return np.array(change)
+
+    def _strayed(self, model: Uniform) -> FloatArray:
+        """Change of the profiles (edges, distances) by light that falls on the next pixels, at the level that it leaves
+        in even light."""
+        cfa, count = self._camera.cfa, len(self._operators.distance)
+        step, places = mosaic.step(cfa), mosaic.phases(cfa)
+        channel = {place: c for c, mine in places.items() for place in mine}
+        found = []
+        for edge, lighting, (squares, scale) in zip(self.edges, self._lighting, self._squares, strict=True):
+            # their mean along the edge
+            shares = {c: [float(s.mean()) for s in model.stray_shares(c, *lighting[:2])] for c in self._camera.channels}
+            mine = places[edge.channel]
+            change = np.zeros(count)
+            for (row, col), square in zip(mine, squares.reshape(len(mine), count, 3, 3), strict=True):
+                kernel = np.zeros((3, 3))
+                kernel[1, 1] = 1.0 - sum(shares[edge.channel])
+                for i, j in ((1, 0), (1, 2), (0, 1), (2, 1)):
+                    kernel[i, j] = 0.5 * shares[channel[(row + i - 1) % step, (col + j - 1) % step]][int(j == 1)]
+                mixed = square.reshape(count, 9) @ kernel.ravel()
+                # far on the bright side all neighbours are lit
+                change += (mixed * square[-1, 1, 1] / mixed[-1] - square[:, 1, 1]) / len(mine)
+            found.append(change / scale)
+        return np.array(found)
 
     @cached_property
     def _squares(self) -> list[tuple[FloatArray, float]]:
@@ -769,7 +794,13 @@ class _Edges:
     def _shade(self, edge: int, distance: FloatArray, effects: Effects) -> FloatArray:
         """Illumination (distances,) over that at the edge, averaged along the edge, with effects."""
         x_um, y_um, light, fit = self._lighting[edge]
-        terms = fit @ Uniform(self._camera, effects).shade_light(light, x_um, y_um)
+        model = Uniform(self._camera, effects)
+        light = model.shade_light(light, x_um, y_um)
+        if model.strays:
+            radiance, place = self.edges[edge].part[0].light_radiance, FieldPoints(x_um, y_um, light)
+            rates = {c: light * self._rate(self._sights.index((c, radiance))) for c in self._camera.channels}
+            light = model.stray_light(rates, place)[self.edges[edge].channel]
+        terms = fit @ light
         reach = self.edges[edge].measured.geometry.reach_px
         return np.asarray(polynomial.polyval(np.clip(distance, -reach, reach) / UNEVEN_PX, terms / terms[0]))
 

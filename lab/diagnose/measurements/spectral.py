@@ -441,6 +441,8 @@ def chart_block(study: Study) -> Block:
         time = np.array([model.collected_s(float(t)) for t in exposures])
         ambient = np.array([model.ambient_e(p.channel, float(t)) for p, t in zip(points, exposures, strict=True)])
         electrons = rates * model.field(place).light * (time + model.leaked_s(place))
+        if model.strays:
+            electrons = _strayed(points, electrons, place, model)
         electrons = electrons * _mixing(study, points, electrons, model)
         veil = even_share(camera, effects) * surround + halo_light([p.around for p in points], effects, camera)
         electrons = wide_contrast(camera, effects) * electrons + (veil + tail) / noise.gain + ambient
@@ -493,14 +495,31 @@ def _row_light(points: list[Patch], model: Uniform, rows: int, lit: FloatArray) 
     return nuisances("chart", vectors)
 
 
+def _strayed(points: list[Patch], electrons: FloatArray, place: FieldPoints, model: Uniform) -> FloatArray:
+    """Return the patches' electrons (n,) after light that misses its pixel fell on the next ones."""
+    found = np.empty(len(points))
+    for members in _by_patch(points):
+        where = [*members.values()]
+        there = FieldPoints(*(v[where] for v in (place.x_um, place.y_um, place.light)))
+        after = model.stray_light({c: electrons[i] * np.ones(len(where)) for c, i in members.items()}, there)
+        for k, (c, i) in enumerate(members.items()):
+            found[i] = after[c][k]
+    return found
+
+
+def _by_patch(points: list[Patch]) -> list[dict[str, int]]:
+    """Return the index of each channel, of every patch of every capture."""
+    found: dict[tuple[str, str], dict[str, int]] = {}
+    for i, p in enumerate(points):
+        found.setdefault((p.captures[0].id, p.name), {})[p.channel] = i
+    return [*found.values()]
+
+
 def _mixing(study: Study, points: list[Patch], electrons: FloatArray, model: Uniform) -> FloatArray:
     """Factors (n,) on the patches' electrons by effects that move charge between neighbouring pixels of different
     channels."""
     factor = np.ones(len(points))
-    by_patch: dict[tuple[str, str], dict[str, int]] = {}
-    for i, p in enumerate(points):
-        by_patch.setdefault((p.captures[0].id, p.name), {})[p.channel] = i
-    for members in by_patch.values():
+    for members in _by_patch(points):
         if len(members) == len(study.channels):
             mixed = model.mixing_factors({c: float(electrons[i]) for c, i in members.items()})
             for c, i in members.items():

@@ -87,6 +87,7 @@ from mocks.former.laws.transmission import (
     DustShadowLaw,
     GhostLaw,
     InfraredCutFilterLaw,
+    MicrolensAngleLaw,
     RedLeakLaw,
     VeilingGlareLaw,
     VignettingDecentreLaw,
@@ -149,6 +150,7 @@ LISTED: tuple[type[Law], ...] = (
     AnisotropicBrighterFatterLaw,
     CoverGlassFringeLaw,
     ColouredReadNoiseLaw,
+    MicrolensAngleLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single

@@ -150,3 +150,52 @@ class GhostLaw(Law):
         copy = image[::-1, ::-1]
         copy = gaussian_filter(copy, 4.0, mode="nearest") if self.variant == 1 else copy
         return image + self.strength / 100.0 * copy
+
+
+class MicrolensAngleLaw(Law):
+    """Microlenses for other chief rays than the lens's: light misses its diode, and 45 % of that falls on the next one
+    outwards. Variants: along rows and columns in proportion to the squares of the place; by a spot of normal profile
+    that leaves a square diode, wider in red; towards the nearer axis alone."""
+
+    name = effect = "microlens_angle"
+    variants, unit, nominal, limits, needs = 3, "%", 6.0, (0.1, 60.0), "bayer"
+    kept = 0.45
+
+    def _missing(self, channel: str) -> tuple[Array, Array]:
+        """Shares of the light that miss their diode along rows and along columns, `strength` in the corner for
+        green."""
+        x, y = np.abs(self.camera.field_position)
+        if self.variant == 2:
+            r2, beside = x * x + y * y, x > y
+            return self.strength / 100 * r2 * beside, self.strength / 100 * r2 * ~beside
+        if self.variant == 0:
+            return self.strength / 100 * x * x, self.strength / 100 * y * y
+
+        def outside(off: Array, spot: float) -> Array:  # of a diode of half a side 2.2 spots
+            return 0.5 * (erfc((2.2 - off) / spot / 2**0.5) + erfc((2.2 + off) / spot / 2**0.5)) - erfc(
+                2.2 / spot / 2**0.5
+            )
+
+        spot = {"R": 1.04, "G": 1.0, "B": 0.97}[channel]
+        whole = outside(x.max(), 1.0) + outside(y.max(), 1.0)
+        return self.strength / 100 * outside(x, spot) / whole, self.strength / 100 * outside(y, spot) / whole
+
+    def colours(self, images: dict[str, Array]) -> dict[str, Array]:
+        along, down = ({c: self._missing(c)[axis] * image for c, image in images.items()} for axis in (0, 1))
+        red_row = (np.arange(self.camera.rows) % 2 == self.camera.cfa.index("R") // 2)[:, None]
+        inner = {c: (self._from_inside(along[c], 1), self._from_inside(down[c], 0)) for c in images}
+        green = inner["G"][0] + inner["G"][1]
+        red_rows, blue_rows = inner["R"][0] + inner["B"][1], inner["B"][0] + inner["R"][1]
+        found = {"R": green, "B": green, "G": np.where(red_row, red_rows, blue_rows)}
+        return {c: image - along[c] - down[c] + self.kept * found[c] for c, image in images.items()}
+
+    def _from_inside(self, light: Array, axis: int) -> Array:
+        """Return the light of the next pixel towards the centre along an axis."""
+        ahead, behind = (np.roll(light, step, axis=axis) for step in (1, -1))
+        return np.where(self.camera.field_position[1 - axis] > 0, ahead, behind)
+
+    def library_parameters(self) -> dict[str, float]:
+        if self.variant != 0:
+            return {}
+        loss = (1 - self.kept) * self.strength  # of which the rest is a share, in the corner
+        return {"crosstalk_percent": self.kept * self.strength / (1 - loss / 100), "loss_percent": loss}

@@ -18,11 +18,13 @@ from mocks.former.laws import (
     CoverGlassFringeLaw,
     ImageLagLaw,
     LeakyShutterLaw,
+    MicrolensAngleLaw,
     PersistenceLaw,
     PhaseDetectionRowsLaw,
     ResponseKneeLaw,
     TapGainLaw,
     TapOffsetLaw,
+    VignettingLaw,
 )
 
 pytestmark = pytest.mark.timeout(300)
@@ -52,9 +54,15 @@ STRONG: tuple[Law, ...] = (
     PersistenceLaw(1.0, 2, 9),
     CoverGlassFringeLaw(2.0, 0, 9),
     CoverGlassFringeLaw(5.0, 1, 4),
-    # the likest law of persistence
+    MicrolensAngleLaw(6.0, 0, 9),
+    MicrolensAngleLaw(6.0, 1, 9),
+    MicrolensAngleLaw(6.0, 2, 9),
+    # the likest laws of persistence and of microlenses
     ImageLagLaw(1.0, 0, 9),
+    VignettingLaw(4.0, 0, 1),
 )
+#: Those that a mosaic shows.
+OF_COLOURS = {"microlens_angle", "vignetting"}
 NEW = {str(law.effect) for law in STRONG}
 
 
@@ -68,7 +76,7 @@ def _diagnosed(law: Law | None, cfa: str = "MONO", seed: int = 930) -> Diagnosis
 
 @pytest.mark.parametrize("law", STRONG, ids=lambda law: f"{law.name}-{law.variant}")
 def test_a_strong_one_is_named_and_sized(law: Law) -> None:
-    (named,) = _diagnosed(law).effects
+    (named,) = _diagnosed(law, "RGGB" if law.effect in OF_COLOURS else "MONO").effects
     assert named.name == law.effect
     for name, truth in law.library_parameters().items():
         if truth != 0.0:

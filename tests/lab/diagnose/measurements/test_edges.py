@@ -3,7 +3,7 @@ apart."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -30,8 +30,10 @@ from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.effects.library import effect
 from sim.point import edge_profile, optical_transfer
+from sim.stages import Charge, Stray
 
 EDGES = Plan(("dark", "slanted_edge"))
 
@@ -139,6 +141,29 @@ def test_crosstalk_between_colours_changes_their_edges() -> None:
     )
     assert _misfit(block) > 1.0
     assert _misfit(block, effect("crosstalk")(share_percent=4.0)) < 1.0
+
+
+class _EvenStray(Effect):
+    """4 % of the light falls on the next pixels in the row and 2 % on those in the column, everywhere."""
+
+    name: ClassVar[str] = "even_stray"
+    family: ClassVar[Family] = Family.FIELD_OF_LIGHT
+
+    def on_charge(self, charge: Charge) -> Charge:
+        return charge.add_laws(
+            strays=Stray(lambda _, x_um, y_um: (np.full(x_um.shape, 0.04), np.full(y_um.shape, 0.02)))
+        )
+
+
+def test_light_that_falls_on_the_next_pixels_blurs_as_charge_that_goes_there() -> None:
+    """The same kernel once in the profiles and once in the transfer functions: alike to 5 % of the change, as a profile
+    between distances of half a pixel is interpolated linearly."""
+    block = edge_block(_recorded(cfa="RGGB", f_number=4.0, rows=96))
+    plain = block.predict(()).mean
+    by_charge = block.predict((effect("crosstalk")(share_percent=1.5, row_excess=1.0 / 3.0),)).mean - plain
+    by_light = block.predict((_EvenStray(),)).mean - plain
+    assert np.abs(by_charge).max() > 0.01
+    assert by_light == pytest.approx(by_charge, abs=0.05 * float(np.abs(by_charge).max()))
 
 
 def test_shading_is_no_blur() -> None:

@@ -21,10 +21,18 @@ from lab.diagnose.measurements.flat_field import (
     shading_block,
 )
 from lab.diagnose.measurements.flat_rows import flicker_block
+from lab.diagnose.measurements.green_balance import green_block
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.formats.recording_set import RecordingSet
 from lab.measure.study import Study
-from mocks.former.laws import DustShadowLaw, NonUniformIlluminationLaw, TapGainLaw, VignettingDecentreLaw, VignettingLaw
+from mocks.former.laws import (
+    DustShadowLaw,
+    MicrolensAngleLaw,
+    NonUniformIlluminationLaw,
+    TapGainLaw,
+    VignettingDecentreLaw,
+    VignettingLaw,
+)
 from tests.lab.diagnose.on_blocks import former, measured_model, names, rendered, sigmas, study, verdict
 from tests.sim.local_effects import ReadOutRamp
 
@@ -55,6 +63,19 @@ def test_vignetting_is_named_whatever_its_power(variant: int) -> None:
 def test_a_fall_off_about_another_point_is_named(variant: int) -> None:
     found = verdict(former(22, VignettingDecentreLaw(0.3, variant, 2)), *LOOKED_AT)
     assert names(found) == ["vignetting_decentre"]
+
+
+def test_microlenses_at_another_angle_are_named_and_vignetting_is_not() -> None:
+    """By the second image former; each parameter within 4 of its own standard deviations."""
+    blocks = (*LOOKED_AT, green_block)
+    law = MicrolensAngleLaw(6.0, 0, 9)
+    found = verdict(former(21, law, cfa="RGGB"), *blocks)
+    assert names(found) == ["microlens_angle"]
+    for name, truth in law.library_parameters().items():
+        std = found.named[0].std[name]
+        assert std is not None
+        assert getattr(found.named[0].effect, name) == pytest.approx(truth, abs=4.0 * std)
+    assert names(verdict(former(21, VignettingLaw(4.0, 0, 1), cfa="RGGB"), *blocks)) == ["vignetting"]
 
 
 @pytest.mark.parametrize("variant", [pytest.param(0, marks=pytest.mark.slow), 1])
