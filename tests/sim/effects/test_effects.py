@@ -93,6 +93,7 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
             float(one.shot_e2(np.array(9e3))), even_share(CAMERA, acting), sum(h[0] for h in halos(CAMERA, acting)),
             1e3 * one.unsteadiness**2, *(light_of(CAMERA, acting).colour(c, 600.0) for c in "RGB"),
             signal_of(CAMERA, acting).changing_e2(600.0),
+            *signal_of(CAMERA, acting).read_power(np.array([0.0, 0.2, 0.4])),
             *one.shade_light(np.ones(5), place, place),
             *np.ravel(np.zeros(10) if moved is None else moved)]  # fmt: skip
     # what acts on dark pixels, on the frame after, and on the read-out, in electrons or DN
