@@ -202,6 +202,13 @@ def test_pixels_of_a_colour_keep_their_mean(one: Effect) -> None:
         assert np.mean(means) == pytest.approx(1000.0, rel=1e-12), colour
 
 
+@pytest.mark.parametrize("one", _acting("signal.read_spectrum"), ids=lambda e: e.name)
+def test_coloured_read_noise_keeps_its_variance(one: Effect) -> None:
+    power = signal_of(CAMERA, (one,)).read_power(np.fft.fftfreq(1000))
+    assert np.ptp(power) > 0.0 and power.min() > 0.0
+    assert power.mean() == pytest.approx(1.0, rel=1e-6)
+
+
 @pytest.mark.parametrize("one", _acting("signal.gains"), ids=lambda e: e.name)
 def test_gains_by_place_keep_the_mean_of_the_frame(one: Effect) -> None:
     gains = Uniform(CAMERA, (one,)).gain_map()
