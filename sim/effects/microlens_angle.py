@@ -29,7 +29,6 @@ class MicrolensAngle(Effect):
     """
 
     name: ClassVar[str] = "microlens_angle"
-    title: ClassVar[str] = "microlenses at another angle"
     family: ClassVar[Family] = Family.FIELD_OF_LIGHT
     reference: ClassVar[str] = (
         "G. Agranov, V. Berezin and R. H. Tsai, Crosstalk and microlens study in a color CMOS image sensor, IEEE "

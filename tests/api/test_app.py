@@ -64,6 +64,7 @@ def test_what_a_path_names_and_is_not_there_is_404_in_a_plain_sentence(shared: R
             kind = "score" if "challenge" in path else "fit"
             body = {"kind": kind} if path.endswith("/jobs") else {} if "requestBody" in described else None
             body = {"station": "fakes"} if path.endswith("/request") and body is not None else body
+            body = {"target": "cap"} if path.endswith("/confirm") else body
             response = client.request(method, there, json=body)
             assert (response.status_code, response.headers["content-type"]) == (404, "application/problem+json"), there
             said = response.json()["detail"]

@@ -98,7 +98,8 @@ def green_block(study: Study) -> Block:
         if model.strays:
             parted = np.array([_parted(r, study, model) for r in ratios])
             found = [ratio + float(own.mean()) for ratio, own in zip(found, parted, strict=True)]
-            of_flats = parted[[r.x == 0.0 for r in ratios]].mean(0)
+            flat = [r.x == 0.0 for r in ratios]  # none where only narrowband light is there, or every flat is noisy
+            of_flats = parted[flat if any(flat) else slice(None)].mean(0)
             placed = np.tile(of_flats - of_flats.mean(), cells // number)
         return Prediction(np.concatenate([found, placed]), {})
 
