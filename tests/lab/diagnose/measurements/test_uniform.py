@@ -12,6 +12,7 @@ from lab.challenge.draw import recordings_of
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import cell_means
 from lab.diagnose.measurements.dark_level import added_dark_dn, dark_current_map
+from lab.diagnose.measurements.flat_field import shading_block
 from lab.diagnose.measurements.linearity import RADIOMETER_STD, linearity_block
 from lab.diagnose.measurements.spectral import (
     MOST_SAMPLE_STD,
@@ -64,8 +65,9 @@ LEVELS: list[tuple[Law, bool]] = [
     ids=lambda value: f"{value.name}-{value.variant}" if isinstance(value, Law) else f"shuttle-{value}",
 )
 def test_effects_on_levels_are_told_apart(law: Law, shuttle: bool) -> None:
-    """A series of levels upwards only, in which time and level go together except in repeats; and one up and down."""
-    found = verdict(former(31, law, shuttle=shuttle), linearity_block)
+    """A series of levels upwards only, in which time and level go together except in repeats; and one up and down. The
+    cells of the flats say that no row has more time than another."""
+    found = verdict(former(31, law, shuttle=shuttle), linearity_block, shading_block)
     assert names(found) == [law.effect]
     for name, value in law.library_parameters().items():
         std = found.named[0].std[name]
