@@ -91,8 +91,8 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
 
 
 def _coloured_power(study: Study, model: Uniform, frequency_cy_per_px: FloatArray, white_dn2: float) -> FloatArray:
-    """Power of a pixel's noise at frequencies along the row over `white_dn2`, the power in `LEVEL_BAND`, less 1. Read
-    noise is a part of it, the rest is white."""
+    """Return the power of a pixel's noise at frequencies along the row over `white_dn2`, the power in `LEVEL_BAND`,
+    less 1. Read noise is a part of it, the rest is white."""
     read_dn2 = study.noise.read_dn**2
     level_dn2 = read_dn2 * float(np.mean(model.read_power(np.linspace(*LEVEL_BAND, 33))))
     found_dn2 = max(white_dn2 - level_dn2, 0.0) + read_dn2 * model.read_power(frequency_cy_per_px)

@@ -474,6 +474,7 @@ GHOST_BLUR_PX = 3.0  # standard deviation of the Gaussian blur of the ghost's te
 LEAST_BEYOND = (
     5e-4  # contrast (rms) of the parts beyond the bands from which on they are fitted; weaker ones are taken as drawn
 )
+LEAST_ODD = 1e-9  # contrast (rms) of an odd part below which it is rounding
 REFINEMENTS = 3  # Gauss-Newton steps of the registration
 FEWEST_CELLS = 400  # of a random pattern, whose spectrum is then even to 5 %
 MOST_MOVES = 4  # times that a displaced channel is drawn anew: a linear step finds about half of a shift by half a cell
@@ -857,7 +858,8 @@ class _LinearModel:
         # like a weak ghost, whose coefficient is therefore that of a fit with it.
         ghost = len(bands) + GHOST
         odd = np.array(turned_halves)
-        unit = np.concatenate([unit, odd / np.sqrt(np.mean(odd**2, axis=1))[:, None]])
+        # in a small window half a band may hold no frequency
+        unit = np.concatenate([unit, odd / np.maximum(np.sqrt(np.mean(odd**2, axis=1)), LEAST_ODD)[:, None]])
         alone = np.eye(len(unit))[ghost]
         weights[ghost] = np.linalg.lstsq(unit @ unit.T, alone, rcond=1e-10)[0] @ unit / scale[ghost]
         pieces = [*smooth, *halves, *turned_halves, *(part.picture[mask] for part in outside)]
