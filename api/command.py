@@ -68,7 +68,7 @@ def _listening(host: str, port: int) -> socket.socket:
 @commands.command()
 def serve(
     host: Annotated[
-        str, typer.Option(help="where to listen; others than this computer need a key first")
+        str, typer.Option(metavar="HOST", help="where to listen; others than this computer need a key first")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="where to listen; 0: a free one")] = 8000,
     allow_host: Annotated[
@@ -89,7 +89,10 @@ def serve(
     tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM, the certificate's private key")] = None,
     data: Folder = None,
 ) -> None:
-    """Run the REST service and the operator's page. The first start on loopback makes a key and prints it."""
+    """Run the REST service and the operator's page. The first start on loopback makes a key and prints it.
+
+    Example: calibench serve --port 8000 --data calibench-data
+    """
     if (tls_certificate is None) != (tls_key is None):
         raise InputError("--tls-certificate and --tls-key belong together; give both")
     for file in (tls_certificate, tls_key):
@@ -146,19 +149,28 @@ def create(
     scope: Annotated[Permission, typer.Option(help="what it allows; each includes read")] = Permission.READ,
     data: Folder = None,
 ) -> None:
-    """Make a key and print it. It can't be printed again."""
+    """Make a key and print it. It can't be printed again.
+
+    Example: calibench key create robot --scope operate
+    """
     typer.echo(create_key(open_store(data), name, scope))
 
 
 @key.command("list")
 def list_keys(data: Folder = None) -> None:
-    """Names and scopes of all keys."""
+    """Names and scopes of all keys.
+
+    Example: calibench key list
+    """
     for stored in stored_keys(store_to_read(data)):
         typer.echo(f"{stored.name}  {stored.scope}")
 
 
 @key.command("remove")
 def remove(name: Annotated[str, typer.Argument(help="name of the key's owner")], data: Folder = None) -> None:
-    """Remove a key and the logins of the operator's page that were made with it."""
+    """Remove a key and the logins of the operator's page that were made with it.
+
+    Example: calibench key remove robot
+    """
     store_to_read(data).remove_key(name)
     typer.echo(f"removed: {name}")

@@ -39,7 +39,10 @@ def fit(
     ] = None,
     data: StoreFolder = None,
 ) -> None:
-    """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo."""
+    """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo.
+
+    Example: calibench fit my-camera --json fit.json
+    """
     check_writable(json)
     check_folder(cameras)
     check_folder(maps)
@@ -108,7 +111,10 @@ def compare(
     ] = None,
     data: StoreFolder = None,
 ) -> None:
-    """Compare two calibrations: figures that changed beyond their uncertainty, and instruments that changed."""
+    """Compare two calibrations: figures that changed beyond their uncertainty, and instruments that changed.
+
+    Example: calibench compare fit-january.json fit-june.json
+    """
     from lab.fit.compare import FailRule, failures
     from lab.fit.compare import compare as compared
     from lab.formats.recording_set import differences

@@ -100,7 +100,10 @@ def import_(
         str, typer.Option(metavar="NAME", help="lensfun: the model of the lens, where the file has several")
     ] = "",
 ) -> None:
-    """Turn another format into a recording set; spectra into CSV, a lens into a camera file."""
+    """Turn another format into a recording set; spectra into CSV, a lens into a camera file.
+
+    Example: calibench import --from raw-folder frames --out my-camera
+    """
     from lab.formats import recording_set
     from lab.formats.importers import read_foreign
     from lab.formats.importers.single_picture import ImportOptions, chart_corners, grid
@@ -168,7 +171,10 @@ def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> 
 
 @commands.command()
 def sessions(data: StoreFolder = None) -> None:
-    """List the stored sessions."""
+    """List the stored sessions.
+
+    Example: calibench sessions --data calibench-data
+    """
     table = Table(box=None, pad_edge=False)
     for heading in ("session", "name", "created", "state", "steps done"):
         table.add_column(heading)
@@ -218,7 +224,10 @@ def export(
     channel: Annotated[str, typer.Option(metavar="R|G|B", help="pyxel: whose efficiency (without: green's)")] = "",
     data: StoreFolder = None,
 ) -> None:
-    """Write a stored session as a recording set; spectra and cameras in the formats of other programs."""
+    """Write a stored session as a recording set; spectra and cameras in the formats of other programs.
+
+    Example: calibench export 20261127-101500-7f3ad2 --to my-camera
+    """
     from lab.formats import recording_set
 
     if kind != TILED:  # a catalogue may be a server's
@@ -247,7 +256,10 @@ def backup(
     data: StoreFolder = None,
 ) -> None:
     """Copy the data folder while it is in use. The copy is a data folder itself: to restore, use it in place of the
-    other."""
+    other.
+
+    Example: calibench backup /mnt/backup/calibench
+    """
     from lab.capture.backup import back_up
 
     made = back_up(store_to_read(data), folder)
@@ -261,11 +273,14 @@ def backup(
 @commands.command()
 def kinds(
     source: Annotated[
-        str, typer.Argument(metavar="[SOURCE]", help="count the captures in a recording set or a stored session")
+        str, typer.Argument(metavar="SOURCE", help="count the captures in a recording set or a stored session")
     ] = "",
     data: StoreFolder = None,
 ) -> None:
-    """The kinds of capture: the scene, and the sequence that takes them."""
+    """The kinds of capture: the scene, and the sequence that takes them.
+
+    Example: calibench kinds my-camera
+    """
     from lab.capture_kinds.base import CAPTURES
 
     counted = Counter(capture.kind for capture in recordings_of(source, data).captures()) if source else None
