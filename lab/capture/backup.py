@@ -20,6 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from lab.capture.generations import (
+    KEPT,
     LATEST,
     MARK,
     RECORD,
@@ -44,8 +45,6 @@ from lab.capture.store import Store
 from lab.errors import InputError
 from lab.formats.recording_set import DataSheet
 
-#: Generations that are kept unless another number is asked for.
-KEPT = 7
 #: Most attempts at copies of registry and files that agree.
 TRIES = 5
 #: Most files of one remark that are named.

@@ -35,6 +35,8 @@ from sim.parameters import Frozen
 
 REGISTRY = "registry.sqlite"
 MARK, RECORD, LATEST = ".backup-of", ".generation.json", "latest"
+#: Generations that are kept unless another number is asked for: a week of nights.
+KEPT = 7
 _CHUNK_BYTES = 1 << 20
 
 

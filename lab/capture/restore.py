@@ -232,11 +232,7 @@ def _check_free_to_write(target: Path, settings: Settings, replace: bool) -> Non
 
 def _entries(target: Path) -> list[Path]:
     """What a data folder holds, without what belongs to restoring."""
-    return [
-        one
-        for one in target.iterdir()
-        if one.name not in _STAYS and not one.name.startswith(_BEFORE)
-    ]
+    return [one for one in target.iterdir() if one.name not in _STAYS and not one.name.startswith(_BEFORE)]
 
 
 def _stage(generation: Generation, target: Path, advance: Advance) -> None:

@@ -9,6 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from lab.capture.generations import KEPT, acting_as_owner
 from lab.cli.console import EXIT_CHECK, err, out, progress_bar, warn
 from lab.cli.sources import StoreFolder, store_to_read
 from lab.errors import InputError
@@ -22,7 +23,7 @@ _MIB = 1 << 20
 def backup(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="the backup: new, or one of this data folder")],
     data: StoreFolder = None,
-    keep: Annotated[int, typer.Option(min=1, max=10_000, help="how many generations to keep, the newest")] = 7,
+    keep: Annotated[int, typer.Option(min=1, max=10_000, help="how many generations to keep, the newest")] = KEPT,
     checksum: Annotated[
         bool,
         typer.Option("--checksum", help="read every file of the data folder, also those of unchanged size and time"),
@@ -35,7 +36,6 @@ def backup(
     files that didn't change. Files that are damaged or missing in the data folder are named (exit code 4); their good
     copies stay."""
     from lab.capture.backup import back_up, verify_backup
-    from lab.capture.generations import acting_as_owner
     from lab.capture.settings import Settings
 
     if verify:
@@ -76,7 +76,6 @@ def restore(
     """Bring a data folder back from its backup: a generation, or with --repair damaged and missing files alone. Each
     file's SHA-256 is checked. A restore that was interrupted is continued by the same command."""
     from lab.capture import restore as restoring
-    from lab.capture.generations import acting_as_owner
     from lab.capture.settings import Settings
 
     if show:

@@ -334,9 +334,7 @@ def test_a_data_folder_that_lost_its_sessions_is_not_backed_up(store: Store, tmp
     assert len(frames(Store(again), session)) == FRAMES
 
 
-def test_a_damaged_registry_is_not_backed_up(
-    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_registry_is_not_backed_up(store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     captured(store)
     backup = tmp_path / "backup"
     back_up(store, backup)
@@ -364,7 +362,11 @@ def test_a_backup_of_before_generations_becomes_the_first_one(store: Store, tmp_
     back_up(store, backup)
     newest, oldest = generations_of(backup)
     assert [oldest.record.sessions, newest.record.sessions] == [1, 2] and verify_backup(backup)[1] == ()
-    assert {one.name for one in backup.iterdir() if not one.name.startswith(".")} == {"latest", newest.name, oldest.name}
+    assert {one.name for one in backup.iterdir() if not one.name.startswith(".")} == {
+        "latest",
+        newest.name,
+        oldest.name,
+    }
     restore(backup, Settings(data=tmp_path / "again"), oldest.name)
     assert same_frames(tmp_path / "again", store, session)
 
@@ -372,9 +374,7 @@ def test_a_backup_of_before_generations_becomes_the_first_one(store: Store, tmp_
 # --- restore ----------------------------------------------------------------------------------------------------------
 
 
-def test_restore_brings_any_generation_back(
-    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_restore_brings_any_generation_back(store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, backup = captured(store), tmp_path / "backup"
     old = back_up(store, backup).generation
     second = captured(store)

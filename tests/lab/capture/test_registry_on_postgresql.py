@@ -133,9 +133,7 @@ def test_sessions_are_searched_and_looked_over(url: str, tmp_path: Path) -> None
     store.close()
 
 
-def test_a_backup_has_the_rows_and_a_restore_brings_them_back(
-    url: str, server: str, tmp_path: Path
-) -> None:
+def test_a_backup_has_the_rows_and_a_restore_brings_them_back(url: str, server: str, tmp_path: Path) -> None:
     """Into another empty database, and with --replace into the one that changed since; the next rows follow on."""
     store = Store(tmp_path / "data", url)
     calibration = calibrated(store, 2.0)
