@@ -58,8 +58,6 @@ def failure_of_environment(error: BaseException) -> str | None:
     if isinstance(error, OSError) and error.errno in _REMEDIES:
         where = error.filename if error.filename is not None else "a file or a connection"
         return f"{where}: {error.strerror}; {_REMEDIES[error.errno]}"
-    if isinstance(error, RuntimeError) and str(error).startswith("cannot cache function"):  # numba's
-        return "compiled loops: no folder can be written to keep them; set NUMBA_CACHE_DIR to a folder of yours"
     of_database = getattr(error, "orig", None)  # as SQLAlchemy wraps what a database's driver raises
     said = one_line(of_database) if isinstance(of_database, Exception) else ""
     for words, remedy in _OF_DATABASES.items():

@@ -476,7 +476,7 @@ def test_a_restore_that_failed_is_continued(
     assert done.before is not None and Store(done.before).has_session(second)
 
 
-# --- processes that are killed, full disks, other users -----------------------------------------------------------------
+# --- processes that are killed, full disks, other users ---------------------------------------------------------------
 
 
 def command(*arguments: str) -> list[str]:

@@ -162,6 +162,7 @@ def test_a_backup_has_the_rows_and_a_restore_brings_them_back(url: str, server: 
     store.close()
     done = restore(backup, store.settings, replace=True)
     restored = Store(store.root, url)
-    assert restored.has_session(session) and [name for name, *_ in restored.keys()] == ["ada"]
+    keys = restored.keys()
+    assert restored.has_session(session) and [name for name, *_ in keys] == ["ada"]
     assert done.before is not None
     restored.close()
