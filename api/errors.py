@@ -113,8 +113,8 @@ def _not_as_expected(request: Request, where: str, one: Mapping[str, Any]) -> st
     """Return one line for what pydantic found: the field, what was sent, what is expected, an example."""
     expected = Expected(request)
     if one["type"] == "value_error":  # of our own checks, which name the value
-        said = str(one["msg"]).removeprefix("Value error, ")
-        return f"{where}: {said}" if where else said
+        text = str(one["msg"]).removeprefix("Value error, ")
+        return f"{where}: {text}" if where else text
     if where:
         return f"{where}: {_of_field(expected, one)}"
     sent = request.headers.get("content-type", "")
@@ -139,8 +139,8 @@ def _of_field(expected: Expected, one: Mapping[str, Any]) -> str:
         return f"is missing{give}"
     if field and kind.endswith(("_type", "_parsing", "literal_error", "enum")):
         return f"{shown} isn't taken{give}"
-    said = re.sub(r"^[A-Z]\w+ (should|must)", r"\1", str(one["msg"]))
-    return f"{shown} {said}{give}"
+    text = re.sub(r"^[A-Z]\w+ (should|must)", r"\1", str(one["msg"]))
+    return f"{shown} {text}{give}"
 
 
 def _invalid(request: Request, error: Exception) -> Response:
@@ -154,7 +154,7 @@ def _invalid(request: Request, error: Exception) -> Response:
             continue
         where = ".".join(str(part) for part in one["loc"] if part != "body")
         line = _not_as_expected(request, where, one)
-        if not any(other.startswith(f"{where}.") for other in lines):  # it follows from what is said of a part of it
+        if not any(other.startswith(f"{where}.") for other in lines):  # it follows from the line on a part of it
             lines.append(line)
     return problem(422, request.app.state.public("; ".join(lines)))
 

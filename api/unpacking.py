@@ -274,15 +274,15 @@ def _why_broken(archive: Path, error: Exception, folder: Path) -> str:
             return f"it is {name}; send a .zip, .tar or .tar.gz"
     if isinstance(error, FileExistsError | NotADirectoryError | IsADirectoryError):
         name = Path(str(error.filename)).relative_to(folder) if error.filename else ""
-        said = f"{name} is there twice, or as a file and as a folder"[-120:]
-        return f"can't be unpacked ({said}); pack each file once"
-    text = re.sub(r"<ZipInfo filename='(.*?)'.*?>", r"'\1'", str(error))
-    said = " ".join(text.replace(str(folder), "").split())[:120]
-    if begin[:2] == b"PK" and said == "File is not a zip file":
+        text = f"{name} is there twice, or as a file and as a folder"[-120:]
+        return f"can't be unpacked ({text}); pack each file once"
+    plain = re.sub(r"<ZipInfo filename='(.*?)'.*?>", r"'\1'", str(error))
+    text = " ".join(plain.replace(str(folder), "").split())[:120]
+    if begin[:2] == b"PK" and text == "File is not a zip file":
         return "it is cut off: the list of files at the end of the .zip is missing; copy it anew and send it again"
-    if isinstance(error, EOFError) or "unexpected end of data" in said:
+    if isinstance(error, EOFError) or "unexpected end of data" in text:
         return "it is cut off before its end; copy it anew and send it again"
-    return f"can't be unpacked ({said}); send a .zip, .tar or .tar.gz with each file once, without a password"
+    return f"can't be unpacked ({text}); send a .zip, .tar or .tar.gz with each file once, without a password"
 
 
 def _is_of_the_system(path: PurePosixPath) -> bool:

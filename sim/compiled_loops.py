@@ -1,4 +1,4 @@
-"""Where compiled loops are kept: beside the modules or in the user's cache, as numba does; else in a folder that can be
+"""Where compiled loops are kept: with the modules or in the user's cache, as numba does; else in a folder that can be
 written."""
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def choose_cache() -> None:
         try:
             chosen.mkdir(mode=0o700, exist_ok=True)
             chosen = chosen if _is_own(chosen) else Path(tempfile.mkdtemp(prefix="calibench-numba-"))
-        except OSError:  # numba says so when it compiles
+        except OSError:  # numba reports it when it compiles
             return
     os.environ["NUMBA_CACHE_DIR"] = str(chosen)
     if (imported := sys.modules.get("numba")) is not None:

@@ -15,7 +15,7 @@ import os
 import sqlite3
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
 from pathlib import Path
 
@@ -51,7 +51,10 @@ TRIES = 5
 _NAMED = 20
 #: Folders of the data folder whose files never change once they are there, though the registry has no sums of them.
 _FIXED = ("recordings", "predictions")
+_NAME = "%Y%m%d-%H%M%S-%f"
 _PARTIAL, _LEFT = ".partial", ".partial-before"
+#: What mends damage of the backup itself.
+_ANEW = "back up with --checksum, which copies it anew while the data folder has it"
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ def verify_backup(backup: Path) -> tuple[int, tuple[str, ...]]:
     generations = generations_of(backup)
     if not generations:
         raise InputError(f"{backup}: holds no generation of a backup; name the folder that `calibench backup` wrote")
-    seen: dict[tuple[int, int, str], str | None] = {}
+    damages: dict[tuple[int, int, str], str | None] = {}
     lines: list[str] = []
     for generation in generations:
         try:
@@ -123,13 +126,13 @@ def verify_backup(backup: Path) -> tuple[int, tuple[str, ...]]:
             with contextlib.suppress(OSError):
                 there = (generation.folder / path).stat()
                 key = (there.st_dev, there.st_ino, recorded.sha256)
-                if key not in seen:
-                    seen[key] = generation.damage(path)
-                if (damage := seen[key]) is not None:
-                    lines.append(f"{generation.name}/{path}: {damage}; take it from another generation or back up anew")
+                if key not in damages:
+                    damages[key] = generation.damage(path)
+                if (damage := damages[key]) is not None:
+                    lines.append(f"{generation.name}/{path}: {damage}; {_ANEW}")
                 continue
-            lines.append(f"{generation.name}/{path}: missing; take it from another generation or back up anew")
-    return len(seen), tuple(lines)
+            lines.append(f"{generation.name}/{path}: missing; {_ANEW}")
+    return len(damages), tuple(lines)
 
 
 def _check_mark(root: Path, target: Path) -> None:
@@ -163,12 +166,12 @@ def _adopt_single_copy(root: Path, target: Path) -> None:
         files[REGISTRY] = FileSum(sha256=sha256_of(registry), bytes=registry.stat().st_size)
         made = datetime.fromtimestamp(registry.stat().st_mtime, UTC)
         _write_record(moved, root, linked, files, known_version=False)
-        moved.rename(target / f"{made:%Y%m%d-%H%M%S-%f}")
+        moved.rename(target / made.strftime(_NAME))
 
 
 @dataclass(frozen=True)
 class _LinkedFiles:
-    """What a copied registry says: the sums of files by path, and of each packed session its frames' places."""
+    """The content of a copied registry: the sums of files by path, and of each packed session its frames' places."""
 
     revision: str
     sessions: frozenset[str]
@@ -237,7 +240,7 @@ class _Writer:
                     f"{self.store.root}: its registry names no session, the newest generation has {newest.sessions}; "
                     "look whether its disk is mounted, or, if all were deleted, back up into a new folder"
                 )
-            if newest.files == files:
+            if newest.files == files and not self.copied:
                 remove_tree(self._partial)
                 remove_tree(self.target / _LEFT)
                 return self._report(before[0], False, linked, files, ())
@@ -246,7 +249,7 @@ class _Writer:
         with made.open("rb") as written:
             os.fsync(written.fileno())
         sync_folders(self._partial)
-        generation = Generation(self.target / f"{now():%Y%m%d-%H%M%S-%f}")
+        generation = Generation(self.target / _name_after(before))
         self._partial.rename(generation.folder)
         sync_folder(self.target)
         self._point_to(generation)
@@ -336,7 +339,9 @@ class _Writer:
         if known is not None and (expected is None or known == expected):
             previous = before[0].folder / path
             with contextlib.suppress(OSError):
-                if _same_size_and_time(source, previous) and not (self.checksum and sha256_of(source) != known.sha256):
+                if _same_size_and_time(source, previous) and not (
+                    self.checksum and (sha256_of(source) != known.sha256 or before[0].damage(path))
+                ):
                     link_or_copy(previous, made)
                     return known
         left = self.target / _LEFT / path
@@ -360,7 +365,7 @@ class _Writer:
         if why is not None:
             partial.unlink()
             return self._carry_forward(path, expected or known, before, why)
-        if known == found:
+        if known == found and not before[0].damage(path):
             partial.unlink()
             link_or_copy(before[0].folder / path, made)
             return found
@@ -425,7 +430,7 @@ def _difference(found: FileSum, expected: FileSum) -> str | None:
 
 def _suspicion(path: str, copy: Path, found: FileSum, known: FileSum) -> str | None:
     """Return why a file that the registry doesn't name, and that changed since the newest generation, is damaged; None
-    where nothing says that it is."""
+    where nothing indicates that it is."""
     if found.bytes == 0:
         return f"empty in the data folder, {known.bytes} bytes before"
     if path.partition("/")[0] in _FIXED:
@@ -433,6 +438,15 @@ def _suspicion(path: str, copy: Path, found: FileSum, known: FileSum) -> str | N
     if not can_be_parsed(copy, Path(path)):
         return f"damaged in the data folder: can't be read as {Path(path).suffix[1:].upper()}"
     return None
+
+
+def _name_after(before: list[Generation]) -> str:
+    """Return the time, UTC, as a generation's name; later than those of before, also where the clock was set back."""
+    at = now()
+    if before:
+        newest = datetime.strptime(before[0].name, _NAME).replace(tzinfo=UTC)
+        at = max(at, newest + timedelta(microseconds=1))
+    return at.strftime(_NAME)
 
 
 def _counted(number: int) -> str:

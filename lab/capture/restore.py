@@ -218,9 +218,9 @@ def _check_free_to_write(target: Path, settings: Settings, replace: bool) -> Non
             raise InputError(f"{target}: a process works with it; stop the service and end what captures")
     if (target / SWAPPING).exists() or replace:
         return
-    if held := [one.name for one in _entries(target)]:
+    if present := [one.name for one in _entries(target)]:
         raise InputError(
-            f"{target}: isn't empty (it has {', '.join(sorted(held)[:3])}); give --replace, which moves what is there "
+            f"{target}: isn't empty (it has {', '.join(sorted(present)[:3])}); give --replace, which moves this "
             f"to {_BEFORE}TIME in it, or another folder by --to"
         )
     if settings.database_url and (number := count_sessions(settings.database_url)):

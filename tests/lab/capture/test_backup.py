@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -263,6 +264,31 @@ def test_verify_finds_what_was_damaged_in_the_backup(
     with pytest.raises(InputError, match="restore another generation"):
         restore(backup, Settings(data=tmp_path / "again"))
     assert not (tmp_path / "again" / REGISTRY).exists()
+
+
+def test_damage_of_the_backup_is_mended_by_checksum(store: Store, tmp_path: Path) -> None:
+    """A file of the backup that rotted, of the same size and time as the good one of the data folder."""
+    session, backup = captured(store), tmp_path / "backup"
+    rotten = back_up(store, backup).generation.folder / "sessions" / session / "session.nxs"
+    there, content = rotten.stat(), bytearray(rotten.read_bytes())
+    content[len(content) // 2] ^= 8
+    rotten.write_bytes(content)
+    os.utime(rotten, ns=(there.st_atime_ns, there.st_mtime_ns))
+    (line,) = verify_backup(backup)[1]
+    assert "back up with --checksum" in line
+    made = back_up(store, backup, keep=1, checksum=True)
+    assert made.is_new and made.copied == 1 and verify_backup(backup)[1] == ()
+
+
+def test_the_newest_generation_is_the_last_one_whatever_the_clock(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    captured(store)
+    first = back_up(store, tmp_path / "backup").generation
+    (store.root / "limits.toml").write_text("valid_days = 90\n")
+    monkeypatch.setattr(lab.capture.backup, "now", lambda: datetime(2001, 1, 1, tzinfo=UTC))
+    made = back_up(store, tmp_path / "backup", keep=1)
+    assert generations_of(tmp_path / "backup")[0].name == made.generation.name > first.name
 
 
 def test_a_session_that_is_packed_meanwhile_is_whole_in_the_backup(
