@@ -45,9 +45,9 @@ def logging_config() -> dict[str, Any]:
     from uvicorn.config import LOGGING_CONFIG
 
     config = copy.deepcopy(LOGGING_CONFIG)
-    config["filters"] = {"hide_keys": {"()": "api.keys.HideKeys"}}
+    config["filters"] = {"hide_keys": {"()": "api.keys.HideKeys"}, "escape": {"()": "api.keys.EscapeControls"}}
     for handler in config["handlers"].values():
-        handler["filters"] = ["hide_keys"]
+        handler["filters"] = ["hide_keys", "escape"]
     for name in ("api", "lab"):
         config["loggers"][name] = {"handlers": ["default"], "level": "INFO", "propagate": False}
     return config

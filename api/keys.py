@@ -18,6 +18,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 from lab.errors import InputError
+from lab.plain_text import escaped
 
 if TYPE_CHECKING:
     from lab.capture.store import Store
@@ -83,6 +84,29 @@ def holder(key: str, stored: Iterable[StoredKey]) -> StoredKey | None:
         if hmac.compare_digest(mine, candidate.sha256):
             found = candidate
     return found
+
+
+class EscapeControls(logging.Filter):
+    """Escapes control characters in log lines: a request, a file or an instrument could otherwise write on the terminal
+    of whoever reads the log, or begin a line of its own. Our own newlines and tracebacks stay."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Escape a record's texts; no record is dropped."""
+        if isinstance(record.args, tuple):  # kept one by one, as uvicorn's formatter unpacks them
+            record.args = tuple(_plain(one) for one in record.args)
+        text = record.getMessage()
+        if (plain := escaped(text, several_lines=True)) != text:
+            record.msg, record.args = plain, ()
+        if record.exc_info and record.exc_info[0] is not None:
+            record.exc_text = record.exc_text or logging.Formatter().formatException(record.exc_info)
+        if record.exc_text:  # a formatter takes it as it is
+            record.exc_text = escaped(record.exc_text, several_lines=True)
+        return True
+
+
+def _plain(argument: object) -> object:
+    """Return a text, or an exception's text, escaped; another value as it is."""
+    return escaped(str(argument)) if isinstance(argument, str | BaseException) else argument
 
 
 class HideKeys(logging.Filter):

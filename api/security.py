@@ -203,7 +203,12 @@ class SameHost:
             except ValueError:
                 origin_host = ""
             if origin_host != named[0].lower():
-                return problem(403, f"Origin {origin[:80]!r} is not this service")
+                own = f"http(s)://{named[0]}"
+                return problem(
+                    403,
+                    f"Origin: {origin[:80]!r} isn't this service's, which is {own!r} here; open the page under that "
+                    "address, or send no Origin",
+                )
         return None
 
 

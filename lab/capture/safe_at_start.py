@@ -24,6 +24,7 @@ from typing import Any
 from drivers.found_settings import FoundSettings
 from drivers.registry import driver
 from lab.capture.file_lock import Lock
+from lab.plain_text import escaped
 
 log = logging.getLogger(__name__)
 #: Longest time (s) that a registry which is locked is waited for.
@@ -192,7 +193,7 @@ def make_safe_at_start(arguments: Sequence[str]) -> None:
 
 
 def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    print(escaped(line), file=sys.stderr, flush=True)
 
 
 def made_safe_at_start() -> dict[str, Lock]:

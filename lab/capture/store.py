@@ -56,6 +56,7 @@ from lab.capture_kinds.base import CAPTURES, Capture, Step
 from lab.errors import InputError
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.spectrum_csv import format_spectrum
+from lab.plain_text import check_line, escaped
 from sim.camera import Side
 from sim.spectrum import Spectrum
 
@@ -130,6 +131,8 @@ class Store:
     ) -> str:
         """Register a session with all its steps; nothing is captured yet. Returns its id. `demands_certified`: it runs
         only with cameras that have a certified calibration."""
+        check_line("name", name)
+        check_line("notes", notes, several_lines=True)
         created = now()
         session_id = f"{created:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
         files: list[StoredFile] = []
@@ -254,7 +257,9 @@ class Store:
             return db.scalars(_searched(sa.select(sa.func.count()).select_from(SessionRow), search, only)).one()
 
     def describe_session(self, session_id: str, name: str | None = None, notes: str | None = None) -> None:
-        """Give a session another name, or other notes; None leaves them."""
+        """Give a session another name, or other notes; None leaves them. Raises InputError for control characters."""
+        check_line("name", name or "")
+        check_line("notes", notes or "", several_lines=True)
         with self.transaction() as db:
             row = self._row(db, session_id)
             row.name = row.name if name is None else name
@@ -504,8 +509,8 @@ class Store:
                 told["changes"] = changes
             cameras: Any = {side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()}
             manifest = Manifest(
-                name=row.name or session_id,
-                notes=row.notes,
+                name=escaped(row.name) or session_id,  # of before control characters were refused
+                notes=escaped(row.notes, several_lines=True),
                 **told,
                 cameras=cameras,
                 captures=tuple(_capture(session_id, one) for one in db.scalars(asked.order_by(CaptureRow.id))),

@@ -7,13 +7,16 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.segment import Segment
+from rich.text import Text
 
 from lab.errors import InputError
+from lab.plain_text import escaped, escaped_json
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -31,9 +34,26 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM: ends a command as Ctrl-C does."""
 
 
+class PlainConsole(Console):
+    """A console that escapes control characters of what it shows: stored names, files' texts and instruments' answers
+    can't write on the terminal. Its own colours stay."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Turn markup into a text, escaped before its width is measured."""
+        return super().render_str(escaped(text, several_lines=True), **options)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """Render as rich's console does, each text escaped."""
+        for segment in super().render(renderable, options):
+            if segment.control:
+                yield segment
+            else:
+                yield Segment(escaped(segment.text, several_lines=True), segment.style)
+
+
 # In a file or a pipe, a table keeps its width.
-out = Console(soft_wrap=True, highlight=False, emoji=False, width=None if sys.stdout.isatty() else 200)
-err = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
+out = PlainConsole(soft_wrap=True, highlight=False, emoji=False, width=None if sys.stdout.isatty() else 200)
+err = PlainConsole(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 
 def warn(lines: tuple[str, ...]) -> None:
@@ -75,7 +95,7 @@ def write_json(result: BaseModel, file: Path | None) -> None:
     from lab.formats.result_file import result_json, write_result
 
     if str(file) == "-":
-        sys.stdout.write(result_json(result))
+        sys.stdout.write(escaped_json(result_json(result)))
     else:
         write_result(result, file)
 

@@ -1,4 +1,4 @@
-"""`calibench import`, `export`, `sessions` and `backup`."""
+"""`calibench import`, `export` and `sessions`."""
 
 from __future__ import annotations
 
@@ -248,23 +248,6 @@ def export(
     with progress_bar("export") as advance:
         folder = recording_set.write(recordings, Path(to), progress=advance)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
-
-
-@commands.command()
-def backup(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="the backup: new, or one of this data folder")],
-    data: StoreFolder = None,
-) -> None:
-    """Copy the data folder while it is in use. The copy is a data folder itself: to restore, use it in place of the
-    other.
-
-    Example: calibench backup /mnt/backup/calibench
-    """
-    from lab.capture.backup import back_up
-
-    made = back_up(store_to_read(data), folder)
-    mib = made.copied_bytes / (1 << 20)
-    out.print(f"{made.sessions} sessions, {made.files} files of them; {made.copied} files copied, {mib:.1f} MiB")
 
 
 # --- `calibench kinds` ------------------------------------------------------------------------------------------------

@@ -19,7 +19,8 @@ from lab.formats.importers.raw_folder import (
     read_raw_folder,
 )
 from lab.formats.importers.single_picture import ImportOptions, read_colour_chart, read_slanted_edge
-from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.recording_set import Manifest, RecordingSet, text_problems
+from lab.plain_text import escaped
 
 __all__ = [
     "KINDS",
@@ -106,7 +107,10 @@ def read_foreign(kind: str, path: Path, options: ImportOptions | None = None) ->
     if path.is_dir() and not any(path.iterdir()):
         raise InputError(f"{path}: is empty; give the folder of the recordings")
     recordings = importer.read(path, options)
-    return recordings.under(_with_notes(recordings, path))
+    manifest = _with_notes(recordings, path)
+    if problems := list(text_problems(manifest.model_dump(exclude_unset=True))):
+        raise InputError("\n".join(f"{path}: {line}" for line in problems))
+    return recordings.under(manifest)
 
 
 def _with_notes(recordings: RecordingSet, path: Path) -> Manifest:
@@ -116,4 +120,5 @@ def _with_notes(recordings: RecordingSet, path: Path) -> Manifest:
     lines = [line.removeprefix(f"{folder}: ") for line in recordings.warnings]
     if folder != Path():
         lines = [line.replace(f"{folder}/", "") for line in lines]
-    return recordings.manifest.model_copy(update={"notes": "\n".join([recordings.manifest.notes, *lines])})
+    notes = escaped("\n".join([recordings.manifest.notes, *lines]), several_lines=True)
+    return recordings.manifest.model_copy(update={"notes": notes})

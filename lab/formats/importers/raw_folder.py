@@ -50,7 +50,8 @@ from lab.formats.importers.images import (
     readout,
 )
 from lab.formats.importers.stated_settings import held_against_frames
-from lab.formats.recording_set import DataSheet, FolderFiles, Manifest, RecordingError, RecordingSet, parse_manifest
+from lab.formats.recording_set import DataSheet, Manifest, RecordingError, RecordingSet, parse_manifest
+from lab.formats.recording_set.files import locate_as_written
 from sim.camera import Side
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -284,8 +285,8 @@ def _recording_set(
     cameras: Callable[[dict[Side, dict[str, Any]]], dict[Side, DataSheet]],
     taps: Mapping[Side, tuple[Tap, ...]] = {},
 ) -> RecordingSet:
-    folder = FolderFiles(path)
     images: dict[str, Path] = {}
+    others: list[str] = []
     captures: list[dict[str, Any]] = []
     numbers: list[int] = []
     problems: list[str] = []
@@ -293,15 +294,16 @@ def _recording_set(
     for number, row in index.rows:
         try:
             capture = capture_of_row(row)
-            found = folder.file(capture["frame"])
+            found, renamed = locate_as_written(path, capture["frame"])
         except InputError as error:
             problems.append(f"{where}: row {number}: {row.get('frame', '')}: {error}")
             continue
+        others += [renamed] if renamed else []
         stem = re.sub(r"[^\w.-]+", "_", str(capture.get("id") or frame_name(capture["frame"])))
         used[stem] += 1
         frame = f"frames/{stem if used[stem] == 1 else f'{stem}-{used[stem]}'}.npy"
         captures.append({"id": stem, "side": "left", "exposure_s": None} | capture | {"frame": frame})
-        images[frame] = found or path / capture["frame"]
+        images[frame] = found
         numbers.append(number)
     if problems:
         raise RecordingError(problems)
@@ -313,6 +315,9 @@ def _recording_set(
             cut = readout(listed, own, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
             measured[side] |= {"rows": cut.shape[0], "cols": cut.shape[1], "black_level_dn": cut.black_level_dn}
             readouts[side] = cut
+    if others:
+        more = f" (and {len(others) - 1} more)" if len(others) > 1 else ""
+        remarks.append(f"{where}: {others[0]}{more}; write the names as the files have them")
     described = cameras(measured)
     text = json.dumps(
         {

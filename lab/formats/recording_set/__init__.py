@@ -15,6 +15,7 @@ from lab.formats.recording_set.manifest import (
     differences,
     manifest_json,
     parse_manifest,
+    text_problems,
 )
 from lab.formats.recording_set.recordings import RecordingSet
 
@@ -40,5 +41,6 @@ __all__ = [
     "packed",
     "parse_manifest",
     "read",
+    "text_problems",
     "write",
 ]

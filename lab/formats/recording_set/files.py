@@ -42,7 +42,9 @@ def locate(root: Path, path: str) -> Path:
     if not inside:
         raise InputError("leads out of the folder; copy the file into the folder and name it by its relative path")
     if not exists:
-        raise InputError("no such file; add it, or take what needs it out of the manifest")
+        others = _in_other_case(root, pure)
+        near = f" (there is {', '.join(others)}: capitals count; rename it)" if others else ""
+        raise InputError(f"no such file{near}; add it, or take what needs it out of the manifest")
     if not is_file:
         raise InputError("not a file; name the file itself")
     if not os.access(found, os.R_OK):
@@ -50,6 +52,33 @@ def locate(root: Path, path: str) -> Path:
             "can't be read (Permission denied); run it as the user to whom it belongs, or have its permissions changed"
         )
     return found
+
+
+def _in_other_case(root: Path, path: PurePosixPath) -> list[str]:
+    """Return the paths below `root` that differ from `path` by capitals alone."""
+    found = [root]
+    for part in path.parts:
+        if part == "..":
+            return []
+        found = [
+            entry
+            for folder in found
+            if folder.is_dir()
+            for entry in folder.iterdir()
+            if entry.name.casefold() == part.casefold()
+        ]
+    return [entry.relative_to(root).as_posix() for entry in found]
+
+
+def locate_as_written(root: Path, path: str) -> tuple[Path, str | None]:
+    """Return the file at a path of an index that a person or another system wrote, and a remark where its name isn't
+    exactly that: separators as Windows has them, or other capitals, where just one file is meant. Raises InputError as
+    `locate`."""
+    named = path.replace("\\", "/") if "/" not in path else path
+    others = [] if (root / named).exists() else _in_other_case(root, PurePosixPath(named))
+    taken = others[0] if len(others) == 1 else named
+    file = locate(root, taken)
+    return file, None if taken == path else f"{path} is taken to be {taken}"
 
 
 def _load_npy(file: Path, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:

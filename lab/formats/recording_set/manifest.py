@@ -15,6 +15,7 @@ from pydantic import Field, ValidationError, field_validator
 
 from lab.capture_kinds.base import CAPTURES, AnyCapture, Capture, Open
 from lab.errors import InputError, one_line
+from lab.plain_text import complaints_of
 from sim.camera import Cfa, Shutter, Side
 
 # --- What each instrument was when recordings were taken: its identity, all its settings, and what couldn't be set ----
@@ -219,6 +220,13 @@ def _usable_captures(listed: list[Any], where: str, sides: Container[str], found
     return captures
 
 
+def text_problems(document: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for each text of a manifest that has control characters. What instruments reported isn't asked
+    for: nobody can correct it, and it is escaped where it is shown."""
+    asked = {key: value for key, value in document.items() if key not in ("instruments", "changes")}
+    return complaints_of(asked, several_lines=("notes",))
+
+
 def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
     """Return the manifest in JSON `text`, and warnings for what was skipped. Raises RecordingError, one line for each
     problem."""
@@ -232,6 +240,7 @@ def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
         given = f"format {raw.get('format')!r} version {raw.get('version')!r}"
         raise RecordingError([f"{where}: {given}, not 'calibench-recording' 1; give a recording set of that version"])
     found = Findings()
+    found.problems += [f"{where}: {line}" for line in text_problems(raw)]
     listed, cameras = raw.get("captures"), raw.get("cameras")
     captures: list[Capture] = []
     if isinstance(listed, list):
