@@ -342,7 +342,7 @@ class _Calibrations:
         found = {kind: correction for kind in _TERMS if (correction := self._correction(kind)) is not None}
         bent, tca, dark = (found.get(kind) for kind in ("distortion", "tca", "vignetting"))
         real_mm, centre = self._real_focal_mm(bent), self.element.find("center")
-        law = None if real_mm is None else np.ones_like
+        law = None if real_mm is None else _undistorted
         decentring = (0.0, 0.0)
         if bent is not None:
             terms = self._along_focal(bent)
@@ -551,6 +551,10 @@ def _stated(text: str, what: str, above_0: bool = True) -> float:
         remedy = f"write {text.strip().replace(',', '.')}, with a decimal point" if comma else "correct it"
         raise InputError(f"{what} is '{text[:20]}', not a number{' above 0' if above_0 else ''}; {remedy}")
     return found
+
+
+def _undistorted(r_mm: FloatArray) -> FloatArray:
+    return np.ones_like(r_mm)
 
 
 def _distortion(correction: _Correction, terms: FloatArray, focal_mm: float) -> Callable[[FloatArray], FloatArray]:

@@ -319,6 +319,7 @@ def test_lensfun_itself_interpolates_so(model: str, focals_mm: tuple[float, ...]
     """Lenses of its own database between their calibrations, against lensfun 0.3.4 in single precision."""
     lensfunpy = library("lensfunpy")
     lens = next(one for one in lensfunpy.Database().lenses if one.model == model)
+    assert lensfunpy.__file__ is not None
     files = sorted((Path(lensfunpy.__file__).parent / "db_files").glob("*.xml"))
     file = next(one for one in files if f">{model}<" in one.read_text(encoding="utf-8"))
     half_mm, r = 0.5 * FULL_FRAME_MM / lens.crop_factor, np.linspace(0.0, 1.0, 5)
