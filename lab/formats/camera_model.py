@@ -69,7 +69,7 @@ def camera_model(
         quantum_efficiency_std=spread,
         lens=Lens(
             f_number=camera.f_number if camera.f_number is not None else 8.0,
-            focal_length_mm=camera.focal_length_mm if camera.focal_length_mm is not None else 5000.0,
+            focal_length_mm=camera.focal_length_mm,
             transmittance=camera.lens_transmittance if camera.lens_transmittance is not None else 1.0,
         ),
         geometry=geometry,
