@@ -277,9 +277,7 @@ def measured_edges(study: Study, kind: type[EdgeCapture]) -> list[MeasuredEdge]:
     the kind, and where no edge is measured."""
     step = (SLANTED_EDGE if kind is SlantedEdgeCapture else STOPPED_EDGE).name
     if not study.diffraction_is_known:
-        raise NotDetermined(
-            step, "f-number or pixel pitch isn't stated: no diffraction to hold the edges against"
-        )
+        raise NotDetermined(step, "f-number or pixel pitch isn't stated: no diffraction to hold the edges against")
     groups = study.groups(
         kind,
         lambda c: (f_number_of(c), c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm),
