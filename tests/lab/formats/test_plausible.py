@@ -100,7 +100,7 @@ def test_curves_are_judged_at_their_peak() -> None:
         return SpectralFit(
             wavelength_nm=(500.0, 600.0),
             quantum_efficiency={channel: (0.5 * peak, peak) for channel, peak in peaks.items()},
-            quantum_efficiency_std={channel: (1e-4, 1e-4) for channel in peaks},
+            quantum_efficiency_std=dict.fromkeys(peaks, (0.0001, 0.0001)),
         )
 
     assert not warnings_of(spectral=curves(R=0.4, G=0.3, B=0.004))
