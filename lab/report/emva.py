@@ -686,6 +686,16 @@ def compared_estimates(noise: NoiseFit) -> Iterator[str]:
                 f"{measured(second, second_std, unit)}, {_percent(first / second - 1.0)} % or {sigma:.1f} combined "
                 f"standard deviations apart: {why}"
             )
+        mean, variance = own.dark_current_from_mean_e_per_s, own.dark_current_from_variance_e_per_s
+        stds = own.dark_current_from_mean_e_per_s_std, own.dark_current_from_variance_e_per_s_std
+        if mean is not None and variance is not None and stds[0] is not None and stds[1] is not None:
+            sigma = abs(mean - variance) / float(np.hypot(stds[0], stds[1]))
+            if sigma >= APART_SIGMA:
+                yield (
+                    f"two estimates of the dark current ({plane}): from means {measured(mean, stds[0], 'e/s')}, from "
+                    f"variances {measured(variance, stds[1], 'e/s')}, {sigma:.1f} combined standard deviations apart: "
+                    "a black level that follows the exposure moves the means alone, excess noise the variances alone"
+                )
 
 
 def _percent(share: float) -> str:
