@@ -30,7 +30,7 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from lab.errors import InputError
-from lab.formats.camera_model import assumed_noise, assumptions, camera_model, limited_values
+from lab.formats.camera_model import camera_model, remarks_on_values
 from lab.formats.model_posterior import ModelPosterior
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
@@ -438,14 +438,8 @@ def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> Camer
         value = getattr(fit.noise, f"{key}_std", None)
         if value is not None:
             std[key] = float(value)
-    stated = recordings.camera(side)
-    assumed = (*assumptions(stated, fit), *assumed_noise(stated, fit, model))
-    remarks = (
-        *(f"{one.quantity}: neither fitted nor stated; taken as {one.value}" for one in assumed),
-        *limited_values(fit),
-    )
-    name = f"{recordings.manifest.name} {side}"
-    return CameraFile(name, model.model_copy(update={"std": std}), remarks=remarks)
+    remarks = remarks_on_values(recordings.camera(side), fit, model)
+    return CameraFile(f"{recordings.manifest.name} {side}", model.model_copy(update={"std": std}), remarks=remarks)
 
 
 # --- the camera without a file ----------------------------------------------------------------------------------------

@@ -162,6 +162,13 @@ def limited_values(fit: CameraFit | None) -> tuple[str, ...]:
     return tuple(found)
 
 
+def remarks_on_values(camera: DataSheet, fit: CameraFit | None, model: CameraModel) -> tuple[str, ...]:
+    """Return a line for each value of a model that nobody stated or fitted, and for each that isn't the fitted one."""
+    assumed = (*assumptions(camera, fit), *assumed_noise(camera, fit, model))
+    taken = (f"{one.quantity}: neither fitted nor stated; taken as {one.value}" for one in assumed)
+    return (*taken, *limited_values(fit))
+
+
 def _curves(
     recordings: RecordingSet, side: Side, fit: CameraFit | None, maker_curves: bool
 ) -> tuple[dict[str, Spectrum], dict[str, Spectrum]]:

@@ -259,16 +259,16 @@ def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
 EXPOSURES_OF_ONE_NUMBER = 3
 
 
-def without_common_photons(manifest: Manifest, where: str, told: list[str]) -> tuple[Manifest, list[str]]:
+def without_common_photons(manifest: Manifest, where: str, warnings: list[str]) -> tuple[Manifest, list[str]]:
     """Return the manifest with the numbers of photons taken out of the flats of a side that all state the same one at
-    three exposures or more, and `told` with a line for each such side."""
+    three exposures or more, and `warnings` with a line for each such side."""
     changed: dict[str, Capture] = {}
     for side in manifest.cameras:
         flats = [c for c in manifest.captures if isinstance(c, FlatCapture) and c.side == side and c.photons_per_pixel]
         exposures = {flat.exposure_s for flat in flats}
         if len({flat.photons_per_pixel for flat in flats}) != 1 or len(exposures) < EXPOSURES_OF_ONE_NUMBER:
             continue
-        told.append(
+        warnings.append(
             f"{where}: all {len(flats)} flats of the {side} camera ({flats[0].id} .. {flats[-1].id}) state "
             f"{flats[0].photons_per_pixel:g} photons a pixel at exposures of {min(exposures):g} to {max(exposures):g} "
             "s; these are numbers of one exposure, so they are taken as unknown: K is fitted, the quantum efficiency "
@@ -276,4 +276,4 @@ def without_common_photons(manifest: Manifest, where: str, told: list[str]) -> t
         )
         changed |= {flat.id: flat.model_copy(update={"photons_per_pixel": None}) for flat in flats}
     captures = tuple(changed.get(capture.id, capture) for capture in manifest.captures)
-    return manifest.model_copy(update={"captures": captures}) if changed else manifest, told
+    return manifest.model_copy(update={"captures": captures}) if changed else manifest, warnings
