@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal, TypeVar, get_args
 
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, Skipped, StereoFit
+from lab.formats.results.plausible import implausible_figures
 from lab.one_blas_thread import one_blas_thread
 from lab.side_processes import in_processes
 from sim.camera import Side
@@ -79,12 +81,15 @@ def fit_recording_set(
     found, refused = _step(pair, None) if paired else (None, ())
     if paired:
         told(None, "stereo")
-    return FitResult(
+    result = FitResult(
         source=recordings.source,
         cameras=cameras,
         stereo=found,
         skipped=(*(skipped for one in fitted.values() for skipped in one.skipped), *refused),
     )
+    squares_mm = [capture.square_mm for capture in recordings.captures(CharucoCapture)]
+    warnings = implausible_figures(result, recordings.manifest.cameras, squares_mm)
+    return result.model_copy(update={"warnings": warnings})
 
 
 def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told: Callable[[Step], None]) -> SideFit:

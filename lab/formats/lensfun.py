@@ -82,14 +82,17 @@ class LensfunLens:
 
 
 def write_lensfun(file: Path, content: CameraFile) -> tuple[str, ...]:
-    """Write the lens of a camera as a lensfun database of one lens. Returns what its laws don't hold."""
+    """Write the lens of a camera as a lensfun database of one lens. Returns what its laws don't hold. Raises InputError
+    where the camera doesn't say the focal length."""
     camera = content.camera
+    if camera.lens.focal_length_mm is None:
+        raise InputError(f"{content.name}: lens.focal_length_mm is not set; write it into the camera file")
     k1, k2, remarks = _poly5(camera, content.effects)
     red, blue = _scales(camera, content.effects)
     shading, more = _pa(camera, content.effects)
     diagonal_mm = 2e-3 * camera.half_diagonal_um
     crop = FULL_FRAME_MM / diagonal_mm
-    focal, aperture = f"{camera.lens.focal_length_mm:.6g}", f"{camera.lens.f_number:.6g}"
+    focal, aperture = f"{camera.lens.known_focal_length_mm:.6g}", f"{camera.lens.f_number:.6g}"
     root = ET.Element("lensdatabase", version="1")
     mount = ET.SubElement(root, "mount")
     ET.SubElement(mount, "name").text = "calibench"
@@ -124,7 +127,7 @@ def _half_short_px(camera: CameraModel) -> float:
 
 
 def _focal_px(camera: CameraModel) -> float:
-    return camera.lens.focal_length_mm * 1e3 / camera.pixel_pitch_um
+    return camera.lens.known_focal_length_mm * 1e3 / camera.pixel_pitch_um
 
 
 def _geometry(camera: CameraModel) -> Geometry:

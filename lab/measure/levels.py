@@ -317,7 +317,8 @@ class PlaneStatistics:
     `temporal_variance_of_all` include defects, as in EMVA 1288. `adjacent_covariance`, `diagonal_covariance`: temporal
     covariance of a pixel with one of its four neighbours along rows and columns, and across corners, on the mosaic (of
     any plane). `shading_rows`, `shading_columns`: mean of the smooth surface over the first and the last tenth of the
-    rows (columns), over `mean`, dark included.
+    rows (columns), over `mean`, dark included. `shading_span`: highest less lowest value of that surface, DN, and its
+    standard deviation by the pixels' scatter.
     """
 
     pixels: int
@@ -344,6 +345,7 @@ class PlaneStatistics:
     covariance_std: float = np.nan
     shading_rows: tuple[float, float] = (1.0, 1.0)
     shading_columns: tuple[float, float] = (1.0, 1.0)
+    shading_span: tuple[float, float] = (0.0, 0.0)
 
     @property
     def repeats(self) -> int:
@@ -541,6 +543,10 @@ class Stack:
         shares = np.mean([share[:3, phase] for share in self._shares], axis=0)
         adjacent, diagonal, covariance_std = self._covariances(phase, variance)
         tenth = max(rows // 10, 1), max(cols // 10, 1)
+        # In a corner, where it is least certain, a surface of k x l Legendre polynomials has the leverage k^2 l^2 / n:
+        # the sum of 2 i + 1 over an axis is the square of their number. The span is the difference of two such values.
+        corner_std = order[0] * order[1] * float(np.sqrt(max(pattern, 0.0) / pixels))
+        span = float(surface.max() - surface.min()), float(np.sqrt(2.0)) * corner_std
         return PlaneStatistics(
             pixels=pixels,
             mean=float(np.mean([means[phase] for means in self._frame_means])),
@@ -569,6 +575,7 @@ class Stack:
                 float(surface[:, : tenth[1]].mean() / first[0]),
                 float(surface[:, -tenth[1] :].mean() / first[0]),
             ),
+            shading_span=span,
         )
 
     def _covariances(self, phase: int, variance: float) -> tuple[float, float, float]:

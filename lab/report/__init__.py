@@ -212,6 +212,7 @@ def render_report(
         **diagnosis_page.context(diagnosis, sides),
         "rows": rows,
         "stated": any(figure.stated is not None for _, figures in rows for figure in figures.values()),
+        "implausible": fit.warnings,
         "remarks": [
             (side, remark)
             for side, camera in fit.cameras.items()

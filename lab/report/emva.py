@@ -17,7 +17,7 @@ from lab.errors import NotDetermined
 from lab.fit.noise.pixel_maps import pixel_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelNoise, Emva1288, Emva1288Points, FitResult, NoiseFit, PixelDefects
-from lab.formats.results.words import measured
+from lab.formats.results.words import measured, plain_number
 from lab.measure.dark_pixels import stack_of
 from lab.measure.stated_light import light_of
 from lab.report.charts import AFTER, BEFORE, CHANNEL, Figure, Trace, axis, layout
@@ -564,6 +564,10 @@ TABLE = {
     "prnu_row_percent": ("of rows", "PRNU1288.row", "%", 1.0),
     "prnu_column_percent": ("of columns", "PRNU1288.col", "%", 1.0),
     "prnu_pixel_percent": ("of pixels", "PRNU1288.pixel", "%", 1.0),
+    "light_nonuniformity_percent": ("nonuniformity of the light, highest less lowest", "ΔE", "%", 1.0),
+    "shading_percent": ("low-frequency part of the PRNU (shading)", "", "%", 1.0),
+    "row_gain_percent": ("PRNU of rows, shading removed", "", "%", 1.0),
+    "column_gain_percent": ("PRNU of columns, shading removed", "", "%", 1.0),
     "dark_current_from_mean_e_per_s": ("dark current, from means", "μ_I.mean", "e/s", 1.0),
     "dark_current_from_variance_e_per_s": ("dark current, from variances", "μ_I.var", "e/s", 1.0),
 }
@@ -624,15 +628,79 @@ def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[EmvaSheet]
                 *spatial_plots(recordings, side, own, plotted),
                 *joint_fit_plots(noise),
             ),
-            remarks=tuple(
-                remark if len(which) == len(names) else f"{', '.join(which)}: {remark}"
-                for remark, which in grouped.items()
+            remarks=(
+                *(
+                    remark if len(which) == len(names) else f"{', '.join(which)}: {remark}"
+                    for remark, which in grouped.items()
+                ),
+                *compared_estimates(noise),
             ),
             channels=tuple(noise.channels) if len(noise.channels) > 1 else (),
             channel_rows=tuple(_channel_rows(noise)),
             maps=tuple(_maps(recordings, side)),
             defects=_defect_sentence(noise.defects),
         )
+
+
+#: Field of `Emva1288` -> (field of the joint fit, why the two may differ).
+BOTH_ESTIMATES = {
+    "system_gain_dn_per_e": (
+        "conversion_gain_dn_per_e",
+        "nonlinearity and brighter-fatter part the standard's line to 70 % of saturation and the slope at zero signal",
+    ),
+    "quantum_efficiency": ("quantum_efficiency", "each is the responsivity over its own K"),
+    "temporal_dark_noise_e": ("read_noise_e", "each has its own K; the joint fit has the defective pixels left out"),
+    "saturation_capacity_e": (
+        "full_well_e",
+        "the standard takes the level of the largest variance, the joint fit the highest code reached",
+    ),
+    "dark_current_from_mean_e_per_s": ("dark_current_e_per_s", "each has its own K and set of pixels"),
+    "linearity_error_percent": ("linearity_error_percent", "each has its own levels and weights"),
+    "dsnu_e": ("dsnu_e", "the standard counts defective pixels"),
+    "prnu_percent": ("prnu_percent", "the standard counts shading and defective pixels"),
+}
+#: Combined standard deviations from which on a difference of two estimates is worth a line of its own.
+APART_SIGMA = 2.0
+
+
+def compared_estimates(noise: NoiseFit) -> Iterator[str]:
+    """Yield by how much the standard's figures and the joint fit's differ, in per cent and in combined standard
+    deviations (which are too large where both use the same noise), and why they may: the system gain always, the
+    others where they are apart."""
+    for plane, own in noise.emva1288.items():
+        joint = noise.channels.get(plane[0], noise)
+        for field, (other, why) in BOTH_ESTIMATES.items():
+            scale = 10.0 ** (noise.gain_db / 20.0) if other == "conversion_gain_dn_per_e" else 1.0
+            first, first_std = getattr(own, field), getattr(own, f"{field}_std")
+            source = joint if other in type(joint).model_fields else noise
+            second, second_std = getattr(source, other), getattr(source, f"{other}_std")
+            if not first or not second or not first_std or not second_std:
+                continue
+            second, second_std = scale * second, scale * second_std
+            sigma = abs(first - second) / float(np.hypot(first_std, second_std))
+            if sigma < APART_SIGMA and field != "system_gain_dn_per_e":
+                continue
+            name, unit = NOISE[other]
+            yield (
+                f"two estimates of the {name} ({plane}): EMVA 1288 {measured(first, first_std, unit)}, joint fit "
+                f"{measured(second, second_std, unit)}, {_percent(first / second - 1.0)} % or {sigma:.1f} combined "
+                f"standard deviations apart: {why}"
+            )
+        mean, variance = own.dark_current_from_mean_e_per_s, own.dark_current_from_variance_e_per_s
+        stds = own.dark_current_from_mean_e_per_s_std, own.dark_current_from_variance_e_per_s_std
+        if mean is not None and variance is not None and stds[0] is not None and stds[1] is not None:
+            sigma = abs(mean - variance) / float(np.hypot(stds[0], stds[1]))
+            if sigma >= APART_SIGMA:
+                yield (
+                    f"two estimates of the dark current ({plane}): from means {measured(mean, stds[0], 'e/s')}, from "
+                    f"variances {measured(variance, stds[1], 'e/s')}, {sigma:.1f} combined standard deviations apart: "
+                    "a black level that follows the exposure moves the means alone, excess noise the variances alone"
+                )
+
+
+def _percent(share: float) -> str:
+    """Return a signed share in per cent, to two digits and without a power of ten."""
+    return f"{'-' if share < 0 else '+'}{plain_number(abs(100.0 * share), 2)}"
 
 
 def table_rows(found: dict[str, Emva1288]) -> Iterator[EmvaRow]:

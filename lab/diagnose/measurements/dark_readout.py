@@ -41,6 +41,7 @@ from sim.uniform import Uniform
 
 BANDS = 6  # of a spectrum across lines
 POWER_FLOOR = 0.02  # relative standard deviation of a band's power: a healthy read-out isn't exactly white
+LEAST_FREQUENCIES = 2  # below the level band: `Bands` makes no band of fewer
 LEAST_LINE_DN = 0.3  # temporal noise of a pixel below which codes are too coarse
 
 
@@ -196,7 +197,7 @@ def correlation_block(study: Study) -> Block:
         weight = np.array([min(c.contrasts, 6) for c in part], float)
         for lines in ("rows", "columns"):
             frequency = part[0].along[lines][0]
-            if len(frequency) < 1:
+            if len(frequency) < LEAST_FREQUENCIES:
                 continue
             power = np.average([c.along[lines][1] for c in part], axis=0, weights=weight)
             modes = np.sum([c.along[lines][2] for c in part], axis=0)
@@ -212,7 +213,7 @@ def correlation_block(study: Study) -> Block:
         raise NotDetermined(
             "dark_correlation",
             f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share is measured from "
-            f"{int(np.ceil(1.0 / LEVEL_BAND[0]))} px a side on",
+            f"{int(np.ceil(LEAST_FREQUENCIES / LEVEL_BAND[0]))} px along rows or columns on",
         )
 
     def predict(effects: Effects) -> Prediction:

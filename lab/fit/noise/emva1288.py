@@ -16,6 +16,7 @@ import numpy as np
 from scipy import special
 
 from lab.formats.results import Emva1288, Emva1288Points
+from lab.formats.results.words import measured
 from lab.measure.levels import BoolArray, MeasuredLevel, PlaneStatistics, SpatialVariance
 from lab.measure.rounding import QUANTISATION_DN2
 from lab.measure.weighted_lines import DarkLine, chi2_factor, dark_line, linearity, root
@@ -28,6 +29,11 @@ EXCESS_CHANCE = 0.01  # probability below which variances aren't on a straight l
 SIGNIFICANT_SIGMA = 3.0  # standard deviations by which two slopes of one line differ
 LINE_LIMIT = 0.7  # of saturation: range of responsivity and system gain
 LINEARITY_RANGE = (0.05, 0.95)  # of saturation
+#: Highest less lowest irradiance over its mean that the standard allows.
+LARGEST_NONUNIFORMITY_PERCENT = 3.0
+#: Standard deviations of what rows or columns share, from which on it is reported: of 8 such numbers (four planes),
+#: one is beyond by chance in 0.03 % of all cameras.
+LINE_SIGMA = 4.0
 SPATIAL_IMAGES = 16  # with fewer, the row and column parts contain temporal noise; the standard asks for more
 
 
@@ -222,6 +228,7 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
     found |= _dark_current(at, gain, remarks)
     stacks = _stacks(given, at, saturation, remarks)
     found |= _spatial(given.plane, stacks, gain)
+    found |= _evenness(given.plane, stacks, found, remarks)
     values_of = {name: value.value for name, value in found.items()}
     values_of |= {f"{name}_std": value.std for name, value in found.items()}
     values_of |= _calibration(at, found, remarks)
@@ -278,16 +285,22 @@ def _saturation(at: EmvaLevels, given: EmvaInput, remarks: list[str]) -> tuple[f
 def _widened_gain(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list[str]) -> Measured:
     """Return the system gain with what its line leaves of the variances in its standard deviation."""
     std = np.hypot(at.variance_std, at.below(at.dark_variance_std, None))
-    ratio = mean_ratio(at.signal[used], (at.variance - at.below_variance)[used], std[used], gain)
+    signal = at.signal[used]
+    ratio = mean_ratio(signal, (at.variance - at.below_variance)[used], std[used], gain)
     if ratio is None:
         return gain
+    # Of a variance K x (1 + a x), the line has K (1 + a A) and the mean ratio K (1 + a B), with A and B the means of x
+    # that each weighs: the line's distance from the gain at zero signal is A / (A - B) times that of the two.
+    high = signal > LEAST_SIGNAL * np.max(signal)
+    line_at, ratio_at = float(np.sum(signal**3) / np.sum(signal**2)), float(np.mean(signal[high]))
+    error = (gain.value - ratio) * line_at / max(line_at - ratio_at, 1e-9 * line_at)
     remarks.append(
         "the temporal variances don't lie on the standard's straight line by more than noise: the line has "
-        f"{gain.value:.4g} DN/e, the "
-        f"mean of variance over signal {ratio:.4g} DN/e; the difference is in the uncertainties of K and of what is "
+        f"{gain.value:.4g} DN/e, the mean of variance over signal {ratio:.4g} DN/e, a parabola at zero signal "
+        f"{gain.value - error:.4g} DN/e; the line's difference from that is in the uncertainties of K and of what is "
         "divided by it"
     )
-    return Measured(gain.value, math.hypot(gain.std, ratio - gain.value))
+    return Measured(gain.value, math.hypot(gain.std, error))
 
 
 def _responsivity(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list[str]) -> Figures:
@@ -464,6 +477,47 @@ def _spatial(plane: str, stacks: _Stacks, gain: Measured) -> Figures:
         root_dn = Measured(*root(square.value - below[name].value, math.hypot(square.std, below[name].std)))
         found[f"prnu{name}_percent"] = Measured(100.0 * root_dn.value / signal, 100.0 * root_dn.std / signal)
     return found
+
+
+def _evenness(plane: str, stacks: _Stacks, found: Figures, remarks: list[str]) -> Figures:
+    """Split the nonuniformity of the bright stack into the smooth surface and what rows and columns share without it,
+    and report light that is more uneven than the standard asks for, and gains of rows and columns."""
+    if stacks.bright is None or stacks.dark is None or "prnu_percent" not in found:
+        return {}
+    bright, dark = stacks.bright.plane[plane], stacks.dark.plane[plane]
+    if bright.pattern is None or dark.pattern is None or bright.every_pixel is None:
+        return {}
+    signal = bright.mean_of_all - dark.mean_of_all
+    span, span_std = bright.shading_span
+    uneven = Measured(100.0 * span / signal, 100.0 * span_std / signal)
+    smooth_dn = Measured(*root(bright.every_pixel.total - bright.pattern.total, bright.every_pixel.total_std))
+    shading = Measured(100.0 * smooth_dn.value / signal, 100.0 * smooth_dn.std / signal)
+    more = {"light_nonuniformity_percent": uneven, "shading_percent": shading}
+    if uneven.value - SIGNIFICANT_SIGMA * uneven.std > LARGEST_NONUNIFORMITY_PERCENT:
+        rest = _without_dark(bright.pattern.total, dark.pattern.total)
+        remarks.append(
+            f"the light is uneven by {measured(uneven.value, uneven.std, '%')} (highest less lowest over the mean), "
+            f"above the standard's limit of {LARGEST_NONUNIFORMITY_PERCENT:g} %: PRNU1288 of "
+            f"{found['prnu_percent'].value:.3g} % is {shading.value:.3g} % of shading and {100.0 * rest / signal:.4g} "
+            "% without it; light the sensor evenly, without a lens"
+        )
+    for line in ("row", "column"):
+        own, below = getattr(bright.pattern, f"{line}s"), getattr(dark.pattern, f"{line}s")
+        std = math.hypot(getattr(bright.pattern, f"{line}s_std"), getattr(dark.pattern, f"{line}s_std"))
+        gains = Measured(*(100.0 * part / signal for part in root(own - below, std)))
+        more[f"{line}_gain_percent"] = gains
+        if own - below > LINE_SIGMA * std:
+            remarks.append(
+                f"the gains of {line}s differ by {measured(gains.value, gains.std, '%')} (standard deviation, shading "
+                f"removed), {(own - below) / std:.0f} standard deviations above what independent pixels give: "
+                f"amplifiers or converters of the {line}s; correct each {line} by its own flat field"
+            )
+    return more
+
+
+def _without_dark(bright_dn2: float, dark_dn2: float) -> float:
+    """Return the standard deviation, DN, of a pattern less that of the dark."""
+    return math.sqrt(max(bright_dn2 - dark_dn2, 0.0))
 
 
 def _parts(split: SpatialVariance) -> dict[str, Measured]:

@@ -38,6 +38,7 @@ from lab.fit.noise.response import (
 from lab.formats.cgats import TableRow, table_rows
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import CameraFit, ChannelNoise, Emva1288, FitResult, NoiseFit, PhotonTransfer, Skipped
+from lab.formats.results.plausible import implausible_figures
 from lab.measure.dark_pixels import DarkPixels, read_noise_distribution, stack_of
 from lab.measure.levels import DEFECT_SIGMA, MeasuredLevel, PlaneStatistics, defective_pixels, rounded_c
 from lab.measure.mishaps import alike_planes, copied_frames, exchanged_frames
@@ -397,7 +398,7 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
         raise NotDetermined("noise", "; ".join((*mishaps, refused.reason))) from refused
     reason = why_not(flats, camera)
     remarks = (*mishaps, *fitted.remarks, *(() if reason is None else (reason,)))
-    return fitted.model_copy(update={"remarks": remarks})
+    return fitted.model_copy(update={"remarks": remarks, "gain_db": gain_db})
 
 
 def _mean_c(captures: Sequence[Capture]) -> float | None:
@@ -509,7 +510,8 @@ def fit_level_table(file: Path, camera: DataSheet) -> FitResult:
     fitted = _without_patterns(noise_fit(darks, flats, camera))
     reason = "a table of means and variances holds no frames"
     skipped = tuple(Skipped(step=step, reason=reason, side="left") for step in ("spectral", "mtf", "psf", "geometry"))
-    return FitResult(source=str(file), cameras={"left": CameraFit(noise=fitted)}, skipped=skipped)
+    fit = FitResult(source=str(file), cameras={"left": CameraFit(noise=fitted)}, skipped=skipped)
+    return fit.model_copy(update={"warnings": implausible_figures(fit, {"left": camera})})
 
 
 def _level(row: TableRow, camera: DataSheet) -> tuple[Setting, PlaneStatistics]:

@@ -24,6 +24,7 @@ from lab.formats.cgats import read_foreign_text
 from lab.formats.importers.images import IMAGES, ImageFiles, read_camera_file, read_image
 from lab.formats.importers.stated_settings import held_against_frames
 from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.recording_set.manifest import without_common_photons
 
 NS = 1e-9
 LARGEST_DESCRIPTOR_BYTES = 8 << 20
@@ -201,6 +202,7 @@ def read_emva1288(path: Path) -> RecordingSet:
             "captures": captures,
         }
     )
+    manifest, warnings = without_common_photons(manifest, str(file), warnings)
     manifest, said = held_against_frames(manifest, frames, str(file))
     warnings += said
     files = ImageFiles(file.parent, frames, shift)

@@ -18,7 +18,8 @@ from lab.errors import InputError
 from lab.formats.recording_set.files import Frame
 from lab.formats.recording_set.manifest import DataSheet, Findings
 from lab.formats.recording_set.recordings import RecordingSet
-from sim.camera import Side
+from sim.camera import CameraModel, Lens, Side
+from sim.parameters import read_quantities
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Darks and flats that contradict their own names or places: more light without light than with it, and frames moved
@@ -422,6 +423,14 @@ def _camera_problems(camera: DataSheet) -> Iterator[str]:
             f"black_level_dn = {camera.black_level_dn:g} isn't below the white level {camera.saturation_dn:g}; "
             "correct one"
         )
+    for key, quantity in (read_quantities(CameraModel) | read_quantities(Lens)).items():
+        value, unit = getattr(camera, key, None), "" if quantity.unit == "1" else f" {quantity.unit}"
+        for limit, beyond in ((quantity.lower, "below"), (quantity.upper, "above")):
+            if value is not None and limit is not None and (value < limit if beyond == "below" else value > limit):
+                yield (
+                    f"{key} = {value:g}{unit} is {beyond} the limit of {limit:g}{unit} ({quantity.meaning}); correct "
+                    "its value or its unit, or leave it out"
+                )
     for channel in camera.quantum_efficiency or {}:
         if channel not in camera.channels:
             yield (

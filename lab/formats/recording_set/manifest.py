@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args
 from pydantic import Field, ValidationError, field_validator
 
 from lab.capture_kinds.base import CAPTURES, AnyCapture, Capture, Open
+from lab.capture_kinds.flat import FlatCapture
 from lab.errors import InputError, one_line
 from lab.plain_text import complaints_of
 from sim.camera import Cfa, Shutter, Side
@@ -259,4 +260,29 @@ def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
         found.problems.append(f"{where}: cameras is empty; describe the left camera at least")
     if found.problems or manifest is None:
         raise RecordingError(found.problems)
-    return manifest.model_copy(update={"captures": tuple(captures)}), found.warnings
+    return without_common_photons(manifest.model_copy(update={"captures": tuple(captures)}), where, found.warnings)
+
+
+#: Exposures from which on one number of photons for all flats is taken for that of a setting, not of an exposure: a
+#: responsivity needs three different lights, so that nothing is lost.
+EXPOSURES_OF_ONE_NUMBER = 3
+
+
+def without_common_photons(manifest: Manifest, where: str, warnings: list[str]) -> tuple[Manifest, list[str]]:
+    """Return the manifest with the numbers of photons taken out of the flats of a side that all state the same one at
+    three exposures or more, and `warnings` with a line for each such side."""
+    changed: dict[str, Capture] = {}
+    for side in manifest.cameras:
+        flats = [c for c in manifest.captures if isinstance(c, FlatCapture) and c.side == side and c.photons_per_pixel]
+        exposures = {flat.exposure_s for flat in flats}
+        if len({flat.photons_per_pixel for flat in flats}) != 1 or len(exposures) < EXPOSURES_OF_ONE_NUMBER:
+            continue
+        warnings.append(
+            f"{where}: all {len(flats)} flats of the {side} camera ({flats[0].id} .. {flats[-1].id}) state "
+            f"{flats[0].photons_per_pixel:g} photons a pixel at exposures of {min(exposures):g} to {max(exposures):g} "
+            "s; these are numbers of one exposure, so they are taken as unknown: K is fitted, the quantum efficiency "
+            "isn't; state the photons of each exposure"
+        )
+        changed |= {flat.id: flat.model_copy(update={"photons_per_pixel": None}) for flat in flats}
+    captures = tuple(changed.get(capture.id, capture) for capture in manifest.captures)
+    return manifest.model_copy(update={"captures": captures}) if changed else manifest, warnings

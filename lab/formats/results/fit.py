@@ -84,6 +84,8 @@ class NoiseFit(ChannelNoise):
     channels: dict[str, ChannelNoise] = {}
     #: By plane of the mosaic (`R`, `G1`, `G2`, `B`, or `Y`), by the letter of the standard.
     emva1288: dict[str, Emva1288] = {}
+    #: Amplification at which flats and darks were recorded; `conversion_gain_dn_per_e` is given for 0 dB.
+    gain_db: float = 0.0
     photon_transfer: PhotonTransfer | None = None
     #: What the recordings show of the bench, in sentences ("the lamp drifted by ...").
     remarks: tuple[str, ...] = ()
@@ -218,6 +220,17 @@ class Emva1288(Frozen):
     prnu_column_percent_std: float | None = None
     prnu_pixel_percent: float | None = None
     prnu_pixel_percent_std: float | None = None
+    #: Of the same stacks, with the smooth surface (degree 6 in rows and columns) apart: highest less lowest light over
+    #: the mean (the standard asks for 3 % at most), standard deviation of the surface, and what rows and columns share
+    #: without it.
+    light_nonuniformity_percent: float | None = None
+    light_nonuniformity_percent_std: float | None = None
+    shading_percent: float | None = None
+    shading_percent_std: float | None = None
+    row_gain_percent: float | None = None
+    row_gain_percent_std: float | None = None
+    column_gain_percent: float | None = None
+    column_gain_percent_std: float | None = None
     dark_current_from_mean_e_per_s: float | None = None
     dark_current_from_mean_e_per_s_std: float | None = None
     dark_current_from_variance_e_per_s: float | None = None
@@ -583,3 +596,5 @@ class FitResult(Frozen):
     cameras: dict[Side, CameraFit]
     stereo: StereoFit | None = None
     skipped: tuple[Skipped, ...] = ()
+    #: Figures and stated lengths outside the range of working cameras, a line each: quantity, value, limit, remedy.
+    warnings: tuple[str, ...] = ()

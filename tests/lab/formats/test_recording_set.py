@@ -372,3 +372,14 @@ def test_joined_sets_keep_apart_what_they_name_alike(small_set: Callable[..., Re
                 assert both.spectrum(getattr(new, key)) == first.spectrum(told[key])
         if "screen" in told:
             assert new.screen.pose == f"resolve/{old.screen.pose}"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "limit"),
+    [("f_number", 0.3, "0.5"), ("pixel_pitch_um", 0.00345, "0.1 um"), ("focal_length_mm", 0.008, "0.1 mm")],
+)
+def test_a_stated_value_that_no_camera_has_is_refused(folder: Path, key: str, value: float, limit: str) -> None:
+    """Before it meets a model's own limits: an f-number of a lens faster than f/0.5, a pitch in mm, a length in m."""
+    edit(folder, lambda manifest: manifest["cameras"]["left"].update({key: value}))
+    found = problems(folder)
+    assert any(f"{key} = {value:g}" in line and f"is below the limit of {limit}" in line for line in found)
