@@ -28,28 +28,25 @@ import numpy as np
 from lab.capture_kinds.base import CAPTURES, Capture, Names, Open, names_in
 from lab.errors import InputError, one_line
 from lab.formats.cgats import in_its_unit, nearest_name, read_foreign_csv, read_foreign_text, remarks_on
+from lab.formats.importers.fits_file import has_keyword, is_fits
+from lab.formats.importers.frame_settings import ALL_FRAMES, HeaderChoice, is_chosen, states, text_of
 from lab.formats.importers.images import (
-    FITS,
-    GZIP,
     IMAGES,
-    FitsHeader,
     Readout,
     Tap,
     TapFiles,
     decoded,
     described_sides,
-    fits_header,
     frame_name,
     grey,
     has_alpha,
-    is_fits,
     is_frame,
     parse_taps,
     read_camera_file,
     read_image,
     readout,
 )
-from lab.formats.importers.stated_settings import held_against_frames
+from lab.formats.importers.stated_settings import frame_header, held_against_frames
 from lab.formats.recording_set import DataSheet, FolderFiles, Manifest, RecordingError, RecordingSet, parse_manifest
 from sim.camera import Side
 
@@ -181,18 +178,20 @@ def _list(key: str, cell: str, size: int) -> list[Any]:
 INDEX, CAMERA = "index.csv", "camera.toml"
 
 
-def read_raw_folder(path: Path, tap: str = "") -> RecordingSet:
+def read_raw_folder(path: Path, tap: str = "", choice: HeaderChoice = ALL_FRAMES) -> RecordingSet:
     """Return the captures that `index.csv` in the folder `path` lists, as a recording set. `tap`: that tap of the
-    sensor alone.
+    sensor alone; `choice`: what is used of the frames' headers.
 
     Raises RecordingError with one line for every row that can't be used.
     """
-    return recordings_of_index(path, read_index(path / INDEX), str(path / INDEX), tap)
+    return recordings_of_index(path, read_index(path / INDEX), str(path / INDEX), tap, choice)
 
 
-def recordings_of_index(path: Path, index: Index, where: str, tap: str = "") -> RecordingSet:
+def recordings_of_index(
+    path: Path, index: Index, where: str, tap: str = "", choice: HeaderChoice = ALL_FRAMES
+) -> RecordingSet:
     """Return the captures of the rows of `index`, with the `camera.toml` of the folder `path`. `where`: what lists
-    them, for messages."""
+    them, for messages. Without `cfa` in `camera.toml`, a mosaic that the headers state is taken."""
     cameras = path / CAMERA
     if not cameras.is_file():
         raise InputError(f"{cameras}: missing; write the camera's keys, `cfa` at least")
@@ -204,8 +203,64 @@ def recordings_of_index(path: Path, index: Index, where: str, tap: str = "") -> 
             names = ", ".join(one.name for one in listed) or "none"
             raise InputError(f"--tap {tap}: {cameras} describes no such tap of the {side} camera; it has {names}")
     remarks = tuple(f"{cameras}: {remark}" for remark in read_foreign_text(cameras).remarks)
-    index = replace(index, remarks=index.remarks + remarks)
-    return _recording_set(path, index, where, lambda measured: read_camera_file(cameras, measured), taps)
+    index = _of_choice(path, replace(index, remarks=index.remarks + remarks), where, choice)
+    lacking = [side for side, keys in described_sides(cameras).items() if "cfa" not in keys]
+    mosaic = {side: _stated_mosaic(path, index, side, choice) for side in lacking}
+    return _recording_set(
+        path,
+        index,
+        where,
+        lambda measured: read_camera_file(
+            cameras, {side: mosaic.get(side, {}) | keys for side, keys in measured.items()}
+        ),
+        taps,
+        choice,
+    )
+
+
+def _of_choice(path: Path, index: Index, where: str, choice: HeaderChoice) -> Index:
+    """Return the rows whose frames have the settings that are asked for, with a remark on the others. Raises InputError
+    where none has, or no header states a keyword that is to be ignored."""
+    if choice == ALL_FRAMES:
+        return index
+    files = [path / row.get("frame", "") for _, row in index.rows]
+    stated = {file: frame_header(file) for file in files if file.is_file()}
+    settings = {file: header.settings for file, header in stated.items() if header is not None}
+    if choice.ignored:
+        unknown = [name for name in choice.ignored if not any(_has(file, name, settings) for file in files)]
+        if unknown:
+            raise InputError(f"--ignore {','.join(unknown)}: no frame's header states it; correct the keyword")
+    kept = [
+        (number, row)
+        for (number, row), file in zip(index.rows, files, strict=True)
+        if file not in stated or is_chosen(choice, row.get("kind", ""), settings.get(file, {}))
+    ]
+    for keyword, wanted in choice.only:
+        there = {text_of(own[keyword]) for own in settings.values() if keyword in own}
+        if not any(states(own, keyword, wanted) for own in settings.values()):
+            found = f"they state {', '.join(sorted(there))}" if there else "none states it"
+            raise InputError(f"--only {keyword}={wanted}: no frame's header states that, {found}; correct it")
+    option = ",".join("=".join(pair) for pair in choice.only)
+    if not kept:
+        raise InputError(f"{where}: no frame's header states all of {option} (--only); give one of them")
+    remarks = [f"{where}: {', '.join(choice.ignored)} of the headers ignored (--ignore)"] if choice.ignored else []
+    if dropped := [row["frame"] for number, row in index.rows if (number, row) not in kept]:
+        some = f"{dropped[0]}{f' and {len(dropped) - 1} more' if len(dropped) > 1 else ''}"
+        remarks.append(f"{where}: --only {option}: {len(dropped)} of {len(index.rows)} frames left out: {some}")
+    return replace(index, rows=kept, remarks=(*index.remarks, *remarks))
+
+
+def _has(file: Path, keyword: str, settings: Mapping[Path, Mapping[str, object]]) -> bool:
+    """Return whether the header of a file has a keyword."""
+    return keyword in settings.get(file, {}) or (is_fits(file) and has_keyword(file, keyword))
+
+
+def _stated_mosaic(path: Path, index: Index, side: Side, choice: HeaderChoice) -> dict[str, Any]:
+    """Return `cfa` of a side where the FITS headers of its frames state one."""
+    files = [path / row.get("frame", "") for _, row in index.rows if row.get("side", "left") == side]
+    headers = (frame_header(file, choice.ignored) for file in files if is_fits(file) and file.is_file())
+    stated = {header.cfa for header in headers if header is not None and header.cfa is not None}
+    return {"cfa": stated.pop()} if len(stated) == 1 else {}
 
 
 def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: float) -> RecordingSet:
@@ -283,6 +338,7 @@ def _recording_set(
     where: str,
     cameras: Callable[[dict[Side, dict[str, Any]]], dict[Side, DataSheet]],
     taps: Mapping[Side, tuple[Tap, ...]] = {},
+    choice: HeaderChoice = ALL_FRAMES,
 ) -> RecordingSet:
     folder = FolderFiles(path)
     images: dict[str, Path] = {}
@@ -331,7 +387,7 @@ def _recording_set(
     warnings = _by_row(warnings, numbers)
     remarks += [remark for one in readouts.values() for remark in one.remarks]
     remarks += remarks_on(path, _spectra(manifest))
-    manifest, said = held_against_frames(manifest, images, where)
+    manifest, said = held_against_frames(manifest, images, where, choice)
     remarks += said
     by_frame = {capture["frame"]: readouts[capture["side"]] for capture in captures if capture["side"] in readouts}
     return RecordingSet(
@@ -384,81 +440,3 @@ def _measured(captures: list[dict[str, Any]], images: dict[str, Path]) -> tuple[
         if image is not None and has_alpha(image):
             remarks.append(f"{first}: has a channel of transparency, which is dropped, as in the others of this side")
     return measured, remarks
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# A folder of FITS frames. The header of each says what it shows, or an `index.csv` beside them, as in a folder of
-# raws.
-#
-# Used of the header: IMAGETYP or OBSTYPE (dark, bias, zero, flat), EXPTIME or EXPOSURE (s), CCD-TEMP, DATE-OBS. An
-# index has one row a frame; its empty cells of exposure, temperature and time are taken from the header. GAIN and
-# BAYERPAT have no common meaning: state these values in `camera.toml`, which has the camera's keys, `cfa` and
-# `bit_depth` at least.
-
-
-def read_fits_folder(path: Path, tap: str = "") -> RecordingSet:
-    """Return the FITS frames in the folder `path` as a recording set. `tap`: that tap of the sensor alone.
-
-    Raises RecordingError with one line for every frame that can't be used: damaged, without an exposure. Frames whose
-    image type is neither dark nor flat need an `index.csv`; without one they are left out with a warning.
-    """
-    if (path / INDEX).is_file():
-        return recordings_of_index(path, _with_headers(path), str(path / INDEX), tap)
-    files = sorted(file for file in path.iterdir() if is_fits(file))
-    if not files:
-        raise InputError(f"{path}: no FITS frames ({', '.join(FITS)}, also with {GZIP}); give their folder")
-    rows: list[tuple[int, dict[str, str]]] = []
-    problems: list[str] = []
-    left_out: dict[str, list[str]] = {}
-    for number, file in enumerate(files, start=1):
-        try:
-            header = fits_header(file)
-        except InputError as error:
-            problems.append(f"{file}: {error}")
-            continue
-        if header.kind is None:
-            left_out.setdefault(header.image_type or "none", []).append(file.name)
-        elif header.exposure_s is None:
-            problems.append(f"{file}: its header has no EXPTIME; write exposure_s into {INDEX}")
-        else:
-            rows.append((number, {"frame": file.name, "kind": header.kind} | _cells(header)))
-    if problems:
-        raise RecordingError(problems)
-    types = "; ".join(f"IMAGETYP {kind}: {names[0]} and {len(names) - 1} more" for kind, names in left_out.items())
-    if not rows:
-        raise InputError(
-            f"{path}: no frame says that it is dark or flat ({types}); write {INDEX}: frame,kind,exposure_s,..."
-        )
-    recordings = recordings_of_index(path, Index(rows), str(path), tap)
-    if left_out:
-        recordings.warnings += (f"{path}: neither dark nor flat and left out: {types}; write {INDEX} to use them",)
-    return recordings
-
-
-def _cells(header: FitsHeader) -> dict[str, str]:
-    """Return what a header states, as cells of an index."""
-    stated = {
-        "exposure_s": None if header.exposure_s is None else f"{header.exposure_s:.12g}",
-        "temperature_c": None if header.temperature_c is None else f"{header.temperature_c:.6g}",
-        "time": None if header.time is None else header.time.isoformat(),
-    }
-    return {key: cell for key, cell in stated.items() if cell is not None}
-
-
-def _with_headers(path: Path) -> Index:
-    """Return the index, with what the headers state in empty cells."""
-    rows: list[tuple[int, dict[str, str]]] = []
-    problems: list[str] = []
-    index = read_index(path / INDEX)
-    for number, row in index.rows:
-        file = path / row.get("frame", "")
-        if is_fits(file) and file.is_file():
-            try:
-                rows.append((number, _cells(fits_header(file)) | row))
-            except InputError as error:
-                problems.append(f"{path / INDEX}: row {number}: {row['frame']}: {error}")
-        else:
-            rows.append((number, row))
-    if problems:
-        raise RecordingError(problems)
-    return replace(index, rows=rows)

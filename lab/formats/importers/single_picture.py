@@ -39,7 +39,8 @@ class ImportOptions:
     place of the `camera.toml` beside the picture. `channel`: of a colour picture, R, G or B. `transfer`: what the
     picture's codes are, proportional to the light or sRGB. `corners`: of a chart's 24 patches, [row, col] of dark skin,
     bluish green, black, white. `light`, `white_patch`: CSV of the radiance of a perfect diffuser, or of the chart's
-    white patch, in the chart's place. `tap`: one tap of the sensor alone."""
+    white patch, in the chart's place. `tap`: one tap of the sensor alone. `only`: frames whose headers state these
+    settings, KEY=VALUE,...; `ignore`: keywords of headers that aren't used, KEY,..."""
 
     checkerboard: tuple[int, int] | None = None
     dots: tuple[int, int] | None = None
@@ -52,6 +53,8 @@ class ImportOptions:
     light: Path | None = None
     white_patch: Path | None = None
     tap: str | None = None
+    only: str | None = None
+    ignore: str | None = None
 
     def stated(self) -> tuple[str, ...]:
         """Names of the options that are stated, as on the command line."""

@@ -10,7 +10,7 @@ from astropy.io import fits
 from lab.errors import InputError
 from lab.formats import recording_set as recording
 from lab.formats.importers import read_fits_folder
-from lab.formats.importers.images import load_fits
+from lab.formats.importers.fits_file import load_fits
 from lab.formats.recording_set import RecordingError
 
 ROWS, COLS = 24, 32
@@ -87,7 +87,7 @@ def test_frames_that_gzip_has_packed(folder: Path, tmp_path: Path, monkeypatch: 
         (c.id, c.kind, c.exposure_s) for c in plain.captures()
     ]
     np.testing.assert_array_equal(recordings.frame(recordings.captures("flat")[1]), load_fits(folder / "flat1.fit.gz"))
-    monkeypatch.setattr("lab.formats.importers.images.LARGEST_BYTES", 2000)
+    monkeypatch.setattr("lab.formats.importers.fits_file.LARGEST_BYTES", 2000)
     with pytest.raises(InputError, match="holds more than the limit of 2000 bytes; save one frame a file"):
         load_fits(folder / "flat1.fit.gz")
     packed = (folder / "flat1.fit.gz").read_bytes()
