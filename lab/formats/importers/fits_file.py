@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, get_args
 
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import InputError, one_line
-from lab.formats.importers.frame_settings import KEYWORDS, Value
+from lab.formats.importers.frame_settings import KEYWORDS, Value, text_of
 from lab.formats.recording_set import Frame
 from sim.camera import Cfa
 
@@ -49,8 +49,6 @@ SET_POINT_KEYS = ("SET-TEMP", "SET_TEMP", "SETTEMP")
 ABSOLUTE_ZERO_C, HOTTEST_C = -273.15, 125.0
 #: Keywords of the time of day where DATE-OBS holds a date alone, and of the time where there is no DATE-OBS.
 TIME_OF_DAY_KEYS, OTHER_TIME_KEYS = ("TIME-OBS", "UTC-OBS", "UT", "UTSTART"), ("DATE-BEG", "FRAME")
-#: Keyword of the time between two frames of a series (Andor), s.
-CYCLE_KEY = "KCT"
 #: Keywords of the pixel pitch along both axes, with binning, um.
 PITCH_KEYS = ("XPIXSZ", "YPIXSZ")
 
@@ -69,10 +67,10 @@ _KELVIN = re.compile(r"^\s*\[K\]|\bkelvin\b|\(K\)|\bin K\b", re.I)
 class FitsHeader:
     """What a header states; None where it doesn't.
 
-    `image_type`: as written; `kind`: of capture; `time`: of the first frame, UTC; `cycle_s`: between two frames of one
-    file; `stacked`: number of frames that the image is made of, as stated; `cfa`: of the first stored pixel on;
-    `settings`: by keyword. `problems`: (key of the capture, line) of values that can't be used; `remarks`: what was
-    converted or left out, in sentences without the file."""
+    `image_type`: as written; `kind`: of capture; `time`: of the first frame, UTC; `frames`: in the file; `stacked`:
+    that the image is made of several frames, as stated; `cfa`: from the first stored pixel on, `mosaic_source`: by
+    which keywords; `settings`: by keyword. `problems`: (key of the capture, line) of values that can't be used;
+    `remarks`: what was converted or left out, in sentences without the file."""
 
     image_type: str | None
     kind: str | None
@@ -80,9 +78,9 @@ class FitsHeader:
     temperature_c: float | None
     time: datetime | None
     frames: int = 1
-    cycle_s: float | None = None
     stacked: str | None = None
     cfa: Cfa | None = None
+    mosaic_source: str = ""
     pixel_pitch_um: float | None = None
     settings: Mapping[str, Value] = field(default_factory=dict)
     problems: tuple[tuple[str, str], ...] = ()
@@ -100,27 +98,21 @@ def unpacked_name(name: str) -> str:
     return inner if inner.lower().endswith(FITS) else name
 
 
-def load_fits(file: Path) -> Frame:
-    """Return the only frame of a FITS file, uint16 (rows, cols) with BZERO and BSCALE applied. InputError without
-    the path."""
-    frames = load_cube(file)
-    if len(frames) != 1:
-        raise InputError(f"holds {len(frames)} frames, not 1; give its folder to --from fits, or save one file a frame")
-    return frames[0]
-
-
-def load_cube(file: Path) -> NDArray[np.uint16]:
-    """Return the frames of a FITS file, uint16 (frames, rows, cols) with BZERO and BSCALE applied: one, or all planes
-    of a cube. InputError without the path."""
-    found, _ = _opened(file)
-    planes = _planes(found.shape)
+def load_fits(file: Path, plane: int | None = None) -> Frame:
+    """Return the only frame of a FITS file, or that `plane` of a cube, uint16 (rows, cols) with BZERO and BSCALE
+    applied. InputError without the path."""
+    values, _ = _opened(file)
+    planes = _planes(values.shape)
+    if planes > 1 and plane is None:
+        raise InputError(f"holds {planes} frames, not 1; give a folder of frames, or save one file a frame")
+    found = values.reshape(planes, *values.shape[-2:])[plane or 0]
     if found.dtype.kind not in "iu" and not np.array_equal(found, np.rint(found)):
         raise InputError(f"its values are {found.dtype} with fractions; save raw DN as integers")
     if found.size and (found.min() < 0 or found.max() > np.iinfo(np.uint16).max):
         raise InputError(
             f"its values are {found.min():g} .. {found.max():g}; raw DN are 0 .. 65535: save them unscaled"
         )
-    return np.ascontiguousarray(found.reshape(planes, *found.shape[-2:]), dtype=np.uint16)
+    return np.ascontiguousarray(found, dtype=np.uint16)
 
 
 def fits_header(file: Path, *, with_image: bool = True, ignored: Collection[str] = ()) -> FitsHeader:
@@ -133,6 +125,7 @@ def fits_header(file: Path, *, with_image: bool = True, ignored: Collection[str]
     exposure_s = found.exposure_s()
     temperature_c = found.temperature_c()
     time = found.time()
+    cfa = _cfa(header)
     if header.get("BSCALE", 1) != 1:
         found.remarks.append(f"BSCALE = {header['BSCALE']:g}: codes are multiples of it")
     stated = next((str(header[key]).strip() for key in IMAGE_TYPE_KEYS if _kind_of(header.get(key))), None)
@@ -147,9 +140,9 @@ def fits_header(file: Path, *, with_image: bool = True, ignored: Collection[str]
         temperature_c=temperature_c,
         time=time,
         frames=_planes_of(header),
-        cycle_s=_float(header.get(CYCLE_KEY)),
         stacked=stacked,
-        cfa=_cfa(header),
+        cfa=cfa,
+        mosaic_source="" if cfa is None else _mosaic_source(header),
         pixel_pitch_um=_pitch_um(header),
         settings={key: value for key in KEYWORDS if (value := _setting(header.get(key))) is not None},
         problems=tuple(found.problems),
@@ -160,14 +153,6 @@ def fits_header(file: Path, *, with_image: bool = True, ignored: Collection[str]
 def has_keyword(file: Path, keyword: str) -> bool:
     """Return whether the header of a FITS file has a keyword."""
     return keyword in _header(file)
-
-
-def time_of(header: FitsHeader, number: int) -> datetime | None:
-    """Return the time of frame `number` of a file: of the first one as stated, of others where the time between two is
-    stated."""
-    if header.time is None or number == 0:
-        return header.time
-    return None if not header.cycle_s else header.time + timedelta(seconds=number * header.cycle_s)
 
 
 # --- Files ------------------------------------------------------------------------------------------------------------
@@ -324,6 +309,13 @@ def _cfa(header: Any) -> Cfa | None:
     places = [((row0 + down * row) % 2, (col0 + col) % 2) for row in (0, 1) for col in (0, 1)]
     made = "".join(pattern[2 * row + col] for row, col in places)
     return next(cfa for cfa in get_args(Cfa) if cfa == made)
+
+
+def _mosaic_source(header: Any) -> str:
+    """Return by what a header states its mosaic, and how that is set aside, in words."""
+    keys = ("BAYERPAT", "COLORTYP", "XBAYROFF", "YBAYROFF", "ROWORDER")
+    stated = ", ".join(f"{key} = {text_of(value)}" for key in keys if (value := _setting(header.get(key))) is not None)
+    return f" from the first stored pixel on ({stated}; where that is wrong, --ignore {stated.partition(' ')[0]})"
 
 
 class _Reading:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import struct
 import tomllib
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
@@ -18,6 +15,7 @@ from pydantic import ValidationError
 from lab.errors import InputError
 from lab.formats.cgats import read_foreign_csv, read_foreign_text
 from lab.formats.importers.fits_file import FITS, is_fits, load_fits, unpacked_name
+from lab.formats.pictures import IMAGES, read_picture
 from lab.formats.recording_set import RAWS, DataSheet, FolderFiles, Frame, load_frame
 from lab.formats.recording_set.files import locate
 from lab.formats.spectrum_csv import parse_spectrum
@@ -26,26 +24,24 @@ from sim.parameters import Frozen
 from sim.spectrum import Spectrum
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, FITS, camera raws, .npy. They are decoded on
+# Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 1 to 16 bit, FITS, camera raws, .npy. They are decoded on
 # access.
 #
 # A channel of transparency (RGBA) is dropped, and `has_alpha` says so. Spectra beside them may have semicolons and
 # decimal commas.
 
 
-IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
-
-
-def read_image(file: Path) -> Frame:
-    """Grey values of an image file as uint16 (rows, cols), as stored. InputError without the path."""
+def read_image(file: Path, page: int | None = None) -> Frame:
+    """Grey values of an image file as uint16 (rows, cols), as stored; `page`: of a TIFF with several, or the
+    plane of a FITS cube. InputError without the path."""
     suffix = file.suffix.lower()
     if suffix == ".npy" or suffix in RAWS:
         return load_frame(file)
     if is_fits(file):
-        return load_fits(file)
+        return load_fits(file, page)
     if suffix not in IMAGES:
         raise InputError(f"can't be read; give one of {' '.join((*IMAGES, *FITS, *RAWS, '.npy'))}")
-    return grey(decoded(file))
+    return grey(read_picture(file, page))
 
 
 def is_frame(file: Path) -> bool:
@@ -64,62 +60,39 @@ def has_alpha(image: NDArray[Any]) -> bool:
     return image.shape[2:] in ((2,), (4,))
 
 
-def decoded(file: Path) -> NDArray[Any]:
-    """Return an image file's samples as they're stored, channels in OpenCV's order. InputError without the path."""
-    data = file.read_bytes()
-    if why := _damage(data):
-        raise InputError(f"damaged image ({why}); copy it again or recapture")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise InputError(f"damaged image ({str(error).split('error:')[-1].strip()}); copy it again") from error
-    if image is None:
-        raise InputError("damaged image (it can't be decoded); copy it again or recapture")
-    return np.asarray(image)
-
-
-def _damage(data: bytes) -> str | None:
-    """Why PNG or JPEG data are incomplete. The decoder would silently fill the missing part with zeros."""
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
-        at = 8
-        while at + 12 <= len(data):
-            (length,) = struct.unpack(">I", data[at : at + 4])
-            body, sum_ = data[at + 4 : at + 8 + length], data[at + 8 + length : at + 12 + length]
-            if len(sum_) < 4:
-                break
-            if zlib.crc32(body) != struct.unpack(">I", sum_)[0]:
-                return f"the checksum of chunk {body[:4]!r} is wrong"
-            if body[:4] == b"IEND":
-                return None
-            at += 12 + length
-        return "it ends too early"
-    if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-1024:]:
-        return "it ends too early"
-    return None
-
-
 def grey(image: NDArray[Any]) -> Frame:
     """Return the grey values (rows, cols) of a decoded image; a channel of transparency is dropped. InputError for
-    colours and other numbers."""
-    if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"its values are {image.dtype}; save grey values of 8 or 16 bit")
+    colours, and for numbers that aren't codes of 0 to 65535."""
     if image.ndim == 3:
         colours = image[..., :3]
         if image.shape[2] >= 3 and not np.array_equal(colours.min(axis=2), colours.max(axis=2)):
             raise InputError("is a colour picture; give the raw mosaic, or grey values")
         image = image[..., 0]
+    return codes_of(image)
+
+
+def codes_of(image: NDArray[Any]) -> Frame:
+    """Return numbers as codes, uint16. InputError for fractions and for numbers beyond 0 to 65535."""
+    if image.dtype not in (np.uint8, np.uint16):
+        if image.dtype.kind not in "iuf" or not np.array_equal(image, np.rint(image)):
+            raise InputError(f"its values are {image.dtype} with fractions; save raw DN as integers of 8 or 16 bit")
+        if image.size and (image.min() < 0 or image.max() > np.iinfo(np.uint16).max):
+            raise InputError(f"its values are {image.min():g} .. {image.max():g}; save raw DN, 0 .. 65535, unscaled")
     return np.ascontiguousarray(image, dtype=np.uint16)
 
 
 class ImageFiles(FolderFiles):
-    """A folder whose frames are images. `images`: the file of each frame by its path in the recording set.
+    """A folder whose frames are images. `images`: the file of each frame by its path in the recording set; `pages`: its
+    page in there, where that has several.
 
     Values are shifted down by `shift` bits. The files are decoded on access and, as spectra, aren't copied byte by
     byte."""
 
-    def __init__(self, root: Path, images: Mapping[str, Path], shift: int = 0) -> None:
+    def __init__(
+        self, root: Path, images: Mapping[str, Path], shift: int = 0, pages: Mapping[str, int] | None = None
+    ) -> None:
         super().__init__(root)
-        self.images, self.shift = dict(images), shift
+        self.images, self.shift, self.pages = dict(images), shift, dict(pages or {})
 
     def file(self, path: str) -> Path | None:
         return None if path in self.images or path.lower().endswith(".csv") else super().file(path)
@@ -128,7 +101,7 @@ class ImageFiles(FolderFiles):
         return parse_spectrum(read_foreign_csv(locate(self.root, path)).text)
 
     def frame(self, path: str, camera: DataSheet) -> Frame:
-        return np.right_shift(read_image(self.images[path]), self.shift, dtype=np.uint16)
+        return np.right_shift(read_image(self.images[path], self.pages.get(path)), self.shift, dtype=np.uint16)
 
     def where(self, path: str) -> str:
         return str(self.images[path]) if path in self.images else super().where(path)
@@ -233,9 +206,15 @@ class Readout:
 class TapFiles(ImageFiles):
     """Images whose frames are cropped, joined and levelled as a `Readout` says."""
 
-    def __init__(self, root: Path, images: Mapping[str, Path], readouts: Mapping[str, Readout]) -> None:
+    def __init__(
+        self,
+        root: Path,
+        images: Mapping[str, Path],
+        readouts: Mapping[str, Readout],
+        pages: Mapping[str, int] | None = None,
+    ) -> None:
         """`readouts`: by the frame's path in the recording set."""
-        super().__init__(root, images)
+        super().__init__(root, images, pages=pages)
         self.readouts = dict(readouts)
 
     def frame(self, path: str, camera: DataSheet) -> Frame:
@@ -355,7 +334,7 @@ def _overscan_means(taps: Sequence[Tap], files: Sequence[Path]) -> dict[str, lis
     if all(tap.overscan is None for tap in taps):
         return means
     for file in chosen:
-        frame = read_image(file)
+        frame = read_image(file, 0)
         for tap in taps:
             if tap.overscan is not None:
                 means.setdefault(tap.name, []).append(float(frame[_box(tap.overscan)].mean()))

@@ -18,8 +18,9 @@ import csv
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -28,14 +29,12 @@ import numpy as np
 from lab.capture_kinds.base import CAPTURES, Capture, Names, Open, names_in
 from lab.errors import InputError, one_line
 from lab.formats.cgats import in_its_unit, nearest_name, read_foreign_csv, read_foreign_text, remarks_on
-from lab.formats.importers.fits_file import has_keyword, is_fits
+from lab.formats.importers.fits_file import fits_header, has_keyword, is_fits
 from lab.formats.importers.frame_settings import ALL_FRAMES, HeaderChoice, is_chosen, states, text_of
 from lab.formats.importers.images import (
-    IMAGES,
     Readout,
     Tap,
     TapFiles,
-    decoded,
     described_sides,
     frame_name,
     grey,
@@ -46,7 +45,9 @@ from lab.formats.importers.images import (
     read_image,
     readout,
 )
+from lab.formats.importers.own_statements import compare_with_files, known_from_file, taken_from_file
 from lab.formats.importers.stated_settings import frame_header, held_against_frames
+from lab.formats.pictures import IMAGES, TIFFS, picture_facts, read_picture
 from lab.formats.recording_set import DataSheet, FolderFiles, Manifest, RecordingError, RecordingSet, parse_manifest
 from sim.camera import Side
 
@@ -128,8 +129,8 @@ def _columns() -> list[str]:
     """Return the keys of all kinds of capture, those of objects in them with a dot."""
     names: dict[str, None] = {}
     for kind in CAPTURES.models.values():
-        for key, field in kind.model_fields.items():
-            parts = [part for part in (field.annotation, *get_args(field.annotation)) if isinstance(part, type)]
+        for key, declared in kind.model_fields.items():
+            parts = [part for part in (declared.annotation, *get_args(declared.annotation)) if isinstance(part, type)]
             inner = next((part for part in parts if issubclass(part, Open)), None)
             names |= dict.fromkeys([key] if inner is None else [f"{key}.{name}" for name in inner.model_fields])
     return list(names)
@@ -159,8 +160,8 @@ def capture_of_row(row: dict[str, str]) -> dict[str, Any]:
 def _list_sizes(kind: type[Capture]) -> dict[str, int]:
     """Keys of a kind that hold several numbers, and how many make a group (0: a flat list)."""
     sizes = {}
-    for key, field in kind.model_fields.items():
-        parts = [part for part in (field.annotation, *get_args(field.annotation)) if get_origin(part) is tuple]
+    for key, declared in kind.model_fields.items():
+        parts = [part for part in (declared.annotation, *get_args(declared.annotation)) if get_origin(part) is tuple]
         if parts:
             sizes[key] = len(get_args(get_args(parts[0])[0]))
     return sizes
@@ -191,7 +192,7 @@ def recordings_of_index(
     path: Path, index: Index, where: str, tap: str = "", choice: HeaderChoice = ALL_FRAMES
 ) -> RecordingSet:
     """Return the captures of the rows of `index`, with the `camera.toml` of the folder `path`. `where`: what lists
-    them, for messages. Without `cfa` in `camera.toml`, a mosaic that the headers state is taken."""
+    them, for messages."""
     cameras = path / CAMERA
     if not cameras.is_file():
         raise InputError(f"{cameras}: missing; write the camera's keys, `cfa` at least")
@@ -204,18 +205,7 @@ def recordings_of_index(
             raise InputError(f"--tap {tap}: {cameras} describes no such tap of the {side} camera; it has {names}")
     remarks = tuple(f"{cameras}: {remark}" for remark in read_foreign_text(cameras).remarks)
     index = _of_choice(path, replace(index, remarks=index.remarks + remarks), where, choice)
-    lacking = [side for side, keys in described_sides(cameras).items() if "cfa" not in keys]
-    mosaic = {side: _stated_mosaic(path, index, side, choice) for side in lacking}
-    return _recording_set(
-        path,
-        index,
-        where,
-        lambda measured: read_camera_file(
-            cameras, {side: mosaic.get(side, {}) | keys for side, keys in measured.items()}
-        ),
-        taps,
-        choice,
-    )
+    return _recording_set(path, index, where, lambda measured: read_camera_file(cameras, measured), taps, choice)
 
 
 def _of_choice(path: Path, index: Index, where: str, choice: HeaderChoice) -> Index:
@@ -253,14 +243,6 @@ def _of_choice(path: Path, index: Index, where: str, choice: HeaderChoice) -> In
 def _has(file: Path, keyword: str, settings: Mapping[Path, Mapping[str, object]]) -> bool:
     """Return whether the header of a file has a keyword."""
     return keyword in settings.get(file, {}) or (is_fits(file) and has_keyword(file, keyword))
-
-
-def _stated_mosaic(path: Path, index: Index, side: Side, choice: HeaderChoice) -> dict[str, Any]:
-    """Return `cfa` of a side where the FITS headers of its frames state one."""
-    files = [path / row.get("frame", "") for _, row in index.rows if row.get("side", "left") == side]
-    headers = (frame_header(file, choice.ignored) for file in files if is_fits(file) and file.is_file())
-    stated = {header.cfa for header in headers if header is not None and header.cfa is not None}
-    return {"cfa": stated.pop()} if len(stated) == 1 else {}
 
 
 def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: float) -> RecordingSet:
@@ -340,34 +322,22 @@ def _recording_set(
     taps: Mapping[Side, tuple[Tap, ...]] = {},
     choice: HeaderChoice = ALL_FRAMES,
 ) -> RecordingSet:
-    folder = FolderFiles(path)
-    images: dict[str, Path] = {}
-    captures: list[dict[str, Any]] = []
-    numbers: list[int] = []
-    problems: list[str] = []
-    used: Counter[str] = Counter()
-    for number, row in index.rows:
-        try:
-            capture = capture_of_row(row)
-            found = folder.file(capture["frame"])
-        except InputError as error:
-            problems.append(f"{where}: row {number}: {row.get('frame', '')}: {error}")
-            continue
-        stem = re.sub(r"[^\w.-]+", "_", str(capture.get("id") or frame_name(capture["frame"])))
-        used[stem] += 1
-        frame = f"frames/{stem if used[stem] == 1 else f'{stem}-{used[stem]}'}.npy"
-        captures.append({"id": stem, "side": "left", "exposure_s": None} | capture | {"frame": frame})
-        images[frame] = found or path / capture["frame"]
-        numbers.append(number)
-    if problems:
-        raise RecordingError(problems)
-    measured, remarks = _measured(captures, images)
+    listed = _listed_frames(path, index, where)
+    captures, images, numbers = listed.captures, listed.images, listed.numbers
+    measured, known, remarks = _measured(listed, choice.ignored)
+    if listed.stacks:
+        more = f" and {len(listed.stacks) - 3} more" if len(listed.stacks) > 3 else ""
+        remarks.append(
+            f"{where}: each page of {', '.join(listed.stacks[:3])}{more} is a frame of its own, in the order of the "
+            "pages (a time in the index isn't used for them)"
+        )
     readouts: dict[Side, Readout] = {}
-    for side, listed in taps.items():
-        if listed and side in measured:
+    for side, own_taps in taps.items():
+        if own_taps and side in measured:
             own = [images[capture["frame"]] for capture in captures if capture["side"] == side]
-            cut = readout(listed, own, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
+            cut = readout(own_taps, own, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
             measured[side] |= {"rows": cut.shape[0], "cols": cut.shape[1], "black_level_dn": cut.black_level_dn}
+            known[side].pop("black_level_dn", None)
             readouts[side] = cut
     described = cameras(measured)
     text = json.dumps(
@@ -389,13 +359,91 @@ def _recording_set(
     remarks += remarks_on(path, _spectra(manifest))
     manifest, said = held_against_frames(manifest, images, where, choice)
     remarks += said
+    statements = described_sides(path / CAMERA)
+    for side, camera in described.items():
+        files = {images[capture["frame"]]: capture["kind"] for capture in captures if capture["side"] == side}
+        stated = statements.get(side, {})
+        if files:
+            boards = [file for file, kind in files.items() if kind == "charuco"]
+            remarks += taken_from_file(stated, known[side], next(iter(files)))
+            remarks += compare_with_files(camera, stated, files, boards, choice.ignored)
     by_frame = {capture["frame"]: readouts[capture["side"]] for capture in captures if capture["side"] in readouts}
     return RecordingSet(
         manifest,
         source=str(path),
         warnings=tuple(dict.fromkeys((*index.remarks, *warnings, *remarks))),
-        files=TapFiles(path, images, by_frame),
+        files=TapFiles(path, images, by_frame, listed.pages),
     )
+
+
+@dataclass
+class _ListedFrames:
+    """What the rows of an index list, a capture for each frame. `images`: file of each frame by its path in the
+    recording set; `pages`: its page, where the file has several; `numbers`: row of each capture; `stacks`: files of
+    several pages, with their number."""
+
+    captures: list[dict[str, Any]] = field(default_factory=list)
+    images: dict[str, Path] = field(default_factory=dict)
+    pages: dict[str, int] = field(default_factory=dict)
+    numbers: list[int] = field(default_factory=list)
+    stacks: list[str] = field(default_factory=list)
+
+
+def _listed_frames(path: Path, index: Index, where: str) -> _ListedFrames:
+    """Return the captures of an index with ids that are unique where the rows state none. Raises RecordingError with
+    one line for each row whose frame can't be used."""
+    listed, folder = _ListedFrames(), FolderFiles(path)
+    problems: list[str] = []
+    used: set[str] = set()
+    stems = Counter(_stem(frame_name(row.get("frame", ""))) for _, row in index.rows if "id" not in row)
+    for number, row in index.rows:
+        try:
+            capture = capture_of_row(row)
+            file = folder.file(capture["frame"]) or path / capture["frame"]
+            many = _pages(file)
+        except InputError as error:
+            problems.append(f"{where}: row {number}: {row.get('frame', '')}: {error}")
+            continue
+        stem = _stem(str(capture.get("id") or frame_name(capture["frame"])))
+        if "id" not in capture and stems[stem] > 1:  # of several folders
+            stem = _stem(capture["frame"].rpartition("/")[0].replace("/", "-") + "-" + stem).lstrip("-")
+        if many > 1:
+            listed.stacks.append(f"{capture['frame']} ({many})")
+        for page in range(many):
+            name = _unused(stem if many == 1 else f"{stem}-p{page + 1}", used)
+            frame = f"frames/{name}.npy"
+            own = {"id": name, "side": "left", "exposure_s": None} | capture | {"frame": frame}
+            if many > 1:
+                listed.pages[frame] = page
+                own |= {"id": name} | ({"pose": f"{capture['pose']}-p{page + 1}"} if "pose" in capture else {})
+                own.pop("time", None)  # of one page, and which isn't known
+            listed.captures.append(own)
+            listed.images[frame] = file
+            listed.numbers.append(number)
+    if problems:
+        raise RecordingError(problems)
+    return listed
+
+
+def _stem(name: str) -> str:
+    """Return a name with the letters that ids and files have."""
+    return re.sub(r"[^\w.-]+", "_", name)
+
+
+def _unused(name: str, used: set[str]) -> str:
+    """Return the name, with the first number behind it that makes it a new one where it is used; it is used from now
+    on."""
+    numbered = (name if number == 1 else f"{name}-{number}" for number in count(1))
+    free = next(one for one in numbered if one not in used)
+    used.add(free)
+    return free
+
+
+def _pages(file: Path) -> int:
+    """Return the pages of a TIFF, or the frames of a FITS file; 1 of other files."""
+    if is_fits(file):
+        return fits_header(file, with_image=False).frames
+    return picture_facts(file).pages if file.suffix.lower() in TIFFS else 1
 
 
 def _by_row(lines: Sequence[str], numbers: Sequence[int]) -> list[str]:
@@ -420,23 +468,30 @@ def _spectra(manifest: Manifest) -> list[str]:
     return list(dict.fromkeys(named))
 
 
-def _measured(captures: list[dict[str, Any]], images: dict[str, Path]) -> tuple[dict[Side, dict[str, Any]], list[str]]:
-    """Rows and columns of each side's first image, and the bit depth of files of 8 bit: what `camera.toml` may leave
-    out. And what is dropped of the images, in sentences."""
+def _measured(
+    listed: _ListedFrames, ignored: Collection[str]
+) -> tuple[dict[Side, dict[str, Any]], dict[Side, dict[str, Any]], list[str]]:
+    """What each side's first image tells and `camera.toml` may leave out: rows and columns, and the bit depth of files
+    of 8 bit; of these, what its file states (mosaic, black level, bits a sample). And what is dropped of the images, in
+    sentences."""
     measured: dict[Side, dict[str, Any]] = {}
+    known: dict[Side, dict[str, Any]] = {}
     remarks = []
     for side in get_args(Side):
-        first = next((images[capture["frame"]] for capture in captures if capture["side"] == side), None)
-        if first is None:
+        name = next((capture["frame"] for capture in listed.captures if capture["side"] == side), None)
+        if name is None:
             continue
+        first = listed.images[name]
         try:
-            image = decoded(first) if first.suffix.lower() in IMAGES else None
-            frame = read_image(first) if image is None else grey(image)
+            image = read_picture(first, listed.pages.get(name)) if first.suffix.lower() in IMAGES else None
+            frame = read_image(first, listed.pages.get(name)) if image is None else grey(image)
+            known[side] = known_from_file(first, (frame.shape[0], frame.shape[1]), ignored)
         except InputError as error:
             raise InputError(f"{first}: {error}") from error
         measured[side] = {"rows": frame.shape[0], "cols": frame.shape[1]}
         if image is not None and image.dtype == np.uint8:
             measured[side]["bit_depth"] = 8
+        measured[side] |= known[side]
         if image is not None and has_alpha(image):
             remarks.append(f"{first}: has a channel of transparency, which is dropped, as in the others of this side")
-    return measured, remarks
+    return measured, known, remarks

@@ -35,7 +35,6 @@ from lab.formats.importers.frame_settings import (
 from lab.formats.raw_file import TiffDescription
 from lab.formats.recording_set import RAWS, DataSheet, InstrumentSnapshot, Manifest, RecordingError
 from lab.formats.recording_set.manifest import Value
-from sim.camera import Cfa
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What a frame's own file says of how it was taken: EXIF of JPEG, PNG and TIFF, the metadata of camera raws, the header
@@ -67,7 +66,6 @@ class FrameHeader:
     gain_db: float | None = None
     temperature_c: float | None = None
     camera: InstrumentSnapshot | None = None
-    cfa: Cfa | None = None
     pixel_pitch_um: float | None = None
     stacked: str | None = None
     settings: Mapping[str, str | float] = field(default_factory=dict)
@@ -114,7 +112,6 @@ def _of_fits(header: FitsHeader) -> FrameHeader:
         exposure_s=header.exposure_s,
         temperature_c=header.temperature_c,
         camera=camera,
-        cfa=header.cfa,
         pixel_pitch_um=header.pixel_pitch_um,
         settings=settings,
         stacked=header.stacked,
@@ -257,8 +254,8 @@ def held_against_frames(
     leaves open; and one line for each quantity that these files contradict or convert, and for exposures that are
     hardly meant in seconds.
 
-    `images`: the file of each frame by its path. Raises InputError where the exposures can't be right, the mosaic
-    contradicts the header's, or settings differ between frames that are fitted together: `where` names what lists
+    `images`: the file of each frame by its path. Raises InputError where the exposures can't be right, frames are made
+    of several, or settings differ between frames that are fitted together: `where` names what lists
     them."""
     by_file = {file: frame_header(file, choice.ignored) for file in dict.fromkeys(images.values())}
     seen = [
@@ -275,7 +272,7 @@ def held_against_frames(
     )
     for side, camera in manifest.cameras.items():
         own = [one for one in seen if one.capture.side == side]
-        problems += [*_stacked(own), *_other_mosaic(own, camera)]
+        problems += _stacked(own)
         lines += _other_pitch(own, camera)
     if problems:
         raise RecordingError(problems)
@@ -315,25 +312,6 @@ def _named_camera(own: Sequence[_HeaderSeen]) -> InstrumentSnapshot | None:
         if all(camera.settings.get(key) == value for camera in named)
     }
     return named[0].model_copy(update={"settings": shared})
-
-
-def _other_mosaic(own: Sequence[_HeaderSeen], camera: DataSheet) -> list[str]:
-    """Return the line for frames whose headers state another mosaic than the camera's."""
-    off = [one for one in own if one.header.cfa is not None and one.header.cfa != camera.cfa]
-    if not off:
-        return []
-    stated = ", ".join(
-        f"{key} = {text_of(off[0].header.settings[key])}"
-        for key in ("BAYERPAT", "XBAYROFF", "YBAYROFF", "ROWORDER")
-        if key in off[0].header.settings
-    )
-    first = off[0]
-    line = (
-        f"{first.file}: its {first.header.source} states {stated}, which is {first.header.cfa} from the first stored "
-        f"pixel on{_and(off)}, and camera.toml cfa = {camera.cfa}; correct cfa, or where the header is wrong, --ignore "
-        "BAYERPAT"
-    )
-    return [line]
 
 
 def _stacked(own: Sequence[_HeaderSeen]) -> list[str]:

@@ -16,7 +16,7 @@ from lab.formats.recording_set.manifest import (
     manifest_json,
     parse_manifest,
 )
-from lab.formats.recording_set.recordings import RecordingSet
+from lab.formats.recording_set.recordings import RecordingSet, frame_problem
 
 __all__ = [
     "RAWS",
@@ -34,6 +34,7 @@ __all__ = [
     "archive",
     "clipped_share",
     "differences",
+    "frame_problem",
     "inspect",
     "load_frame",
     "manifest_json",
