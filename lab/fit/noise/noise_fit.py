@@ -23,6 +23,7 @@ from lab.fit.noise.dark_current import (
     dark_signal_hidden,
     dark_temperature_c,
     read_noise,
+    remark_on_temperatures,
 )
 from lab.fit.noise.emva1288 import EmvaInput, emva1288_figures
 from lab.fit.noise.evaluation import Evaluation, evaluate, in_electrons
@@ -173,6 +174,7 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
     remark_on_scatter(e)
     remark_on_levels(e)
     remark_on_shading(e)
+    remark_on_temperatures(e)
     principal = principal_figures(e)
     from_variance, from_variance_std = dark_current_from_variance(e)
     dark = pixels is not None and e.levels.darks
