@@ -643,6 +643,14 @@ class SentAs(Schema):
         default=None, gt=0, le=1e6, description="the checkerboard's squares, the dots' spacing"
     )
     tap: str = Field(default="", max_length=100, description="raw-folder, fits: this tap of the sensor alone")
+    only: str = Field(
+        default="",
+        max_length=400,
+        description="raw-folder, fits: frames alone whose headers state these settings, KEY=VALUE,...",
+    )
+    ignore: str = Field(
+        default="", max_length=400, description="raw-folder, fits: keywords of the headers that are wrong, KEY,..."
+    )
     camera: str = Field(default="", max_length=400, description="a picture's camera.toml inside the archive")
     exposure_s: float | None = Field(default=None, gt=0, le=1e6, description="a picture's exposure")
     transfer: Literal["linear", "srgb"] | None = Field(default=None, description="what a picture's codes are")

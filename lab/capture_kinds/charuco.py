@@ -91,6 +91,7 @@ class CharucoCapture(Capture):
     shows: ClassVar[str] = "a ChArUco board"
     sequence: ClassVar[type[Sequence] | None] = StereoSequence
     clipping_matters: ClassVar[bool] = False
+    codes_are_fitted: ClassVar[bool] = False
 
     kind: Literal["charuco"]
     # An imported photograph may not say how long it was exposed; the geometry doesn't need it.

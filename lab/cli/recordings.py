@@ -69,6 +69,13 @@ def import_(
     dots: Annotated[str, typer.Option(metavar="ROWSxCOLS", help="dot-grid: dots of the plane grid")] = "",
     square_mm: Annotated[float, typer.Option(help="side of the checkerboard's squares, or spacing of the dots")] = 0.0,
     tap: Annotated[str, typer.Option(metavar="NAME", help="raw-folder, fits: this tap of the sensor alone")] = "",
+    only: Annotated[
+        str,
+        typer.Option(metavar="KEY=VALUE,...", help="raw-folder, fits: frames alone whose headers state these settings"),
+    ] = "",
+    ignore: Annotated[
+        str, typer.Option(metavar="KEY,...", help="raw-folder, fits: keywords of the headers that are wrong")
+    ] = "",
     camera: Annotated[
         Path | None,
         typer.Option(
@@ -122,6 +129,8 @@ def import_(
         light=light,
         white_patch=white_patch,
         tap=tap or None,
+        only=only or None,
+        ignore=ignore or None,
     )
     if lens and kind != LENSFUN:
         raise InputError(f"--from {kind} doesn't take --lens")

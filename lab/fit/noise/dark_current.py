@@ -243,6 +243,34 @@ def dark_temperature_c(e: Evaluation) -> float | None:
     return sum(exposure_s * sensor_c for exposure_s, sensor_c in known) / total_s if total_s > 0 else None
 
 
+def remark_on_temperatures(e: Evaluation) -> None:
+    """Remark on flats that were taken at another temperature than the darks that are subtracted: more than a degree
+    apart, to which levels are grouped, and where a dark current that is significant (three standard deviations) would
+    change a mean by more than three of its own, the scatter of the light included."""
+    dark_c = dark_temperature_c(e)
+    if dark_c is None:
+        return
+    found: list[tuple[float, float, float]] = []
+    for level in e.levels.flats:
+        rise_c = 0.0 if level.temperature_c is None else level.temperature_c - dark_c
+        for name, plane in level.plane.items():
+            line = e.dark.lines[name]
+            if abs(rise_c) <= 1.0 or line.rate is None or line.rate < 3.0 * math.sqrt(line.covariance[1, 1]):
+                continue
+            signal_dn = plane.mean - line.black
+            std_dn = math.hypot(0.0 if math.isnan(plane.mean_std) else plane.mean_std, e.light_scatter * signal_dn)
+            change_dn = line.rate * level.exposure_s * (2.0 ** (rise_c / DOUBLING_C) - 1.0)
+            if abs(change_dn) > 3.0 * std_dn and signal_dn > 0.0:
+                found.append((abs(change_dn) / signal_dn, change_dn, dark_c + rise_c))
+    if found:
+        share, change_dn, flat_c = max(found)
+        e.remarks.add(
+            f"flats at {flat_c:.1f} °C have darks at {dark_c:.1f} °C subtracted: their own dark signal differs by "
+            f"{change_dn:+.2g} DN, {100.0 * share:.2g} % of the signal, if it doubles every {DOUBLING_C:g} °C; "
+            "take darks at the temperature of the flats"
+        )
+
+
 def dark_current_temperature(e: Evaluation) -> DarkCurrentLaws | None:
     """Dark current at every temperature with darks of two exposures, and the laws through those significantly above
     0.

@@ -23,6 +23,7 @@ from lab.fit.noise.dark_current import (
     dark_signal_hidden,
     dark_temperature_c,
     read_noise,
+    remark_on_temperatures,
 )
 from lab.fit.noise.emva1288 import EmvaInput, emva1288_figures
 from lab.fit.noise.evaluation import Evaluation, evaluate, in_electrons
@@ -174,6 +175,7 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
     remark_on_scatter(e)
     remark_on_levels(e)
     remark_on_shading(e)
+    remark_on_temperatures(e)
     principal = principal_figures(e)
     from_variance, from_variance_std = dark_current_from_variance(e)
     dark = pixels is not None and e.levels.darks
@@ -372,8 +374,10 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
         recordings = exchanged.corrected
     flats = recordings.captures(FlatCapture, side)
     gain_db = most_frequent_gain_db(flats)
+    darks = recordings.captures(DarkCapture, side)
+    other_gains = _at_other_gains([*flats, *darks], gain_db)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
-    darks = [dark for dark in recordings.captures(DarkCapture, side) if (dark.gain_db or 0.0) == gain_db]
+    darks = [dark for dark in darks if (dark.gain_db or 0.0) == gain_db]
     dark_levels, pixels = _dark_levels(recordings, darks, camera)
     light = light_of(flats, camera)
     lamps = _lamps_of(recordings, flats, light)
@@ -391,7 +395,7 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
         for group in _grouped(flats, lambda flat: (flat.exposure_s, light[flat.id].amount, lamps[flat.id]))
     ]
     alike = alike_planes(recordings, side)
-    mishaps = (*copies.told, *(one.told(side) for one in (exchanged, alike) if one is not None))
+    mishaps = (*other_gains, *copies.told, *(one.told(side) for one in (exchanged, alike) if one is not None))
     try:
         fitted = noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
     except NotDetermined as refused:
@@ -399,6 +403,21 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     reason = why_not(flats, camera)
     remarks = (*mishaps, *fitted.remarks, *(() if reason is None else (reason,)))
     return fitted.model_copy(update={"remarks": remarks, "gain_db": gain_db})
+
+
+def _at_other_gains(captures: Sequence[Capture], gain_db: float) -> list[str]:
+    """Return a remark on the darks and flats that aren't fitted, as they aren't of the gain of most flats."""
+    others = [capture for capture in captures if (capture.gain_db or 0.0) != gain_db]
+    if not others:
+        return []
+    listed = []
+    for group in _grouped(others, lambda capture: (capture.kind, capture.gain_db)):
+        kind, gain = group[0].kind, group[0].gain_db
+        stated = "without gain_db (taken as 0 dB)" if gain is None else f"at {gain:g} dB"
+        ids = group[0].id if len(group) == 1 else f"{group[0].id} .. {group[-1].id}"
+        listed.append(f"{len(group)} {kind}{'s' if len(group) > 1 else ''} {stated} ({ids})")
+    what = ", ".join(listed)
+    return [f"fitted at {gain_db:g} dB, the gain of most flats: {what} left out; fit them in a set of their own"]
 
 
 def _mean_c(captures: Sequence[Capture]) -> float | None:

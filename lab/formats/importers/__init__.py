@@ -11,11 +11,12 @@ from pathlib import Path
 
 from lab.errors import InputError
 from lab.formats.importers.emva1288 import read_emva1288
+from lab.formats.importers.fits_folder import read_fits_folder
+from lab.formats.importers.frame_settings import HeaderChoice, parse_choice
 from lab.formats.importers.raw_folder import (
     read_boards,
     read_checkerboard_pairs,
     read_dot_grids,
-    read_fits_folder,
     read_raw_folder,
 )
 from lab.formats.importers.single_picture import ImportOptions, read_colour_chart, read_slanted_edge
@@ -47,9 +48,13 @@ class Importer:
     of_a_folder: bool = False
 
 
+def _choice(options: ImportOptions) -> HeaderChoice:
+    return parse_choice(options.only or "", options.ignore or "")
+
+
 def _raw_folder(path: Path, options: ImportOptions) -> RecordingSet:
     if options.checkerboard is None:
-        return read_raw_folder(path, options.tap or "")
+        return read_raw_folder(path, options.tap or "", _choice(options))
     if not options.square_mm:
         raise InputError("--checkerboard: state --square-mm, the side of its squares")
     return read_checkerboard_pairs(path, options.checkerboard, options.square_mm)
@@ -72,13 +77,16 @@ def _checkerboards(path: Path, options: ImportOptions) -> RecordingSet:
     return read_boards(path, "none", options.checkerboard, options.square_mm)
 
 
+_HEADERS = frozenset({"--only", "--ignore"})
 _PICTURE = frozenset({"--camera", "--exposure-s", "--transfer"})
 #: `--from KIND` -> its importer.
 KINDS: dict[str, Importer] = {
     "emva1288": Importer(lambda path, _: read_emva1288(path)),
-    "raw-folder": Importer(_raw_folder, frozenset({"--checkerboard", "--square-mm", "--tap"}), of_a_folder=True),
+    "raw-folder": Importer(_raw_folder, _HEADERS | {"--checkerboard", "--square-mm", "--tap"}, of_a_folder=True),
     "fits": Importer(
-        lambda path, options: read_fits_folder(path, options.tap or ""), frozenset({"--tap"}), of_a_folder=True
+        lambda path, options: read_fits_folder(path, options.tap or "", _choice(options)),
+        _HEADERS | {"--tap"},
+        of_a_folder=True,
     ),
     "slanted-edge": Importer(read_slanted_edge, _PICTURE | {"--channel"}, of_a_file=True),
     "colorchecker": Importer(read_colour_chart, _PICTURE | {"--corners", "--light", "--white-patch"}, of_a_file=True),

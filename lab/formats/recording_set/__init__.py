@@ -17,7 +17,7 @@ from lab.formats.recording_set.manifest import (
     parse_manifest,
     text_problems,
 )
-from lab.formats.recording_set.recordings import RecordingSet
+from lab.formats.recording_set.recordings import RecordingSet, frame_problem
 
 __all__ = [
     "RAWS",
@@ -35,6 +35,7 @@ __all__ = [
     "archive",
     "clipped_share",
     "differences",
+    "frame_problem",
     "inspect",
     "load_frame",
     "manifest_json",

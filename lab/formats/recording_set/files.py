@@ -10,10 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 import rawpy
-import tifffile
 from numpy.typing import NDArray
 
 from lab.errors import InputError, one_line
+from lab.formats.pictures import picture_facts, read_picture
 from lab.formats.recording_set.manifest import DataSheet
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.spectrum import Spectrum
@@ -101,27 +101,20 @@ def _load_npy(file: Path, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
 def _load_tif(file: Path, wanted: tuple[int, int] | None = None) -> NDArray[Any]:
     """Return a TIFF of one page, 16 bit, one sample a pixel. One of another shape than `wanted` isn't decoded: it may
     be far larger than its file."""
-    frame = None
-    try:
-        with tifffile.TiffFile(file) as tif:
-            pages, page = len(tif.pages), tif.pages[0]
-            shape, dtype = tuple(page.shape), np.dtype(page.dtype)
-            if pages == 1 and dtype == np.uint16 and len(shape) == 2 and wanted in (None, shape):
-                frame = np.ascontiguousarray(page.asarray())
-    except Exception as error:
-        raise InputError(f"damaged TIFF ({one_line(error)}); write it again or recapture") from error
-    if pages != 1:
-        raise InputError(f"has {pages} pages, not 1; save one file a frame")
-    if dtype != np.uint16:
-        raise InputError(f"its samples are {dtype}, not uint16; save raw DN as 16 bit")
-    if frame is None and len(shape) == 2 and wanted is not None:
+    facts = picture_facts(file)
+    shape = facts.shape or ()
+    if facts.pages != 1:
+        raise InputError(f"has {facts.pages} pages, not 1; save one file a frame")
+    if facts.dtype != np.uint16:
+        raise InputError(f"its samples are {facts.dtype}, not uint16; save raw DN as 16 bit")
+    if len(shape) != 2:
+        raise InputError(f"has the shape {shape}, not (rows, cols); save the mosaic, not colours")
+    if wanted is not None and wanted != shape:
         raise InputError(
             f"{shape[0]} x {shape[1]} pixels (rows x cols), but the manifest says {wanted[0]} x {wanted[1]}; "
             "recapture, or correct rows and cols"
         )
-    if frame is None:
-        raise InputError(f"has the shape {shape}, not (rows, cols); save the mosaic, not colours")
-    return frame
+    return read_picture(file)
 
 
 def _load_raw(file: Path, shape: tuple[int, int] | None = None) -> NDArray[Any]:
