@@ -1,0 +1,127 @@
+"""The step of a camera's codes: 1 DN, or more where fewer bits are stored left-aligned or scaled to more.
+
+It is found from the frames, whatever a manifest states: rounding to multiples of a step s has a variance of s^2 / 12.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.capture_kinds.base import Capture
+from lab.formats.recording_set import RecordingSet
+from sim.camera import Side
+
+Counts = NDArray[np.int64]
+
+CODES = 1 << 16  # of 16 bits
+#: Share of the pixels whose codes are left out, the rarest first: pixels that were replaced after the conversion, and
+#: full scale that isn't a multiple.
+RAREST_SHARE = 1e-3
+#: Probability that codes of a step of 1 DN look like those of a larger one by chance.
+CHANCE = 1e-6
+#: Pixels of a frame that are counted, at most: a million hold every code that matters.
+MOST_PIXELS = 1 << 20
+
+
+@dataclass(frozen=True)
+class CodeStep:
+    """Step of the codes of one camera, DN, and the rest that all codes have modulo a whole step.
+
+    `coarser`: captures whose own step, `their_step_dn`, is larger than that of all frames together: of another setting,
+    or of a converter whose steps grow.
+    """
+
+    step_dn: float = 1.0
+    offset_dn: int = 0
+    coarser: tuple[str, ...] = ()
+    their_step_dn: float = 1.0
+
+    def highest_dn(self, limit_dn: float) -> float:
+        """Return the highest code up to `limit_dn`: 65520 of multiples of 16 in 16 bits."""
+        if self.step_dn == 1.0 or not self.step_dn.is_integer():
+            return limit_dn
+        return limit_dn - (limit_dn - self.offset_dn) % self.step_dn
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What was found, in one line each; none of codes of 1 DN."""
+        found = []
+        if self.step_dn > 1.0:
+            exact = self.step_dn.is_integer()
+            bits = round(float(np.log2(self.step_dn)))
+            aligned = f", as codes shifted up by {bits} bits are" if exact and 2**bits == self.step_dn else ""
+            found.append(
+                f"the codes lie {self.step_dn:.5g} DN apart{aligned}: rounding counts with this step (a variance of "
+                f"{self.step_dn**2 / 12.0:.3g} DN^2), and levels in DN are those of the stored codes"
+            )
+        if self.coarser:
+            more = f" and {len(self.coarser) - 3} more" if len(self.coarser) > 3 else ""
+            found.append(
+                f"the codes of {', '.join(self.coarser[:3])}{more} lie {self.their_step_dn:.5g} DN apart, those of the "
+                f"other frames {self.step_dn:.5g} DN: rounding counts with {self.step_dn:.5g} DN; give frames of one "
+                "read-out mode and bit depth"
+            )
+        return tuple(found)
+
+
+def find_code_step(recordings: RecordingSet, side: Side) -> CodeStep:
+    """Return the step of the codes of `side`, from one frame of each setting."""
+    first: dict[str, Capture] = {}
+    for capture in recordings.captures(side=side):
+        setting = capture.model_dump(mode="json", exclude={"id", "frame", "time", "temperature_c"})
+        first.setdefault(json.dumps(setting, sort_keys=True), capture)
+    total = np.zeros(CODES, np.int64)
+    own: dict[str, float] = {}
+    for capture in first.values():
+        counts = count_codes(recordings.frame(capture))
+        own[capture.id] = step_of(counts)
+        total += counts
+    step_dn = step_of(total)
+    coarser = {id: step for id, step in own.items() if step >= 2.0 * step_dn}
+    offset_dn = int(np.argmax(total)) % int(step_dn)
+    return CodeStep(step_dn, offset_dn, tuple(coarser), max(coarser.values(), default=1.0))
+
+
+def under_highest_code(recordings: RecordingSet, side: Side, code: CodeStep) -> RecordingSet:
+    """Return the recordings with the highest code of the step as the camera's white level."""
+    camera, manifest = recordings.camera(side), recordings.manifest
+    highest_dn = code.highest_dn(camera.saturation_dn)
+    if highest_dn == camera.saturation_dn:
+        return recordings
+    cameras = manifest.cameras | {side: camera.model_copy(update={"white_level_dn": highest_dn})}
+    return recordings.under(manifest.model_copy(update={"cameras": cameras}))
+
+
+def count_codes(frame: NDArray[np.uint16]) -> Counts:
+    """Return how often each code comes (65536,), in at most about `MOST_PIXELS` pixels: whole rows, evenly spaced by an
+    odd number."""
+    apart = -(-frame.size // MOST_PIXELS)
+    return np.bincount(frame[:: apart + (apart % 2 == 0)].ravel(), minlength=CODES)
+
+
+def step_of(counts: Counts) -> float:
+    """Return the step of codes of which `counts` (65536,) come, DN; 1 where they don't tell.
+
+    The greatest common divisor g of their differences is the step. Codes that were scaled to more bits and rounded have
+    g = 1, but no two nearer than their step d: then it is the mean of the differences of d and d + 1.
+
+    Codes of a step of 1 DN that lie anywhere have n codes in one class modulo g by a chance of g^(1 - n), and no two of
+    n codes over a range R nearer than d by one of exp(-n^2 (d - 1) / R). The step counts where that is below `CHANCE`.
+    """
+    codes = np.flatnonzero(counts)
+    rarest = codes[np.argsort(counts[codes], kind="stable")]
+    left_out = np.searchsorted(np.cumsum(counts[rarest]), RAREST_SHARE * counts.sum(), side="right")
+    codes = np.sort(rarest[left_out:])
+    if codes.size < 2:
+        return 1.0
+    apart = np.diff(codes)
+    common, nearest = int(np.gcd.reduce(apart)), int(apart.min())
+    if common > 1:
+        return float(common) if (codes.size - 1) * np.log(common) > -np.log(CHANCE) else 1.0
+    if nearest > 1 and codes.size**2 * (nearest - 1) / float(codes[-1] - codes[0]) > -np.log(CHANCE):
+        return float(apart[apart <= nearest + 1].mean())
+    return 1.0
