@@ -12,15 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.base import Capture
+from lab.capture_kinds.dark import DarkCapture
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
 Counts = NDArray[np.int64]
 
 CODES = 1 << 16  # of 16 bits
-#: Share of the pixels whose codes are left out, the rarest first: pixels that were replaced after the conversion, and
-#: full scale that isn't a multiple.
-RAREST_SHARE = 1e-3
+#: Share of the pixels whose codes may be none of the step: pixels that were replaced after the conversion.
+OFF_SHARE = 1e-3
+#: Shares of the pixels whose codes, the most frequent first, give the step in turn.
+CORE_SHARES = (0.9, 0.99, 1.0)
 #: Probability that codes of a step of 1 DN look like those of a larger one by chance.
 CHANCE = 1e-6
 #: Pixels of a frame that are counted, at most: a million hold every code that matters.
@@ -78,9 +80,9 @@ def find_code_step(recordings: RecordingSet, side: Side) -> CodeStep:
     own: dict[str, float] = {}
     for capture in first.values():
         counts = count_codes(recordings.frame(capture))
-        own[capture.id] = step_of(counts)
+        own[capture.id] = step_of(counts, has_one_mode=isinstance(capture, DarkCapture))
         total += counts
-    step_dn = step_of(total)
+    step_dn = step_of(total, has_one_mode=all(isinstance(capture, DarkCapture) for capture in first.values()))
     coarser = {id: step for id, step in own.items() if step >= 2.0 * step_dn}
     offset_dn = int(np.argmax(total)) % int(step_dn)
     return CodeStep(step_dn, offset_dn, tuple(coarser), max(coarser.values(), default=1.0))
@@ -103,25 +105,41 @@ def count_codes(frame: NDArray[np.uint16]) -> Counts:
     return np.bincount(frame[:: apart + (apart % 2 == 0)].ravel(), minlength=CODES)
 
 
-def step_of(counts: Counts) -> float:
+def step_of(counts: Counts, *, has_one_mode: bool = False) -> float:
     """Return the step of codes of which `counts` (65536,) come, DN; 1 where they don't tell.
 
-    The greatest common divisor g of their differences is the step. Codes that were scaled to more bits and rounded have
-    g = 1, but no two nearer than their step d: then it is the mean of the differences of d and d + 1.
+    The greatest common divisor g of the differences of the frequent codes is the step, where almost all pixels have
+    codes of it. Codes that were scaled to more bits and rounded have g = 1, but no two nearer than their step d: then
+    it is the mean of the differences of d and d + 1. The highest code isn't looked at: full scale may be no multiple.
 
     Codes of a step of 1 DN that lie anywhere have n codes in one class modulo g by a chance of g^(1 - n), and no two of
     n codes over a range R nearer than d by one of exp(-n^2 (d - 1) / R). The step counts where that is below `CHANCE`.
+    `has_one_mode`: the pixels' distribution has one mode, as that of a dark. Then a code between the most frequent and
+    another is expected at least as often as that other, and none comes by a chance of exp(-count): three codes suffice.
     """
-    codes = np.flatnonzero(counts)
-    rarest = codes[np.argsort(counts[codes], kind="stable")]
-    left_out = np.searchsorted(np.cumsum(counts[rarest]), RAREST_SHARE * counts.sum(), side="right")
-    codes = np.sort(rarest[left_out:])
+    codes = np.flatnonzero(counts)[:-1] if not has_one_mode else np.flatnonzero(counts)
     if codes.size < 2:
         return 1.0
-    apart = np.diff(codes)
-    common, nearest = int(np.gcd.reduce(apart)), int(apart.min())
-    if common > 1:
-        return float(common) if (codes.size - 1) * np.log(common) > -np.log(CHANCE) else 1.0
-    if nearest > 1 and codes.size**2 * (nearest - 1) / float(codes[-1] - codes[0]) > -np.log(CHANCE):
-        return float(apart[apart <= nearest + 1].mean())
+    number = counts[codes]
+    frequent = np.argsort(-number, kind="stable")
+    covered = np.cumsum(number[frequent])
+    for share in CORE_SHARES:
+        core = np.sort(codes[frequent[: int(np.searchsorted(covered, share * covered[-1])) + 1]])
+        apart = np.diff(core)
+        if not apart.size:
+            continue
+        common, nearest = int(np.gcd.reduce(apart)), int(apart.min())
+        if common > 1:
+            on = (codes - core[0]) % common == 0
+            is_sure = (np.count_nonzero(on) - 1) * np.log(common) > -np.log(CHANCE)
+            if has_one_mode and np.count_nonzero(on) > 2:
+                is_sure = is_sure or float(np.sort(number[on])[:-1].sum()) > -np.log(CHANCE)
+            step_dn = float(common)
+        else:
+            off = np.abs(codes[:, None] - core[np.searchsorted(core, codes).clip(1, core.size - 1)[:, None] - [1, 0]])
+            on = (off.min(axis=1) == 0) | (off.min(axis=1) >= nearest)
+            is_sure = core.size**2 * (nearest - 1) / float(core[-1] - core[0]) > -np.log(CHANCE)
+            step_dn = float(apart[apart <= nearest + 1].mean())
+        if is_sure and number[~on].sum() <= OFF_SHARE * covered[-1]:
+            return step_dn
     return 1.0

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -175,7 +174,8 @@ def read_emva1288(path: Path) -> RecordingSet:
         )
     captures, frames, pages, remarks = _captures(there)
     warnings += [f"{file}: {remark}" for remark in remarks]
-    shape, shift = _shape_and_shift(frames, pages, descriptor, file, warnings)
+    brightest = max(captures, key=lambda one: (one.get("photons_per_pixel") or 0.0, one["exposure_s"]))["frame"]
+    shape, shift = _shape_and_shift(frames[brightest], pages.get(brightest), descriptor, file, warnings)
     cameras = read_camera_file(
         file.parent / "camera.toml",
         {"left": {"rows": shape[0], "cols": shape[1], "cfa": "MONO", "bit_depth": descriptor.bits or 16}},
@@ -219,16 +219,16 @@ def read_emva1288(path: Path) -> RecordingSet:
 
 
 def _shape_and_shift(
-    frames: Mapping[str, Path],
-    pages: Mapping[str, int],
+    first: Path,
+    page: int | None,
     descriptor: ImageDescriptor,
     file: Path,
     warnings: list[str],
 ) -> tuple[tuple[int, int], int]:
-    """Rows and columns of the images, and by how many bits the values are shifted up in their 16-bit container."""
-    path, first = next(iter(frames.items()))
+    """Rows and columns of the images, and by how many bits the values are shifted up in their 16-bit container, by an
+    image of the brightest level."""
     try:
-        frame = read_image(first, pages.get(path))
+        frame = read_image(first, page)
     except InputError as error:
         raise InputError(f"{first}: {error}") from error
     rows, cols = frame.shape
