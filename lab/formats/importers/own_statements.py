@@ -64,8 +64,10 @@ def sensor_facts(file: Path, shape: tuple[int, int] | None = None) -> SensorFact
         with rawpy.imread(str(file)) as raw:
             turned = RAW_TURNS.get(int(raw.sizes.flip), 1)
             levels = tuple(float(level) for level in raw.black_level_per_channel)
-            if raw.raw_pattern is None:  # one sample a pixel without colours
-                return SensorFacts(None, None, levels, float(raw.white_level), turned)
+            if raw.raw_pattern is None or raw.num_colors == 1:
+                return SensorFacts(
+                    "MONO" if raw.num_colors == 1 else None, None, levels, float(raw.white_level), turned
+                )
             period, names = raw.raw_pattern.shape, raw.color_desc.decode()
             # LibRaw's colours count from the visible area
             is_visible = shape in (None, (raw.sizes.height, raw.sizes.width))

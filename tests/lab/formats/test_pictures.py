@@ -127,7 +127,7 @@ def test_each_page_of_a_stack_is_a_picture(tmp_path: Path, kind: str) -> None:
 
 def test_pages_that_are_no_frames_of_one_kind_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "c.tif", codes(12, (3, 2, 20, 30)), imagej=True, metadata={"axes": "TCYX"})
-    with pytest.raises(InputError, match="has 2 channels as pages"):
+    with pytest.raises(InputError, match="has 2 pages that it calls channels"):
         picture_facts(tmp_path / "c.tif")
     with tifffile.TiffWriter(tmp_path / "s.tif") as writer:
         for shape in ((20, 30), (10, 30)):
