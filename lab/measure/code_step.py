@@ -27,6 +27,8 @@ CORE_SHARES = (0.9, 0.99, 1.0)
 CHANCE = 1e-6
 #: Pixels of a frame that are counted, at most: a million hold every code that matters.
 MOST_PIXELS = 1 << 20
+#: Frames that are looked at, at most: evenly over the settings.
+MOST_FRAMES = 64
 
 
 @dataclass(frozen=True)
@@ -71,18 +73,21 @@ class CodeStep:
 
 
 def find_code_step(recordings: RecordingSet, side: Side) -> CodeStep:
-    """Return the step of the codes of `side`, from one frame of each setting."""
+    """Return the step of the codes of `side`, from one frame of each setting, of `MOST_FRAMES` settings at most."""
     first: dict[str, Capture] = {}
     for capture in recordings.captures(side=side):
         setting = capture.model_dump(mode="json", exclude={"id", "frame", "time", "temperature_c"})
         first.setdefault(json.dumps(setting, sort_keys=True), capture)
+    chosen = list(first.values())
+    if len(chosen) > MOST_FRAMES:
+        chosen = [chosen[int(k)] for k in np.linspace(0, len(chosen) - 1, MOST_FRAMES).round()]
     total = np.zeros(CODES, np.int64)
     own: dict[str, float] = {}
-    for capture in first.values():
+    for capture in chosen:
         counts = count_codes(recordings.frame(capture))
         own[capture.id] = step_of(counts, has_one_mode=isinstance(capture, DarkCapture))
         total += counts
-    step_dn = step_of(total, has_one_mode=all(isinstance(capture, DarkCapture) for capture in first.values()))
+    step_dn = step_of(total, has_one_mode=all(isinstance(capture, DarkCapture) for capture in chosen))
     coarser = {id: step for id, step in own.items() if step >= 2.0 * step_dn}
     offset_dn = int(np.argmax(total)) % int(step_dn)
     return CodeStep(step_dn, offset_dn, tuple(coarser), max(coarser.values(), default=1.0))

@@ -157,6 +157,11 @@ def test_codes_of_an_emva_set_are_shifted_by_its_brightest_image(tmp_path: Path)
     (tmp_path / "data.txt").write_text("n 12 32 24\nd 1\ni d.png\nb 1 100\ni b.png\n")
     recordings = read_foreign("emva1288", tmp_path)
     np.testing.assert_array_equal(recordings.frame(recordings.capture("d")), noise() - 60)
+    (tmp_path / "data.txt").write_text("n 12 32 24\nd 1\ni d.png\ni e.png\nb 1 100\ni b.png\n")
+    assert cv2.imwrite(str(tmp_path / "e.png"), noise())  # not shifted: it would lose four bits
+    recordings = read_foreign("emva1288", tmp_path)
+    with pytest.raises(InputError, match="its codes aren't multiples of 16"):
+        recordings.frame(recordings.capture("e"))
 
 
 def test_ids_of_one_name_in_several_folders_are_unique(tmp_path: Path) -> None:
