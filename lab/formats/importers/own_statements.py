@@ -99,16 +99,22 @@ def taken_from_file(stated: Collection[str], known: Mapping[str, Any], file: Pat
 
 
 def compare_with_files(
-    camera: DataSheet, stated: Collection[str], files: Iterable[Path], boards: Collection[Path] = ()
+    camera: DataSheet,
+    stated: Collection[str],
+    files: Iterable[Path],
+    boards: Collection[Path] = (),
+    *,
+    is_whole: bool = True,
 ) -> list[str]:
     """Return one line for each kind of thing that the files of a camera's frames state and that isn't as stated, or
     that changes the codes. Raises InputError where a file's own mosaic isn't the stated one.
 
-    `stated`: keys of the camera that somebody states. `boards`: files of boards, whose corners JPEG hardly moves."""
+    `stated`: keys of the camera that somebody states. `boards`: files of boards, whose corners JPEG hardly moves.
+    `is_whole`: the camera's frames are the files', not joined of the parts that taps read."""
     found: dict[str, list[Path]] = {}
     for file in dict.fromkeys(files):
         try:
-            facts = sensor_facts(file, (camera.rows, camera.cols))
+            facts = sensor_facts(file, (camera.rows, camera.cols)) if is_whole else SensorFacts()
             picture = picture_facts(file) if file.suffix.lower() in IMAGES else PictureFacts("")
         except InputError as error:
             raise InputError(f"{file}: {error}") from error
