@@ -368,7 +368,7 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
         recordings = recordings.without(copies.ids)
     exchanged = exchanged_frames(recordings, side)
     if exchanged is not None:
-        recordings = exchanged.corrected
+        recordings = recordings.without(set(exchanged.captures))
     flats = recordings.captures(FlatCapture, side)
     gain_db = most_frequent_gain_db(flats)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
