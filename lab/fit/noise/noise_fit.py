@@ -445,7 +445,7 @@ def _dark_levels(
     """Statistics of the darks, longest exposure first: it shows the hot pixels, which are left out from there on."""
     pixels = DarkPixels(camera.cfa)
     levels = []
-    drift_of = {name: drift for drift in drifts if drift.is_of_one_setting for name in drift.changing}
+    drift_of = {name: drift for drift in drifts for name in drift.changing}
     groups = _grouped(darks, lambda dark: (dark.exposure_s, rounded_c(dark.temperature_c)))
     for group in sorted(groups, key=lambda group: -group[0].exposure_s):
         stack = stack_of(recordings, group, pixels.bad)

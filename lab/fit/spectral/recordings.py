@@ -67,12 +67,7 @@ class SpectralCaptures:
         self.recordings, self.side, self.noise = recordings, side, noise
         #: Standard deviation of the mean of each repeat by a drift, DN: in the mean over the n repeats, where these
         #: count as independent, the drift's uncertainty is left whole.
-        self.drift_dn = {
-            name: one.level_dn_std * len(one.captures) ** 0.5
-            for one in drifts
-            if one.is_of_one_setting
-            for name in one.captures
-        }
+        self.drift_dn = {name: one.level_dn_std * len(one.mean_dn) ** 0.5 for one in drifts for name in one.captures}
         self.camera = recordings.camera(side)
         self.remarks: list[str] = []
         self.narrowband: list[NarrowbandCapture | FlatCapture] = [

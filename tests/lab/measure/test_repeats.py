@@ -242,6 +242,19 @@ def test_exposures_that_repeat_themselves_decide_where_another_fades() -> None:
     assert abs((fit.read_noise_e or 0.0) - 6.0) < 3.0 * (fit.read_noise_e_std or 0.0)
 
 
+def test_a_trend_that_dark_pairs_have_in_common_is_in_their_uncertainty() -> None:
+    """The second of two frames is 0.5 DN higher at every exposure."""
+    exposures_s = np.geomspace(0.01, 8.0, 24)
+    pairs = [("dark", float(t), 6.0 * float(t) + more) for t in exposures_s for more in (0.0, 1.0)]
+    recordings = captured([*pairs, *bright()], "MONO", timed=True, gain=0.5, read_e=4.0, seed=6)
+    (drift,) = find_drifts(recordings, "left", ("dark",))
+    assert not drift.is_of_one_setting
+    fit = fit_noise(recordings, "left")
+    # either frame may be the right one: 0.25 DN of each level, over 24 of them
+    assert (fit.black_level_dn_std or 0.0) >= 0.25 / np.sqrt(24)
+    assert abs((fit.dark_current_e_per_s or 0.0) - 6.0) < 3.0 * (fit.dark_current_e_per_s_std or 0.0)
+
+
 def test_a_drift_is_a_line_of_the_fit_and_a_picture_of_the_report() -> None:
     recordings, _ = drifting("a fade after the flats")
     result = fit_recording_set(recordings)
