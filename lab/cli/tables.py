@@ -90,9 +90,8 @@ def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
     for line in fit.warnings:
         out.print(f"[yellow]warning:[/] {escape(line)}")
     for side, camera in fit.cameras.items():
-        for part in (camera.noise, camera.spectral):
-            for remark in part.remarks if part else ():
-                out.print(f"{side}: {escape(remark)}")
+        for remark in camera.remarks:
+            out.print(f"{side}: {escape(remark)}")
     print_skipped(fit.skipped)
 
 

@@ -101,6 +101,8 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
     from lab.fit.noise.noise_fit import fit_noise
     from lab.fit.psf.recordings import fit_psf_field
     from lab.fit.spectral.recordings import fit_spectral
+    from lab.measure.mishaps import exchanged_frames
+    from lab.measure.repeats import find_drifts
 
     skipped: list[Skipped] = []
 
@@ -118,16 +120,19 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as pool:
         geometry = pool.submit(pinhole)
         edges_left_out: list[str] = []
-        levels = step("noise", lambda: fit_noise(recordings, side))
+        exchanged = exchanged_frames(recordings, side)
+        drifts = find_drifts(recordings, side, left_out=() if exchanged is None else exchanged.captures)
+        levels = step("noise", lambda: fit_noise(recordings, side, drifts))
         kernels = step("psf", lambda: fit_psf_field(recordings, side))
         camera = CameraFit(
             noise=levels,
-            spectral=step("spectral", lambda: fit_spectral(recordings, side, levels)),
+            spectral=step("spectral", lambda: fit_spectral(recordings, side, levels, drifts)),
             mtf=step("mtf", lambda: fit_mtf(recordings, side, levels, edges_left_out)) or (),
             psf=kernels.kernels if kernels else (),
             psf_field=kernels.parts if kernels else (),
             psf_symmetry=kernels.symmetry if kernels else None,
             geometry=geometry.result(),
+            repeat_drifts=drifts,
         )
     if camera.mtf:  # else the first is the reason why there is none
         skipped.extend(Skipped(step="mtf", reason=reason, side=side) for reason in edges_left_out)

@@ -52,14 +52,18 @@ class DarkSignal:
         return np.asarray(found)
 
     def _own(self, exposure_s: float) -> MeasuredLevel | None:
-        """Darks of that exposure, the first where there are several."""
-        alike = (level for level in self.darks if abs(level.exposure_s - exposure_s) <= 1e-6 * exposure_s)
+        """Darks of that exposure that don't drift, the first where there are several."""
+        alike = (
+            level
+            for level in self.darks
+            if level.drift is None and abs(level.exposure_s - exposure_s) <= 1e-6 * exposure_s
+        )
         return next(alike, None)
 
 
 def mean_and_std(levels: Sequence[MeasuredLevel], names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
     """Mean of each level over the planes `names`, DN, and its standard deviation: by temporal noise and rounding,
-    increased where repeats differ by more.
+    increased where repeats differ by more, and by a drift of the repeats.
     """
     means, stds, rounding, excess, freedom = [], [], [], 0.0, 0
     for level in levels:
@@ -72,13 +76,15 @@ def mean_and_std(levels: Sequence[MeasuredLevel], names: Sequence[str]) -> tuple
         means.append(float(frames.mean()))
         stds.append(np.sqrt(noise / pixels.sum()))
         if len(frames) > 1:
-            excess += float(np.sum((frames - frames.mean()) ** 2) / stds[-1] ** 2)
-            freedom += len(frames) - 1
+            rest, free = level.scatter(frames)
+            excess += float(np.sum(rest**2) / stds[-1] ** 2)
+            freedom += free
     known = np.array(stds)
     if np.isnan(known).any():
         known = np.where(np.isnan(known), np.nanmax(known) if np.isfinite(known).any() else 1.0, known)
     frame_std = known * np.sqrt(chi2_factor(excess, freedom))
-    return np.array(means), np.hypot(frame_std / np.sqrt([level.repeats for level in levels]), rounding)
+    std = np.hypot(frame_std / np.sqrt([level.repeats for level in levels]), rounding)
+    return np.array(means), np.hypot(std, [level.drift_std_dn for level in levels])
 
 
 def dark_lines(recorded: RecordedLevels, remarks: Remarks) -> dict[str | None, DarkLine]:

@@ -13,7 +13,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.dark import DarkCapture
 from lab.formats.recording_set import DataSheet
+from lab.formats.results import RepeatDrift
 from lab.measure.rounding import (
     HIDDEN_DN2,
     QUANTISATION_DN2,
@@ -380,6 +383,7 @@ class MeasuredLevel:
     `light` is proportional to the photons among the levels of the same `lamp`. `captures`: ids of the frames.
     `light_std`, `light_calibration_std`: relative standard uncertainties of `light`, of its own, and common to all
     levels of the lamp. `temperature_c`: to a degree where it groups darks; `sensor_c`: the frames' mean, not rounded.
+    `drift`: of the repeats over time, where there is one.
     """
 
     exposure_s: float
@@ -391,11 +395,27 @@ class MeasuredLevel:
     light_std: float = 0.0
     light_calibration_std: float = 0.0
     sensor_c: float | None = None
+    drift: RepeatDrift | None = None
 
     @property
     def repeats(self) -> int:
         """Number of frames."""
         return next(iter(self.plane.values())).repeats
+
+    @property
+    def drift_std_dn(self) -> float:
+        """Standard uncertainty of the mean by a drift of the repeats, DN."""
+        return 0.0 if self.drift is None else self.drift.level_dn_std
+
+    def scatter(self, frame_means: FloatArray) -> tuple[FloatArray, int]:
+        """Return frame means (n,) less their mean and less the drift in proportion, and the degrees of freedom."""
+        rest = frame_means - frame_means.mean()
+        if self.drift is None or set(self.captures) != set(self.drift.captures):
+            return rest, rest.size - 1
+        at = dict(zip(self.drift.captures, self.drift.curve_dn, strict=True))
+        curve = np.array([at[name] for name in self.captures])
+        curve -= curve.mean()
+        return rest - float(curve @ rest) / float(curve @ curve) * curve, rest.size - 2
 
 
 _NONE = np.zeros((0, 0), bool)
@@ -704,9 +724,7 @@ class RecordedLevels:
         """Choose the darks of the temperature at which most flats (or else most darks) were taken."""
         bright = tuple(sorted(flats, key=lambda level: (level.light, level.exposure_s)))
         every = tuple(sorted(darks, key=lambda level: level.exposure_s))
-        present = [level.temperature_c for level in every]
-        wanted = [rounded_c(level.temperature_c) for level in bright]
-        temperature = max(dict.fromkeys(present), key=lambda t: (wanted.count(t), present.count(t)), default=None)
+        temperature = usual_c([level.temperature_c for level in every], [level.temperature_c for level in bright])
         own = tuple(level for level in every if level.temperature_c == temperature)
         clipped = any(level.plane[name].zero_share > BLACK_CLIPPED_SHARE for level in own for name in names)
         if clipped:
@@ -715,6 +733,28 @@ class RecordedLevels:
                 "raise the black level"
             )
         return cls(camera, gain_db, defects, names, bright, every, () if clipped else own, temperature, clipped)
+
+
+def usual_c(dark_c: Sequence[float | None], bright_c: Sequence[float | None]) -> float | None:
+    """Return the temperature, to a degree, of the darks (`dark_c`) at which most bright captures were taken, or else
+    most darks."""
+    present = [rounded_c(one) for one in dark_c]
+    wanted = [rounded_c(one) for one in bright_c]
+    return max(dict.fromkeys(present), key=lambda t: (wanted.count(t), present.count(t)), default=None)
+
+
+#: Darks within this of the usual temperature belong to it: their dark current differs by 10 % (it doubles in some 7 C),
+#: and a sensor that stands between two whole degrees keeps all of its darks.
+NEAR_C = 1.0
+
+
+def darks_near(darks: Sequence[DarkCapture], bright: Sequence[Capture]) -> list[DarkCapture]:
+    """Return the darks of the temperature at which most of the captures `bright` were taken, or else most darks; all
+    where none is stated."""
+    usual = usual_c([dark.temperature_c for dark in darks], [capture.temperature_c for capture in bright])
+    if usual is None:
+        return [dark for dark in darks if dark.temperature_c is None]
+    return [dark for dark in darks if dark.temperature_c is not None and abs(dark.temperature_c - usual) <= NEAR_C]
 
 
 def rounded_c(temperature_c: float | None) -> float | None:

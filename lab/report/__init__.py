@@ -44,6 +44,7 @@ from sim.camera import Side
 
 __all__ = ["Provenance", "installed_versions", "provenance_of", "render_report", "write_report"]
 KERNELS_A_SIDE = 12
+DRIFTS_A_SIDE = 6  # the most significant of each kind come first
 
 
 @dataclass(frozen=True)
@@ -213,11 +214,11 @@ def render_report(
         "rows": rows,
         "stated": any(figure.stated is not None for _, figures in rows for figure in figures.values()),
         "implausible": fit.warnings,
-        "remarks": [
-            (side, remark)
+        "remarks": [(side, remark) for side, camera in fit.cameras.items() for remark in camera.remarks],
+        "drifts": [
+            (side, drift, charts.repeat_drift(drift))
             for side, camera in fit.cameras.items()
-            for part in (camera.noise, camera.spectral)
-            for remark in (part.remarks if part else ())
+            for drift in camera.repeat_drifts[:DRIFTS_A_SIDE]
         ],
         "transfer": {side: charts.photon_transfer(noise) if noise else None for side, noise in noises.items()},
         "sheets": list(data_sheets(recordings, fit)),

@@ -17,7 +17,15 @@ import numpy as np
 
 from lab.diagnose.measurements.block import measurement_title
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import Check, DiagnosisResult, NoiseFit, PatchComparison, ResidualCurve, SpectralFit
+from lab.formats.results import (
+    Check,
+    DiagnosisResult,
+    NoiseFit,
+    PatchComparison,
+    RepeatDrift,
+    ResidualCurve,
+    SpectralFit,
+)
 from lab.formats.results.words import measured, plain_number
 from lab.predict.validate import SensitivityCurve
 from sim.camera import Side
@@ -134,6 +142,38 @@ def photon_transfer(noise: NoiseFit) -> Figure | None:
             yaxis=axis("temporal variance above dark, DN²", range=[-0.02 * highest, highest]),
         ),
     }
+
+
+def repeat_drift(drift: RepeatDrift) -> Figure:
+    """Means of repeats over time, with the fitted curve where it changes and its standard uncertainty, DN; of several
+    settings in common, departures from each setting's mean."""
+    curve, half = np.array(drift.curve_dn), np.array(drift.curve_dn_std)
+    abscissa = "elapsed time, s" if drift.elapsed_s is not None else "number of the repeat"
+    x = list(drift.elapsed_s) if drift.elapsed_s is not None else [float(k + 1) for k in range(len(curve))]
+    points: Trace = {
+        "type": "scatter",
+        "mode": "markers",
+        "name": "mean of a frame" if drift.is_of_one_setting else "mean departure of a repeat",
+        "x": x,
+        "y": list(drift.mean_dn),
+        "error_y": _bars([drift.scatter_dn] * len(x) if drift.is_of_one_setting else half.tolist(), BEFORE),
+        "marker": {"color": BEFORE, "size": 6},
+    }
+    data = [points]
+    if drift.is_of_one_setting:
+        at = [k for k, name in enumerate(drift.captures) if name in drift.changing]
+        along = [x[k] for k in at]
+        line: Trace = {
+            "type": "scatter",
+            "mode": "lines",
+            "name": drift.shape.replace("_", "-"),
+            "x": along,
+            "y": curve[at].tolist(),
+            "line": {"color": AFTER, "width": 2},
+        }
+        data = [band(along, curve[at], half[at], AFTER), line, points]
+    title = "mean, DN" if drift.is_of_one_setting else "departure, DN"
+    return {"data": data, "layout": layout(260, xaxis=axis(abscissa), yaxis=axis(title))}
 
 
 def linearity(noise: NoiseFit) -> Figure | None:

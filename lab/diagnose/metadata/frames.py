@@ -17,7 +17,7 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.dark_frames import TEMPERATURE_STEP_C
 from lab.diagnose.measurements.dark_level import BLACK_LEVEL, DARK
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
-from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
+from lab.diagnose.metadata.misstatement import LEFT_OUT, Misstatement, restated_camera
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.formats.recording_set.files import Frame
@@ -74,7 +74,8 @@ def misstated_exposure_unit(
 def misplaced_frames(
     recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
 ) -> Misstatement | None:
-    """Pairs of darks and flats that hold each other's frames (`lab.measure.mishaps`); None where none is found."""
+    """Pairs of darks and flats that seem to hold each other's frames (`lab.measure.mishaps`); None where none is
+    found. They are left out."""
     found = exchanged_frames(recordings, side)
     if found is None:
         return None
@@ -88,7 +89,8 @@ def misplaced_frames(
         chi2_corrected=0.0,
         n=len(every),
         captures=found.captures,
-        corrected=found.corrected,
+        corrected=recordings.without(set(found.captures)),
+        correction=LEFT_OUT,
     )
 
 
@@ -123,6 +125,7 @@ def exchanged_kinds(
         n=1,
         captures=captures,
         corrected=recordings.without(set(captures)),
+        correction=LEFT_OUT,
     )
 
 

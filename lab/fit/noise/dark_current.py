@@ -206,6 +206,8 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
         own = [level.plane[name] for level in repeated]
         variance = np.array([plane.temporal_variance for plane in own])
         std = np.array([plane.temporal_variance_std for plane in own])
+        # a charge that drifts changes the shot noise by the gain times its change
+        std = np.hypot(std, e.transfer.gain * np.array([level.drift_std_dn for level in repeated]))
         if variance.min() < e.levels.hidden_dn2:
             return None, None
         line = dark_line(exposure, variance, std)
@@ -282,6 +284,11 @@ def dark_current_temperature(e: Evaluation) -> DarkCurrentLaws | None:
         if line.rate is not None:
             std = float(np.sqrt(line.covariance[1, 1]))
             found.append((temperature, line.rate / e.transfer.gain, std / e.transfer.gain))
-            own_value = ", the value given" if temperature == e.levels.temperature_c else ""
-            e.remarks.add(f"the dark current at {temperature:g} deg C is {found[-1][1]:.4g} e/s{own_value}")
-    return temperature_law(found, e.transfer.gain_std / e.transfer.gain) if found else None
+    if not found:
+        return None
+    laws = temperature_law(found, e.transfer.gain_std / e.transfer.gain)
+    columns = (laws.temperature_c, laws.dark_current_e_per_s, laws.dark_current_e_per_s_std)
+    for temperature, current, std in zip(*columns, strict=True):
+        own_value = ", the value given" if temperature == e.levels.temperature_c else ""
+        e.remarks.add(f"the dark current at {temperature:g} deg C is {current:.4g} ± {std:.2g} e/s{own_value}")
+    return laws

@@ -17,7 +17,7 @@ from scipy import special
 
 from lab.formats.results import Emva1288, Emva1288Points
 from lab.formats.results.words import measured
-from lab.measure.levels import BoolArray, MeasuredLevel, PlaneStatistics, SpatialVariance
+from lab.measure.levels import BoolArray, MeasuredLevel, SpatialVariance
 from lab.measure.rounding import QUANTISATION_DN2
 from lab.measure.weighted_lines import DarkLine, chi2_factor, dark_line, linearity, root
 from sim.spectrum import FloatArray
@@ -45,6 +45,7 @@ class EmvaInput:
     `spatial`: levels that the spatial figures may come from, all flats where it is empty. `in_photons`: `light` counts
     photons per pixel. `saturation_dn`: signal above dark taken for saturation where the flats don't reach it.
     `variance_error`, `lamp_error`: relative errors of a temporal variance beyond sampling, and of a mean.
+    `gain_dn_per_e`: by which a drift of a dark's charge changes its variance.
     """
 
     plane: str
@@ -56,6 +57,7 @@ class EmvaInput:
     variance_error: float = 0.0
     lamp_error: float = 0.0
     spatial: tuple[MeasuredLevel, ...] = ()
+    gain_dn_per_e: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -83,9 +85,12 @@ class EmvaLevels:
         self.step_dn = max((plane.step_dn for plane in (*own, *dark)), default=1.0)
         self.dark_exposure = np.array([level.exposure_s for level in self.darks])
         self.dark_variance = np.array([plane.temporal_variance for plane in dark])
-        self.dark_variance_std = np.array([plane.temporal_variance_std for plane in dark])
+        drift_dn = np.array([level.drift_std_dn for level in self.darks])
+        self.dark_variance_std = np.hypot(
+            np.array([plane.temporal_variance_std for plane in dark]), given.gain_dn_per_e * drift_dn
+        )
         self.dark_mean = np.array([plane.mean for plane in dark])
-        self.dark_mean_std = mean_std(dark)
+        self.dark_mean_std = np.hypot(mean_std(self.darks, given.plane), drift_dn)
         self.mean_line = dark_line(self.dark_exposure, self.dark_mean, self.dark_mean_std)
         self.variance_line = dark_line(self.dark_exposure, self.dark_variance, np.maximum(self.dark_variance_std, 1e-9))
         self.exposure = np.array([level.exposure_s for level in self.flats])
@@ -154,17 +159,19 @@ class EmvaLevels:
         return Measured(value, math.sqrt(square) / norm)
 
 
-def mean_std(planes: Sequence[PlaneStatistics]) -> FloatArray:
-    """Standard deviations of means of a plane: temporal noise and rounding, increased where repeats differ by more."""
+def mean_std(levels: Sequence[MeasuredLevel], name: str) -> FloatArray:
+    """Standard deviations of the means of a plane: temporal noise and rounding, increased where repeats differ by more
+    than by a drift."""
     noise, excess, freedom = [], 0.0, 0
-    for plane in planes:
+    planes = [level.plane[name] for level in levels]
+    for level, plane in zip(levels, planes, strict=True):
         least = QUANTISATION_DN2 * plane.step_dn**2
         variance = plane.temporal_variance if np.isfinite(plane.temporal_variance) else least
         noise.append(math.sqrt(max(variance, least) / plane.pixels))
         if plane.repeats > 1:
-            frames = np.array(plane.frame_means)
-            excess += float(np.sum((frames - frames.mean()) ** 2)) / noise[-1] ** 2
-            freedom += plane.repeats - 1
+            rest, free = level.scatter(np.array(plane.frame_means))
+            excess += float(np.sum(rest**2)) / noise[-1] ** 2
+            freedom += free
     widened = np.array(noise) * math.sqrt(chi2_factor(excess, freedom))
     repeats = np.sqrt([plane.repeats for plane in planes])
     return np.hypot(widened / repeats, [plane.mean_rounding_std for plane in planes])

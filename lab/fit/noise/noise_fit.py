@@ -38,12 +38,22 @@ from lab.fit.noise.response import (
 )
 from lab.formats.cgats import TableRow, table_rows
 from lab.formats.recording_set import DataSheet, RecordingSet
-from lab.formats.results import CameraFit, ChannelNoise, Emva1288, FitResult, NoiseFit, PhotonTransfer, Skipped
+from lab.formats.results import (
+    CameraFit,
+    ChannelNoise,
+    Emva1288,
+    FitResult,
+    NoiseFit,
+    PhotonTransfer,
+    RepeatDrift,
+    Skipped,
+)
 from lab.formats.results.plausible import implausible_figures
 from lab.measure.code_step import find_code_step, under_highest_code
 from lab.measure.dark_pixels import DarkPixels, read_noise_distribution, stack_of
 from lab.measure.levels import DEFECT_SIGMA, MeasuredLevel, PlaneStatistics, defective_pixels, rounded_c
 from lab.measure.mishaps import alike_planes, copied_frames, exchanged_frames
+from lab.measure.repeats import find_drifts
 from lab.measure.stated_light import StatedLight, lamps_of, light_of, most_frequent_gain_db, why_not
 from lab.measure.weighted_lines import chi2_factor, root
 from sim.camera import Side
@@ -255,6 +265,7 @@ def emva1288_by_plane(e: Evaluation) -> dict[str, Emva1288]:
             variance_error=e.transfer.model_error,
             lamp_error=e.light_scatter,
             spatial=tuple(level for level in e.levels.flats if level.lamp == lamp and level.light > 0),
+            gain_dn_per_e=e.transfer.gain,
         )
         own = emva1288_figures(given)
         if isinstance(own, str):
@@ -349,12 +360,12 @@ MIN_SIZE_PX = 16
 C = TypeVar("C", bound=Capture)
 
 
-def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
+def fit_noise(recordings: RecordingSet, side: Side, drifts: Sequence[RepeatDrift] | None = None) -> NoiseFit:
     """Photon transfer of one camera from its darks and flats (two repeats or more per level).
 
-    Flats and darks of the most frequent `gain_db` are used; the conversion gain is given for 0 dB. Every frame is read
-    once, and no more than one level is held in memory. Raises `NotDetermined` where the flats don't determine the
-    conversion gain. The method: `lab.fit.noise`.
+    Flats and darks of the most frequent `gain_db` are used; the conversion gain is given for 0 dB. `drifts`: of the
+    side's repeats over time, None: they are looked for. No more than one level is held in memory. Raises
+    `NotDetermined` where the flats don't determine the conversion gain. The method: `lab.fit.noise`.
     """
     camera = recordings.camera(side)
     flats = recordings.captures(FlatCapture, side)
@@ -371,17 +382,19 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
         recordings = recordings.without(copies.ids)
     exchanged = exchanged_frames(recordings, side)
     if exchanged is not None:
-        recordings = exchanged.corrected
+        recordings = recordings.without(set(exchanged.captures))
     flats = recordings.captures(FlatCapture, side)
     gain_db = most_frequent_gain_db(flats)
     darks = recordings.captures(DarkCapture, side)
     other_gains = _at_other_gains([*flats, *darks], gain_db)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
     darks = [dark for dark in darks if (dark.gain_db or 0.0) == gain_db]
+    if drifts is None:
+        drifts = find_drifts(recordings, side, ("dark",))
     code = find_code_step(recordings, side)
     recordings = under_highest_code(recordings, side, code)
     camera = recordings.camera(side)
-    dark_levels, pixels = _dark_levels(recordings, darks, camera, code.step_dn)
+    dark_levels, pixels = _dark_levels(recordings, darks, camera, code.step_dn, drifts)
     light = light_of(flats, camera)
     lamps = _lamps_of(recordings, flats, light)
     flat_levels = [
@@ -450,11 +463,16 @@ def _lamps_of(
 
 
 def _dark_levels(
-    recordings: RecordingSet, darks: Sequence[DarkCapture], camera: DataSheet, step_dn: float
+    recordings: RecordingSet,
+    darks: Sequence[DarkCapture],
+    camera: DataSheet,
+    step_dn: float,
+    drifts: Sequence[RepeatDrift],
 ) -> tuple[list[MeasuredLevel], DarkPixels]:
     """Statistics of the darks, longest exposure first: it shows the hot pixels, which are left out from there on."""
     pixels = DarkPixels(camera.cfa, step_dn)
     levels = []
+    drift_of = {name: drift for drift in drifts for name in drift.changing}
     groups = _grouped(darks, lambda dark: (dark.exposure_s, rounded_c(dark.temperature_c)))
     for group in sorted(groups, key=lambda group: -group[0].exposure_s):
         stack = stack_of(recordings, group, pixels.bad, step_dn)
@@ -471,7 +489,9 @@ def _dark_levels(
                 "dark",
                 stack.statistics(),
                 rounded_c(group[0].temperature_c),
+                tuple(dark.id for dark in group),
                 sensor_c=_mean_c(group),
+                drift=next((drift_of[dark.id] for dark in group if dark.id in drift_of), None),
             )
         )
     return levels, pixels

@@ -14,7 +14,7 @@ from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.measure.code_step import find_code_step
 from lab.measure.dark_pixels import stack_of
-from lab.measure.levels import BoolArray, Stack, defective_pixels, shading
+from lab.measure.levels import BoolArray, Stack, darks_near, defective_pixels, shading
 from lab.measure.rounding import QUANTISATION_DN2
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import planes
@@ -44,18 +44,21 @@ class PixelMaps:
 def pixel_maps(recordings: RecordingSet, side: Side) -> PixelMaps:
     """Maps of offset, dark current and relative gain of the pixels of `side`.
 
-    Offset and dark current: a weighted line through the dark means of each pixel against exposure. Gain: the weighted
+    Offset and dark current: a weighted line through the dark means of each pixel against exposure, of the darks of the
+    temperature at which most flats, or else most darks, were taken. Gain: the weighted
     mean over the flats between 10 and 90 % of saturation. Raises `NotDetermined` without darks.
     """
     camera = recordings.camera(side)
-    darks = sorted(_levels(recordings.captures(DarkCapture, side)), key=lambda group: -group[0].exposure_s)
+    flats = recordings.captures(FlatCapture, side)
+    own = darks_near(recordings.captures(DarkCapture, side), flats)
+    darks = sorted(_levels(own), key=lambda group: -group[0].exposure_s)
     if not darks:
         raise NotDetermined("noise", "no darks: capture two or more at each of two exposures for maps of single pixels")
     step_dn = find_code_step(recordings, side).step_dn
     offset, dark, defective = _dark_maps(recordings, darks, camera.cfa, step_dn)
     white = camera.saturation_dn - float(np.median(offset[0]))
     total, square, weight = np.zeros(offset[0].shape), 0.0, 0.0
-    for group in _levels(recordings.captures(FlatCapture, side)):
+    for group in _levels(flats):
         stack = stack_of(recordings, group, defective, step_dn)
         image = stack.image()
         signal = image - offset[0] - (dark[0] * group[0].exposure_s if dark is not None else 0.0)

@@ -574,6 +574,53 @@ class PsfSymmetry(Frozen):
 # --- The result of `calibench fit` ------------------------------------------------------------------------------------
 
 
+# --- Repeats of one setting over time ---------------------------------------------------------------------------------
+
+
+DriftShape = Literal["trend", "decay", "warm_up", "step"]
+
+
+class RepeatDrift(Frozen):
+    """What the means of repeated frames show over time beyond white scatter; how it is found: `lab.measure.repeats`.
+
+    `kind`: of the captures; `captures`: all repeats of the setting in order, `changing`: those in which the curve
+    changes. `amplitude_dn`: change of the curve from the first of these to the last. `time_constant_s`, or `_frames`
+    where captures state no time: of a decay or warm-up; `steady_dn`: the value that it approaches. `p_value`:
+    probability by chance, for the number of settings of this kind. `scatter_dn`: standard deviation about the curve;
+    `noise_dn`: that by the noise of pixels. `level_dn_std`: standard uncertainty of the setting's mean by the drift.
+    `elapsed_s`, `mean_dn`, `curve_dn`, `curve_dn_std`: of each of `captures`; of a trend that several settings have in
+    common, departures from each setting's mean by number of the repeat.
+    """
+
+    shape: DriftShape
+    kind: str
+    setting: str
+    captures: tuple[str, ...]
+    changing: tuple[str, ...]
+    amplitude_dn: float
+    amplitude_dn_std: float
+    time_constant_s: float | None = None
+    time_constant_s_std: float | None = None
+    time_constant_frames: float | None = None
+    time_constant_frames_std: float | None = None
+    steady_dn: float | None = None
+    steady_dn_std: float | None = None
+    p_value: float
+    scatter_dn: float
+    noise_dn: float
+    level_dn_std: float
+    elapsed_s: tuple[float, ...] | None = None
+    mean_dn: tuple[float, ...]
+    curve_dn: tuple[float, ...]
+    curve_dn_std: tuple[float, ...]
+    statement: str = ""
+
+    @property
+    def is_of_one_setting(self) -> bool:
+        """Whether the numbers are of the repeats of one setting, not departures that several have in common."""
+        return len(self.mean_dn) == len(self.captures)
+
+
 class CameraFit(Frozen):
     """All that was fitted of one camera; None and empty: see `FitResult.skipped`."""
 
@@ -585,6 +632,14 @@ class CameraFit(Frozen):
     psf_field: tuple[PsfKernel, ...] = ()
     psf_symmetry: PsfSymmetry | None = None
     geometry: GeometryFit | None = None
+    #: Repeats that change over time, of every capture kind.
+    repeat_drifts: tuple[RepeatDrift, ...] = ()
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the recordings show beside the figures: repeats that drift first, then what the fits report."""
+        parts = (part.remarks for part in (self.noise, self.spectral) if part is not None)
+        return (*(drift.statement for drift in self.repeat_drifts), *(remark for own in parts for remark in own))
 
 
 class FitResult(Frozen):
