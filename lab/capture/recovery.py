@@ -85,6 +85,8 @@ class Recovery:
         self._made_safe = dict(made_safe or {})
         self._store, self._connect, self._clock = store, connect, clock
         self._resume: Callable[[str], None] | None = None
+        self._note: Callable[[Station, SafeState], None] | None = None
+        self._found: list[tuple[Station, SafeState]] = []  # of which nobody was informed yet
         self._waiting: list[str] = []  # sessions that are safe and will be resumed automatically
         self._next_try_s: dict[str, tuple[float, float]] = {}  # session -> (when, the pause before it)
         self._looked, self._ended = threading.Event(), threading.Event()
@@ -97,9 +99,12 @@ class Recovery:
             self._thread.start()
         self._looked.wait(patience_s)
 
-    def resume_with(self, resume: Callable[[str], None]) -> None:
-        """Set the function that resumes a session; sessions that waited for it are resumed now."""
-        self._resume = resume
+    def resume_with(
+        self, resume: Callable[[str], None], note: Callable[[Station, SafeState], None] = lambda station, found: None
+    ) -> None:
+        """Set the functions that resume a session and that keep what a station's instruments have answered; sessions
+        that waited are resumed now."""
+        self._resume, self._note = resume, note
         self._wake.set()
 
     @property
@@ -133,6 +138,8 @@ class Recovery:
             at, _ = self._next_try_s.get(session_id, (0.0, 0.0))
             if self._clock() >= at and not self._ended.is_set():
                 self._recover(session_id)
+        while self._found and self._note is not None:
+            self._note(*self._found.pop(0))
         while self._waiting and self._resume is not None and not self._ended.is_set():
             session_id = self._waiting.pop()
             try:
@@ -152,8 +159,10 @@ class Recovery:
                 return  # it ended in good order, just now
             station = self._store.station(session_id)
             began = f"the process that ran it died (a crash, kill -9, a power cut), found {now():%Y-%m-%d %H:%M:%S} UTC"
-            complaints = () if is_safe else make_station_safe(station, self._connect).complaints
-            if complaints:
+            shutter: Shutter = "none" if station.monochromator is None else "closed"
+            safe = SafeState(shutter=shutter, at=now()) if is_safe else make_station_safe(station, self._connect)
+            self._found.append((station, safe))
+            if complaints := safe.complaints:
                 _, pause_s = self._next_try_s.get(session_id, (0.0, LOOK_S / 2))
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
                 self._next_try_s[session_id] = (self._clock() + pause_s, pause_s)

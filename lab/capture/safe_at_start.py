@@ -105,7 +105,11 @@ class _Station:
             try:
                 instrument.connect()
                 instrument.stop()
-                if said:
+                if said:  # the monochromator's
+                    if instrument.shutter_is_open():
+                        instrument.close_shutter()
+                        if instrument.shutter_is_open():
+                            raise OSError("the shutter is open though it was told to close")
                     self._tell(said)
             finally:
                 instrument.close()

@@ -51,7 +51,17 @@ from lab.capture.records import (
 from lab.capture.session_files import PACK, SessionFiles, StoredPlace
 from lab.capture.settings import Settings
 from lab.capture.station import Station
-from lab.capture.tables import CaptureRow, FileRow, KeyRow, ResultRow, SessionRow, StepRow, open_engine, upgrade
+from lab.capture.tables import (
+    CaptureRow,
+    FileRow,
+    HaltTokenRow,
+    KeyRow,
+    ResultRow,
+    SessionRow,
+    StepRow,
+    open_engine,
+    upgrade,
+)
 from lab.capture_kinds.base import CAPTURES, Capture, Step
 from lab.errors import InputError
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
@@ -630,6 +640,26 @@ class Store:
                 raise InputError(f"no API key is called {name!r}; list them for their names")
             db.delete(row)
         self._keys = (0.0, [])
+
+    def add_halt_token(self, sha256: str, key_sha256: str, expires: datetime) -> None:
+        """Register a halt token by its hash, for the key of that hash, and remove those that have expired."""
+        with self.transaction() as db:
+            db.execute(sa.delete(HaltTokenRow).where(HaltTokenRow.expires < now()))
+            db.add(HaltTokenRow(sha256=sha256, key_sha256=key_sha256, expires=expires))
+
+    def key_of_halt_token(self, sha256: str) -> tuple[str, str, str] | None:
+        """Return (name, scope, SHA-256) of the key that a halt token was made for; None where the token is unknown or
+        expired, or its key removed."""
+        asked = sa.select(KeyRow).join(HaltTokenRow, HaltTokenRow.key_sha256 == KeyRow.sha256)
+        asked = asked.where(HaltTokenRow.sha256 == sha256, HaltTokenRow.expires > now())
+        with self.reading() as db:
+            row = db.scalars(asked).first()
+            return None if row is None else (row.name, row.scope, row.sha256)
+
+    def remove_halt_token(self, sha256: str) -> None:
+        """Remove a halt token, where there is one."""
+        with self.transaction() as db:
+            db.execute(sa.delete(HaltTokenRow).where(HaltTokenRow.sha256 == sha256))
 
 
 def _searched(asked: Any, search: str, only: Sequence[str] | None) -> Any:

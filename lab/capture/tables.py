@@ -179,6 +179,17 @@ class KeyRow(Base):
     created: Mapped[datetime]
 
 
+class HaltTokenRow(Base):
+    """The hash of a token with which the operator's page halts, and of the key that it was made for (see
+    `api.security`)."""
+
+    __tablename__ = "halt_tokens"
+
+    sha256: Mapped[str] = mapped_column(sa.String(64), primary_key=True)
+    key_sha256: Mapped[str] = mapped_column(sa.ForeignKey("api_keys.sha256", ondelete="CASCADE"))
+    expires: Mapped[datetime]
+
+
 class IdempotentRow(Base):
     """A request with an idempotency key (see `api.idempotency`). `status` None: it isn't answered yet."""
 
