@@ -28,6 +28,7 @@ from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.pictures import Pictures
 from api.public_text import PublicText
+from api.room_watch import RoomWatch
 from api.routes import (
     calibrations,
     camera_models,
@@ -63,7 +64,7 @@ from lab.capture.session import Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
 from lab.challenge.kept import Challenges
-from lab.errors import InputError, one_line
+from lab.errors import CannotWrite, InputError, one_line
 from lab.jobs import JobRunner
 from lab.quick_look.process import QuickLook
 
@@ -95,7 +96,7 @@ TAGS = [
 #: Statuses that the service answers before a route is asked: a foreign Host, a method that the path hasn't, a body that
 #: is too large, a foreign Origin; and a defect.
 EVERYWHERE = (400, 405, 413, 500)
-EVERY_CHANGE = (*EVERYWHERE, 403)
+EVERY_CHANGE = (*EVERYWHERE, 403, 507)
 open_to_all = APIRouter()
 
 
@@ -110,14 +111,17 @@ def health() -> Health:
 
 @open_to_all.get("/healthz", tags=["access"], responses=answers(503))
 def ready(service: Here) -> Health:
-    """Whether the service can work: its registry answers and its data folder takes files. For a supervisor or a
-    balancer."""
+    """Whether the service can work: its registry answers, its data folder takes files, and its disk has room. Else 503
+    with the reason; halts, and what runs, don't need it. For a supervisor or a balancer."""
     try:
         service.store.under_way()
         with tempfile.TemporaryFile(dir=service.store.root):
             pass
-    except (OSError, SQLAlchemyError):
-        log.exception("not ready")
+        service.store.room.check()
+    except CannotWrite as error:
+        raise HTTPException(503, service.public(str(error))) from None
+    except (OSError, SQLAlchemyError) as error:
+        log.warning("not ready: %s", one_line(error))
         raise HTTPException(503, "the registry or the data folder can't be used; the service's log says more") from None
     return Health(version=version("calibench"))
 
@@ -142,7 +146,11 @@ async def login(service: Here, request: Request, asked: Login, response: Respons
     if key.scope is not Permission.READ:
         try:
             halt = await asyncio.to_thread(create_halt_token, service.store, key)
-        except (InputError, SQLAlchemyError) as error:  # a full disk: whoever is logged in halts with the login
+        except (
+            InputError,
+            CannotWrite,
+            SQLAlchemyError,
+        ) as error:  # a full disk: whoever is logged in halts with the login
             log.warning("no halt token for the page of %s: %s", key.name, one_line(error))
     set_cookies(response, service.gate.logins.open(key), halt, secure=request.url.scheme == "https")
     return Me(name=key.name, scope=key.scope)
@@ -153,7 +161,7 @@ def logout(service: Here, request: Request, response: Response) -> None:
     """Forget the page's login, and that it may halt."""
     service.gate.logins.close(request.cookies.get(COOKIE, ""))
     if halt := request.cookies.get(HALT_COOKIE):
-        with contextlib.suppress(InputError, SQLAlchemyError):  # the browser forgets it in any case
+        with contextlib.suppress(InputError, CannotWrite, SQLAlchemyError):  # the browser forgets it in any case
             service.store.remove_halt_token(digest(halt))
     for name in (COOKIE, HALT_COOKIE):
         response.delete_cookie(name, path="/")
@@ -211,12 +219,13 @@ def create_app(
     folder.mkdir(parents=True, exist_ok=True)
     caps = limits or Limits()
 
-    rescue = recovery or Recovery(store, connect)
+    rescue, watch = recovery or Recovery(store, connect), RoomWatch(store)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         rescue.resume_with(app.state.service.live.resume, app.state.service.live.safety.note_found)
         rescue.start()
+        watch.start()
         app.state.service.waiting.start()
         app.state.service.then.start()
         yield
@@ -227,6 +236,7 @@ def create_app(
         app.state.service.jobs.close()  # first: a job that captures ends its session itself
         app.state.service.live.close()
         app.state.service.quick_look.close()
+        await asyncio.to_thread(watch.close)
 
     shared = Shared()
     live = LiveSessions(store, connect, shared.forget)

@@ -96,8 +96,12 @@ def serve(
         if file is not None and not os.access(file, os.R_OK):
             raise InputError(f"{file}: can't be read; give a PEM file")
     from lab.capture.recovery import Recovery
+    from lab.capture.room import Room
     from lab.capture.safe_at_start import made_safe_at_start
+    from lab.capture.settings import Settings
 
+    if (lack := Room(Settings().data if data is None else data).look()) is not None:
+        typer.echo(f"calibench: {lack}; until then halts and deletions work, and nothing new is started", err=True)
     store = open_store(data)
     wanted = is_loopback(host) if create_first_key is None else create_first_key
     makes_key = wanted and not stored_keys(store)
@@ -115,7 +119,7 @@ def serve(
 
         from api.app import create_app
 
-        if makes_key:
+        if makes_key and lack is None:
             _first_key(store)
         names = {name.strip("[]").lower() for name in [*(allow_host or []), host] if name not in _ANY}
         told = {name.lower() for name in webhook_host or []}

@@ -22,7 +22,7 @@ from lab.capture.recovery import make_station_safe
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
-from lab.errors import Cancelled, DeviceError, InputError
+from lab.errors import Cancelled, CannotWrite, DeviceError, InputError
 from lab.pipeline import Capturer, CaptureRequest
 
 log = logging.getLogger(__name__)
@@ -83,7 +83,7 @@ class LiveSession:
     def _work(self, capture: CaptureSession) -> None:
         try:
             capture.run()
-        except (InputError, DeviceError) as error:
+        except (InputError, DeviceError, CannotWrite) as error:
             log.warning("session %s: %s", capture.id, error)
         except Exception:
             log.exception("session %s: a defect", capture.id)

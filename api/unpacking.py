@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-from lab.errors import InputError
+from lab.errors import InputError, NoRoom
 
 CHUNK = 1 << 20
 #: Bytes of an archive's list of files, per file that is allowed: a name of 200 and what `zip` or `tar` writes beside
@@ -38,10 +38,6 @@ _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 
 class TooMuch(InputError):
     """More than the upper limit."""
-
-
-class NoRoom(Exception):
-    """The data folder's disk hasn't the room."""
 
 
 def check_room(folder: Path, wanted_bytes: int) -> None:

@@ -13,7 +13,7 @@ from lab.capture.queue import hold_queue, put_into_queue, queue
 from lab.capture.records import now
 from lab.capture.station import Station
 from lab.capture.store import Store
-from lab.errors import InputError
+from lab.errors import CannotWrite, InputError
 
 log = logging.getLogger(__name__)
 #: How often (s) the queue is looked at.
@@ -61,6 +61,8 @@ class QueueRunner:
                 self._write_holds()
                 if self._ready():
                     self.look()
+            except CannotWrite as error:  # tried again
+                log.debug("looking at the queue: %s", error)
             except Exception:
                 log.exception("looking at the queue: a defect")
             self._wake.wait(LOOK_S)
@@ -69,6 +71,8 @@ class QueueRunner:
     def look(self) -> None:
         """Start every session whose turn has come."""
         halts = self._live.halts
+        if self._store.room.lack() is not None:  # what waits goes on waiting
+            return
         waiting = queue(self._store)
         if not waiting:
             return

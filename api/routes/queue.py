@@ -16,7 +16,7 @@ from api.routes.sessions import check_then, registered, stored_session
 from api.safety import StationSafety, key_of
 from api.schemas import Halt, Halted, HaltedStation, MayHalt, QueueEntry, QueuePlace, SessionStart, StoredSession
 from api.security import DemandHalt, TooManyFailures
-from api.service import OPERATE, OVER, READ, Here, Service, SessionId
+from api.service import OPERATE, OVER, READ, ROOM, Here, Service, SessionId
 from api.then import kept_request
 from lab.capture.catalogue import step_times
 from lab.capture.queue import leave_queue, put_into_queue, queue
@@ -105,7 +105,7 @@ def unqueue_session(service: Here, session_id: SessionId) -> list[QueueEntry]:
     return _told(service)
 
 
-@router.put("/sessions/{session_id}/request", dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422))
+@router.put("/sessions/{session_id}/request", dependencies=[OPERATE, ROOM], responses=answers(401, 403, 404, 409, 422))
 def change_request(
     service: Here, request: Request, session_id: SessionId, start: SessionStart, response: Response
 ) -> StoredSession:

@@ -20,7 +20,7 @@ from lab.capture.instruments import SafeState, Shutter, made_safe
 from lab.capture.records import now
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
-from lab.errors import DeviceError, InputError
+from lab.errors import CannotWrite, DeviceError, InputError
 
 log = logging.getLogger(__name__)
 #: Interval (s) between searches of the registry for sessions whose process died, and longest interval between attempts
@@ -88,6 +88,7 @@ class Recovery:
         self._note: Callable[[Station, SafeState], None] | None = None
         self._found: list[tuple[Station, SafeState]] = []  # of which nobody was informed yet
         self._waiting: list[str] = []  # sessions that are safe and will be resumed automatically
+        self._safe_since: dict[str, SafeState] = {}  # stations that were made safe, which couldn't be recorded yet
         self._next_try_s: dict[str, tuple[float, float]] = {}  # session -> (when, the pause before it)
         self._looked, self._ended = threading.Event(), threading.Event()
         self._wake = threading.Event()
@@ -125,6 +126,8 @@ class Recovery:
         while not self._ended.is_set():
             try:
                 self.look()
+            except CannotWrite as error:  # tried again
+                log.warning("sessions whose process ended: %s", error)
             except Exception:
                 log.exception("looking for sessions whose process ended: a defect")
             self._looked.set()
@@ -160,7 +163,9 @@ class Recovery:
             station = self._store.station(session_id)
             began = f"the process that ran it died (a crash, kill -9, a power cut), found {now():%Y-%m-%d %H:%M:%S} UTC"
             shutter: Shutter = "none" if station.monochromator is None else "closed"
-            safe = SafeState(shutter=shutter, at=now()) if is_safe else make_station_safe(station, self._connect)
+            safe = SafeState(shutter=shutter, at=now()) if is_safe else self._safe_since.get(session_id)
+            if safe is None:
+                safe = make_station_safe(station, self._connect)
             self._found.append((station, safe))
             if complaints := safe.complaints:
                 _, pause_s = self._next_try_s.get(session_id, (0.0, LOOK_S / 2))
@@ -173,11 +178,13 @@ class Recovery:
                 self._store.set_state(session_id, "running", error=said)  # so that the next look finds it
                 log.error("session %s: %s", session_id, said)
                 return
+            self._safe_since.setdefault(session_id, safe)
             self._next_try_s.pop(session_id, None)
             then, again = self._what_next(session_id, station)
             left = left_by_session(self._store.root, session_id)
             then += "" if left is None else f"; {left.words}"
             self._store.set_state(session_id, "interrupted", error=f"{began}; its station was made safe; {then}")
+            del self._safe_since[session_id]
             log.warning("session %s: %s; its station was made safe; %s", session_id, began, then)
             if again:
                 self._waiting.append(session_id)

@@ -10,6 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
+from lab.capture.room import Room, why_unwritable
 from lab.errors import InputError
 
 
@@ -222,8 +223,9 @@ def open_engine(url: str) -> sa.Engine:
         ) from error
     except sa.exc.NoSuchModuleError as error:
         raise InputError(f"registry {address!r} can't be opened ({error}); correct CALIBENCH_DATABASE_URL") from error
-    if engine.dialect.name != "sqlite":
+    if engine.dialect.name != "sqlite" or address.database is None:
         return engine
+    registry = Path(address.database)
 
     @sa.event.listens_for(engine, "connect")
     def _pragmas(connection: Any, record: Any) -> None:
@@ -236,6 +238,20 @@ def open_engine(url: str) -> sa.Engine:
         # A transaction that reads first and then writes fails, and doesn't wait, if another process wrote in between.
         writes = connection.get_execution_options().get("writes")
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+    @sa.event.listens_for(engine, "handle_error")
+    def _explain(context: sa.ExceptionContext) -> None:
+        # Of a full disk, a read-only one and another user's folder, SQLite says no more than these.
+        words = str(context.original_exception)
+        if not any(one in words for one in ("disk is full", "disk I/O error", "unable to open", "readonly database")):
+            return
+        why = why_unwritable(registry.parent, (registry,))
+        if "full" in words or "I/O" in words:
+            room = Room(registry.parent)
+            why = why or room.lack()
+            room.give_up()  # for what comes next: that a run has ended, that a session is deleted
+        if why is not None:
+            raise why from context.original_exception
 
     return engine
 

@@ -105,11 +105,12 @@ def serving(root: Path, *, limits: Limits | None = None, delay_s: float = 0.0) -
 
 
 @contextmanager
-def served(data: Path, *options: str) -> Iterator[tuple[str, subprocess.Popen[str], Path]]:
-    """The service as its own process: its address, the process, the file of its output."""
+def served(data: Path, *options: str, log: Path | None = None) -> Iterator[tuple[str, subprocess.Popen[str], Path]]:
+    """The service as its own process: its address, the process, the file of its output (by default beside the
+    data)."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    output = data.with_suffix(".log")
+    output = (log or data).with_suffix(".log")
     arguments = ["serve", "--data", str(data), "--port", str(port), *options]
     with output.open("w") as file:
         code = "import sys; from lab.cli import main; sys.exit(main(sys.argv[1:]))"
