@@ -19,7 +19,7 @@ from api.security import DemandHalt, TooManyFailures
 from api.service import OPERATE, OVER, READ, ROOM, Here, Service, SessionId
 from api.then import kept_request
 from lab.capture.catalogue import step_times
-from lab.capture.queue import leave_queue, put_into_queue, queue
+from lab.capture.queue import expected_times, leave_queue, put_into_queue, queue
 from lab.capture.records import now
 from lab.capture.station import Station
 from lab.capture.store import Store
@@ -41,21 +41,21 @@ def _told(service: Service) -> list[QueueEntry]:
     live, store = service.live, service.store
     waiting = [one for one in queue(store) if live.find(one.id) is None]
     at = now()
-    free: dict[str, datetime | None] = {}  # address -> when it is free; None: not known
+    busy_until: dict[str, datetime | None] = {}
     for session in live.running():
         left_s = session.latest.left_s if session.latest is not None else None
         until = None if left_s is None else at + timedelta(seconds=left_s)
-        free |= dict.fromkeys(session.station.addresses, until)
+        busy_until |= dict.fromkeys(session.station.addresses, until)
+    expected = expected_times(
+        waiting,
+        {one.id: store.station(one.id).addresses for one in waiting},
+        {one.id: _duration_s(store, one.id, int(at.timestamp()) // 3600) for one in waiting},
+        busy_until,
+        at,
+    )
     told = []
     for place, one in enumerate(waiting, start=1):
-        addresses = store.station(one.id).addresses
-        before = [free.get(address, at) for address in addresses]
-        start = end = None
-        if one.held is None and all(when is not None for when in before):
-            start = max(at, one.not_before or at, *(when for when in before if when is not None))
-            end = start + timedelta(seconds=_duration_s(store, one.id, int(at.timestamp()) // 3600))
-        if one.held is not None or one.not_before is None:  # who comes later on these instruments waits for it
-            free |= dict.fromkeys(addresses, end)
+        start, end = expected.get(one.id, (None, None))
         request = kept_request(store, one.id)
         told.append(
             QueueEntry(

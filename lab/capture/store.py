@@ -125,9 +125,11 @@ class Store:
         nothing."""
         if self._engine.dialect.name != "sqlite":
             return
-        with contextlib.suppress(sqlite3.Error, sa.exc.SQLAlchemyError, CannotWrite):
-            with contextlib.closing(self._engine.raw_connection()) as taken:
-                taken.cursor().execute("PRAGMA wal_checkpoint(PASSIVE)").close()
+        with (
+            contextlib.suppress(sqlite3.Error, sa.exc.SQLAlchemyError, CannotWrite),
+            contextlib.closing(self._engine.raw_connection()) as taken,
+        ):
+            taken.cursor().execute("PRAGMA wal_checkpoint(PASSIVE)").close()
 
     def look_for_room(self) -> NoRoom | None:
         """Look whether the disk has room, and what is wrong where it hasn't. The reserve makes way on a full disk, and

@@ -25,36 +25,39 @@ DARKS = {"station": "fakes", "quick": True, "sequences": ["dark"]}
 def test_a_session_waits_for_room_and_the_service_answers_what_to_do(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with small_disk(tmp_path / "disk", 8 << 10) as disk, serving(disk / "data", delay_s=0.02) as running:
-        with running.client() as client:
-            old = client.post("/api/v1/sessions", json=DARKS).json()["id"]
-            until_state(client, old, "finished")
-            session = client.post("/api/v1/sessions", json=DARKS).json()["id"]
-            until(client, f"/api/v1/sessions/{session}", lambda now: now["steps_done"] >= 2)
-            filling = fill(disk)
-            paused = until_state(client, session, "paused")
-            assert "its disk is full" in paused["error"] and "delete sessions" in paused["error"]
-            assert not running.bench.opened
-            folders = set((running.store.root / "sessions").iterdir())
-            for refused in (
-                client.post("/api/v1/sessions", json=DARKS),
-                client.post("/api/v1/sessions", json=DARKS | {"queue": True}),
-                client.patch(f"/api/v1/sessions/{old}", json={"name": "other"}),
-                client.post(f"/api/v1/sessions/{old}/jobs", json={"kind": "fit"}),
-            ):
-                assert refused.status_code == 507, refused.text
-                assert "the data folder: its disk is full" in refused.json()["detail"]
-            assert set((running.store.root / "sessions").iterdir()) == folders
-            assert client.get("/healthz").status_code == 503 and "full" in client.get("/healthz").json()["detail"]
-            assert client.get("/health").status_code == 200
-            states = {client.get(f"/api/v1/sessions/{session}").json()["state"] for _ in range(20)}
-            assert states == {"paused"}
-            assert client.delete(f"/api/v1/sessions/{old}").status_code == 204
-            assert client.get(f"/api/v1/sessions/{old}").status_code == 404
-            filling.unlink()
-            finished = until_state(client, session, "finished")
-            assert finished["error"] is None
-            until(client, "/healthz", lambda now: now.get("status") == "ok")
+    with (
+        small_disk(tmp_path / "disk", 8 << 10) as disk,
+        serving(disk / "data", delay_s=0.02) as running,
+        running.client() as client,
+    ):
+        old = client.post("/api/v1/sessions", json=DARKS).json()["id"]
+        until_state(client, old, "finished")
+        session = client.post("/api/v1/sessions", json=DARKS).json()["id"]
+        until(client, f"/api/v1/sessions/{session}", lambda now: now["steps_done"] >= 2)
+        filling = fill(disk)
+        paused = until_state(client, session, "paused")
+        assert "its disk is full" in paused["error"] and "delete sessions" in paused["error"]
+        assert not running.bench.opened
+        folders = set((running.store.root / "sessions").iterdir())
+        for refused in (
+            client.post("/api/v1/sessions", json=DARKS),
+            client.post("/api/v1/sessions", json=DARKS | {"queue": True}),
+            client.patch(f"/api/v1/sessions/{old}", json={"name": "other"}),
+            client.post(f"/api/v1/sessions/{old}/jobs", json={"kind": "fit"}),
+        ):
+            assert refused.status_code == 507, refused.text
+            assert "the data folder: its disk is full" in refused.json()["detail"]
+        assert set((running.store.root / "sessions").iterdir()) == folders
+        assert client.get("/healthz").status_code == 503 and "full" in client.get("/healthz").json()["detail"]
+        assert client.get("/health").status_code == 200
+        states = {client.get(f"/api/v1/sessions/{session}").json()["state"] for _ in range(20)}
+        assert states == {"paused"}
+        assert client.delete(f"/api/v1/sessions/{old}").status_code == 204
+        assert client.get(f"/api/v1/sessions/{old}").status_code == 404
+        filling.unlink()
+        finished = until_state(client, session, "finished")
+        assert finished["error"] is None
+        until(client, "/healthz", lambda now: now.get("status") == "ok")
     assert not [one.getMessage() for one in caplog.records if one.levelno >= logging.ERROR]
 
 
