@@ -15,7 +15,7 @@ import typer
 from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
 from lab.cli.console import Terminated
 from lab.cli.sources import open_store, store_to_read
-from lab.errors import InputError
+from lab.errors import InputError, NoRoom
 
 if TYPE_CHECKING:
     from lab.capture.store import Store
@@ -99,10 +99,22 @@ def serve(
     from lab.capture.room import Room
     from lab.capture.safe_at_start import made_safe_at_start
     from lab.capture.settings import Settings
+    from lab.capture.tables import use_alone
 
-    if (lack := Room(Settings().data if data is None else data).look()) is not None:
+    settings = Settings() if data is None else Settings(data=data)
+    if (lack := Room(settings.data).look()) is not None:
         typer.echo(f"calibench: {lack}; until then halts and deletions work, and nothing new is started", err=True)
-    store = open_store(data)
+    try:
+        store = open_store(data)
+    except NoRoom:
+        if settings.registry_file is None or not settings.registry_file.is_file():
+            raise
+        use_alone(settings.registry_file)
+        store = open_store(data)
+        typer.echo(
+            "calibench: no other process can use the registry until this one ends; restart it when there is room",
+            err=True,
+        )
     wanted = is_loopback(host) if create_first_key is None else create_first_key
     makes_key = wanted and not stored_keys(store)
     if not makes_key:

@@ -152,8 +152,9 @@ class FoundSettings:
                     os.fsync(file.fileno())
                 fresh.replace(self._file)
         except OSError as error:
+            with suppress(OSError):
+                fresh.unlink(missing_ok=True)
             raise InstrumentError(
                 f"{self._who}: its settings can't be kept in {self._file} ({error.strerror}), to be restored later; "
-                "make room, or set "
-                "CALIBENCH_DATA to a folder of yours"
+                "make room, have its permissions changed, or set CALIBENCH_DATA to another folder"
             ) from error

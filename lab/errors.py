@@ -77,6 +77,16 @@ def lacks_room(error: BaseException | None) -> bool:
     return False
 
 
+def cannot_write(place: object, error: OSError, otherwise: str) -> CannotWrite | InputError:
+    """Return that a place can't be written, with the remedy that the system's error has; `otherwise`: the remedy where
+    it is no failure of the disk or of permissions."""
+    remedy = _REMEDIES[error.errno] if error.errno in _OF_DISKS else otherwise
+    text = f"{place}: can't be written ({error.strerror}); {remedy}"
+    if error.errno in FULL:
+        return NoRoom(text)
+    return CannotWrite(text) if error.errno in _OF_DISKS else InputError(text)
+
+
 def failure_of_environment(error: BaseException) -> CannotWrite | DeviceError | None:
     """Return a failure of the disk, of permissions, of the database or of the network as an error whose text is one
     line: where, what, remedy; None for anything else, which is a defect."""

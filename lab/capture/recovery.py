@@ -123,11 +123,14 @@ class Recovery:
             self._made_safe.popitem()[1].release()
 
     def _work(self) -> None:
+        failed = False
         while not self._ended.is_set():
             try:
                 self.look()
+                failed = False
             except CannotWrite as error:  # tried again
-                log.warning("sessions whose process ended: %s", error)
+                log.log(logging.DEBUG if failed else logging.WARNING, "sessions whose process ended: %s", error)
+                failed = True
             except Exception:
                 log.exception("looking for sessions whose process ended: a defect")
             self._looked.set()

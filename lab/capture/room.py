@@ -21,32 +21,46 @@ RESERVE_BYTES = 2 << 20
 FULL_BYTES = 64 << 10
 
 
-def why_unwritable(folder: Path, files: tuple[Path, ...] = ()) -> CannotWrite | None:
-    """Return why nothing can be written into a folder and into files in it; None: it can, as far as is known."""
+#: What makes room on the disk of a data folder.
+_DELETE = (
+    "delete sessions that are no longer needed (their view on the page, DELETE /api/v1/sessions/ID), or make room on "
+    "that disk otherwise"
+)
+
+
+def why_unwritable(
+    folder: Path, files: tuple[Path, ...] = (), make_room: str = "make room there"
+) -> CannotWrite | None:
+    """Return why nothing can be written into a folder and into files in it; None: it can, as far as is known.
+    `make_room`: what makes room on its disk."""
     try:
         free_bytes = _free_bytes(folder)
         is_read_only = bool(os.statvfs(folder).f_flag & os.ST_RDONLY)
     except OSError as error:
-        return CannotWrite(f"{folder}: can't be looked at ({error.strerror}); look after its disk")
+        return CannotWrite(f"{folder}: can't be written ({error.strerror}); look after its disk")
     if is_read_only:
         return CannotWrite(
-            f"{folder}: its disk is mounted read-only, and calibench has to write there, also to read the registry; "
-            "mount it writable, or name a copy of the folder (--data, CALIBENCH_DATA)"
+            f"{folder}: can't be written, its disk is mounted read-only; mount it writable, or name another folder"
         )
     for place in (folder, *(file for file in files if file.exists())):
         if not os.access(place, os.W_OK | (os.X_OK if place == folder else 0)):
             return CannotWrite(
-                f"{place}: belongs to the user {_owner(place)}, and {_name(os.geteuid())} may not write it; run it as "
-                f"the user {_owner(place)}, or change its permissions"
+                f"{place}: can't be written by the user {_name(os.geteuid())}, it belongs to {_owner(place)}; run it "
+                f"as {_owner(place)}, have its permissions changed, or name another folder"
             )
-    return NoRoom(_full(folder, free_bytes, FULL_BYTES)) if free_bytes < FULL_BYTES else None
+    return NoRoom(_full(folder, free_bytes, FULL_BYTES, make_room)) if free_bytes < FULL_BYTES else None
 
 
-def _full(folder: Path, free_bytes: int, wanted_bytes: int) -> str:
+def why_registry_unwritable(registry: Path) -> CannotWrite | None:
+    """Return why a registry in a data folder can't be written, or read, which needs a file beside it; None: it can, as
+    far as is known."""
+    return why_unwritable(registry.parent, (registry,), _DELETE)
+
+
+def _full(folder: Path, free_bytes: int, wanted_bytes: int, make_room: str) -> str:
     return (
-        f"{folder}: its disk is full, {free_bytes / 1e6:.1f} MB are free and {wanted_bytes / 1e6:.1f} MB are needed; "
-        "delete sessions that are no longer needed (their view on the page, DELETE /api/v1/sessions/ID), or make room "
-        "on that disk otherwise"
+        f"{folder}: can't be written, its disk is full: {free_bytes / 1e6:.1f} MB are free and "
+        f"{wanted_bytes / 1e6:.1f} MB are needed; {make_room}"
     )
 
 
@@ -81,9 +95,9 @@ class Room:
         try:
             free_bytes = _free_bytes(self.folder)
         except OSError as error:
-            return NoRoom(f"{self.folder}: can't be looked at ({error.strerror}); look after its disk")
+            return NoRoom(f"{self.folder}: can't be written ({error.strerror}); look after its disk")
         needed_bytes = max(wanted_bytes, FULL_BYTES)
-        return NoRoom(_full(self.folder, free_bytes, needed_bytes)) if free_bytes < needed_bytes else None
+        return NoRoom(_full(self.folder, free_bytes, needed_bytes, _DELETE)) if free_bytes < needed_bytes else None
 
     def check(self, wanted_bytes: int = 0) -> None:
         """Raise NoRoom where the disk doesn't take `wanted_bytes` beside the reserve."""

@@ -65,7 +65,7 @@ from lab.capture.tables import (
     upgrade,
 )
 from lab.capture_kinds.base import CAPTURES, Capture, Step
-from lab.errors import CannotWrite, InputError, NoRoom
+from lab.errors import CannotWrite, InputError, NoRoom, cannot_write
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.spectrum_csv import format_spectrum
 from sim.camera import Side
@@ -87,15 +87,16 @@ class Store:
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(
-                f"{self.root}: can't be made ({error.strerror}); set CALIBENCH_DATA to a folder of yours"
-            ) from error
+            raise cannot_write(self.root, error, "set CALIBENCH_DATA to another folder") from error
         self.room = Room(self.root)
         self._engine = open_engine(self.settings.url)
         self._read = sessionmaker(self._engine, expire_on_commit=False)
         self._write = sessionmaker(self._engine.execution_options(writes=True), expire_on_commit=False)
         self._keys: tuple[float, list[tuple[str, str, str]]] = (0.0, [])
-        upgrade(self._engine, self.root)
+        try:
+            upgrade(self._engine, self.root)
+        except NoRoom:  # once more, as the reserve has made way
+            upgrade(self._engine, self.root)
         FoundSettings.keep_in(self.root / "instruments")
 
     @classmethod

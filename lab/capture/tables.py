@@ -6,11 +6,12 @@ import contextlib
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 import sqlalchemy as sa
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-from lab.capture.room import Room, why_unwritable
+from lab.capture.room import Room, why_registry_unwritable
 from lab.errors import InputError
 
 
@@ -204,6 +205,16 @@ class IdempotentRow(Base):
     body: Mapped[str | None] = mapped_column(sa.Text)
 
 
+#: Registries that this process uses alone.
+_alone: set[Path] = set()
+
+
+def use_alone(registry: Path) -> None:
+    """Have this process use a registry alone, from its next opening on: SQLite needs no room on the disk then to open
+    it. Other processes find it locked until this one ends."""
+    _alone.add(registry.resolve())
+
+
 # --- the database -----------------------------------------------------------------------------------------------------
 
 
@@ -213,6 +224,8 @@ def open_engine(url: str) -> sa.Engine:
         address = sa.make_url(url)
         if address.drivername in ("postgres", "postgresql"):
             address = address.set(drivername="postgresql+psycopg")
+        if address.get_backend_name() == "sqlite" and address.database and Path(address.database) in _alone:
+            address = address.set(database=f"file:{quote(address.database)}", query={"vfs": "unix-excl", "uri": "true"})
         # A connection that the server has closed, as after its restart, is replaced before it is used.
         engine = sa.create_engine(address, pool_pre_ping=address.get_backend_name() != "sqlite")
     except sa.exc.ArgumentError as error:
@@ -225,7 +238,7 @@ def open_engine(url: str) -> sa.Engine:
         raise InputError(f"registry {address!r} can't be opened ({error}); correct CALIBENCH_DATABASE_URL") from error
     if engine.dialect.name != "sqlite" or address.database is None:
         return engine
-    registry = Path(address.database)
+    registry = Path(unquote(address.database.removeprefix("file:")))
 
     @sa.event.listens_for(engine, "connect")
     def _pragmas(connection: Any, record: Any) -> None:
@@ -245,7 +258,7 @@ def open_engine(url: str) -> sa.Engine:
         words = str(context.original_exception)
         if not any(one in words for one in ("disk is full", "disk I/O error", "unable to open", "readonly database")):
             return
-        why = why_unwritable(registry.parent, (registry,))
+        why = why_registry_unwritable(registry)
         if "full" in words or "I/O" in words:
             room = Room(registry.parent)
             why = why or room.lack()

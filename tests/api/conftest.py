@@ -80,14 +80,16 @@ class Running:
 
 
 @contextmanager
-def serving(root: Path, *, limits: Limits | None = None, delay_s: float = 0.0) -> Iterator[Running]:
-    """The service in a thread of its own, with a key of each scope."""
+def serving(
+    root: Path, *, limits: Limits | None = None, delay_s: float = 0.0, keys: dict[str, str] | None = None, port: int = 0
+) -> Iterator[Running]:
+    """The service in a thread of its own, with a key of each scope: those of before, or fresh ones."""
     store, bench = Store(root), Bench(delay_s)
-    keys = {scope.value: create_key(store, scope.value, scope) for scope in Permission}
+    keys = keys or {scope.value: create_key(store, scope.value, scope) for scope in Permission}
     app = create_app(store, limits=limits, connect=bench.drivers)
     app.state.gate.failures = FailedKeys(most=1e6)  # all tests come from one address
     (store.root / "stations" / "fakes.toml").write_text(STATION)
-    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="warning", ws="none", timeout_graceful_shutdown=2))
+    server = uvicorn.Server(uvicorn.Config(app, port=port, log_level="warning", ws="none", timeout_graceful_shutdown=2))
     thread = threading.Thread(target=server.run)
     thread.start()
     try:

@@ -46,7 +46,7 @@ def test_a_session_waits_for_room_and_the_service_answers_what_to_do(
             client.post(f"/api/v1/sessions/{old}/jobs", json={"kind": "fit"}),
         ):
             assert refused.status_code == 507, refused.text
-            assert "the data folder: its disk is full" in refused.json()["detail"]
+            assert "the data folder: can't be written, its disk is full" in refused.json()["detail"]
         assert set((running.store.root / "sessions").iterdir()) == folders
         assert client.get("/healthz").status_code == 503 and "full" in client.get("/healthz").json()["detail"]
         assert client.get("/health").status_code == 200
