@@ -152,7 +152,7 @@ function showStartButton(station) {
 }
 
 form.addEventListener("change", () => showStart());
-form.addEventListener("submit", told("live-problem", async () => {
+form.addEventListener("submit", told("start-problem", async () => {
   const fields = form.elements;
   const at = fields.not_before.value ? new Date(fields.not_before.value).toISOString() : null;
   const station = stations.find((s) => s.name === fields.station.value);

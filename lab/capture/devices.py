@@ -189,6 +189,7 @@ class ShutterDevice(Device):
 
     async def pause(self) -> None:
         await self.stop()
+        self.value = False
 
     def resume(self) -> None:
         """Do nothing: after a pause, each step sets the bench and opens the shutter if it needs light."""

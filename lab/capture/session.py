@@ -627,7 +627,7 @@ class CaptureSession:
             elapsed_s=time.monotonic() - self._began_s,
             left_s=self._pace.left_s(to_do) if to_do else None,
             remark=remark,
-            bench=self._instruments.state() if self._instruments is not None else None,
+            bench=self._bench(),
             asks=self._asks,
         )
         self._told = progress
@@ -636,6 +636,12 @@ class CaptureSession:
         except Exception:
             if not quietly:
                 raise
+
+    def _bench(self) -> BenchState | None:
+        """Return the state of the instruments: while the run holds them, and after that as it left them."""
+        if self._instruments is not None:
+            return self._instruments.state()
+        return BenchState(shutter_open=False) if self.safe is not None and self.safe.shutter == "closed" else None
 
     @contextlib.contextmanager
     def _signals(self) -> Iterator[threading.Event]:

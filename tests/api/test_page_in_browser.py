@@ -45,6 +45,9 @@ ALL_TEXTS = """() => { window.haltTexts = []; const place = document.getElementB
     new MutationObserver(() => window.haltTexts.push(place.textContent)).observe(place, {childList: true, characterData: true, subtree: true}) }"""  # noqa: E501
 #: Has the page show what the stations' instruments have answered by now.
 REFRESH = """async () => (await import("/static/page.js")).tellHalts(await (await fetch("/api/v1/stations")).json())"""
+#: Has nothing follow the sessions that are started: a pipeline by default.
+NOTHING_FOLLOWS = """() => { const then = document.querySelector("#start-form select[name=then]");
+    window.followed = then.value; then.value = ""; then.dispatchEvent(new Event("change", {bubbles: true})) }"""
 #: The views by their addresses, and what stands in each when it is complete. Words in capitals: ids.
 VIEWS = {
     "/": "#plan-words:has-text('3 sequences')",
@@ -141,6 +144,7 @@ class Watched:
         self.page.press("input[name=key]", "Enter")
         self.page.wait_for_selector("#view-desk:not([hidden])")
         self.page.wait_for_selector("#strip li .state:not(:empty)")
+        self.page.evaluate(NOTHING_FOLLOWS)
 
     def go(self, address: str, there: str = "") -> None:
         """Go to a view; `there`: what stands in it then."""
@@ -608,6 +612,7 @@ def test_what_waits_is_edited_and_copied_with_what_follows(browser: Any, lab: Ru
     page = watched.page
     watched.log_in(lab)
     page.wait_for_selector("#plan-words:has-text('3 sequences')")
+    assert page.evaluate("window.followed") == "pipeline"  # a session that is started gets its report
     page.fill("#start-form input[name=name]", "for the night")
     page.fill("#start-form input[name=notes]", "cold #night")
     page.fill("#start-form input[name=not_before]", "2999-01-01T20:00")
