@@ -15,7 +15,7 @@ import typer
 from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
 from lab.cli.console import Terminated
 from lab.cli.sources import open_store, store_to_read
-from lab.errors import InputError
+from lab.errors import InputError, NoRoom
 
 if TYPE_CHECKING:
     from lab.capture.store import Store
@@ -99,9 +99,25 @@ def serve(
         if file is not None and not os.access(file, os.R_OK):
             raise InputError(f"{file}: can't be read; give a PEM file")
     from lab.capture.recovery import Recovery
+    from lab.capture.room import Room
     from lab.capture.safe_at_start import made_safe_at_start
+    from lab.capture.settings import Settings
+    from lab.capture.tables import use_alone
 
-    store = open_store(data)
+    settings = Settings() if data is None else Settings(data=data)
+    if (lack := Room(settings.data).look()) is not None:
+        typer.echo(f"calibench: {lack}; until then halts and deletions work, and nothing new is started", err=True)
+    try:
+        store = open_store(data)
+    except NoRoom:
+        if settings.registry_file is None or not settings.registry_file.is_file():
+            raise
+        use_alone(settings.registry_file)
+        store = open_store(data)
+        typer.echo(
+            "calibench: no other process can use the registry until this one ends; restart it when there is room",
+            err=True,
+        )
     wanted = is_loopback(host) if create_first_key is None else create_first_key
     makes_key = wanted and not stored_keys(store)
     if not makes_key:
@@ -118,7 +134,7 @@ def serve(
 
         from api.app import create_app
 
-        if makes_key:
+        if makes_key and lack is None:
             _first_key(store)
         names = {name.strip("[]").lower() for name in [*(allow_host or []), host] if name not in _ANY}
         told = {name.lower() for name in webhook_host or []}

@@ -17,7 +17,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.expected import Expected, paths_of
-from lab.errors import DeviceError, InputError
+from lab.errors import CannotWrite, DeviceError, InputError, NoRoom, failure_of_environment
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -68,6 +68,7 @@ _MEANINGS = {
     429: "too many keys that aren't valid; `Retry-After` says when another is looked at",
     500: "a defect of calibench; its log says more",
     503: "an instrument or the data folder failed",
+    507: "the data folder's disk is full: what to do",
 }
 
 
@@ -178,7 +179,8 @@ def _refused(request: Request, error: Exception) -> Response:
 
 
 class DefectMiddleware:
-    """Turns an unexpected exception into status 500. Its text stays in the log."""
+    """Turns a failure of the disk, the registry or the network into status 507 or 503, and an unexpected exception into
+    status 500, whose text stays in the log."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -197,6 +199,11 @@ class DefectMiddleware:
         except ClientDisconnect:  # there is nobody to answer
             log.info("%s %s: the client broke off", scope.get("method"), scope.get("path"))
         except Exception as error:
+            if (failure := failure_of_environment(error)) is not None and not begun:
+                log.warning("%s %s: %s", scope.get("method"), scope.get("path"), failure)
+                status = 507 if isinstance(failure, NoRoom) else 503
+                await problem(status, scope["app"].state.public(_one_line(failure)))(scope, receive, send)
+                return
             log.exception("%s %s: a defect", scope.get("method"), scope.get("path"))
             if begun:
                 raise
@@ -208,6 +215,8 @@ def install(app: FastAPI) -> None:
     """Turn exceptions of `lab` into answers."""
     app.add_exception_handler(InputError, _answer(422))
     app.add_exception_handler(DeviceError, _answer(503))
+    app.add_exception_handler(NoRoom, _answer(507))
+    app.add_exception_handler(CannotWrite, _answer(503))
     app.add_exception_handler(Conflict, _answer(409))
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(RouterException, _refused)

@@ -14,9 +14,11 @@ import re
 import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import timedelta
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
+from lab.capture.records import now
 from lab.errors import InputError
 from lab.plain_text import escaped
 
@@ -74,6 +76,25 @@ def create_key(store: Store, name: str, scope: Permission) -> str:
     key = new_key()
     store.add_key(name, scope.value, digest(key))
     return key
+
+
+#: How long a page can halt after its last login.
+HALT_TOKEN_LIFETIME = timedelta(days=30)
+
+
+def create_halt_token(store: Store, key: StoredKey) -> str:
+    """Register a token that allows a halt and nothing else, for the holder of `key`, and return it."""
+    token = secrets.token_urlsafe(32)
+    store.add_halt_token(digest(token), key.sha256, now() + HALT_TOKEN_LIFETIME)
+    return token
+
+
+def halt_token_key(store: Store, sha256: str) -> StoredKey | None:
+    """Return the key that the halt token of this hash was made for; None where it is no longer valid, or its key may
+    only read."""
+    found = store.key_of_halt_token(sha256)
+    key = None if found is None else StoredKey(found[0], Permission(found[1]), found[2])
+    return None if key is None or key.scope is Permission.READ else key
 
 
 def holder(key: str, stored: Iterable[StoredKey]) -> StoredKey | None:

@@ -271,6 +271,12 @@ class Halt(Asked):
     station: str | None = Field(default=None, max_length=100, description="null: every station")
 
 
+class MayHalt(Schema):
+    """Whether the client may halt."""
+
+    may_halt: bool
+
+
 class HaltedStation(Schema):
     """A station after a halt."""
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-from lab.errors import InputError
+from lab.errors import InputError, NoRoom
 from lab.plain_text import complaint_of, escaped
 
 CHUNK = 1 << 20
@@ -39,10 +39,6 @@ _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 
 class TooMuch(InputError):
     """More than the upper limit."""
-
-
-class NoRoom(Exception):
-    """The data folder's disk hasn't the room."""
 
 
 def check_room(folder: Path, wanted_bytes: int) -> None:

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import EXIT_CHECK, check_writable, out, write_json
+from lab.cli.console import EXIT_CHECK, check_writable, out, warn, write_json
 from lab.cli.sources import Json, StoreFolder, store_to_read
 from lab.errors import InputError
 
@@ -121,6 +121,8 @@ def certify(
     out.print(
         escape(f"{found.id}: certified by {found.certified_by}, {len(found.judgements)} figures within limits, {until}")
     )
+    if found.limits is not None and (dependence := found.limits.dependence_on(found.id)) is not None:
+        warn((dependence,))
 
 
 def _user() -> str:

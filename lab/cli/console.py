@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -63,29 +62,36 @@ def warn(lines: tuple[str, ...]) -> None:
 
 
 def check_writable(file: Path | None) -> None:
-    """Refuse a result's file that can't be written, before the work. Raises InputError."""
+    """Refuse a result's file that can't be written, before the work. Raises InputError, or CannotWrite where the disk
+    or its permissions are why."""
     if file is None or str(file) == "-":
         return
-    if file.is_dir() or not file.parent.is_dir() or not os.access(file.parent, os.W_OK):
-        raise InputError(f"{file}: can't be written; name a file in a folder that exists and is yours")
+    if file.is_dir() or not file.parent.is_dir():
+        raise InputError(f"{file}: can't be written; name a file in a folder that exists")
+    _check_takes_files(file.parent)
 
 
 def check_folder(folder: Path | None) -> None:
-    """Refuse a folder of results that can't be made or written into, before the work. Raises InputError."""
-    if folder is None:
-        return
-    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK):
-        raise InputError(f"{folder}: can't be written into; name a folder that is yours")
+    """Refuse a folder of results that can't be made or written into, before the work. Raises as `check_writable`."""
+    if folder is not None:
+        _check_takes_files(folder.absolute())
 
 
 def check_output(path: Path) -> None:
-    """Refuse a file or folder of results that can't be made with the folders above it, before the work. Raises
-    InputError."""
-    above = path.absolute() if path.is_dir() else path.absolute().parent
-    there = next(one for one in (above, *above.parents) if one.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK):
-        raise InputError(f"{path}: can't be written; name a place that is yours")
+    """Refuse a file or folder of results that can't be made with the folders above it, before the work. Raises as
+    `check_writable`."""
+    _check_takes_files(path.absolute() if path.is_dir() else path.absolute().parent)
+
+
+def _check_takes_files(folder: Path) -> None:
+    """Raise where nothing can be written into a folder, or into the nearest one above it that exists."""
+    from lab.capture.room import why_unwritable
+
+    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
+    if not there.is_dir():
+        raise InputError(f"{folder}: can't be written into, {there} is no folder; name another place")
+    if (why := why_unwritable(there)) is not None:
+        raise why
 
 
 def write_json(result: BaseModel, file: Path | None) -> None:
@@ -105,7 +111,7 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: can't be made ({error.strerror}); name a folder that is yours") from error
+        raise InputError(f"{folder}: can't be made ({error.strerror}); name another folder") from error
 
 
 # --- The progress bar of long commands, on stderr where that is a terminal --------------------------------------------

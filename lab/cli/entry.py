@@ -19,7 +19,7 @@ from lab.cli.challenge import commands as challenge
 from lab.cli.console import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated, err, out
 from lab.cli.help import complete_help
 from lab.cli.twin import commands as twin
-from lab.errors import DeviceError, InputError, failure_of_environment
+from lab.errors import CannotWrite, DeviceError, InputError, failure_of_environment
 
 app = typer.Typer(
     name="calibench",
@@ -98,7 +98,7 @@ def main(arguments: list[str] | None = None) -> int:
         commands = command_tree()
         with _ended_as_by_ctrl_c():
             code = commands.main(arguments, prog_name="calibench", standalone_mode=False)
-    except (InputError, DeviceError) as error:
+    except (InputError, DeviceError, CannotWrite) as error:
         if os.environ.get("CALIBENCH_DEBUG"):
             traceback.print_exc()
         for line in str(error).splitlines():
@@ -117,7 +117,7 @@ def main(arguments: list[str] | None = None) -> int:
         if os.environ.get("CALIBENCH_DEBUG"):
             traceback.print_exc()
         if (told := failure_of_environment(error)) is not None:
-            err.print(f"[red]calibench:[/] {escape(told)}")
+            err.print(f"[red]calibench:[/] {escape(str(told))}")
             return EXIT_INPUT
         text = " ".join(str(error).split())
         err.print(

@@ -16,7 +16,7 @@ from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.measurements.block import measurement_title
 from lab.effect_titles import at_beginning, effect_title
-from lab.errors import InputError
+from lab.errors import cannot_write
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
 from lab.formats.recording_set.manifest import told
@@ -317,5 +317,5 @@ def write_page(file: Path, page: str) -> Path:
         with replacing(file) as partial:
             partial.write_text(page, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{file}: can't be written ({error.strerror}); name a place that is yours") from error
+        raise cannot_write(file, error, "name another place") from error
     return file
