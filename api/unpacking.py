@@ -34,6 +34,8 @@ RESERVE_BYTES = 1 << 30
 #: ones, pack less.
 MOST_RATIO, FREE_BYTES = 100, 64 << 20
 _GZIP = b"\x1f\x8b"
+#: Compressions of a .zip that aren't read.
+_METHODS = {9: "deflate64", zipfile.ZIP_BZIP2: "bzip2", zipfile.ZIP_LZMA: "lzma", 93: "zstd", 95: "xz", 98: "ppmd"}
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 
 
@@ -115,7 +117,7 @@ class _Zip(_Archive):
                 raise _no_plain_file(one.filename)
             # Another compression could take any amount of memory to undo.
             if one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                method = zipfile.compressor_names.get(one.compress_type, f"method {one.compress_type}")
+                method = _METHODS.get(one.compress_type, f"method {one.compress_type}")
                 raise InputError(
                     f"archive: {one.filename[:80]!r} is compressed by {method}, neither stored nor deflated; pack it "
                     "again with the ordinary compression of .zip (deflate)"
@@ -269,8 +271,8 @@ def _why_broken(archive: Path, error: Exception, folder: Path) -> str:
         if begin.startswith(first):
             return f"it is {name}; send a .zip, .tar or .tar.gz"
     if isinstance(error, FileExistsError | NotADirectoryError | IsADirectoryError):
-        name = Path(str(error.filename)).relative_to(folder) if error.filename else ""
-        text = f"{name} is there twice, or as a file and as a folder"[-120:]
+        place = Path(str(error.filename)).relative_to(folder) if error.filename else ""
+        text = f"{place} is there twice, or as a file and as a folder"[-120:]
         return f"can't be unpacked ({text}); pack each file once"
     plain = re.sub(r"<ZipInfo filename='(.*?)'.*?>", r"'\1'", str(error))
     text = " ".join(plain.replace(str(folder), "").split())[:120]

@@ -16,7 +16,7 @@ from pydantic import Field, ValidationError, field_validator
 from lab.capture_kinds.base import CAPTURES, AnyCapture, Capture, Open
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import InputError, one_line
-from lab.plain_text import complaints_of
+from lab.plain_text import complaints_of, escaped
 from sim.camera import Cfa, Shutter, Side
 
 # --- What each instrument was when recordings were taken: its identity, all its settings, and what couldn't be set ----
@@ -198,7 +198,10 @@ def _usable_captures(listed: list[Any], where: str, sides: Container[str], found
         if not isinstance(item, dict):
             found.problems.append(f"{at}: isn't an object; write the capture's keys")
             continue
-        at += f" ({item['id']})" if item.get("id") is not None else ""
+        at += f" ({escaped(str(item['id']))})" if item.get("id") is not None else ""
+        if lines := list(complaints_of(item)):
+            found.problems += [f"{at}: {line}" for line in lines]
+            continue
         kind = item.get("kind")
         if not isinstance(kind, str):
             found.problems.append(f"{at}: the kind is {kind!r}; write one of {', '.join(CAPTURES.names)}")
@@ -221,10 +224,10 @@ def _usable_captures(listed: list[Any], where: str, sides: Container[str], found
     return captures
 
 
-def text_problems(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line for each text of a manifest that has control characters. What instruments reported isn't asked
-    for: nobody can correct it, and it is escaped where it is shown."""
-    asked = {key: value for key, value in document.items() if key not in ("instruments", "changes")}
+def text_problems(document: Mapping[str, Any], *unasked: str) -> Iterator[str]:
+    """Yield a line for each text of a manifest that has control characters, except in the keys `unasked`. Reports of
+    instruments are never asked for: nobody can correct them, and they are escaped where they are shown."""
+    asked = {key: value for key, value in document.items() if key not in ("instruments", "changes", *unasked)}
     return complaints_of(asked, several_lines=("notes",))
 
 
@@ -241,7 +244,7 @@ def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
         given = f"format {raw.get('format')!r} version {raw.get('version')!r}"
         raise RecordingError([f"{where}: {given}, not 'calibench-recording' 1; give a recording set of that version"])
     found = Findings()
-    found.problems += [f"{where}: {line}" for line in text_problems(raw)]
+    found.problems += [f"{where}: {line}" for line in text_problems(raw, "captures")]
     listed, cameras = raw.get("captures"), raw.get("cameras")
     captures: list[Capture] = []
     if isinstance(listed, list):
