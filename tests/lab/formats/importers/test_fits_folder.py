@@ -406,6 +406,7 @@ def test_temperatures_and_problems_of_headers_reach_the_set(tmp_path: Path) -> N
     (tmp_path / "index.csv").write_text("frame,kind,temperature_c\na0.fits,dark,-10\na1.fits,dark,-9.9\n")
     read = read_fits_folder(tmp_path)
     assert [c.temperature_c for c in read.captures()] == [-10.0, -9.9]
+    assert "CCD-TEMP" not in "".join(read.warnings)
     assert any("pixel_pitch_um = 2.4 um, its FITS header says 3.76 um" in line for line in read.warnings)
     for k in range(2):
         fits.setval(tmp_path / f"a{k}.fits", "CCD-TEMP", value=20.0 + k)
