@@ -120,7 +120,10 @@ def _frames(tif: Any) -> list[Any]:
     except Exception as error:
         raise InputError(f"damaged TIFF ({one_line(error)}); write it again or recapture") from error
     if (channels := stored.get("C", 1)) > 1:
-        raise InputError(f"has {channels} channels as pages (axes {axes}); save one file a channel")
+        raise InputError(
+            f"has {channels} pages that it calls channels (axes {axes}); save repeats as frames (axis T), and "
+            "channels as a file each"
+        )
     shapes = list(dict.fromkeys(page.shape for page in pages))
     if len(shapes) > 1:
         listed = ", ".join(" x ".join(map(str, shape)) for shape in shapes[:3])

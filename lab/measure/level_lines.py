@@ -68,7 +68,7 @@ def mean_and_std(levels: Sequence[MeasuredLevel], names: Sequence[str]) -> tuple
         rounding.append(max(plane.mean_rounding_std for plane in own))  # the errors of the planes are correlated
         frames = np.average([plane.frame_means for plane in own], axis=0, weights=pixels)
         variance = np.average([plane.temporal_variance for plane in own], weights=pixels)
-        noise = max(float(variance), QUANTISATION_DN2) if np.isfinite(variance) else float("nan")
+        noise = max(float(variance), QUANTISATION_DN2 * own[0].step_dn ** 2) if np.isfinite(variance) else float("nan")
         means.append(float(frames.mean()))
         stds.append(np.sqrt(noise / pixels.sum()))
         if len(frames) > 1:
@@ -113,7 +113,7 @@ def refuse_light_darks(recorded: RecordedLevels, dark: DarkSignal) -> None:
         for name in recorded.names:
             expected = dark.lines[name].at(level.exposure_s)
             short = expected - level.plane[name].mean
-            if short > max(DARKER_SHARE * (recorded.white_dn - expected), 1.0):
+            if short > max(DARKER_SHARE * (recorded.white_dn - expected), recorded.step_dn):
                 raise NotDetermined(
                     "noise",
                     f"a flat of {level.exposure_s:g} s has {level.plane[name].mean:.0f} DN and is darker than darks "
@@ -179,9 +179,12 @@ def _clipped_flats(recorded: RecordedLevels, dark: DarkSignal, name: str) -> tup
         ratio = excess / signal if signal > 0 else np.nan
         typical = float(np.median(ratios)) if ratios else np.nan
         at_white = plane.clipped_share > CLIPPED_LIMIT
-        piled = plane.piled_share > max(PILED_LIMIT, PILED_PIXELS / plane.pixels) and plane.temporal_variance > 4.0
+        piled = (
+            plane.piled_share > max(PILED_LIMIT, PILED_PIXELS / plane.pixels)
+            and plane.temporal_variance > 4.0 * plane.step_dn**2
+        )
         saturates = signal > 0.2 * (recorded.white_dn - dark.lines[name].black) and (
-            ratio < 0.5 * typical or plane.temporal_variance < 0.01
+            ratio < 0.5 * typical or plane.temporal_variance < 0.01 * plane.step_dn**2
         )
         if at_white:
             plateau = recorded.white_dn

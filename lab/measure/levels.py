@@ -222,16 +222,16 @@ def shading(image: NDArray[F], degree: int = SHADING_DEGREE) -> NDArray[F]:
 DEFECT_SIGMA = 8.0  # a normal pattern of a million pixels doesn't reach that far
 
 
-def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa) -> BoolArray:
+def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa, step_dn: float = 1.0) -> BoolArray:
     """Pixels of a mean frame (rows, cols) beyond 8 robust standard deviations of their plane, as a mask (rows, cols).
 
-    Robust: 1.4826 times the median modulus of the residual from the smooth surface.
+    Robust: 1.4826 times the median modulus of the residual from the smooth surface. `step_dn`: step of the codes.
     """
     bad = np.zeros(image.shape, bool)
     for name, plane in planes(image, cfa).items():
         rest = plane - np.median(plane)
-        # Most pixels of a rounded plane may be equal: the least scale is then that of rounding, else a tenth of a DN
-        least = np.sqrt(QUANTISATION_DN2) if not np.median(np.abs(rest)) > 0 else 0.1
+        # Most pixels of a rounded plane may be equal: the least scale is then that of rounding, else a tenth of a step
+        least = step_dn * (np.sqrt(QUANTISATION_DN2) if not np.median(np.abs(rest)) > 0 else 0.1)
         for _ in range(2):  # glow widens the first scale, hot pixels distort the first surface
             limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), least)
             rest = rest - shading(np.clip(rest, -limit, limit))
@@ -317,7 +317,7 @@ class PlaneStatistics:
     `temporal_variance_of_all` include defects, as in EMVA 1288. `adjacent_covariance`, `diagonal_covariance`: temporal
     covariance of a pixel with one of its four neighbours along rows and columns, and across corners, on the mosaic (of
     any plane). `shading_rows`, `shading_columns`: mean of the smooth surface over the first and the last tenth of the
-    rows (columns), over `mean`, dark included.
+    rows (columns), over `mean`, dark included. `step_dn`: step of the codes.
     """
 
     pixels: int
@@ -344,6 +344,7 @@ class PlaneStatistics:
     covariance_std: float = np.nan
     shading_rows: tuple[float, float] = (1.0, 1.0)
     shading_columns: tuple[float, float] = (1.0, 1.0)
+    step_dn: float = 1.0
 
     @property
     def repeats(self) -> int:
@@ -354,8 +355,8 @@ class PlaneStatistics:
     def mean_std(self) -> float:
         """Standard deviation of `mean` by temporal noise and by rounding, DN."""
         variance = self.temporal_variance / self.repeats
-        if self.temporal_variance < HIDDEN_DN2:  # the mean of each pixel is rounded: repeats don't help
-            variance = max(variance, QUANTISATION_DN2)
+        if self.temporal_variance < HIDDEN_DN2 * self.step_dn**2:  # each pixel's mean is rounded: repeats don't help
+            variance = max(variance, QUANTISATION_DN2 * self.step_dn**2)
         return float(np.hypot(np.sqrt(variance / self.pixels), self.mean_rounding_std))
 
     @property
@@ -367,7 +368,7 @@ class PlaneStatistics:
     @property
     def mean_rounding_std(self) -> float:
         """Standard deviation of `mean` by rounding, DN, which no averaging reduces."""
-        return float(rounding_std_dn(variance_before_rounding(self.spread)))
+        return float(rounding_std_dn(variance_before_rounding(self.spread, self.step_dn), self.step_dn))
 
 
 @dataclass(frozen=True)
@@ -402,11 +403,11 @@ class Stack:
     """Repeats of one level, read one after the other.
 
     `mean`, `squares` (rows, cols): mean and sum of squared deviations over the repeats, by pixel. `bad` (rows, cols):
-    pixels to leave out.
+    pixels to leave out. `step_dn`: step of the codes.
     """
 
-    def __init__(self, cfa: Cfa, white_dn: float, bad: BoolArray | None) -> None:
-        self.cfa, self.white_dn = cfa, white_dn
+    def __init__(self, cfa: Cfa, white_dn: float, bad: BoolArray | None, step_dn: float = 1.0) -> None:
+        self.cfa, self.white_dn, self.step_dn = cfa, white_dn, step_dn
         self.period = step(cfa)
         self.bad = bad if bad is not None and bad.any() else None
         self.count = 0
@@ -436,7 +437,14 @@ class Stack:
         means = sums[1] / np.maximum(self._good, 1)
         highest, top, zero = counts[0].astype(float), counts[1] / self._sizes, counts[2] / self._sizes
         self._shares.append(
-            np.stack([np.where(highest >= self.white_dn, top, 0.0), top, np.where(means < 50, zero, 0.0), highest])
+            np.stack(
+                [
+                    np.where(highest >= self.white_dn, top, 0.0),
+                    top,
+                    np.where(means < 50 * self.step_dn, zero, 0.0),
+                    highest,
+                ]
+            )
         )
         self._frame_means.append(means)
         self._means_of_all.append(sums[0] / self._sizes)
@@ -513,7 +521,7 @@ class Stack:
         )
         spatial = (sums[2] - sums[1] ** 2 / pixels) / (pixels - 1)
         if np.isfinite(variance):
-            variance_std = float(np.hypot(variance_std, variance_rounding_std(variance, spatial - share)))
+            variance_std = float(np.hypot(variance_std, variance_rounding_std(variance, spatial - share, self.step_dn)))
         pattern, outliers = (sums[4] - sums[3] ** 2 / pixels) / (pixels - 1), 0
         good = (cols, rows) if bad.size == 0 else (cols - bad.sum(axis=1), rows - bad.sum(axis=0))
         rows_mean, cols_mean = (
@@ -569,6 +577,7 @@ class Stack:
                 float(surface[:, : tenth[1]].mean() / first[0]),
                 float(surface[:, -tenth[1] :].mean() / first[0]),
             ),
+            step_dn=self.step_dn,
         )
 
     def _covariances(self, phase: int, variance: float) -> tuple[float, float, float]:
@@ -658,6 +667,21 @@ class RecordedLevels:
     def white_dn(self) -> float:
         """Highest code."""
         return self.camera.saturation_dn
+
+    @property
+    def step_dn(self) -> float:
+        """Step of the codes, DN."""
+        return self.flats[0].plane[self.names[0]].step_dn
+
+    @property
+    def quantisation_dn2(self) -> float:
+        """Variance of rounding to the step of the codes, DN^2."""
+        return QUANTISATION_DN2 * self.step_dn**2
+
+    @property
+    def hidden_dn2(self) -> float:
+        """Variance, DN^2, below which rounding to the step of the codes hides the noise."""
+        return HIDDEN_DN2 * self.step_dn**2
 
     @classmethod
     def of(

@@ -15,7 +15,8 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import Frame, RecordingSet
+from lab.measure.code_step import count_codes, step_of
 from lab.measure.level_lines import CLIPPED_LIMIT, robust_response
 from lab.measure.stated_light import light_of, most_frequent_gain_db
 from sim.camera import Side
@@ -74,9 +75,15 @@ def copied_frames(recordings: RecordingSet, side: Side, captures: Sequence[Captu
             continue
         mark = hashlib.blake2b(frame.tobytes(), digest_size=16).digest()
         twin = first.setdefault(mark, capture)
-        if twin is not capture and twin.frame != capture.frame:
+        if twin is not capture and twin.frame != capture.frame and _is_noisy(frame):
             found.append((capture, twin))
     return CopiedFrames(side, tuple(found))
+
+
+def _is_noisy(frame: Frame) -> bool:
+    """Return whether a frame has a standard deviation of `NOISELESS_DN` steps of its codes, and can't be equal to
+    another by chance."""
+    return float(frame.std(dtype=np.float32)) >= NOISELESS_DN * step_of(count_codes(frame))
 
 
 # --- exchanged frames ----------------------------------------------------------------------------------------------

@@ -28,7 +28,6 @@ from lab.measure.edge_finding import Region
 from lab.measure.edge_mtf import ROUGHNESS_SHARE, EdgeGeometry, EdgeMtf
 from lab.measure.edges import check_phases, find_edges, measure_edge
 from lab.measure.reads import acting
-from lab.measure.rounding import rounding_waves_dn
 from lab.measure.study import Study, held_out_of
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
@@ -536,7 +535,7 @@ class _Edges:
         """
         contrast = np.array([e.measured.light_level - e.measured.dark_level for e in self.edges])[:, None]
         level_dn = np.maximum(self._light_profile * contrast, 0.0)
-        waves = rounding_waves_dn(level_dn, self._study.noise.spread_dn2(level_dn))
+        waves = self._study.noise.rounding_waves_dn(level_dn)
         base = self.predict(())
         return np.array([self._numbers(self._reported((), wave / contrast)) - base for wave in waves]).reshape(
             -1, *base.shape

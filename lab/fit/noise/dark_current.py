@@ -11,7 +11,6 @@ from lab.errors import NotDetermined
 from lab.fit.noise.evaluation import Evaluation, in_electrons, transfer_of
 from lab.formats.results import DarkCurrentLaws
 from lab.measure.level_lines import mean_and_std
-from lab.measure.rounding import HIDDEN_DN2, QUANTISATION_DN2
 from lab.measure.weighted_lines import chi2_factor, dark_line, least_squares
 from sim.parameters import Frozen
 
@@ -109,8 +108,8 @@ def temperature_law(found: Sequence[tuple[float, float, float]], gain_error: flo
 
 
 def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
-    """Read noise, e, and its standard deviation: sqrt(floor - 1/12 DN^2) / K, the floor a weighted mean over the
-    planes.
+    """Read noise, e, and its standard deviation: sqrt(floor - s^2 / 12) / K with the step s of the codes, the floor a
+    weighted mean over the planes.
 
     None where darks have no repeats, or where rounding hides the noise.
     """
@@ -119,7 +118,7 @@ def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
         if any(level.repeats > 1 for level in e.levels.darks):
             e.remarks.add(
                 "repeated dark frames are all alike: rounding hides the read noise, which is below "
-                f"{0.4 / t.gain:.2f} e"
+                f"{0.4 * e.levels.step_dn / t.gain:.2f} e"
             )
         return None, None
     count = t.floor.size
@@ -127,16 +126,16 @@ def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
     weight = 1.0 / np.diag(own)
     weight /= weight.sum()
     floor = float(weight @ t.floor)
-    if floor < HIDDEN_DN2:
+    if floor < e.levels.hidden_dn2:
         e.remarks.add(
             f"the temporal noise of dark frames is {np.sqrt(max(floor, 0)):.2f} DN, where rounding hides it: the read "
             "noise is below "
-            f"{0.4 / t.gain:.2f} e; a higher gain would show it"
+            f"{0.4 * e.levels.step_dn / t.gain:.2f} e; a higher gain would show it"
         )
         return None, None
     between = float(np.sum((t.floor - floor) ** 2 / np.diag(own)))
     gradient = np.zeros(2 + count)
-    noise = float(np.sqrt(floor - QUANTISATION_DN2))
+    noise = float(np.sqrt(floor - e.levels.quantisation_dn2))
     gradient[0] = -noise / t.gain**2
     gradient[2:] = weight / (2.0 * noise * t.gain)
     widened = t.covariance.copy()
@@ -165,7 +164,7 @@ def dark_signal_hidden(e: Evaluation) -> bool:
     Where neither noise nor pattern spreads the values over codes, their means don't follow the signal.
     """
     spread = min(level.plane[name].spread for level in e.levels.darks for name in e.levels.names)
-    if spread >= HIDDEN_DN2:
+    if spread >= e.levels.hidden_dn2:
         return False
     e.remarks.add(
         f"noise and pattern of the darks spread over {np.sqrt(spread):.2f} DN only, so rounding decides their means: "
@@ -207,7 +206,7 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
         own = [level.plane[name] for level in repeated]
         variance = np.array([plane.temporal_variance for plane in own])
         std = np.array([plane.temporal_variance_std for plane in own])
-        if variance.min() < HIDDEN_DN2:
+        if variance.min() < e.levels.hidden_dn2:
             return None, None
         line = dark_line(exposure, variance, std)
         if line.rate is not None:

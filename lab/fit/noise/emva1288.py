@@ -21,7 +21,7 @@ from lab.measure.rounding import QUANTISATION_DN2
 from lab.measure.weighted_lines import DarkLine, chi2_factor, dark_line, linearity, root
 from sim.spectrum import FloatArray
 
-HIDDEN_DN2 = 0.24  # temporal variance below which rounding hides the noise
+HIDDEN_DN2 = 0.24  # temporal variance below which rounding hides the noise, of a step of the codes of 1 DN
 HIDDEN_DN = 0.40  # the limit that is stated then
 LEAST_SIGNAL = 0.01  # of the range of the line: below, the variance is that of the dark
 EXCESS_CHANCE = 0.01  # probability below which variances aren't on a straight line
@@ -66,7 +66,7 @@ class Measured:
 
 
 class EmvaLevels:
-    """Means and variances by level, and the same less dark, (levels,) each."""
+    """Means and variances by level, and the same less dark, (levels,) each; `step_dn`: step of the codes."""
 
     def __init__(self, given: EmvaInput) -> None:
         self.given = given
@@ -74,6 +74,7 @@ class EmvaLevels:
         own = [level.plane[given.plane] for level in self.flats]
         self.darks = [level for level in given.darks if level.repeats > 1]
         dark = [level.plane[given.plane] for level in self.darks]
+        self.step_dn = max((plane.step_dn for plane in (*own, *dark)), default=1.0)
         self.dark_exposure = np.array([level.exposure_s for level in self.darks])
         self.dark_variance = np.array([plane.temporal_variance for plane in dark])
         self.dark_variance_std = np.array([plane.temporal_variance_std for plane in dark])
@@ -151,8 +152,9 @@ def mean_std(planes: Sequence[PlaneStatistics]) -> FloatArray:
     """Standard deviations of means of a plane: temporal noise and rounding, increased where repeats differ by more."""
     noise, excess, freedom = [], 0.0, 0
     for plane in planes:
-        variance = plane.temporal_variance if np.isfinite(plane.temporal_variance) else QUANTISATION_DN2
-        noise.append(math.sqrt(max(variance, QUANTISATION_DN2) / plane.pixels))
+        least = QUANTISATION_DN2 * plane.step_dn**2
+        variance = plane.temporal_variance if np.isfinite(plane.temporal_variance) else least
+        noise.append(math.sqrt(max(variance, least) / plane.pixels))
         if plane.repeats > 1:
             frames = np.array(plane.frame_means)
             excess += float(np.sum((frames - frames.mean()) ** 2)) / noise[-1] ** 2
@@ -316,16 +318,16 @@ def _dark_noise(at: EmvaLevels, gain: Measured, remarks: list[str]) -> tuple[Fig
     else:
         shortest = int(np.argmin(at.dark_exposure))
         square = Measured(float(at.dark_variance[shortest]), float(at.dark_variance_std[shortest]))
-    if square.value < HIDDEN_DN2:
-        limit_e = HIDDEN_DN / gain.value
+    hidden_dn2 = HIDDEN_DN2 * at.step_dn**2
+    if square.value < hidden_dn2:
+        limit_e = HIDDEN_DN * at.step_dn / gain.value
         remarks.append(
-            f"the dark variance is {max(square.value, 0.0):.2g} DN^2, below 0.24, where rounding hides it: the "
-            "temporal dark noise is "
-            f"below {limit_e:.3g} e"
+            f"the dark variance is {max(square.value, 0.0):.2g} DN^2, below {hidden_dn2:.3g}, where rounding hides "
+            f"it: the temporal dark noise is below {limit_e:.3g} e"
         )
         return {}, limit_e
     noise_dn = math.sqrt(square.value)
-    noise_e = math.sqrt(square.value - QUANTISATION_DN2)
+    noise_e = math.sqrt(square.value - QUANTISATION_DN2 * at.step_dn**2)
     return {
         "temporal_dark_noise_dn": Measured(noise_dn, square.std / (2.0 * noise_dn)),
         "temporal_dark_noise_e": Measured(noise_e, square.std / (2.0 * noise_e)).over(gain),
@@ -397,7 +399,7 @@ def _dark_current(at: EmvaLevels, gain: Measured, remarks: list[str]) -> Figures
         return {}
     found: Figures = {}
     mean, variance = at.mean_line, at.variance_line
-    hidden = float(at.dark_variance.min()) < HIDDEN_DN2
+    hidden = float(at.dark_variance.min()) < HIDDEN_DN2 * at.step_dn**2
     if hidden and mean.rate is not None and abs(mean.rate) < 3.0 * math.sqrt(float(mean.covariance[1, 1])):
         remarks.append("rounding hides the dark current, which the means of the darks don't show")
     elif mean.rate is not None:

@@ -26,7 +26,6 @@ from lab.measure.level_lines import (
     saturation_of,
 )
 from lab.measure.levels import LEAST_REACH, MeasuredLevel, RecordedLevels, Remarks
-from lab.measure.rounding import QUANTISATION_DN2
 from lab.measure.weighted_lines import least_squares
 from sim.spectrum import FloatArray
 
@@ -448,7 +447,7 @@ def lamp_drift(recorded: RecordedLevels, dark: DarkSignal, saturation: Saturatio
         frames = np.average([plane.frame_means for plane in planes], axis=0, weights=pixels)
         variance = float(np.average([plane.temporal_variance for plane in planes], weights=pixels))
         rounding = max(plane.mean_rounding_std for plane in planes)
-        noise = max(variance, QUANTISATION_DN2) / pixels.sum() + rounding**2
+        noise = max(variance, recorded.quantisation_dn2) / pixels.sum() + rounding**2
         signal = float(
             np.average([p.mean - dark.lines[n].black for p, n in zip(planes, own, strict=True)], weights=pixels)
         )

@@ -39,10 +39,10 @@ from lab.fit.noise.response import (
 from lab.formats.cgats import TableRow, table_rows
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import CameraFit, ChannelNoise, Emva1288, FitResult, NoiseFit, PhotonTransfer, Skipped
+from lab.measure.code_step import find_code_step, under_highest_code
 from lab.measure.dark_pixels import DarkPixels, read_noise_distribution, stack_of
 from lab.measure.levels import DEFECT_SIGMA, MeasuredLevel, PlaneStatistics, defective_pixels, rounded_c
 from lab.measure.mishaps import alike_planes, copied_frames, exchanged_frames
-from lab.measure.rounding import HIDDEN_DN2, QUANTISATION_DN2
 from lab.measure.stated_light import StatedLight, lamps_of, light_of, most_frequent_gain_db, why_not
 from lab.measure.weighted_lines import chi2_factor, root
 from sim.camera import Side
@@ -60,8 +60,8 @@ def dsnu(e: Evaluation) -> tuple[float | None, float | None]:
     if pattern is None or dark_signal_hidden(e):
         return None, None
     level, square, std = pattern
-    if min(level.plane[name].temporal_variance for name in e.levels.names) < HIDDEN_DN2:
-        std = float(np.hypot(std, QUANTISATION_DN2))  # the mean of each pixel is rounded
+    if min(level.plane[name].temporal_variance for name in e.levels.names) < e.levels.hidden_dn2:
+        std = float(np.hypot(std, e.levels.quantisation_dn2))  # the mean of each pixel is rounded
     return in_electrons(e, *root(square, std))
 
 
@@ -377,7 +377,10 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     other_gains = _at_other_gains([*flats, *darks], gain_db)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
     darks = [dark for dark in darks if (dark.gain_db or 0.0) == gain_db]
-    dark_levels, pixels = _dark_levels(recordings, darks, camera)
+    code = find_code_step(recordings, side)
+    recordings = under_highest_code(recordings, side, code)
+    camera = recordings.camera(side)
+    dark_levels, pixels = _dark_levels(recordings, darks, camera, code.step_dn)
     light = light_of(flats, camera)
     lamps = _lamps_of(recordings, flats, light)
     flat_levels = [
@@ -385,7 +388,7 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
             group[0].exposure_s,
             light[group[0].id].amount,
             lamps[group[0].id],
-            stack_of(recordings, group, pixels.bad).statistics(),
+            stack_of(recordings, group, pixels.bad, code.step_dn).statistics(),
             group[0].temperature_c,
             tuple(flat.id for flat in group),
             light[group[0].id].std,
@@ -400,7 +403,7 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     except NotDetermined as refused:
         raise NotDetermined("noise", "; ".join((*mishaps, refused.reason))) from refused
     reason = why_not(flats, camera)
-    remarks = (*mishaps, *fitted.remarks, *(() if reason is None else (reason,)))
+    remarks = (*mishaps, *code.lines, *fitted.remarks, *(() if reason is None else (reason,)))
     return fitted.model_copy(update={"remarks": remarks})
 
 
@@ -446,19 +449,19 @@ def _lamps_of(
 
 
 def _dark_levels(
-    recordings: RecordingSet, darks: Sequence[DarkCapture], camera: DataSheet
+    recordings: RecordingSet, darks: Sequence[DarkCapture], camera: DataSheet, step_dn: float
 ) -> tuple[list[MeasuredLevel], DarkPixels]:
     """Statistics of the darks, longest exposure first: it shows the hot pixels, which are left out from there on."""
-    pixels = DarkPixels(camera.cfa)
+    pixels = DarkPixels(camera.cfa, step_dn)
     levels = []
     groups = _grouped(darks, lambda dark: (dark.exposure_s, rounded_c(dark.temperature_c)))
     for group in sorted(groups, key=lambda group: -group[0].exposure_s):
-        stack = stack_of(recordings, group, pixels.bad)
+        stack = stack_of(recordings, group, pixels.bad, step_dn)
         if pixels.longest is None and stack.mean is not None:
-            bad = defective_pixels(stack.mean, camera.cfa)
+            bad = defective_pixels(stack.mean, camera.cfa, step_dn)
             if bad.any():
                 pixels.bad = bad
-                stack = stack_of(recordings, group, bad)
+                stack = stack_of(recordings, group, bad, step_dn)
         pixels.take(stack, group[0].exposure_s)
         levels.append(
             MeasuredLevel(

@@ -31,6 +31,7 @@ from lab.fit.spectral.sensitivity import (
 )
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
+from lab.measure.code_step import find_code_step
 from lab.measure.plane_means import PlaneMean, plane_means
 from lab.measure.weighted_lines import DarkLine, dark_line
 from lab.one_blas_thread import one_blas_thread
@@ -79,6 +80,7 @@ class SpectralCaptures:
                 )
         self.gain, self.gain_std = self._conversion_gain()
         self.region = self._central_region()
+        self._step_dn = find_code_step(self.recordings, self.side).step_dn
         self.pixels = {channel: self._pixel_count(channel) for channel in phases(self.camera.cfa)}
         self.photons = self._photons_per_radiance()
         self.darks: dict[tuple[float, str], DarkLine] = {}
@@ -149,7 +151,8 @@ class SpectralCaptures:
 
     def _means(self, capture: Capture) -> dict[str, PlaneMean]:
         """Return the mean of each channel in the region, which starts on whole periods of the mosaic."""
-        return plane_means(self.recordings.frame(capture)[self.region], self.camera.cfa, self.camera.saturation_dn)
+        frame = self.recordings.frame(capture)[self.region]
+        return plane_means(frame, self.camera.cfa, self.camera.saturation_dn, self._step_dn)
 
     def _pixel_count(self, channel: str) -> int:
         """Count the pixels of a channel in the region."""

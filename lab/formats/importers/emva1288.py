@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -175,7 +175,9 @@ def read_emva1288(path: Path) -> RecordingSet:
         )
     captures, frames, pages, remarks = _captures(there)
     warnings += [f"{file}: {remark}" for remark in remarks]
-    shape, shift = _shape_and_shift(frames, pages, descriptor, file, warnings)
+    brightest = max(captures, key=lambda one: (one.get("photons_per_pixel") or 0.0, one["exposure_s"]))["frame"]
+    first = [(frames[path], pages.get(path)) for path in dict.fromkeys((captures[0]["frame"], brightest))]
+    shape, shift = _shape_and_shift(first, descriptor, file, warnings)
     cameras = read_camera_file(
         file.parent / "camera.toml",
         {"left": {"rows": shape[0], "cols": shape[1], "cfa": "MONO", "bit_depth": descriptor.bits or 16}},
@@ -219,38 +221,36 @@ def read_emva1288(path: Path) -> RecordingSet:
 
 
 def _shape_and_shift(
-    frames: Mapping[str, Path],
-    pages: Mapping[str, int],
-    descriptor: ImageDescriptor,
-    file: Path,
-    warnings: list[str],
+    images: Sequence[tuple[Path, int | None]], descriptor: ImageDescriptor, file: Path, warnings: list[str]
 ) -> tuple[tuple[int, int], int]:
-    """Rows and columns of the images, and by how many bits the values are shifted up in their 16-bit container."""
-    path, first = next(iter(frames.items()))
-    try:
-        frame = read_image(first, pages.get(path))
-    except InputError as error:
-        raise InputError(f"{first}: {error}") from error
-    rows, cols = frame.shape
-    if (descriptor.height, descriptor.width) not in ((rows, cols), (None, None)):
+    """Rows and columns of the images, and by how many bits the values are shifted up in their 16-bit container: by the
+    first image and one of the brightest level (file, page)."""
+    shape, shift = (0, 0), 0
+    for image, page in images:
+        try:
+            frame = read_image(image, page)
+        except InputError as error:
+            raise InputError(f"{image}: {error}") from error
+        shape = shape if any(shape) else (frame.shape[0], frame.shape[1])
+        if descriptor.bits is not None and int(frame.max()) >= 2**descriptor.bits:
+            shift = 16 - descriptor.bits
+            if np.any(frame & ((1 << shift) - 1)):
+                raise InputError(
+                    f"{image}: {int(frame.max())} DN is above the {descriptor.bits} bits of line 'n' in {file.name}; "
+                    "correct it"
+                )
+    rows, cols = shape
+    if (descriptor.height, descriptor.width) not in (shape, (None, None)):
         warnings.append(
             f"{file}: line 'n' says {descriptor.height} x {descriptor.width}, the images are {rows} x {cols} (rows x "
             "cols): "
             "the images are believed; correct the line"
         )
-    shift = 0
-    if descriptor.bits is not None and int(frame.max()) >= 2**descriptor.bits:
-        padding = 16 - descriptor.bits
-        if np.any(frame & ((1 << padding) - 1)):
-            raise InputError(
-                f"{first}: {int(frame.max())} DN is above the {descriptor.bits} bits of line 'n' in {file.name}; "
-                "correct it"
-            )
-        shift = padding
+    if shift:
         warnings.append(
             f"{file}: the images hold {descriptor.bits} bits shifted up by {shift}; they are shifted down: check that"
         )
-    return (rows, cols), shift
+    return shape, shift
 
 
 def _captures(

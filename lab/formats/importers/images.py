@@ -101,7 +101,13 @@ class ImageFiles(FolderFiles):
         return parse_spectrum(read_foreign_csv(locate(self.root, path)).text)
 
     def frame(self, path: str, camera: DataSheet) -> Frame:
-        return np.right_shift(read_image(self.images[path], self.pages.get(path)), self.shift, dtype=np.uint16)
+        frame = read_image(self.images[path], self.pages.get(path))
+        if np.any(frame & ((1 << self.shift) - 1)):
+            raise InputError(
+                f"its codes aren't multiples of {1 << self.shift}, as those of other images of the set are; give "
+                "images of one bit depth"
+            )
+        return np.right_shift(frame, self.shift, dtype=np.uint16)
 
     def where(self, path: str) -> str:
         return str(self.images[path]) if path in self.images else super().where(path)

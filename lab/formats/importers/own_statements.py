@@ -68,8 +68,10 @@ def sensor_facts(file: Path, shape: tuple[int, int] | None = None, ignored: Coll
         with rawpy.imread(str(file)) as raw:
             turned = RAW_TURNS.get(int(raw.sizes.flip), 1)
             levels = tuple(float(level) for level in raw.black_level_per_channel)
-            if raw.raw_pattern is None:  # one sample a pixel without colours
-                return SensorFacts(None, None, levels, float(raw.white_level), turned)
+            if raw.raw_pattern is None or raw.num_colors == 1:
+                return SensorFacts(
+                    "MONO" if raw.num_colors == 1 else None, None, levels, float(raw.white_level), turned
+                )
             period, names = raw.raw_pattern.shape, raw.color_desc.decode()
             # LibRaw's colours count from the visible area
             is_visible = shape in (None, (raw.sizes.height, raw.sizes.width))
@@ -111,16 +113,19 @@ def compare_with_files(
     files: Iterable[Path],
     boards: Collection[Path] = (),
     ignored: Collection[str] = (),
+    *,
+    is_whole: bool = True,
 ) -> list[str]:
     """Return one line for each kind of thing that the files of a camera's frames state and that isn't as stated, or
     that changes the codes. Raises InputError where a file's own mosaic isn't the stated one.
 
     `stated`: keys of the camera that somebody states. `boards`: files of boards, whose corners JPEG hardly moves.
-    `ignored`: keywords of headers that aren't used."""
+    `is_whole`: the camera's frames are the files', not joined of the parts that taps read. `ignored`: keywords of
+    headers that aren't used."""
     found: dict[str, list[Path]] = {}
     for file in dict.fromkeys(files):
         try:
-            facts = sensor_facts(file, (camera.rows, camera.cols), ignored)
+            facts = sensor_facts(file, (camera.rows, camera.cols), ignored) if is_whole else SensorFacts()
             picture = picture_facts(file) if file.suffix.lower() in IMAGES else PictureFacts("")
         except InputError as error:
             raise InputError(f"{file}: {error}") from error

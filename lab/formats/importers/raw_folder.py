@@ -337,7 +337,9 @@ def _recording_set(
             own = [images[capture["frame"]] for capture in captures if capture["side"] == side]
             cut = readout(own_taps, own, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
             measured[side] |= {"rows": cut.shape[0], "cols": cut.shape[1], "black_level_dn": cut.black_level_dn}
-            known[side].pop("black_level_dn", None)
+            for key in ("cfa", "black_level_dn"):  # of the whole sensor
+                if known[side].pop(key, None) is not None and key == "cfa":
+                    del measured[side]["cfa"]
             readouts[side] = cut
     described = cameras(measured)
     text = json.dumps(
@@ -366,7 +368,8 @@ def _recording_set(
         if files:
             boards = [file for file, kind in files.items() if kind == "charuco"]
             remarks += taken_from_file(stated, known[side], next(iter(files)))
-            remarks += compare_with_files(camera, stated, files, boards, choice.ignored)
+            is_whole = side not in readouts
+            remarks += compare_with_files(camera, stated, files, boards, choice.ignored, is_whole=is_whole)
     by_frame = {capture["frame"]: readouts[capture["side"]] for capture in captures if capture["side"] in readouts}
     return RecordingSet(
         manifest,

@@ -128,7 +128,7 @@ def _of_raw(file: Path) -> FrameHeader | None:
         if taken is None:
             return None
         f_number, iso = _above_zero(taken.aperture), _above_zero(taken.iso_speed)
-        of_dials = {"FNumber": f_number, "ISO": iso, "FocalLength": _above_zero(taken.focal_len)}
+        of_dials = {"FNumber": f_number, "ISO": iso, "FocalLength": _above_zero(taken.focal_length)}
         return FrameHeader(
             "metadata",
             exposure_s=_above_zero(taken.shutter_speed),
