@@ -128,6 +128,7 @@ def _of_raw(file: Path) -> FrameHeader | None:
         if taken is None:
             return None
         f_number, iso = _above_zero(taken.aperture), _above_zero(taken.iso_speed)
+        settings = dict(told.settings) if told is not None else {}
         of_dials = {"FNumber": f_number, "ISO": iso, "FocalLength": _above_zero(taken.focal_length)}
         return FrameHeader(
             "metadata",
@@ -135,8 +136,7 @@ def _of_raw(file: Path) -> FrameHeader | None:
             f_number=f_number,
             iso=iso,
             camera=told.camera if told is not None else None,
-            settings=(told.settings if told is not None else {})
-            | {key: value for key, value in of_dials.items() if value is not None},
+            settings=settings | {key: value for key, value in of_dials.items() if value is not None},
         )
 
 
@@ -157,7 +157,8 @@ def _of_tiff(stream: Any) -> FrameHeader | None:
         pass
     f_number = _above_zero(tags.get("FNumber"))
     iso = _above_zero(tags.get("PhotographicSensitivity", tags.get("ISOSpeedRatings")))
-    stated = {"FNumber": f_number, "ISO": iso, "FocalLength": _above_zero(tags.get("FocalLength"))}
+    stated: dict[str, str | float | None] = {"FNumber": f_number, "ISO": iso}
+    stated["FocalLength"] = _above_zero(tags.get("FocalLength"))
     stated |= {key: _text(tags.get(key)) or None for key in ("Model", "BodySerialNumber")}
     return FrameHeader(
         "EXIF",
