@@ -106,7 +106,8 @@ def compare_settings(frames: Sequence[StatedFrame], where: str) -> tuple[list[st
     settings that some of these frames don't state.
 
     Of captures whose codes aren't fitted with others' (boards, edges), another gain is a warning."""
-    problems, warnings = [], []
+    problems: list[str] = []
+    warnings: list[str] = []
     for side in dict.fromkeys(frame.capture.side for frame in frames):
         own = [frame for frame in frames if frame.capture.side == side]
         for setting in SETTINGS:
@@ -141,13 +142,13 @@ def _groups(setting: FrameSetting, own: Sequence[StatedFrame]) -> list[list[Stat
         Changes.CODES: lambda capture: round(capture.gain_db or 0.0, 6),
         Changes.LIGHT: _light,
     }
-    key = keys.get(setting.changes, lambda capture: None)
     groups: dict[object, list[StatedFrame]] = {}
     for frame in own:
         is_dark = isinstance(frame.capture, DarkCapture)
         if is_dark and setting.changes in (Changes.LIGHT, Changes.VIEW):
             continue
-        groups.setdefault(key(frame.capture), []).append(frame)
+        key = keys.get(setting.changes)
+        groups.setdefault(key(frame.capture) if key is not None else None, []).append(frame)
     return list(groups.values())
 
 

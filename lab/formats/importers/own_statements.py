@@ -120,8 +120,8 @@ def compare_with_files(
     that changes the codes. Raises InputError where a file's own mosaic isn't the stated one.
 
     `stated`: keys of the camera that somebody states. `boards`: files of boards, whose corners JPEG hardly moves.
-    `ignored`: keywords of headers that aren't used. `is_whole`: the camera's frames are the files', not joined of the
-    parts that taps read."""
+    `is_whole`: the camera's frames are the files', not joined of the parts that taps read. `ignored`: keywords of
+    headers that aren't used."""
     found: dict[str, list[Path]] = {}
     for file in dict.fromkeys(files):
         try:

@@ -55,9 +55,9 @@ PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 @dataclass(frozen=True)
 class FrameHeader:
     """How a frame was taken, by its own file. None: not stated. `source`: what states it, in a word; `camera`: which
-    camera did, and how it was set; `stacked`: that the frame is made of several; `settings`: those
-    of `frame_settings`, by keyword; `problems`: values that can't be
-    used; `remarks`: values that were converted."""
+    camera did, and how it was set; `stacked`: that the frame is made of several; `settings`: those of `frame_settings`,
+    by keyword; `problems`: (key of the capture, line) of values that can't be used; `remarks`: values that were
+    converted."""
 
     source: str
     exposure_s: float | None = None
@@ -69,7 +69,7 @@ class FrameHeader:
     pixel_pitch_um: float | None = None
     stacked: str | None = None
     settings: Mapping[str, str | float] = field(default_factory=dict)
-    problems: tuple[str, ...] = ()
+    problems: tuple[tuple[str, str], ...] = ()
     remarks: tuple[str, ...] = ()
 
     @property
@@ -86,7 +86,7 @@ def frame_header(file: Path, ignored: Collection[str] = ()) -> FrameHeader | Non
     try:
         if is_fits(file):
             return _of_fits(fits_header(file, with_image=False, ignored=ignored))
-        elif suffix in RAWS:
+        if suffix in RAWS:
             found = _of_raw(file)
         elif suffix in (".tif", ".tiff"):
             with file.open("rb") as stream:
@@ -115,7 +115,7 @@ def _of_fits(header: FitsHeader) -> FrameHeader:
         pixel_pitch_um=header.pixel_pitch_um,
         settings=settings,
         stacked=header.stacked,
-        problems=tuple(line for _, line in header.problems),
+        problems=header.problems,
         remarks=header.remarks,
     )
 
@@ -128,15 +128,15 @@ def _of_raw(file: Path) -> FrameHeader | None:
         if taken is None:
             return None
         f_number, iso = _above_zero(taken.aperture), _above_zero(taken.iso_speed)
-        of_dials = {"FNumber": f_number, "ISO": iso, "FocalLength": _above_zero(taken.focal_len)}
+        settings = dict(told.settings) if told is not None else {}
+        of_dials = {"FNumber": f_number, "ISO": iso, "FocalLength": _above_zero(taken.focal_length)}
         return FrameHeader(
             "metadata",
             exposure_s=_above_zero(taken.shutter_speed),
             f_number=f_number,
             iso=iso,
             camera=told.camera if told is not None else None,
-            settings=(told.settings if told is not None else {})
-            | {key: value for key, value in of_dials.items() if value is not None},
+            settings=settings | {key: value for key, value in of_dials.items() if value is not None},
         )
 
 
@@ -157,7 +157,8 @@ def _of_tiff(stream: Any) -> FrameHeader | None:
         pass
     f_number = _above_zero(tags.get("FNumber"))
     iso = _above_zero(tags.get("PhotographicSensitivity", tags.get("ISOSpeedRatings")))
-    stated = {"FNumber": f_number, "ISO": iso, "FocalLength": _above_zero(tags.get("FocalLength"))}
+    stated: dict[str, str | float | None] = {"FNumber": f_number, "ISO": iso}
+    stated["FocalLength"] = _above_zero(tags.get("FocalLength"))
     stated |= {key: _text(tags.get(key)) or None for key in ("Model", "BodySerialNumber")}
     return FrameHeader(
         "EXIF",
@@ -263,9 +264,10 @@ def held_against_frames(
         for capture in manifest.captures
         if (header := by_file[images[capture.frame]]) is not None
     ]
-    manifest, lines = _completed(manifest, seen)
-    captures = {capture.id: capture for capture in manifest.captures}
-    seen = [replace(one, capture=captures[one.capture.id]) for one in seen]
+    whole, lines = _completed(manifest, seen)
+    places = {id(capture): place for place, capture in enumerate(manifest.captures)}
+    seen = [replace(one, capture=whole.captures[places[id(one.capture)]]) for one in seen]
+    manifest = whole
     lines += _contradictions(manifest, seen, images, where)
     problems, uneven = compare_settings(
         [StatedFrame(one.capture, one.file, one.header.settings) for one in seen], where
@@ -286,12 +288,13 @@ def held_against_frames(
 def _completed(manifest: Manifest, seen: Sequence[_HeaderSeen]) -> tuple[Manifest, list[str]]:
     """Return the manifest with temperatures and gains that it leaves open and the frames' own files state, and a line
     for each quantity."""
-    captures = {capture.id: capture for capture in manifest.captures}
+    captures = {id(capture): capture for capture in manifest.captures}
     lines = []
     for key, unit in (("temperature_c", "degree C"), ("gain_db", "dB")):
         added = [one for one in seen if getattr(one.capture, key) is None and getattr(one.header, key) is not None]
         for one in added:
-            captures[one.capture.id] = captures[one.capture.id].model_copy(update={key: getattr(one.header, key)})
+            known = {key: getattr(one.header, key)}
+            captures[id(one.capture)] = captures[id(one.capture)].model_copy(update=known)
         if added:
             values = [getattr(one.header, key) for one in added]
             span = f"{min(values):g}" + (f" .. {max(values):g}" if max(values) > min(values) else "")
@@ -342,9 +345,13 @@ def _other_pitch(own: Sequence[_HeaderSeen], camera: DataSheet) -> list[str]:
 
 
 def _remarks(seen: Sequence[_HeaderSeen]) -> list[str]:
-    """Return the headers' problems and remarks, one line for all frames that have the same but for numbers."""
-    files = {one.file: one.header for one in seen}
-    return join_alike([(file, text) for file, one in files.items() for text in (*one.problems, *one.remarks)])
+    """Return the headers' remarks, and problems with what the captures don't state either, one line for all frames
+    that have the same but for numbers."""
+    texts: list[tuple[Path | str, str]] = []
+    for one in {one.file: one for one in seen}.values():
+        open_ones = [line for key, line in one.header.problems if getattr(one.capture, key) is None]
+        texts += [(one.file, text) for text in (*open_ones, *one.header.remarks)]
+    return join_alike(texts)
 
 
 def join_alike(texts: Sequence[tuple[Path | str, str]]) -> list[str]:
