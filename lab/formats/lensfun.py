@@ -342,7 +342,7 @@ class _Calibrations:
         found = {kind: correction for kind in _TERMS if (correction := self._correction(kind)) is not None}
         bent, tca, dark = (found.get(kind) for kind in ("distortion", "tca", "vignetting"))
         real_mm, centre = self._real_focal_mm(bent), self.element.find("center")
-        law = None if real_mm is None else _undistorted
+        law: Callable[[FloatArray], FloatArray] | None = None if real_mm is None else _undistorted
         decentring = (0.0, 0.0)
         if bent is not None:
             terms = self._along_focal(bent)
