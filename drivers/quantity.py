@@ -1,8 +1,7 @@
 """Numbers with units in the answers of instruments: read in the unit that a driver asks for, or refused.
 
-Sources: IEEE 488.2, section 7.7.3 (suffixes, in either case, M is milli but for hertz and ohms); SCPI-99, section 7.2
-(9.9E37 stands for infinity, 9.91E37 for a reading that there isn't); Keithley 6517B manual, FORMat:ELEMents (a letter
-of the reading's state before the unit, as in NADC).
+Sources: IEEE 488.2 (suffixes, in either case; M is milli but for hertz and ohms); SCPI-99 (9.9E37 stands for infinity,
+9.91E37 for no reading); manuals of Keithley's electrometers (a letter of the reading's state before the unit: NADC).
 """
 
 from __future__ import annotations

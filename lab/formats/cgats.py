@@ -417,13 +417,13 @@ def _norm(
         if greatest > 100.0 * MOST_SHARE:
             raise InputError(f"a {quantity} of {greatest:g} is neither a share nor percent; state SPECTRAL_NORM")
         return 100.0, (f"SPECTRAL_NORM isn't stated: values up to {greatest:g} are taken as percent of {quantity}",)
-    remarks = ("the fields SPECTRAL_PCT are percent: divided by 100",) if percent and norm == 100.0 else ()
+    remarks = ["the fields SPECTRAL_PCT are percent: divided by 100"] if percent and norm == 100.0 else []
     if quantity is None:
-        remarks += ("MEAS_TYPE isn't stated: values over the norm, their unit unknown",)
+        remarks.append("MEAS_TYPE isn't stated: values over the norm, their unit unknown")
         if greatest / norm > MOST_SHARE:
             remedy = 'add the lines MEAS_TYPE "REFLECTIVE" and SPECTRAL_NORM "100" to its header'
-            remarks += (f"values reach {greatest / norm:g}: if they are percent of a reflectance, {remedy}",)
-    return norm, remarks
+            remarks.append(f"values reach {greatest / norm:g}: if they are percent of a reflectance, {remedy}")
+    return norm, tuple(remarks)
 
 
 def _sample_names(fields: list[str], rows: list[list[str]]) -> tuple[list[str], tuple[str, ...]]:

@@ -345,7 +345,7 @@ class _Calibrations:
         found = {kind: correction for kind in _TERMS if (correction := self._correction(kind)) is not None}
         bent, tca, dark = (found.get(kind) for kind in ("distortion", "tca", "vignetting"))
         real_mm, centre = self._real_focal_mm(bent), self.element.find("center")
-        law = None if real_mm is None else _undistorted
+        law: Callable[[FloatArray], FloatArray] | None = None if real_mm is None else _undistorted
         decentring = (0.0, 0.0)
         if bent is not None:
             terms = self._along_focal(bent)
@@ -494,10 +494,9 @@ class _Calibrations:
             scaled = np.array([one.terms * one.focal_mm**powers for one in entries])
             k = weight @ scaled / weight.sum() / focal_mm**powers
             one = entries[nearest]
-            self.remarks.append(
-                f"vignetting: weighted mean of {len(entries)} calibrations, the nearest at {one.focal_mm:g} mm, "
-                f"f/{one.aperture:g}, {one.distance_m:g} m"
-            )
+            place = f"at {one.focal_mm:g} mm, f/{one.aperture:g}, {one.distance_m:g} m"
+            mean = f"weighted mean of {len(entries)} calibrations, the nearest" if len(entries) > 1 else "as calibrated"
+            self.remarks.append(f"vignetting: {mean} {place}")
         unit_mm = dark.half_diagonal_mm if dark.model == "pa" else focal_mm
         return lambda r_mm: 1.0 + sum(k[n] * (r_mm / unit_mm) ** (2 * n + 2) for n in range(3))
 

@@ -231,7 +231,7 @@ def test_light_falls_off_as_stated(tmp_path: Path) -> None:
         '<vignetting model="pa" focal="14" aperture="4" distance="10" k1="-0.5" k2="0.1" k3="-0.05"/>'
     )
     _, camera, remarks = imported(lens_file(tmp_path, body), camera_of())
-    assert remarks == ("vignetting: weighted mean of 1 calibrations, the nearest at 14 mm, f/4, 10 m",)
+    assert remarks == ("vignetting: as calibrated at 14 mm, f/4, 10 m",)
     col = np.linspace(299.5, 599.5, 7)
     r2 = ((col - 299.5) * 0.037 / (0.5 * FULL_FRAME_MM / 1.622)) ** 2
     light = np.ravel(relative_illumination(camera, np.array([199.5]), col))
