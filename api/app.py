@@ -42,7 +42,7 @@ from api.routes import (
     twin,
 )
 from api.routes.stations import router as stations_router
-from api.schemas import Health, Login, Me
+from api.schemas import Health, Login, MayHalt, Me
 from api.security import (
     COOKIE,
     HALT_COOKIE,
@@ -165,6 +165,17 @@ def logout(service: Here, request: Request, response: Response) -> None:
             service.store.remove_halt_token(digest(halt))
     for name in (COOKIE, HALT_COOKIE):
         response.delete_cookie(name, path="/")
+
+
+@open_to_all.get("/halt", tags=["access"])
+def may_halt(service: Here, request: Request) -> MayHalt:
+    """Whether this client may halt, by its key, its login or its halt token. Needs no key: for a page whose login has
+    ended."""
+    try:
+        key = service.gate.identify_for_halt(request)
+    except TooManyFailures:
+        key = None
+    return MayHalt(may_halt=key is not None and key.scope is not Permission.READ)
 
 
 @open_to_all.get("/", include_in_schema=False)

@@ -32,7 +32,7 @@ function showLogin() {
 
 // A page that was logged in halts also where its login has ended, as after a restart of the service.
 async function offerHalt() {
-  const { may_halt } = await ask("/halt");
+  const { may_halt } = await (await reach("/halt")).json();
   if ($("login").hidden) return;
   $("halt").hidden = $("strip-bar").hidden = $("halt-hint").hidden = !may_halt;
 }

@@ -11,11 +11,11 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, HTTPException, Request, Response
 
 from api.errors import Conflict, answers
-from api.keys import Permission, StoredKey
+from api.keys import StoredKey
 from api.routes.sessions import check_then, registered, stored_session
 from api.safety import StationSafety, key_of
-from api.schemas import Halt, Halted, HaltedStation, MayHalt, QueueEntry, QueuePlace, SessionStart, StoredSession
-from api.security import DemandHalt, TooManyFailures
+from api.schemas import Halt, Halted, HaltedStation, QueueEntry, QueuePlace, SessionStart, StoredSession
+from api.security import DemandHalt
 from api.service import OPERATE, OVER, READ, ROOM, Here, Service, SessionId
 from api.then import kept_request
 from lab.capture.catalogue import step_times
@@ -141,17 +141,6 @@ def _stations(service: Service) -> tuple[dict[str, Station], dict[str, str]]:
         except (InputError, OSError, HTTPException) as error:  # a file that is gone meanwhile: 404
             unusable[name] = one_line(error)
     return found, unusable
-
-
-@router.get("/halt")
-def may_halt(service: Here, request: Request) -> MayHalt:
-    """Whether this client may halt, by its key, its login or its halt token. Needs no key: for a page whose login has
-    ended."""
-    try:
-        key = service.gate.identify_for_halt(request)
-    except TooManyFailures:
-        key = None
-    return MayHalt(may_halt=key is not None and key.scope is not Permission.READ)
 
 
 @router.post("/halt", responses=answers(401, 403, 404, 422))

@@ -179,19 +179,19 @@ def test_a_run_that_only_packs_is_halted_and_its_station_asked(
 
 def test_a_page_halts_after_a_restart_of_the_service_and_does_nothing_else(tmp_path: Path) -> None:
     with serving(tmp_path) as running, running.client(None) as page, running.client(None) as reader:
-        assert page.get("/api/v1/halt").json() == {"may_halt": False} and page.post("/api/v1/halt").status_code == 401
+        assert page.get("/halt").json() == {"may_halt": False} and page.post("/api/v1/halt").status_code == 401
         login = page.post("/login", json={"key": running.keys["operate"]})
         stated = next(one for one in login.headers.get_list("set-cookie") if one.startswith("calibench_halt="))
         assert "httponly" in stated.lower() and "samesite=strict" in stated.lower()
         assert reader.post("/login", json={"key": running.keys["read"]}).status_code == 200
-        assert "calibench_halt" not in reader.cookies and not reader.get("/api/v1/halt").json()["may_halt"]
+        assert "calibench_halt" not in reader.cookies and not reader.get("/halt").json()["may_halt"]
         token, keys = page.cookies["calibench_halt"], running.keys
         rows = (tmp_path / "registry.sqlite").read_bytes() + (tmp_path / "registry.sqlite-wal").read_bytes()
         assert token.encode() not in rows  # only its hash is kept
     with serving(tmp_path, keys=keys) as running, running.client(None) as page:
         page.cookies.set("calibench_halt", token)
         running.bench.opened = True
-        assert page.get("/api/v1/halt").json() == {"may_halt": True}
+        assert page.get("/halt").json() == {"may_halt": True}
         assert halt(page)["shutter"] == "closed" and not running.bench.opened
         assert page.get("/api/v1/stations").status_code == 401
         assert page.post("/api/v1/sessions", json=DARKS).status_code == 401
