@@ -88,9 +88,11 @@ def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
         for figure in stereo_figures(fit.stereo):
             out.print(f"{figure.name}: {figure.text}")
     for side, camera in fit.cameras.items():
-        for part in (camera.noise, camera.spectral):
+        for part in (camera.noise, camera.spectral, camera.geometry):
             for remark in part.remarks if part else ():
                 out.print(f"{side}: {escape(remark)}")
+    for remark in fit.stereo.remarks if fit.stereo is not None else ():
+        out.print(f"stereo: {escape(remark)}")
     print_skipped(fit.skipped)
 
 
