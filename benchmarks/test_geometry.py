@@ -19,7 +19,7 @@ from lab.fit.stereo import fit_stereo
 from lab.formats.importers import read_checkerboard_pairs
 from lab.measure.board_calibration import calibrate, calibrate_robustly
 from lab.measure.board_detection import find_board, luminance
-from lab.measure.pinhole import difference, grid, grid_points, intrinsics_of, points_at
+from lab.measure.projection import Camera, difference, grid, grid_points, points_at
 from tests.lab.fit import conftest as drawn
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
@@ -40,13 +40,13 @@ def opencv(views) -> tuple[np.ndarray, float]:
     points = [view.image_px.astype(np.float32) for view in views]
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-10)
     rms, matrix, distortion, *_ = cv2.calibrateCamera(boards, points, SHAPE[::-1], None, None, criteria=criteria)
-    return intrinsics_of(matrix, distortion.ravel()[:5]), rms
+    return Camera.of(matrix, distortion.ravel()[:5]), rms
 
 
 @pytest.mark.parametrize(("board", "warp_mm"), [("flat", (0.0, 0.0, 0.0)), ("bent by 0.4 mm", (0.4, -0.3, 0.2))])
 def test_calibration_of_known_cameras(board: str, warp_mm: tuple[float, float, float]) -> None:
     truth = replace(TRUTH, warp_mm=warp_mm)
-    intrinsics = intrinsics_of(truth.left, truth.distortion_left)
+    camera = Camera.of(truth.left, truth.distortion_left)
     image = grid_points(*grid(SHAPE))
     at = poses(VIEWS)
     off: dict[str, list[float]] = {"ours": [], "theirs": []}
@@ -61,15 +61,12 @@ def test_calibration_of_known_cameras(board: str, warp_mm: tuple[float, float, f
         if draw < 5:
             seconds["all"] += timed(lambda views=views: geometry_result(calibrate_robustly(views, SHAPE)))[1] / 5
         gauge = np.concatenate(
-            [
-                points_at(view.image_px, intrinsics, d)
-                for view, d in zip(views, np.linspace(500, 850, VIEWS), strict=True)
-            ]
+            [points_at(view.image_px, camera, d) for view, d in zip(views, np.linspace(500, 850, VIEWS), strict=True)]
         )
-        for name, found in (("ours", own.state.intrinsics[0]), ("theirs", theirs)):
-            left = difference(intrinsics, found, np.eye(12) * 1e-12, gauge[::4], points_at(image, intrinsics, 700.0))
+        for name, found in (("ours", own.state.camera()), ("theirs", theirs)):
+            left = difference(camera, found, (np.eye(12) * 1e-12,) * 2, gauge[::4], points_at(image, camera, 700.0))
             off[name].append(left.rms_px)
-            focal[name].append(found[0] - intrinsics[0])
+            focal[name].append(found.intrinsics[0] - camera.intrinsics[0])
     rms = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in off.items()}
     lengths = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in focal.items()}
     show(

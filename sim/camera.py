@@ -63,11 +63,25 @@ class Lens(Frozen):
         return self
 
 
+ProjectionKind = Literal["pinhole", "equidistant", "splined_stereographic"]
+
+
 class Geometry(Frozen):
-    """Pinhole and Brown distortion, as OpenCV defines them (`k1 k2 p1 p2 k3`); points in px, x to the right."""
+    """How the camera projects (`sim.scene.projection`): camera matrix, px, x to the right, and distortion coefficients.
+
+    Of a pinhole these are OpenCV's `k1 k2 p1 p2 k3 [k4 k5 k6]`; of an equidistant fisheye OpenCV's `k1 k2 k3 k4`; of a
+    splined stereographic projection `s1 s2 p1 p2 s3 s4 s5 s6`, with the angle from the axis at which its spline ends.
+    """
 
     camera_matrix: tuple[tuple[float, float, float], ...]
     distortion: tuple[float, ...] = ()
+    projection: ProjectionKind = "pinhole"
+    spline_angle_deg: float | None = None
+
+    @property
+    def is_ideal(self) -> bool:
+        """Return whether this is a pinhole without distortion."""
+        return self.projection == "pinhole" and not any(self.distortion)
 
 
 class CameraModel(Frozen):

@@ -92,6 +92,8 @@ def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
     for side, camera in fit.cameras.items():
         for remark in camera.remarks:
             out.print(f"{side}: {escape(remark)}")
+    for remark in fit.stereo.remarks if fit.stereo is not None else ():
+        out.print(f"stereo: {escape(remark)}")
     print_skipped(fit.skipped)
 
 

@@ -20,7 +20,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,20 +46,10 @@ from lab.formats.results import (
     StereoFit,
 )
 from lab.formats.results.words import plain_name, unit_of
-from lab.measure.pinhole import (
-    COUNT,
-    NAMES,
-    difference,
-    grid,
-    grid_points,
-    implied_motion,
-    intrinsics_of_fit,
-    project,
-    seen_points,
-    unproject,
-)
-from sim.camera import Side
+from lab.measure.projection import Camera, difference, grid, grid_points, implied_motion, seen_points
+from sim.camera import ProjectionKind, Side
 from sim.parameters import Frozen
+from sim.scene.projection import COUNT, Projection
 
 Array = NDArray[np.floating[Any]]
 FALSE_ALARM_RATE = 0.01
@@ -215,6 +205,10 @@ def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
     for field in type(model).model_fields:
         value, std = getattr(model, field), getattr(model, f"{field}_std", None)
         name = f"{prefix}{field}"
+        if field == "distortion" and isinstance(model, GeometryFit) and model.lens_projection != "pinhole":
+            # Coefficients of another projection mean another thing; so does a spline that ends at another angle
+            spline = "" if model.spline_angle_deg is None else f" to {model.spline_angle_deg:.3g} deg"
+            name = f"{prefix}{model.lens_projection}{spline} {field}"
         if isinstance(value, Frozen):
             yield from numbers_of(value, f"{name} ")
         elif isinstance(value, tuple) and value and isinstance(value[0], Frozen):
@@ -336,6 +330,12 @@ def title_of(numbers: Numbers, at: int) -> str:
     return name if numbers.sensor is None else f"{name} {numbers.sensor.text}"
 
 
+def _projection_of(name: str) -> Projection:
+    """Return the projection that the name of a distortion states (`numbers_of`); a pinhole where none is stated."""
+    kind: ProjectionKind = next((kind for kind in get_args(ProjectionKind) if kind in name.split()), "pinhole")
+    return Projection(kind, 90.0 if kind == "splined_stereographic" else None)  # its names don't depend on the angle
+
+
 def place_of(numbers: Numbers, at: int) -> str:
     """Say which of the numbers under one name the one at index `at` is: on the axis, by its symbol, or by its index."""
     if numbers.axis is not None:
@@ -346,7 +346,7 @@ def place_of(numbers: Numbers, at: int) -> str:
     if numbers.name.endswith("camera_matrix"):
         return {0: "fx", 4: "fy", 2: "cx", 5: "cy"}.get(at, str(at))
     if numbers.name.endswith("distortion"):
-        return NAMES[4 + at]
+        return _projection_of(numbers.name).coefficients[at]
     if numbers.name.endswith("translation_mm"):
         return "xyz"[at]
     place = ", ".join(str(int(k)) for k in np.unravel_index(at, numbers.value.shape))
@@ -359,7 +359,8 @@ def _covariance(fit: GeometryFit) -> Array | None:
     if fit.covariance is None:
         return None
     found = np.zeros((COUNT, COUNT))
-    at = [NAMES.index(name) for name in fit.parameters if name in NAMES]
+    names = Camera.of_fit(fit).projection.names
+    at = [names.index(name) for name in fit.parameters if name in names]
     found[np.ix_(at, at)] = np.array(fit.covariance)[: len(at), : len(at)]
     return found
 
@@ -367,7 +368,7 @@ def _covariance(fit: GeometryFit) -> Array | None:
 def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange | Skipped:
     """Compare the projections of two fits over the corners of both, without the motion that they imply."""
     of_a, of_b = _covariance(a), _covariance(b)
-    first, second = intrinsics_of_fit(a), intrinsics_of_fit(b)
+    first, second = Camera.of_fit(a), Camera.of_fit(b)
     if of_a is None or of_b is None:
         which = "A" if of_a is None else "B"
         return Skipped(
@@ -377,19 +378,19 @@ def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange 
     places = [seen_points(a)]
     other = seen_points(b)
     if len(other):
-        rays = unproject(project(other, second), first) * other[:, 2:]
-        places.append(rays[np.isfinite(rays).all(axis=1)])
+        points = first.at_depth(second.project(other), other[:, 2])
+        places.append(points[np.isfinite(points).all(axis=1)])
     gauge = np.concatenate(places)
     if len(gauge) < MIN_SEEN:
         return Skipped(
             step="projection", reason=f"{len(gauge)} corners are stated, {MIN_SEEN} needed: fit again", side=side
         )
     rotation, shift = implied_motion(first, second, gauge)
-    found = difference(first, second, of_a + of_b, gauge, gauge)
-    stated = project(gauge, second) - project(gauge, first)
+    found = difference(first, second, (of_a, of_b), gauge, gauge)
+    stated = second.project(gauge) - first.project(gauge)
     x, y = grid(_frame(a, b))
-    points = unproject(grid_points(x, y), first) * float(np.median(gauge[:, 2]))
-    vectors = np.nan_to_num(project(points @ rotation.T + shift, second) - project(points, first))
+    points = first.at_depth(grid_points(x, y), float(np.median(gauge[:, 2])))
+    vectors = np.nan_to_num(second.project(points @ rotation.T + shift) - first.project(points))
     return ProjectionChange(
         side=side,
         as_stated_px=float(np.sqrt(np.mean(np.sum(stated**2, axis=1)))),

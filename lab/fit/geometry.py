@@ -2,13 +2,13 @@
 
 - `lab.measure.board_detection`: corners of a ChArUco board or a checkerboard in the raw mosaic, to hundredths of a
   pixel;
-- `lab.measure.pinhole`: the camera model of OpenCV and its Jacobian, the uncertainty of the projection over the frame,
-  and the difference of two calibrations;
+- `sim.scene.projection`: OpenCV's pinhole and fisheye and a splined stereographic projection, with their Jacobians;
+- `lab.measure.projection`: the uncertainty of the projection over the frame, and the difference of two calibrations;
 - `lab.measure.bundle_adjustment`: one least-squares solve for intrinsics, poses and the warp of the boards, whose
   Jacobian and residuals give the full covariance. Errors that neighbouring corners share are an error of the model,
   and part of it;
-- `lab.measure.board_calibration`: outlying corners and views are left out, with the reason. The distortion model is
-  chosen by views that its fit has not seen: a richer model is refused where it predicts them worse. Two halves of the
+- `lab.measure.board_calibration`: outlying corners and views are left out, with the reason. Projection and
+  distortion are chosen by views that their fits haven't used: a richer model is refused where it predicts them worse. Two halves of the
   views are calibrated separately; what they differ by beyond their uncertainties widens the covariance.
 
 Lateral colour: the camera of each colour of a mosaic follows from where its corners lie beside those of the luminance
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.capture_kinds.charuco import CharucoCapture
+from lab.capture_kinds.charuco import CharucoCapture, square_doubt
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
@@ -49,38 +49,35 @@ from lab.measure.board_calibration import (
 )
 from lab.measure.board_detection import MIN_CORNERS, BoardView, CornerFits, channel_corners, find_boards
 from lab.measure.bundle_adjustment import Solution, warp_prior_mm
-from lab.measure.pinhole import (
-    COUNT,
-    distortion_of,
-    grid,
-    grid_points,
-    matrix_of,
-    project_with_jacobian,
-    unproject,
-)
+from lab.measure.projection import Camera, grid, grid_points
 from lab.one_blas_thread import one_blas_thread
-from sim.camera import Side
+from sim.camera import ProjectionKind, Side
+from sim.scene.projection import COUNT
 
 Array = NDArray[np.floating[Any]]
 HUBER_STD = 1.5  # standard deviations of a coordinate from which residuals lose weight
 MOST_ITERATIONS = 50
 
+PROJECTION_NAMES: dict[ProjectionKind, str] = {
+    "pinhole": "a pinhole with Brown's distortion",
+    "equidistant": "an equidistant fisheye (OpenCV's fisheye)",
+    "splined_stereographic": "a splined stereographic fisheye (radial spline)",
+}
 LARGEST_WARP_STD = 0.5  # of the standard deviation of the prior; above it, the views don't determine a warp
 
 
 def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, CornerFits]]) -> tuple[ChannelGeometry, ...]:
     """Fit the camera of each colour to its corners, one entry of `corners` for each view.
 
-    Poses and boards are the same for all colours, so that only differences count: scale, principal point, k1 and k2 of
-    each colour by least squares, dq = J dtheta. The radial shift of a colour is its own less that of green, against
+    Poses and boards are the same for all colours, so that only differences count: scale, principal point and the
+    first two radial coefficients of each colour by least squares, dq = J dtheta. The radial shift of a colour is its own less that of green, against
     the distance from the principal point, positive outwards.
     """
     if not corners or "G" not in corners[0]:
         return ()
-    intrinsics = calibration.intrinsics
+    camera, intrinsics = calibration.camera, calibration.intrinsics
     seen = np.concatenate([view.image_px for view in calibration.views])
-    rays = unproject(seen, intrinsics)
-    by_camera = project_with_jacobian(rays, intrinsics)[2]
+    by_camera = camera.project_with_jacobian(camera.unproject(seen))[2]
     parameters = _colour_parameters(intrinsics)
     jacobian = by_camera @ parameters
     farthest = float(np.linalg.norm(seen - intrinsics[2:4], axis=1).max())
@@ -94,19 +91,19 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
         beside = _fit_shift(at - green, jacobian, trusted) if channel != "G" else None
         if own is None or (channel != "G" and beside is None):
             continue
-        theta = intrinsics + parameters @ own[0]
+        theta = Camera(camera.projection, intrinsics + parameters @ own[0])
         result = ChannelGeometry(
             channel=channel,
-            camera_matrix=matrix_of(theta).tolist(),
-            distortion=distortion_of(theta).tolist(),
+            camera_matrix=theta.matrix.tolist(),
+            distortion=theta.distortion.tolist(),
             rms_px=own[2],
             corners=int(own[3]),
         )
         if beside is not None:
             # Along the diagonal of the frame; the radial part hardly depends on the direction
             along = np.array([0.8, 0.6])
-            line = unproject(intrinsics[2:4] + radius[:, None] * along, intrinsics)
-            radial = np.einsum("i,nij->nj", along, project_with_jacobian(line, intrinsics)[2] @ parameters)
+            line = camera.unproject(intrinsics[2:4] + radius[:, None] * along)
+            radial = np.einsum("i,nij->nj", along, camera.project_with_jacobian(line)[2] @ parameters)
             radial[:, 1:3] = 0.0  # a common shift of the frame isn't radial
             result = result.model_copy(
                 update={
@@ -122,7 +119,7 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
 
 
 def _colour_parameters(intrinsics: Array) -> Array:
-    """Return the directions (12, 5) of the intrinsics for scale, cx, cy, k1 and k2."""
+    """Return the directions (12, 5) of the intrinsics for scale, cx, cy and the first two radial coefficients."""
     parameters = np.zeros((COUNT, 5))
     parameters[0, 0], parameters[1, 0] = intrinsics[0], intrinsics[1]
     for column, row in ((1, 2), (2, 3), (3, 4), (4, 5)):
@@ -209,12 +206,15 @@ def geometry_result(
     intrinsics_count = int(solution.free.sum())
     warps = solution.covariance[intrinsics_count:, intrinsics_count:]
     fx, fy, cx, cy = (float(value) for value in std[:4])
-    intrinsics = calibration.intrinsics
+    camera = calibration.camera
+    distortion = camera.distortion
     return GeometryFit(
-        camera_matrix=matrix_of(intrinsics).tolist(),
+        lens_projection=camera.projection.kind,
+        spline_angle_deg=camera.projection.spline_angle_deg,
+        camera_matrix=camera.matrix.tolist(),
         camera_matrix_std=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 0.0)),
-        distortion=distortion_of(intrinsics).tolist(),
-        distortion_std=std[4 : 4 + len(distortion_of(intrinsics))].tolist(),
+        distortion=distortion.tolist(),
+        distortion_std=camera.projection.distortion(std)[: len(distortion)].tolist(),
         rms_px=solution.rms_px,
         views=len(calibration.views),
         rejected=(*missed, *calibration.rejected),
@@ -230,7 +230,7 @@ def geometry_result(
         projection=projection_maps(calibration),
         channels=channels,
         residuals=view_residuals(calibration),
-        remarks=tuple(_remarks(solution, validation, of_pictures)),
+        remarks=(*_projection_remarks(calibration), *_remarks(solution, validation, of_pictures)),
     )
 
 
@@ -242,6 +242,7 @@ def corner_errors(solution: Solution) -> CornerErrors:
         model_error_px=solution.model_error_px,
         length_squares=None if errors is None else errors.length_squares,
         between_cameras=None if errors is None or len(solution.free) == 1 else errors.between_cameras,
+        lens_px=solution.lens_px,
         sampling_std=np.sqrt(np.diag(solution.covariance_by_sampling)).tolist(),
     )
 
@@ -302,6 +303,30 @@ def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
             )
         )
     return tuple(found)
+
+
+def _projection_remarks(calibration: Calibration) -> list[str]:
+    """Say that another projection than a pinhole was chosen and why, and what a lens departs from its projection by;
+    and where the stated squares are improbable.
+    """
+    kind = calibration.camera.projection.kind
+    name = PROJECTION_NAMES[kind]
+    remarks = []
+    if kind != "pinhole":
+        held_out = {model.lens_projection: model.held_out_rms_px for model in calibration.models if model.chosen}
+        pinhole = [model.held_out_rms_px for model in calibration.models if model.lens_projection == "pinhole"]
+        beside = f", with the best pinhole {min(pinhole):.3f} px" if pinhole else "; no pinhole fits"
+        remarks.append(
+            f"The lens projects as {name}: views that the fit hasn't used are predicted to {held_out[kind]:.3f} px rms"
+            f"{beside}. Its distortion is {' '.join(calibration.camera.projection.coefficients)}."
+        )
+    if calibration.solution.lens_px > 0.0:
+        remarks.append(
+            f"The lens departs from {name} by about {calibration.solution.lens_px:.3f} px (standard deviation, along "
+            "the radius at the farthest corner). The standard uncertainties include it."
+        )
+    sizes = dict.fromkeys(view.capture.square_mm for view in calibration.views)
+    return [*remarks, *(doubt for size in sizes if (doubt := square_doubt(size)) is not None)]
 
 
 def _remarks(solution: Solution, validation: CrossValidation | None, of_pictures: float | None) -> list[str]:

@@ -39,20 +39,10 @@ from lab.measure.bundle_adjustment import (
     board_pose,
     rms_px,
 )
-from lab.measure.pinhole import (
-    NAMES,
-    cross_matrices,
-    distortion_of,
-    grid,
-    grid_points,
-    intrinsics_of,
-    intrinsics_of_fit,
-    matrix_of,
-    project_with_jacobian,
-    unproject,
-)
+from lab.measure.projection import Camera, cross_matrices, grid, grid_points
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
+from sim.scene.projection import Projection
 
 Array = NDArray[np.floating[Any]]
 
@@ -60,6 +50,7 @@ MIN_PAIRS = 2
 OUTLYING_PAIR = 3.0  # times the median rms of the pairs
 OUTLYING_PAIR_PX = 0.1
 REVERSED_DEG = 10.0  # turn beside the other pairs, below which the renumbered view explains a pair
+SIDES_SIGMA = 2.6  # significance of 1 %, above which the right camera stands on the left
 NO_RIG = 5.0  # times the single cameras' rms (and at least 1 px), above which no rig explains the pairs
 DEPTHS_MM = (500.0, 1000.0, 2000.0)
 
@@ -104,6 +95,7 @@ def fit_pairs(
             f"{len(pairs)} poses of the board were found by both cameras, {MIN_PAIRS} are needed: capture charuco "
             "poses with both, under the same pose name",
         )
+    every_pair, alone = pairs, max(left.rms_px, right.rms_px)
     pairs, rejected = _split_by_numbering(pairs, left, right)
     if len(pairs) < MIN_PAIRS:
         raise NotDetermined("stereo", f"{len(pairs)} pairs can be used, {MIN_PAIRS} are needed{list_reasons(rejected)}")
@@ -120,16 +112,41 @@ def fit_pairs(
         rejected.append(Skipped(step=f"pose {pairs[worst].left.capture.pose}", reason=reason))
         pairs = [pair for k, pair in enumerate(pairs) if k != worst]
     solution = BundleAdjustment(rig_observations(pairs), solution.free, shapes[0]).with_correlated_errors(solution)
-    alone = max(left.rms_px, right.rms_px)
-    if not solution.rms_px < max(NO_RIG * alone, 1.0) or not solution.determined:
+    if not _explains(solution, alone) or not solution.determined:
+        late = _shifted_pose(every_pair, left, right, shapes[0], alone)
         raise NotDetermined(
             "stereo",
             f"no rig explains the pairs (rms {solution.rms_px:.1f} px, each camera alone {alone:.2f} px; worst: pose "
             f"{pairs[worst].left.capture.pose}, {of_pairs[worst]:.1f} px{list_reasons(rejected)}): check that equal "
             "poses are the same pose of the board, that the rig was rigid, and that neither camera's frames are "
-            "mirrored",
+            f"mirrored{late}",
         )
     return _result(solution, pairs, shapes, depths_mm, tuple(rejected))
+
+
+def _explains(solution: Solution, alone_px: float) -> bool:
+    """Tell whether a rig explains the pairs as well as the cameras alone do, whose larger rms is `alone_px`."""
+    return solution.rms_px < max(NO_RIG * alone_px, 1.0)
+
+
+def _shifted_pose(
+    pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit, shape: tuple[int, int], alone_px: float
+) -> str:
+    """Say that a rig explains the pairs if the right views belong to the pose before or after theirs; empty where none
+    does. For the end of a sentence.
+    """
+    for later, name in ((1, "next"), (-1, "previous")):
+        of_left, of_right = (pairs[:-1], pairs[1:]) if later > 0 else (pairs[1:], pairs[:-1])
+        moved = [StereoPair(one.left, other.right) for one, other in zip(of_left, of_right, strict=True)]
+        if len(moved) <= MIN_PAIRS:
+            continue
+        try:
+            solution = solve_rig(moved, left, right, shape)
+        except NotDetermined:
+            continue
+        if _explains(solution, alone_px):
+            return f"; each left picture fits the right one of the {name} pose: the right ones are one pose off"
+    return ""
 
 
 def pair_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> list[StereoPair]:
@@ -159,8 +176,8 @@ def _views_by_pose(recordings: RecordingSet, side: Side, fit: GeometryFit) -> di
 def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
     """Return the mask (12,) of the intrinsics that a fit has fitted."""
     if fit.parameters:
-        return np.array([name in fit.parameters for name in NAMES])
-    return np.append(np.ones(8, dtype=bool), intrinsics_of_fit(fit)[8:] != 0.0)
+        return np.array([name in fit.parameters for name in Camera.of_fit(fit).projection.names])
+    return np.append(np.ones(8, dtype=bool), Camera.of_fit(fit).intrinsics[8:] != 0.0)
 
 
 def _split_by_numbering(
@@ -176,7 +193,7 @@ def _split_by_numbering(
     half_turn = Rotation.from_rotvec([0.0, 0.0, np.pi])
     for pair in pairs:
         of_left, of_right = (
-            Rotation.from_matrix(board_pose(view, intrinsics_of_fit(fit))[0])
+            Rotation.from_matrix(board_pose(view, Camera.of_fit(fit))[0])
             for view, fit in ((pair.left, left), (pair.right, right))
         )
         turns.append(of_right * of_left.inv())
@@ -216,7 +233,7 @@ def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit
     It starts from the fits of the single cameras. Its covariance takes corners as independent. Observations are pair by
     pair, left then right. `shape`: (rows, cols).
     """
-    cameras = np.array([intrinsics_of_fit(left), intrinsics_of_fit(right)])
+    cameras = Camera.of_fit(left), Camera.of_fit(right)
     observations = rig_observations(pairs)
     poses, turns, translations = [], [], []
     for pair in pairs:
@@ -228,7 +245,8 @@ def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit
         turns.append(Rotation.from_matrix(rotation).as_rotvec())
         translations.append(translation_two - rotation @ translation_one)
     start = RigParameters(
-        intrinsics=cameras,
+        projections=tuple(camera.projection for camera in cameras),
+        intrinsics=np.array([camera.intrinsics for camera in cameras]),
         rotation=Rotation.from_rotvec(np.median(turns, axis=0)).as_matrix(),
         translation_mm=np.median(translations, axis=0),
         warps_mm=np.zeros((1 + max(one.board for one in observations), 3)),
@@ -249,6 +267,7 @@ def _result(
     state = solution.state
     at = solution.names.index(RIG[0])
     std = np.sqrt(np.diag(solution.covariance)[at : at + 6])
+    left, right = state.camera(0), state.camera(1)
     translation = state.translation_mm
     baseline = float(np.linalg.norm(translation))
     along = translation / baseline
@@ -262,18 +281,38 @@ def _result(
         baseline_mm_std=float(np.sqrt(along @ of_translation @ along)),
         rms_px=solution.rms_px,
         pairs=len(pairs),
-        camera_matrix_left=matrix_of(state.intrinsics[0]).tolist(),
-        distortion_left=distortion_of(state.intrinsics[0]).tolist(),
-        camera_matrix_right=matrix_of(state.intrinsics[1]).tolist(),
-        distortion_right=distortion_of(state.intrinsics[1]).tolist(),
+        lens_projection_left=left.projection.kind,
+        spline_angle_deg_left=left.projection.spline_angle_deg,
+        camera_matrix_left=left.matrix.tolist(),
+        distortion_left=left.distortion.tolist(),
+        lens_projection_right=right.projection.kind,
+        spline_angle_deg_right=right.projection.spline_angle_deg,
+        camera_matrix_right=right.matrix.tolist(),
+        distortion_right=right.distortion.tolist(),
         parameters=solution.names,
         covariance=solution.covariance.tolist(),
         corner_px_std=solution.noise_px,
         corner_errors=corner_errors(solution),
         rejected=rejected,
         rectification=rectification(state, pairs, shapes[0]) if shapes[0] == shapes[1] else None,
+        remarks=tuple(_side_remarks(state, float(std[3]))),
         depth=tuple(depth_uncertainty(solution, depth_mm, shapes) for depth_mm in depths_mm),
     )
+
+
+def _side_remarks(state: RigParameters, x_std_mm: float) -> list[str]:
+    """Say that the right camera stands left of the left one. `x_std_mm`: standard deviation of the x of the
+    translation.
+
+    A rig whose cameras stand mostly above or behind each other has no left and right.
+    """
+    x, y, z = -state.rotation.T @ state.translation_mm  # the right camera in the frame of the left one
+    if not (x < -SIDES_SIGMA * x_std_mm and abs(x) > max(abs(y), abs(z))):
+        return []
+    return [
+        f"The right camera stands {abs(x):.4g} mm left of the left one: are the pictures of the sides exchanged, or is "
+        "the rig upside down? Where they are exchanged, state the other side; nothing was changed."
+    ]
 
 
 # --- depth -----------------------------------------------------------------------------------------------------------
@@ -286,11 +325,11 @@ def triangulation_jacobian(solution: Solution, points: Array) -> tuple[Array, Ar
     state, free = solution.state, solution.free
     shared = np.zeros((len(points), 4, len(solution.names)))
     by_point = np.empty((len(points), 4, 3))
-    _, by_point[:, :2], by_camera = project_with_jacobian(points, state.intrinsics[0])
+    _, by_point[:, :2], by_camera = state.camera(0).project_with_jacobian(points)
     first = int(free[0].sum())
     shared[:, :2, :first] = by_camera[:, :, free[0]]
     turned = points @ state.rotation.T
-    _, point_jacobian, by_camera = project_with_jacobian(turned + state.translation_mm, state.intrinsics[1])
+    _, point_jacobian, by_camera = state.camera(1).project_with_jacobian(turned + state.translation_mm)
     by_point[:, 2:] = point_jacobian @ state.rotation
     at = solution.names.index(RIG[0])
     shared[:, 2:, first:at] = by_camera[:, :, free[1]]
@@ -320,13 +359,13 @@ def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tupl
     """
     x, y = grid(shapes[0])
     state = solution.state
-    points = unproject(grid_points(x, y), state.intrinsics[0]) * depth_mm
+    points = state.camera(0).at_depth(grid_points(x, y), depth_mm)
     there = np.isfinite(points).all(axis=1)
     seen = np.full((len(points), 2), np.nan)
     on_right = points[there] @ state.rotation.T + state.translation_mm
-    front = on_right[:, 2] > 0
+    front = state.camera(1).projection.sees(on_right)
     there[there] = front
-    seen[there] = project_with_jacobian(on_right[front], state.intrinsics[1])[0]
+    seen[there] = state.camera(1).project(on_right[front])
     rows, cols = shapes[1]
     there &= (seen[:, 0] >= 0) & (seen[:, 0] <= cols - 1) & (seen[:, 1] >= 0) & (seen[:, 1] <= rows - 1)
     maps = np.full((2, len(points)), np.nan)
@@ -350,31 +389,48 @@ def rectification(state: RigParameters, pairs: Sequence[StereoPair], shape: tupl
 
     `shape`: (rows, cols) of the frames.
     """
-    one, two = (matrix_of(camera) for camera in state.intrinsics)
-    of_one, of_two = (distortion_of(camera) for camera in state.intrinsics)
+    cameras = state.camera(0), state.camera(1)
+    if all(camera.projection.kind == "pinhole" for camera in cameras):
+        distortions, alpha = [camera.distortion for camera in cameras], 0.0
+    else:  # OpenCV knows only Brown's distortion; the rectified pair then has the scale of the cameras' axes
+        distortions, alpha = [np.zeros(5)] * 2, -1.0
     found = cv2.stereoRectify(
-        one, of_one, two, of_two, shape[::-1], state.rotation, state.translation_mm[:, None], alpha=0.0
-    )
+        cameras[0].matrix, distortions[0], cameras[1].matrix, distortions[1],
+        shape[::-1], state.rotation, state.translation_mm[:, None], alpha=alpha,
+    )  # fmt: skip
     rotation_one, rotation_two, new_one, new_two, to_depth = found[:5]
     gaps = []
     for pair in pairs:
         _, at_left, at_right = np.intersect1d(pair.left.index, pair.right.index, return_indices=True)
-        row_px = [
-            cv2.undistortPoints(view.image_px[at][:, None, :], matrix, distortion, R=turn, P=new)[:, 0, 1]
-            for view, at, matrix, distortion, turn, new in (
-                (pair.left, at_left, one, of_one, rotation_one, new_one),
-                (pair.right, at_right, two, of_two, rotation_two, new_two),
+        rows_px = [
+            _rectified_rows(view.image_px[at], camera, turn, new)
+            for view, at, camera, turn, new in (
+                (pair.left, at_left, cameras[0], rotation_one, new_one),
+                (pair.right, at_right, cameras[1], rotation_two, new_two),
             )
-            if len(at)
         ]
-        gaps += [row_px[1] - row_px[0]] if row_px else []
+        gaps.append(rows_px[1] - rows_px[0])
+    gap = np.concatenate(gaps)
+    gap = gap[np.isfinite(gap)]  # a ray of 90 deg or more from the rectified axis has no row
     return Rectification(
         rotation_left=rotation_one.tolist(),
         rotation_right=rotation_two.tolist(),
         projection_left=new_one.tolist(),
         projection_right=new_two.tolist(),
         disparity_to_depth=to_depth.tolist(),
-        row_rms_px=float(np.sqrt(np.mean(np.concatenate(gaps) ** 2))),
+        row_rms_px=float(np.sqrt(np.mean(gap**2))) if len(gap) else None,
+    )
+
+
+def _rectified_rows(image: Array, camera: Camera, turn: Array, new: Array) -> Array:
+    """Return the rows (n,), px, of the rectified frame in which corners at `image` (n, 2) lie; NaN behind it.
+
+    `turn` (3, 3): rotation of the camera to the rectified one; `new` (3, 4): projection of that.
+    """
+    rays = camera.unproject(image) @ np.asarray(turn).T
+    return (
+        np.where(rays[:, 2] > 0.0, new[1, 1] * rays[:, 1] / np.where(rays[:, 2] > 0.0, rays[:, 2], 1.0), np.nan)
+        + new[1, 2]
     )
 
 
@@ -387,19 +443,39 @@ def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, 
     if stereo.rectification is None or stereo.camera_matrix_left is None or stereo.camera_matrix_right is None:
         raise NotDetermined("rectification", "the stereo fit has none: fit again cameras of equal size")
     own = stereo.rectification
-    left = intrinsics_of(stereo.camera_matrix_left, stereo.distortion_left or ())
-    right = intrinsics_of(stereo.camera_matrix_right, stereo.distortion_right or ())
+    left, right = _cameras_of(stereo)
+    x, y = np.meshgrid(np.arange(shape[1], dtype=float), np.arange(shape[0], dtype=float))
     found: dict[Side, tuple[Array, Array]] = {}
-    sides: tuple[tuple[Side, Array, Any, Any], ...] = (
+    sides: tuple[tuple[Side, Camera, Any, Any], ...] = (
         ("left", left, own.rotation_left, own.projection_left),
         ("right", right, own.rotation_right, own.projection_right),
     )
     for side, camera, turn, new in sides:
-        x, y = cv2.initUndistortRectifyMap(
-            matrix_of(camera), distortion_of(camera), np.array(turn), np.array(new)[:, :3], shape[::-1], cv2.CV_32FC1
-        )
-        found[side] = (x, y)
+        pixels = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)])
+        rays = pixels @ np.linalg.inv(np.array(new)[:, :3]).T @ np.array(turn)
+        seen = camera.project(rays).astype(np.float32)
+        seen[~camera.projection.sees(rays)] = -1.0  # outside of the frame
+        found[side] = seen[:, 0].reshape(shape), seen[:, 1].reshape(shape)
     return found
+
+
+def _cameras_of(stereo: StereoFit) -> tuple[Camera, Camera]:
+    """Return the cameras of a stereo fit, as fitted together."""
+    left, right = (
+        Camera.of(matrix, distortion or (), Projection(kind, angle))
+        for matrix, distortion, kind, angle in (
+            (
+                stereo.camera_matrix_left, stereo.distortion_left,
+                stereo.lens_projection_left, stereo.spline_angle_deg_left,
+            ),
+            (
+                stereo.camera_matrix_right, stereo.distortion_right,
+                stereo.lens_projection_right, stereo.spline_angle_deg_right,
+            ),
+        )
+        if matrix is not None
+    )  # fmt: skip
+    return left, right
 
 
 def _open_rows(values: Array) -> tuple[tuple[float | None, ...], ...]:

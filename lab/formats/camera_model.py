@@ -50,7 +50,13 @@ def camera_model(
     gain = first("conversion_gain_dn_per_e", 1.0)
     geometry = None
     if fit is not None and fit.geometry is not None:
-        geometry = Geometry(camera_matrix=fit.geometry.camera_matrix, distortion=fit.geometry.distortion)
+        fitted = fit.geometry
+        geometry = Geometry(
+            camera_matrix=fitted.camera_matrix,
+            distortion=fitted.distortion,
+            projection=fitted.lens_projection,
+            spline_angle_deg=fitted.spline_angle_deg,
+        )
     curves, spread = _curves(recordings, side, fit, maker_curves)
     return CameraModel(
         rows=camera.rows,

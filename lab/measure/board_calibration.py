@@ -6,12 +6,13 @@ where two halves of the views, calibrated separately, differ beyond their uncert
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from lab.errors import NotDetermined
 from lab.formats.results import CrossValidation, DistortionModel, Skipped
@@ -24,20 +25,30 @@ from lab.measure.bundle_adjustment import (
     Solution,
     board_key,
     board_pose,
-    first_intrinsics,
+    first_camera,
     first_state,
     rms_px,
+    splined,
     with_boards,
 )
-from lab.measure.pinhole import COUNT, NAMES, Difference, difference, points_at, projection_std
-from sim.camera import Side
+from lab.measure.projection import Camera, Difference, difference, points_at, projection_std
+from sim.camera import ProjectionKind, Side
+from sim.scene.projection import CAMERA, COUNT, EQUIDISTANT, PINHOLE, Projection
 
 Array = NDArray[np.floating[Any]]
 FOLDS = 5
 #: Of the squared error of held-out views, by which a richer model has to be worse to be refused.
 OVERFITTING_SHARE = 0.05
-#: From simple to rich; each model has the coefficients of those before it.
+#: Chance of taking another projection where both predict alike.
+PROJECTION_FALSE_ALARM = 0.01
+#: Of a pinhole, from simple to rich; each model has the coefficients of those before it.
 MODELS = (("k1",), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"))
+#: The projections, from the most usual one, with the coefficients of their richest model.
+PROJECTIONS: dict[ProjectionKind, tuple[str, ...]] = {
+    "pinhole": MODELS[-1],
+    "equidistant": EQUIDISTANT.coefficients,
+    "splined_stereographic": Projection("splined_stereographic", 90.0).coefficients,
+}
 
 MIN_VIEWS = 3
 OUTLYING_VIEW_RATIO = 3.0  # rms of a view over the median rms, above which it is left out
@@ -52,68 +63,118 @@ MOST_LISTED = 3  # views named in a refusal
 DIFFERENCE_SIGMA = 2.6  # significance of 1 %, above which two halves of the views differ beyond their uncertainties
 
 
-def free_intrinsics(coefficients: Sequence[str], *, centre: bool = True) -> NDArray[np.bool_]:
-    """Return the mask (12,) of the intrinsics that a distortion model fits: the pinhole and these coefficients; without
-    `centre` the principal point is held.
+def free_intrinsics(
+    coefficients: Sequence[str], projection: Projection = PINHOLE, *, centre: bool = True
+) -> NDArray[np.bool_]:
+    """Return the mask (12,) of the intrinsics that a distortion model fits: the camera matrix and these coefficients;
+    without `centre` the principal point is held.
     """
-    pinhole = ("fx", "fy", "cx", "cy") if centre else ("fx", "fy")
-    return np.array([name in (*pinhole, *coefficients) for name in NAMES])
+    matrix = CAMERA if centre else CAMERA[:2]
+    return np.array([name in (*matrix, *coefficients) for name in projection.names])
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A projection with the coefficients of its distortion."""
+
+    kind: ProjectionKind
+    coefficients: tuple[str, ...]
 
 
 def choose_model(
-    views: Sequence[BoardView], shape: tuple[int, int], solution: Solution
-) -> tuple[tuple[str, ...], tuple[DistortionModel, ...]]:
-    """Choose the coefficients of the distortion model by cross-validation, and list how well each of `MODELS` predicts
-    held-out views.
+    views: Sequence[BoardView], shape: tuple[int, int], solutions: Mapping[ProjectionKind, Solution]
+) -> tuple[ProjectionKind, tuple[str, ...], tuple[DistortionModel, ...]]:
+    """Choose the projection and the coefficients of its distortion by cross-validation, and list how well each model
+    predicts held-out views. `solutions`: of all `views`, by projection.
 
-    Each model is fitted to the other views; of a held-out view only the pose is fitted. The richest model is taken
-    unless a simpler one predicts the held-out views better, by more than its standard deviation and by 5 % of the
+    Each model is fitted to the other views; of a held-out view only the pose is fitted. Of the pinholes the richest is
+    taken unless a simpler one predicts the held-out views better, by more than its standard deviation and by 5 % of the
     squared error. A coefficient is never dropped for being small: this would claim that it is known to be 0, and make
-    the uncertainty of the others too small.
+    the uncertainty of the others too small. Another projection is taken where it predicts the held-out views better
+    (`_projects_better`).
     """
-    folds = [np.arange(start, len(views), min(FOLDS, len(views))) for start in range(min(FOLDS, len(views)))]
-    scores = {model: np.zeros(len(views)) for model in MODELS}
-    for fold in folds:
-        rest = [k for k in range(len(views)) if k not in fold]
-        chosen = [views[k] for k in rest]
-        if len(chosen) < 2:
-            continue
-        start = solution.state
-        start = replace(start, rotations=start.rotations[rest], translations_mm=start.translations_mm[rest])
-        boards = {board_key(view): number for number, view in enumerate(first_view_of_boards(views))}
-        for model in MODELS:
-            free = free_intrinsics(model)
-            held = replace(start, intrinsics=np.where(free, start.intrinsics, 0.0))
-            observations = [Observation(view, pose=k, board=boards[board_key(view)]) for k, view in enumerate(chosen)]
-            trained = BundleAdjustment(observations, free[None, :], shape, boards=len(boards)).solve(held).state
-            for k in map(int, fold):
-                scores[model][k] = _held_out_square(views[k], trained, boards[board_key(views[k])], solution, k, shape)
+    models = [
+        _Model(kind, coefficients)
+        for kind in solutions
+        for coefficients in (MODELS if kind == "pinhole" else (PROJECTIONS[kind],))
+    ]
+    scores = {model: _held_out_squares(views, shape, model, solutions[model.kind]) for model in models}
     counts = sum(len(view.index) for view in views)
-    best = MODELS[-1]
-    reasons = dict.fromkeys(MODELS, "")
-    for model in reversed(MODELS[:-1]):
-        worse = scores[best] - scores[model]
-        error = float(np.std(worse, ddof=1) * np.sqrt(len(worse)))
-        if worse.sum() > max(error, OVERFITTING_SHARE * scores[model].sum()):
-            reasons[best] = "refused: it predicts held-out views worse than a simpler one does"
-            best = model
+    best, reasons = models[0], dict.fromkeys(models, "")
+    for kind in solutions:
+        own = [model for model in models if model.kind == kind]
+        richest = own[-1]
+        for model in reversed(own[:-1]):
+            if _is_better(scores[model], scores[richest], 1.0):
+                reasons[richest] = "refused: it predicts held-out views worse than a simpler one does"
+                richest = model
+        if best.kind == kind or _projects_better(scores[richest], scores[best]):
+            best = richest
     listed = []
-    for model in MODELS:
+    for model in models:
         reason = reasons[model]
+        change = 100.0 * (np.sqrt(scores[model].sum() / scores[best].sum()) - 1.0)
         if model == best:
             reason = "chosen: no simpler model predicts held-out views better"
+        elif model.kind != best.kind:
+            reason = f"another projection, and no better: held-out views change by {change:+.2g} %"
         elif not reason:
-            change = 100.0 * (np.sqrt(scores[model].sum() / scores[best].sum()) - 1.0)
             reason = f"simpler, and no better: held-out views change by {change:+.2g} %"
         listed.append(
             DistortionModel(
-                coefficients=model,
+                lens_projection=model.kind,
+                coefficients=model.coefficients,
                 held_out_rms_px=float(np.sqrt(scores[model].sum() / counts)),
                 chosen=model == best,
                 reason=reason,
             )
         )
-    return best, tuple(listed)
+    return best.kind, best.coefficients, tuple(listed)
+
+
+def _is_better(one: Array, other: Array, sigma: float) -> bool:
+    """Tell whether the squared errors (views,) of `one` are smaller, by more than `sigma` standard deviations of the
+    sum of the differences and by 5 %.
+    """
+    worse = other - one
+    error = float(np.std(worse, ddof=1) * np.sqrt(len(worse)))
+    return float(worse.sum()) > max(sigma * error, OVERFITTING_SHARE * float(one.sum()))
+
+
+def _projects_better(one: Array, other: Array) -> bool:
+    """Tell whether the squared errors (views,) of `one` are smaller, by 5 % in sum and by Wilcoxon's signed-rank test
+    at 1 %, which one bad view doesn't sway. With fewer than seven views, whose test has no such level: in every view.
+    """
+    if not float(other.sum()) > (1.0 + OVERFITTING_SHARE) * float(one.sum()):
+        return False
+    chance = float(stats.wilcoxon(other, one, alternative="greater", method="auto").pvalue)
+    return chance <= max(PROJECTION_FALSE_ALARM, 0.5 ** len(one))
+
+
+def _held_out_squares(views: Sequence[BoardView], shape: tuple[int, int], model: _Model, solution: Solution) -> Array:
+    """Return the sum of squared residuals, px^2, of each view (views,), predicted by the `model` of the other folds."""
+    found = np.zeros(len(views))
+    boards = {board_key(view): number for number, view in enumerate(first_view_of_boards(views))}
+    free = free_intrinsics(model.coefficients, solution.state.projections[0])
+    for first in range(min(FOLDS, len(views))):
+        fold = range(first, len(views), FOLDS)
+        rest = [k for k in range(len(views)) if k not in fold]
+        if len(rest) < 2:
+            continue
+        start = solution.state
+        held = replace(
+            start,
+            intrinsics=np.where(free, start.intrinsics, 0.0),
+            rotations=start.rotations[rest],
+            translations_mm=start.translations_mm[rest],
+        )
+        observations = [
+            Observation(views[k], pose=number, board=boards[board_key(views[k])]) for number, k in enumerate(rest)
+        ]
+        trained = BundleAdjustment(observations, free[None, :], shape, boards=len(boards)).solve(held).state
+        for k in fold:
+            found[k] = _held_out_square(views[k], trained, boards[board_key(views[k])], solution, k, shape)
+    return found
 
 
 def first_view_of_boards(views: Sequence[BoardView]) -> list[BoardView]:
@@ -139,7 +200,9 @@ def _held_out_square(
         translations_mm=solution.state.translations_mm[pose : pose + 1],
     )
     only = BundleAdjustment([Observation(view, pose=0)], np.zeros((1, COUNT), dtype=bool), shape, only_poses=True)
-    return float(np.sum(only.solve(state).residuals[0] ** 2))
+    square = float(np.sum(only.solve(state).residuals[0] ** 2))
+    # Where the projection isn't defined for a corner, it is off by as much as the frame is wide
+    return square if np.isfinite(square) else len(view.index) * float(np.hypot(*shape)) ** 2
 
 
 @dataclass(frozen=True)
@@ -158,8 +221,13 @@ class Calibration:
 
     @property
     def intrinsics(self) -> Array:
-        """Return the intrinsics (12,); see `lab.measure.pinhole`."""
+        """Return the intrinsics (12,); see `sim.scene.projection`."""
         return np.asarray(self.solution.state.intrinsics[0])
+
+    @property
+    def camera(self) -> Camera:
+        """Return the camera."""
+        return self.solution.state.camera()
 
     @property
     def covariance(self) -> Array:
@@ -177,8 +245,8 @@ class Calibration:
         """Return the standard deviation (n,), px, of projecting to `image` (n, 2) from a distance; NaN where nothing
         projects.
         """
-        points = points_at(image, self.intrinsics, distance_mm)
-        return projection_std(self.intrinsics, self.covariance, self.points, points)
+        points = points_at(image, self.camera, distance_mm)
+        return projection_std(self.camera, self.covariance, self.points, points)
 
 
 def points_in_camera(views: Sequence[BoardView], solution: Solution, camera: int = 0) -> Array:
@@ -195,18 +263,33 @@ def observations_of(views: Sequence[BoardView]) -> list[Observation]:
     return [Observation(view, pose=k, board=keys.index(board_key(view))) for k, view in enumerate(views)]
 
 
-def calibrate(views: Sequence[BoardView], shape: tuple[int, int], coefficients: Sequence[str] = MODELS[-1]) -> Solution:
-    """Calibrate one camera from all views, in frames of `shape` (rows, cols), with the distortion `coefficients`.
+def calibrate(
+    views: Sequence[BoardView],
+    shape: tuple[int, int],
+    coefficients: Sequence[str] = (),
+    kind: ProjectionKind = "pinhole",
+) -> Solution:
+    """Calibrate one camera from all views, in frames of `shape` (rows, cols), with a projection of `kind` and the
+    distortion `coefficients`; none given: those of its richest model.
 
-    The solve starts from a pinhole and goes by way of k1 about the middle of the frame: started without distortion, a
-    rich model may end in another minimum. With a free centre k1 alone takes a decentred lens for one whose centre is
-    far off, from where the richer model doesn't come back.
+    The solve starts without distortion and goes by way of k1 about the middle of the frame: otherwise a rich model may
+    end in another minimum. With a free centre k1 alone takes a decentred lens for one whose centre is far off, from
+    where the richer model doesn't come back. A splined projection starts from the equidistant one.
     """
     observations = observations_of(views)
-    start = first_state(views, first_intrinsics(views, shape))
-    start = with_boards(start, 1 + max(observation.board for observation in observations))
-    rough = BundleAdjustment(observations, free_intrinsics(MODELS[0], centre=False)[None, :], shape).solve(start)
-    return BundleAdjustment(observations, free_intrinsics(coefficients)[None, :], shape).solve(rough.state)
+    boards = 1 + max(observation.board for observation in observations)
+    coefficients = coefficients or PROJECTIONS[kind]
+    if kind == "splined_stereographic":
+        start = calibrate(views, shape, (), "equidistant").state
+        camera = splined(start.camera(), shape)
+        start = replace(start, projections=(camera.projection,), intrinsics=camera.intrinsics[None, :])
+    else:
+        projection = PINHOLE if kind == "pinhole" else EQUIDISTANT
+        start = with_boards(first_state(views, first_camera(views, shape, projection)), boards)
+        free = free_intrinsics(MODELS[0], projection, centre=False)
+        start = BundleAdjustment(observations, free[None, :], shape).solve(start).state
+    free = free_intrinsics(coefficients, start.projections[0])
+    return BundleAdjustment(observations, free[None, :], shape).solve(start)
 
 
 def with_model_error(
@@ -219,16 +302,68 @@ def with_model_error(
 
 
 def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side: Side | None = None) -> Calibration:
-    """Calibrate without the corners and views that don't fit, with the distortion model that predicts unseen views
-    best. The errors that neighbouring corners share are in the covariance.
+    """Calibrate without the corners and views that don't fit, with the projection and the distortion model that predict
+    unseen views best. The errors that neighbouring corners share are in the covariance.
 
     A corner is left out beyond 5 standard deviations of the others. A view is left out where its rms is beyond 3 times
-    the median, or where a quarter of its corners would go. Raises `NotDetermined` where too few views are left, where
-    no camera explains them, or where they don't determine the focal length.
+    the median, or where a quarter of its corners would go. What a projection can't follow it takes for outliers:
+    projections are compared on the corners of that which leaves out the fewest. Raises `NotDetermined` where too few
+    views are left, where no camera explains them, or where they don't determine the focal length.
     """
+    fits: dict[ProjectionKind, _RobustFit] = {}
+    refused: NotDetermined | None = None
+    for kind in PROJECTIONS:
+        try:
+            fits[kind] = _fit_without_outliers(views, shape, kind, side)
+        except NotDetermined as reason:
+            refused = refused or reason
+    if refused is not None and not fits:
+        raise refused
+    common = max(fits.values(), key=lambda fit: fit.corners).views
+    solutions = {
+        kind: fit.solution if fit.views is common else calibrate(common, shape, (), kind) for kind, fit in fits.items()
+    }
+    chosen, coefficients, models = choose_model(common, shape, solutions)
+    kept, rejected, outliers, solution = (
+        getattr(fits[chosen], name) for name in ("views", "rejected", "outliers", "solution")
+    )
+    _check_board(kept, solution, shape, rejected)
+    if coefficients != PROJECTIONS[chosen]:
+        solution = calibrate(kept, shape, coefficients, chosen)
+    solution = with_model_error(kept, shape, solution)
+    _check_focal_length(solution)
+    corners = tuple(
+        Skipped(step=capture, reason=_corner_reason(numbers, solution.noise_px), side=side)
+        for capture, numbers in outliers.items()
+    )
+    return Calibration(tuple(kept), solution, shape, models, tuple(rejected), corners)
+
+
+@dataclass(frozen=True)
+class _RobustFit:
+    """A fit of one projection to the views and corners that it explains.
+
+    `outliers`: capture -> (number, distance in px) of the corners that were left out of it.
+    """
+
+    views: list[BoardView]
+    solution: Solution
+    rejected: list[Skipped]
+    outliers: dict[str, list[tuple[int, float]]]
+
+    @property
+    def corners(self) -> int:
+        """Return the number of corners that were kept."""
+        return sum(len(view.index) for view in self.views)
+
+
+def _fit_without_outliers(
+    views: Sequence[BoardView], shape: tuple[int, int], kind: ProjectionKind, side: Side | None
+) -> _RobustFit:
+    """Fit the richest model of a projection without the corners and views that don't fit."""
     kept: list[BoardView] = []
     rejected: list[Skipped] = []
-    start = first_intrinsics(views, shape)
+    start = first_camera(views, shape, PINHOLE if kind == "pinhole" else EQUIDISTANT)
     for view in views:
         try:
             board_pose(view, start)
@@ -242,7 +377,7 @@ def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side:
                 "geometry",
                 f"{len(kept)} views of the board can be used, {MIN_VIEWS} are needed{list_reasons(rejected)}",
             )
-        solution = calibrate(kept, shape)
+        solution = calibrate(kept, shape, (), kind)
         outlying = _outlying_view(kept, solution)
         if outlying is not None:
             which, reason = outlying
@@ -251,18 +386,7 @@ def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side:
             del kept[which]
             continue
         if not _remove_outlying_corners(kept, solution, outliers):
-            break
-    _check_board(kept, solution, shape, rejected)
-    coefficients, models = choose_model(kept, shape, solution)
-    if coefficients != MODELS[-1]:
-        solution = calibrate(kept, shape, coefficients)
-    solution = with_model_error(kept, shape, solution)
-    _check_focal_length(solution)
-    corners = tuple(
-        Skipped(step=capture, reason=_corner_reason(numbers, solution.noise_px), side=side)
-        for capture, numbers in outliers.items()
-    )
-    return Calibration(tuple(kept), solution, shape, models, tuple(rejected), corners)
+            return _RobustFit(kept, solution, rejected, outliers)
 
 
 def _outlying_view(views: Sequence[BoardView], solution: Solution) -> tuple[int, str] | None:
@@ -383,7 +507,8 @@ def compare_halves(calibration: Calibration) -> tuple[Difference, float] | None:
     halves = [views[0::2], views[1::2]]
     if min(len(half) for half in halves) < MIN_VIEWS:
         return None
-    solved = [calibrate(half, calibration.shape, coefficients) for half in halves]
+    kind = calibration.camera.projection.kind
+    solved = [calibrate(half, calibration.shape, coefficients, kind) for half in halves]
     if not all(one.determined for one in solved):
         return None
     errors = calibration.solution.errors
@@ -394,13 +519,15 @@ def compare_halves(calibration: Calibration) -> tuple[Difference, float] | None:
     one, two = solved
     points = calibration.points
     points = points[:: max(1, len(points) // 300)]
-    covariances = (
-        one.of_camera() + two.of_camera(),
-        one.of_camera(only_sampling=True) + two.of_camera(only_sampling=True),
-    )
     whole, sampling = (
-        difference(one.state.intrinsics[0], two.state.intrinsics[0], covariance, calibration.points, points)
-        for covariance in covariances
+        difference(
+            one.state.camera(),
+            two.state.camera(),
+            (one.of_camera(only_sampling=only_sampling), two.of_camera(only_sampling=only_sampling)),
+            calibration.points,
+            points,
+        )
+        for only_sampling in (False, True)
     )
     return whole, sampling.expected_px
 
@@ -425,4 +552,5 @@ def widen_covariance(calibration: Calibration, validation: CrossValidation | Non
 
 def distortion_coefficients(solution: Solution) -> tuple[str, ...]:
     """Return the names of the distortion coefficients that were fitted."""
-    return tuple(name for name, free in zip(NAMES[4:], solution.free[0, 4:], strict=True) if free)
+    names = solution.state.projections[0].names
+    return tuple(name for name, free in zip(names[4:], solution.free[0, 4:], strict=True) if free)

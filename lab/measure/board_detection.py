@@ -46,6 +46,9 @@ MIN_CORNERS = 8  # of a view: a pose has six parameters
 WINDOW_PX = 9.0  # largest radius of the window of a corner
 
 
+OUTLYING_GUESS = 5.0  # median distances from the bent homography, from which a corner has no say in it
+
+
 class CornerFits(NamedTuple):
     """Corners (n, 2), (x, y), px; which fits are to be trusted (n,); standard deviation of a coordinate by the noise
     of the picture, px (n,).
@@ -63,12 +66,14 @@ def fit_corners(
     down: Array,
     half_px: Array,
     clear: Callable[[Array], NDArray[np.bool_]] | None = None,
+    bend_per_px: Array | None = None,
 ) -> CornerFits:
     """Fit checkerboard corners by least squares (Levenberg-Marquardt, all corners at once).
 
         I = level + gradient . r + contrast E(d1) E(d2)
 
-    E: a blurred edge, an error function of -1..1; d1, d2: distances from two lines through the corner. `points` (n,
+    E: a blurred edge, an error function of -1..1; d1, d2: distances from two lines through the corner, straight ones or
+    parabolas with the curvatures `bend_per_px` (2, n, 2), vectors (x, y) of the lines along `across` and `down`. `points` (n,
     2), (x, y): the first guess, good to about 2 px. `across`, `down` (n, 2): directions of the axes of the board
     there. `half_px` (n,): radius of the window. `clear(points) -> bool` says which pixels may be used. Trusted are
     fits that converged near the guess, are sharp enough, and explain the picture.
@@ -88,6 +93,7 @@ def fit_corners(
         used &= clear(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(used.shape)
     value = picture[np.clip(y, 0, rows - 1).astype(int), np.clip(x, 0, cols - 1).astype(int)]
     weight = used.astype(float)
+    bend = np.zeros((2, count, 2)) if bend_per_px is None else bend_per_px
 
     # Edge 1 runs along `across`, edge 2 along `down`. Parameters: place (2), angles of the normals (2), width, level,
     # gradient (2), contrast.
@@ -96,17 +102,17 @@ def fit_corners(
     p[:, 2] = np.arctan2(across[:, 0], -across[:, 1])
     p[:, 3] = np.arctan2(down[:, 0], -down[:, 1])
     p[:, 4] = 1.0
-    p[:, 5:] = _damped_step(_corner_model(p, dx, dy)[1][:, :, 5:], weight, value)[0]
+    p[:, 5:] = _damped_step(_corner_model(p, dx, dy, bend)[1][:, :, 5:], weight, value)[0]
     damping = np.full(count, 1e-3)
-    cost = _residual_squares(p, dx, dy, value, weight)
+    cost = _residual_squares(p, dx, dy, bend, value, weight)
     limit = np.array([1.0, 1.0, 0.3, 0.3, 0.5, np.inf, np.inf, np.inf, np.inf])
     moving = np.arange(count)  # corners that still move
     for _ in range(25):
-        model, jacobian = _corner_model(p[moving], dx, dy)
+        model, jacobian = _corner_model(p[moving], dx, dy, bend[:, moving])
         change, _ = _damped_step(jacobian, weight[moving], value[moving] - model, damping[moving])
         tried = p[moving] + np.clip(change, -limit, limit)
         tried[:, 4] = np.clip(tried[:, 4], 0.2, 4.0)
-        new = _residual_squares(tried, dx, dy, value[moving], weight[moving])
+        new = _residual_squares(tried, dx, dy, bend[:, moving], value[moving], weight[moving])
         better = new <= cost[moving]
         moved = np.abs(tried - p[moving])[:, :2].max(axis=1)
         p[moving[better]], cost[moving[better]] = tried[better], new[better]
@@ -114,7 +120,7 @@ def fit_corners(
         moving = moving[np.where(better, moved > 1e-4, damping[moving] < 1e3)]
         if not len(moving):
             break
-    covariance = _damped_step(_corner_model(p, dx, dy)[1], weight, value)[1]
+    covariance = _damped_step(_corner_model(p, dx, dy, bend)[1], weight, value)[1]
     unit_std = np.sqrt(np.abs(covariance[:, 0, 0] + covariance[:, 1, 1]))
     pixels = weight.sum(axis=1)
     residual = np.sqrt(cost / np.maximum(pixels - 9.0, 1.0))
@@ -128,33 +134,45 @@ def fit_corners(
     return CornerFits(found, trusted, residual * unit_std / np.sqrt(2.0))
 
 
-def _corner_model(p: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
-    """Return the model (n, window) of the picture and its Jacobian (n, window, 9).
-
-    `p` (n, 9): parameters of the corners, see `fit_corners`. `dx`, `dy` (window,): places of the pixels from the
-    pixel of the corner, px.
+def _edge_distances(p: Array, dx: Array, dy: Array, bend: Array) -> list[tuple[Array, Array, Array]]:
+    """Return for each of the two edges: the distance of the pixels from it (n, window), the place along it, px, and its
+    curvature towards its normal (n, 1), 1/px. See `_corner_model`.
     """
     x, y = dx - p[:, :1], dy - p[:, 1:2]
-    width = p[:, 4:5]
-    edges, derivatives, across, along = [], [], [], []
-    for angle in (p[:, 2:3], p[:, 3:4]):
-        u = np.cos(angle) * x + np.sin(angle) * y
-        edges.append(erf(u / (np.sqrt(2.0) * width)))
-        derivatives.append(np.sqrt(2.0 / np.pi) / width * np.exp(-0.5 * (u / width) ** 2))
-        across.append(np.cos(angle) * y - np.sin(angle) * x)
-        along.append(u)
-    contrast = p[:, 8:9]
-    first, second = derivatives[0] * edges[1] * contrast, derivatives[1] * edges[0] * contrast
+    found = []
+    for angle, curvature in zip((p[:, 2:3], p[:, 3:4]), bend, strict=True):
+        along = np.cos(angle) * y - np.sin(angle) * x
+        towards = np.cos(angle) * curvature[:, :1] + np.sin(angle) * curvature[:, 1:]
+        found.append((np.cos(angle) * x + np.sin(angle) * y - 0.5 * towards * along**2, along, towards))
+    return found
+
+
+def _corner_model(p: Array, dx: Array, dy: Array, bend: Array) -> tuple[Array, Array]:
+    """Return the model (n, window) of the picture and its Jacobian (n, window, 9), in which a turn of an edge doesn't
+    change its sag.
+
+    `p` (n, 9): parameters of the corners, see `fit_corners`. `dx`, `dy` (window,): places of the pixels from the
+    pixel of the corner, px. `bend` (2, n, 2): curvatures of the edges.
+    """
+    width, contrast = p[:, 4:5], p[:, 8:9]
+    distances = _edge_distances(p, dx, dy, bend)
+    edges = [erf(u / (np.sqrt(2.0) * width)) for u, _, _ in distances]
+    derivatives = [np.sqrt(2.0 / np.pi) / width * np.exp(-0.5 * (u / width) ** 2) for u, _, _ in distances]
+    slopes = [derivatives[0] * edges[1] * contrast, derivatives[1] * edges[0] * contrast]
+    by_x, by_y = np.zeros_like(slopes[0]), np.zeros_like(slopes[0])
+    for slope, angle, (_, along, towards) in zip(slopes, (p[:, 2:3], p[:, 3:4]), distances, strict=True):
+        by_x -= slope * (np.cos(angle) + towards * along * np.sin(angle))
+        by_y -= slope * (np.sin(angle) - towards * along * np.cos(angle))
     jacobian = np.stack(
         [
-            -first * np.cos(p[:, 2:3]) - second * np.cos(p[:, 3:4]),
-            -first * np.sin(p[:, 2:3]) - second * np.sin(p[:, 3:4]),
-            first * across[0],
-            second * across[1],
-            -(first * along[0] + second * along[1]) / width,
-            np.ones_like(x),
-            np.broadcast_to(dx, x.shape),
-            np.broadcast_to(dy, x.shape),
+            by_x,
+            by_y,
+            slopes[0] * distances[0][1],
+            slopes[1] * distances[1][1],
+            -(slopes[0] * distances[0][0] + slopes[1] * distances[1][0]) / width,
+            np.ones_like(by_x),
+            np.broadcast_to(dx, by_x.shape),
+            np.broadcast_to(dy, by_x.shape),
             edges[0] * edges[1],
         ],
         axis=-1,
@@ -163,15 +181,14 @@ def _corner_model(p: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
     return model, jacobian
 
 
-def _residual_squares(p: Array, dx: Array, dy: Array, value: Array, weight: Array) -> Array:
+def _residual_squares(p: Array, dx: Array, dy: Array, bend: Array, value: Array, weight: Array) -> Array:
     """Return the weighted sums of squared residuals (n,).
 
-    `p`, `dx`, `dy`: see `_corner_model`. `value`, `weight` (n, window): the picture, and 1 where a pixel is used, else
-    0.
+    `p`, `dx`, `dy`, `bend`: see `_corner_model`. `value`, `weight` (n, window): the picture, and 1 where a pixel is
+    used, else 0.
     """
-    x, y = dx - p[:, :1], dy - p[:, 1:2]
     width = np.sqrt(2.0) * p[:, 4:5]
-    one, two = (erf((np.cos(angle) * x + np.sin(angle) * y) / width) for angle in (p[:, 2:3], p[:, 3:4]))
+    one, two = (erf(u / width) for u, _, _ in _edge_distances(p, dx, dy, bend))
     model = p[:, 5:6] + p[:, 6:7] * dx + p[:, 7:8] * dy + p[:, 8:9] * one * two
     return np.asarray((weight * (value - model) ** 2).sum(axis=1))
 
@@ -506,10 +523,8 @@ def refine_corners(
     homography, _ = cv2.findHomography(board.astype(np.float64), points.astype(np.float64), cv2.RANSAC, 3.0)
     if homography is None:
         raise NotDetermined("geometry", "the corners found don't lie on a plane: light or place the board better")
-    inverse = np.linalg.inv(homography)
-
-    def to_image(at: Array) -> Array:
-        return np.asarray(cv2.perspectiveTransform(at[:, None, :].astype(np.float64), homography)[:, 0])
+    to_image = _bent_homography(homography, board, points)
+    to_board = _bent_homography(np.linalg.inv(homography), points, board)
 
     step = 0.5 * square_mm
     along = [
@@ -520,7 +535,7 @@ def refine_corners(
 
     def clear(at_px: Array) -> NDArray[np.bool_]:
         """Tell which pixels (n, 2) are on the board with no marker that blurs into them."""
-        mm = cv2.perspectiveTransform(at_px.reshape(-1, 1, 2).astype(np.float64), inverse)[:, 0]
+        mm = to_board(at_px)
         inside = np.all((mm > 0) & (mm < np.array([cols, rows]) * square_mm), axis=1)
         if marker_mm <= 0:
             return np.asarray(inside)
@@ -536,7 +551,50 @@ def refine_corners(
         return np.asarray(inside & ~(near & light))
 
     light_squares = _light_squares(picture, to_image, square_mm, marker_mm, rows, cols)
-    return fit_corners(picture, points, along[0], along[1], half, clear)
+    bend = edge_curvatures(board, to_image, square_mm)
+    return fit_corners(picture, points, along[0], along[1], half, clear, bend)
+
+
+def _bent_homography(homography: Array, source: Array, target: Array) -> Callable[[Array], Array]:
+    """Return a map of places (n, 2) that takes `source` (n, 2) to `target` (n, 2), the corners of a board: a homography
+    (3, 3), and a polynomial for what a lens that bends edges adds, of the highest degree up to 4 for which there are
+    three corners a term.
+    """
+    middle, scale = source.mean(axis=0), float(np.ptp(source, axis=0).max()) / 2.0 + 1e-9
+    degree = max((d for d in range(5) if 3 * (d + 1) * (d + 2) // 2 <= len(source)), default=0)
+
+    def plane(at: Array) -> Array:
+        return np.asarray(cv2.perspectiveTransform(at[:, None, :].astype(np.float64), homography)[:, 0])
+
+    def terms(at: Array) -> Array:
+        x, y = ((at - middle) / scale).T
+        return np.column_stack([x**i * y ** (k - i) for k in range(degree + 1) for i in range(k + 1)])
+
+    design, displaced = terms(source), target - plane(source)
+    near = np.ones(len(source), dtype=bool)
+    for _ in range(2):  # a corner that was found at a wrong place would bend the map about its neighbours
+        coefficients = np.linalg.lstsq(design[near], displaced[near], rcond=1e-9)[0]
+        distance = np.linalg.norm(displaced - design @ coefficients, axis=1)
+        near = distance <= max(OUTLYING_GUESS * float(np.median(distance)), 1e-9)
+    return lambda at: np.asarray(plane(at) + terms(at) @ coefficients)
+
+
+def edge_curvatures(board: Array, to_image: Callable[[Array], Array], square_mm: float) -> Array:
+    """Return the curvatures (2, n, 2), 1/px, of the images of the edges along x and along y of the board, as vectors
+    (x, y) at its corners (n, 2), mm. `to_image` maps mm to px.
+
+    A fit of straight edges to curved ones is off by about curvature times window^2 / 6: 0.02 px at half the frame of a
+    fisheye.
+    """
+    step, found = 0.25 * square_mm, []
+    for direction in (np.array([step, 0.0]), np.array([0.0, step])):
+        after, before = to_image(board + direction), to_image(board - direction)
+        chord, sag = 0.5 * (after - before), 0.5 * (after + before) - to_image(board)
+        length = np.maximum(np.linalg.norm(chord, axis=1, keepdims=True), 1e-9)
+        unit = chord / length
+        sag -= np.sum(sag * unit, axis=1, keepdims=True) * unit  # perspective moves the middle along the edge
+        found.append(2.0 * sag / length**2)
+    return np.array(found)
 
 
 def _light_squares(

@@ -21,6 +21,13 @@ independent: the error falls with the number of poses, not with that of corners.
 likelihood (Patterson and Thompson 1971), which allows for what the fit has absorbed. Where it is no better than that of
 independent corners, nothing changes.
 
+A lens that doesn't project as its model displaces the corners at one place of the frame alike in every view. Neither
+views nor halves of them show that by their scatter; what shows it is that residuals have a mean over the frame. This
+discrepancy is taken as radial, d(r) = (r / R) h(r / R), R the distance of the farthest corner from the principal point,
+with h a Gaussian process of variance b^2 and correlation length R / 4 (Kennedy and O'Hagan 2001). b is the most likely
+one, given what poses and parameters leave of d in the residuals (`fit_lens_error`). The part of d that the parameters have absorbed, a focal length that is off, is in their
+covariance: A^-1 (sum J^T d) (sum J^T d)^T A^-1 over all poses.
+
 The estimates of the solve stay. Their covariance becomes the sandwich A^-1 B A^-1 of Huber (1967) and White (1980),
 with A = sum J^T J the normal matrix of the solve, J the Jacobian without the poses, and B the covariance of the scores
 J^T r of the poses. A dozen poses are too few for a matrix of a dozen parameters: their B is shrunk towards sum J^T V J.
@@ -40,15 +47,9 @@ from scipy.spatial.transform import Rotation
 
 from lab.errors import NotDetermined
 from lab.measure.board_detection import BoardView
-from lab.measure.pinhole import (
-    COUNT,
-    NAMES,
-    cross_matrices,
-    distortion_of,
-    matrix_of,
-    project,
-    project_with_jacobian,
-)
+from lab.measure.projection import Camera, cross_matrices
+from sim.camera import ProjectionKind
+from sim.scene.projection import COUNT, PINHOLE, WIDEST_DEG, Projection
 
 Array = NDArray[np.floating[Any]]
 #: Twice the log of the ratio of likelihoods, above which corners are taken as correlated: chi2 of four parameters
@@ -61,17 +62,35 @@ FIRST_ERRORS = (1.0, 1.5, 1.5, 0.5)  # a, lx, ly, r
 STIFFNESS = 1.0  # degrees of freedom of the fitted V beside those of the scores, of the number of parameters
 DEVIANCE_TOLERANCE = 1e-6  # relative, of the deviance of about 1e4: 0.01
 MOST_POSES = 40  # that V is fitted to; more change little and take long
+#: Of the discrepancy of a lens: places at which it is free; its correlation length, of the radius of the farthest
+#: corner. What varies more slowly the polynomials of the projections follow, and residuals can't show it.
+LENS_NODES = 8
+LENS_LENGTH = 0.25
+LEAST_SHOWN = 1e-4  # of the largest part of the discrepancy, below which parameters have taken up a part of it
+#: Twice the log of the ratio of likelihoods, above which a lens is taken as departing from its projection: half a chi2 of
+#: one parameter, whose bound is 0, exceeds it once in 1000.
+LEAST_LENS_RATIO = 9.55
+LENS_RANGE = 12.0  # of the log of b, below the largest part that is seen: 6e-6 of it
 
 RIG = ("turn_x_rad", "turn_y_rad", "turn_z_rad", "translation_x_mm", "translation_y_mm", "translation_z_mm")
 WARP = ("bend_x_mm", "bend_y_mm", "twist_mm")
 #: Standard deviation of the prior of each distortion term: share of the radius at the corner of the frame, and power of
 #: the radius. Tens of px: it only keeps terms that no view determines from growing without bound.
-DISTORTION_PRIOR = {
-    "k1": (0.3, 2), "k2": (0.1, 4), "k3": (0.03, 6), "k4": (0.3, 2), "k5": (0.1, 4), "k6": (0.03, 6),
-    "p1": (0.03, 1), "p2": (0.03, 1),
+DISTORTION_PRIOR: dict[ProjectionKind, dict[str, tuple[float, int]]] = {
+    "pinhole": {
+        "k1": (0.3, 2), "k2": (0.1, 4), "k3": (0.03, 6), "k4": (0.3, 2), "k5": (0.1, 4), "k6": (0.03, 6),
+        "p1": (0.03, 1), "p2": (0.03, 1),
+    },
+    "equidistant": {"k1": (0.3, 2), "k2": (0.1, 4), "k3": (0.03, 6), "k4": (0.01, 8)},
+    "splined_stereographic": {**{f"s{k}": (0.3, 0) for k in range(1, 7)}, "p1": (0.03, 1), "p2": (0.03, 1)},
 }  # fmt: skip
 WARP_PRIOR = 0.005  # standard deviation of the prior of a warp, of the diagonal of the board
 FIRST_NOISE_PX = 0.1  # of a corner, for the weight of the priors in the first solve
+MIN_POSE_CORNERS = 4  # that determine the pose of a plane
+FOCAL_VIEWS = 6  # with which the first focal length of a fisheye is chosen
+#: Trial focal lengths, of the longer side: half of it is 143 deg of an equidistant lens off its axis at 0.2 (a circular
+#: fisheye of 180 deg has 0.32), and 14 deg at 2. Steps of 1.4: from twice the right one the solve still converges.
+FOCAL_SHARES = (0.2, 0.28, 0.4, 0.56, 0.8, 1.1, 1.6, 2.2)
 MAX_STEPS = 300  # a long lens of a small frame takes 60 to 200: its centre and its distortion trade with each other
 
 
@@ -80,7 +99,8 @@ class PoseErrors:
     """Residuals and Jacobians of the corners of one pose, which determine V.
 
     `squares` (n, 2): places on the board, in squares. `camera` (n,): 0 or 1. `residuals` (n, 2), px. `shared` (n, 2,
-    k), `by_pose` (n, 2, 6): Jacobians of both coordinates by the shared parameters and by the pose.
+    k), `by_pose` (n, 2, 6): Jacobians of both coordinates by the shared parameters and by the pose. `away` (n, 2): from
+    the principal point of the camera, over the distance of its farthest corner.
     """
 
     squares: Array
@@ -88,6 +108,26 @@ class PoseErrors:
     residuals: Array
     shared: Array
     by_pose: Array
+    away: Array
+
+
+def _lens_columns(pose: PoseErrors) -> Array:
+    """Return the displacements (n, 2, m), px, of the corners of a pose by the discrepancy of the lens, d(r) for b = 1:
+    one for each of its m independent parts, those of camera 0, then those of camera 1.
+    """
+    nodes = np.linspace(0.0, 1.0, LENS_NODES)
+
+    def covariance(a: Array, b: Array) -> Array:
+        return np.asarray(np.exp(-0.5 * ((a[:, None] - b[None, :]) / LENS_LENGTH) ** 2))
+
+    factor = np.linalg.cholesky(covariance(nodes, nodes) + 1e-9 * np.eye(LENS_NODES))
+    radius = np.linalg.norm(pose.away, axis=1)
+    parts = linalg.solve_triangular(factor, covariance(nodes, radius), lower=True).T
+    found = np.zeros((len(radius), 2, 2 * LENS_NODES))
+    for camera in (0, 1):
+        its = pose.camera == camera
+        found[its, :, camera * LENS_NODES : (camera + 1) * LENS_NODES] = pose.away[its, :, None] * parts[its, None, :]
+    return found
 
 
 @dataclass(frozen=True)
@@ -156,6 +196,66 @@ def fit_correlated_errors(poses: Sequence[PoseErrors], prior: Array) -> Correlat
     return CorrelatedErrors(noise_px, noise_px * float(np.sqrt(amount)), (along_x, along_y), between, ratio)
 
 
+def fit_lens_error(
+    poses: Sequence[PoseErrors], errors: CorrelatedErrors | None, noise_px: float, prior: Array
+) -> tuple[float, Array]:
+    """Fit the discrepancy of the lens to the residuals at the end of a solve. Returns b, px, its standard deviation at
+    the farthest corner, and what it adds to the covariance (k, k) of the shared parameters.
+
+    With F the columns of d for b = 1, without what poses and parameters take up, F^T r = F^T (F c + e) has the
+    covariance b^2 G^2 + W, with G = F^T F and W = F^T V F of `errors` (None: `noise_px`^2 G). b is the most likely
+    one; 0 where it is no better than none, by `LEAST_LENS_RATIO`. `prior`: see `fit_correlated_errors`.
+    """
+    size, count = len(prior), 2 * LENS_NODES
+    normal, mixed = np.diag(prior).astype(float), np.zeros((size, count))
+    gram, middle, score = np.zeros((count, count)), np.zeros((size + count, size + count)), np.zeros(size + count)
+    for pose in poses:
+        free = _free_of_pose(pose, np.concatenate([pose.shared, _lens_columns(pose)], axis=2))
+        shared, lens = free[:, :size], free[:, size:]
+        normal += shared.T @ shared
+        mixed += shared.T @ lens
+        gram += lens.T @ lens
+        score += free.T @ pose.residuals.ravel()
+        if errors is None:
+            middle += noise_px**2 * (free.T @ free)
+        else:
+            v = errors.covariance(pose)
+            middle += free.T @ (v @ free.reshape(len(v), -1)).reshape(free.shape)
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    absorbed = np.linalg.solve(normal / np.outer(scale, scale), mixed / scale[:, None]) / scale[:, None]  # A^-1 J^T F
+    take = np.concatenate([-absorbed, np.eye(count)])
+    gram, middle, score = gram - mixed.T @ absorbed, take.T @ middle @ take, take.T @ score
+    size_px, axes = np.linalg.eigh(gram)
+    shown = size_px > LEAST_SHOWN * float(size_px.max(initial=0.0))
+    axes, size_px = axes[:, shown], size_px[shown]
+    if not shown.any():
+        return 0.0, np.zeros((size, size))
+    # Of each independent part: what is seen, its variance by noise, and its share for b = 1
+    seen = (axes.T @ score) / np.sqrt(size_px)
+    noise = np.maximum(np.einsum("ji,jk,ki->i", axes, middle, axes) / size_px, 1e-300)
+
+    def deviance(log_amplitude: float) -> float:
+        variance = noise + np.exp(2.0 * log_amplitude) * size_px
+        return float(np.sum(np.log(variance) + seen**2 / variance))
+
+    largest = float(np.sqrt(np.max(seen**2 / size_px)))
+    if not largest > 0.0:
+        return 0.0, np.zeros((size, size))
+    found = optimize.minimize_scalar(
+        deviance, bounds=(np.log(largest) - LENS_RANGE, np.log(largest) + 1.0), method="bounded"
+    )
+    none = float(np.sum(np.log(noise) + seen**2 / noise))
+    amplitude_px = float(np.exp(found.x)) if none - float(found.fun) > LEAST_LENS_RATIO else 0.0
+    return amplitude_px, amplitude_px**2 * np.asarray(absorbed @ absorbed.T)
+
+
+def _free_of_pose(pose: PoseErrors, columns: Array) -> Array:
+    """Return displacements `columns` (n, 2, k) of the corners, as (2n, k), without the part that the pose takes up."""
+    own = pose.by_pose.reshape(2 * len(pose.squares), 6)
+    flat = columns.reshape(len(own), -1)
+    return np.asarray(flat - own @ np.linalg.lstsq(own, flat, rcond=None)[0])
+
+
 def sandwich_covariance(poses: Sequence[PoseErrors], errors: CorrelatedErrors, prior: Array) -> Array:
     """Return the covariance (k, k) of the shared parameters: A^-1 B A^-1.
 
@@ -165,11 +265,7 @@ def sandwich_covariance(poses: Sequence[PoseErrors], errors: CorrelatedErrors, p
     """
     free, model = [], []
     for pose in poses:
-        count = len(pose.squares)
-        own = pose.by_pose.reshape(2 * count, 6)
-        shared = pose.shared.reshape(2 * count, -1)
-        # Without the part that the pose takes up
-        free.append(shared - own @ np.linalg.lstsq(own, shared, rcond=None)[0])
+        free.append(_free_of_pose(pose, pose.shared))
         model.append(errors.covariance(pose))
     scale = np.sqrt(np.maximum(sum(np.sum(one**2, axis=0) for one in free) + prior, 1e-300))
     free = [one / scale for one in free]
@@ -298,16 +394,21 @@ class Observation:
 class RigParameters:
     """All parameters.
 
-    `intrinsics` (cameras, 12). `rotation` (3, 3), `translation_mm` (3,): camera 0 to camera 1. `warps_mm` (boards, 3).
+    `projections`, `intrinsics` (cameras, 12): see `sim.scene.projection`. `rotation` (3, 3), `translation_mm` (3,): camera 0 to camera 1. `warps_mm` (boards, 3).
     `rotations` (poses, 3, 3), `translations_mm` (poses, 3): board to camera 0.
     """
 
+    projections: tuple[Projection, ...]
     intrinsics: Array
     rotation: Array
     translation_mm: Array
     warps_mm: Array
     rotations: Array
     translations_mm: Array
+
+    def camera(self, number: int = 0) -> Camera:
+        """Return one of the cameras."""
+        return Camera(self.projections[number], self.intrinsics[number])
 
 
 @dataclass(frozen=True)
@@ -319,7 +420,8 @@ class Solution:
     the rig, and the warps. `free` (cameras, 12): which intrinsics were fitted. `residuals`: (n, 2) for each
     observation, seen less predicted, px. `noise_px`: standard deviation of one coordinate. `errors`: what neighbouring
     corners share, in `covariance`; None where corners are independent. `sampling_covariance` (n, n): by the independent
-    part alone; None where this is `covariance`.
+    part alone; None where this is `covariance`. `lens_px`: standard deviation, at the farthest corner, of the
+    discrepancy of the lens from its projection, in `covariance`; 0 where the residuals show none.
     """
 
     state: RigParameters
@@ -330,6 +432,7 @@ class Solution:
     noise_px: float
     errors: CorrelatedErrors | None = None
     sampling_covariance: Array | None = None
+    lens_px: float = 0.0
 
     @property
     def model_error_px(self) -> float:
@@ -442,29 +545,29 @@ class BundleAdjustment:
             at = self.at_warp + 3 * number
             self.prior_std[at : at + 3] = warp_prior_mm(seen[0])
 
-    def _set_distortion_prior(self, intrinsics: Array) -> None:
+    def _set_distortion_prior(self, start: RigParameters) -> None:
         """Set the priors of the distortion terms, which need the focal length of the start: the radius of the corner of
         the frame follows from it.
         """
         at = 0
         for camera, mask in enumerate(self.free):
-            radius = self.half_diagonal_px / float(intrinsics[camera, 0])
-            std = np.full(COUNT, np.inf)
-            for name, (share, power) in DISTORTION_PRIOR.items():
-                std[NAMES.index(name)] = share / radius**power
+            radius = self.half_diagonal_px / float(start.intrinsics[camera, 0])
+            std, projection = np.full(COUNT, np.inf), start.projections[camera]
+            for name, (share, power) in DISTORTION_PRIOR[projection.kind].items():
+                std[projection.names.index(name)] = share / radius**power
             count = int(mask.sum())
             self.prior_std[at : at + count] = std[mask]
             at += count
 
-    def names(self) -> tuple[str, ...]:
+    def names(self, projections: Sequence[Projection]) -> tuple[str, ...]:
         """Return the names of the shared parameters, in their order."""
         if self.only_poses:
             return ()
         sides = [""] if self.cameras == 1 else ["left ", "right "]
         found = [
             side + name
-            for side, mask in zip(sides, self.free, strict=True)
-            for name, one in zip(NAMES, mask, strict=True)
+            for side, mask, projection in zip(sides, self.free, projections, strict=True)
+            for name, one in zip(projection.names, mask, strict=True)
             if one
         ]
         found += RIG if self.cameras > 1 else ()
@@ -487,14 +590,15 @@ class BundleAdjustment:
         return own, rotated, placed
 
     def residuals(self, state: RigParameters) -> Array:
-        """Return the residuals, seen less predicted (n, 2), px; infinite where a corner would be behind its camera."""
+        """Return the residuals, seen less predicted (n, 2), px; infinite where a corner would be
+        outside of what the projection is defined for."""
         own = self._place_corners(state)[0]
-        if np.any(own[:, 2] <= 0) or not np.isfinite(own).all():
-            return np.full_like(self.seen, np.inf)
         predicted = np.empty_like(self.seen)
-        for camera in range(self.cameras):
-            its = self.of_camera == camera
-            predicted[its] = project(own[its], state.intrinsics[camera])
+        for number in range(self.cameras):
+            its, camera = self.of_camera == number, state.camera(number)
+            if not (np.isfinite(own[its]).all() and camera.projection.sees(own[its]).all()):
+                return np.full_like(self.seen, np.inf)
+            predicted[its] = camera.project(own[its])
         return self.seen - predicted
 
     def jacobian(self, state: RigParameters) -> tuple[Array, Array]:
@@ -506,7 +610,7 @@ class BundleAdjustment:
         at = 0
         for camera, mask in enumerate(self.free):
             its = self.of_camera == camera
-            _, point_jacobian, by_camera = project_with_jacobian(own[its], state.intrinsics[camera])
+            _, point_jacobian, by_camera = state.camera(camera).project_with_jacobian(own[its])
             by_point[its] = point_jacobian
             if not self.only_poses:
                 shared[its, :, at : at + int(mask.sum())] = by_camera[:, :, mask]
@@ -557,7 +661,10 @@ class BundleAdjustment:
         rotations = np.array(
             [_rotation(step[:3]) @ before for step, before in zip(poses, state.rotations, strict=True)]
         )
-        return RigParameters(intrinsics, rotation, translation, warps, rotations, state.translations_mm + poses[:, 3:])
+        return RigParameters(
+            state.projections, intrinsics, rotation, translation, warps, rotations,
+            state.translations_mm + poses[:, 3:],
+        )  # fmt: skip
 
     def _normal(self, state: RigParameters, residual: Array, noise_px: float) -> tuple[Array, ...]:
         """Return the normal matrices of the shared parameters, shared x pose, and pose, and the right-hand sides.
@@ -589,7 +696,7 @@ class BundleAdjustment:
     def solve(self, start: RigParameters, noise_px: float = FIRST_NOISE_PX) -> Solution:
         """Solve by the method of Levenberg and Marquardt, from `start`."""
         if not self.only_poses:
-            self._set_distortion_prior(start.intrinsics)
+            self._set_distortion_prior(start)
         state, residual = start, self.residuals(start)
         cost, damping = self._cost(start, residual, noise_px), 1e-4
         for _ in range(MAX_STEPS):
@@ -615,41 +722,51 @@ class BundleAdjustment:
         return Solution(
             state=state,
             free=self.free,
-            names=self.names(),
+            names=self.names(state.projections),
             covariance=self._covariance(state, residual, max(noise, 1e-9)),
             residuals=tuple(residual[part] for part in self.parts),
             noise_px=noise,
         )
 
     def with_correlated_errors(self, solution: Solution, errors: CorrelatedErrors | None = None) -> Solution:
-        """Return the solution with a covariance that holds the errors which neighbouring corners share: those given, or
-        those that its residuals show. The same solution where they show none.
+        """Return the solution with a covariance that holds the errors which neighbouring corners share, those given, or
+        those that its residuals show, and the discrepancy of the lens, unless errors are given. The same solution where
+        the residuals show none.
         """
         if not solution.determined:
             return solution
         poses, prior = self._pose_errors(solution), (solution.noise_px / self.prior_std) ** 2
+        of_all, lens_px, of_lens = errors is None, 0.0, np.zeros_like(solution.covariance)
         errors = fit_correlated_errors(poses, prior) if errors is None else errors
-        if errors is None:
+        if of_all:  # parts of the views share the lens: it isn't among what they may differ by
+            lens_px, of_lens = fit_lens_error(poses, errors, solution.noise_px, prior)
+        if errors is None and not lens_px:
             return solution
-        share = (errors.noise_px / max(solution.noise_px, 1e-9)) ** 2
+        share = 1.0 if errors is None else (errors.noise_px / max(solution.noise_px, 1e-9)) ** 2
+        covariance = solution.covariance if errors is None else sandwich_covariance(poses, errors, prior)
         return replace(
             solution,
-            covariance=sandwich_covariance(poses, errors, prior),
+            covariance=covariance + of_lens,
             sampling_covariance=share * solution.covariance,
             errors=errors,
+            lens_px=lens_px,
         )
 
     def _pose_errors(self, solution: Solution) -> list[PoseErrors]:
         """Collect the residuals and Jacobians of each pose at the end of a solve."""
-        self._set_distortion_prior(solution.state.intrinsics)
+        self._set_distortion_prior(solution.state)
         shared, by_pose = self.jacobian(solution.state)
         squares = np.concatenate(
             [one.view.board_mm[:, :2] / one.view.capture.square_mm for one in self.observations]
         ).astype(float)
         residuals = np.concatenate(solution.residuals)
+        away = self.seen - solution.state.intrinsics[self.of_camera, 2:4]
+        for camera in range(self.cameras):
+            its = self.of_camera == camera
+            away[its] /= np.linalg.norm(away[its], axis=1).max(initial=1e-9)
         pose = np.concatenate([np.full(len(one.view.index), one.pose) for one in self.observations])
         return [
-            PoseErrors(squares[at], self.of_camera[at], residuals[at], shared[at], by_pose[at])
+            PoseErrors(squares[at], self.of_camera[at], residuals[at], shared[at], by_pose[at], away[at])
             for at in (np.flatnonzero(pose == number) for number in np.unique(pose))
         ]
 
@@ -700,51 +817,108 @@ def _rotation(rotation_vector: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(rotation_vector).as_matrix())
 
 
-def board_pose(view: BoardView, intrinsics: Array) -> tuple[Array, Array]:
+def board_pose(view: BoardView, camera: Camera) -> tuple[Array, Array]:
     """Find the rotation (3, 3) and translation (3,), mm, from the flat board to a camera, from one view. Raises
     `NotDetermined` where none fits.
+
+    The rays of the corners are turned about their mean and seen by an ideal pinhole along it, so that a board far from
+    the axis of a wide lens has a pose, too.
     """
-    matrix, distortion = matrix_of(intrinsics), distortion_of(intrinsics)
-    points, seen = view.board_mm.astype(float), view.image_px.astype(float)
-    try:
-        found, rotation_vector, translation = cv2.solvePnP(points, seen, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
-    except cv2.error:
-        found, rotation_vector, translation = False, np.zeros(3), np.zeros(3)
-    rotation = np.asarray(cv2.Rodrigues(rotation_vector)[0]) if found else np.eye(3)
-    translation = np.asarray(translation).ravel() if found else np.zeros(3)
-    if not np.all(points @ rotation[2] + translation[2] > 0):
+    rays = camera.unproject(view.image_px.astype(float))
+    there = np.isfinite(rays).all(axis=1)
+    rays, points = rays[there], view.board_mm[there].astype(float)
+    rotation, translation = np.eye(3), np.zeros(3)
+    found = False
+    if len(rays) >= MIN_POSE_CORNERS:
+        turn = _towards_axis(rays.mean(axis=0))
+        ahead = rays @ turn.T
+        try:
+            found, rotation_vector, of_board = cv2.solvePnP(
+                points, ahead[:, :2] / ahead[:, 2:], np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE
+            )
+        except cv2.error:
+            found = False
+        if found:
+            rotation = turn.T @ np.asarray(cv2.Rodrigues(rotation_vector)[0])
+            translation = turn.T @ np.asarray(of_board).ravel()
+    placed = view.board_mm.astype(float) @ rotation.T + translation
+    if not (found and camera.projection.sees(placed).all()):
         raise NotDetermined(
             "geometry", "no pose of the board fits its corners: check what the capture says of the board"
         )
     return rotation, translation
 
 
-def first_intrinsics(views: Sequence[BoardView], shape: tuple[int, int]) -> Array:
-    """Return a pinhole without distortion to begin with: the focal length of Zhang, or the width of the frame where the
-    views determine none.
+def _towards_axis(direction: Array) -> Array:
+    """Return the smallest rotation (3, 3) that turns a direction (3,) to the axis of the camera."""
+    axis = np.cross(direction, [0.0, 0.0, 1.0])
+    length = float(np.linalg.norm(axis))
+    angle = float(np.arctan2(length, direction[2]))
+    return _rotation(axis * (angle / length) if length > 0.0 else np.zeros(3))
 
-    `shape`: (rows, cols) of the frames. Returns a vector (12,), see `lab.measure.pinhole`.
+
+def first_camera(views: Sequence[BoardView], shape: tuple[int, int], projection: Projection = PINHOLE) -> Camera:
+    """Return a camera without distortion to begin with. `shape`: (rows, cols) of the frames.
+
+    The focal length of a pinhole is that of Zhang, or the width of the frame where the views determine none. That of
+    another projection is the one with which the poses of a few views fit best.
     """
+    middle = (shape[1] - 1) / 2.0, (shape[0] - 1) / 2.0
+
+    def camera(focal: float) -> Camera:
+        return Camera.of([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]], (), projection)
+
     boards = [view.board_mm.astype(np.float32) for view in views]
     points = [view.image_px.astype(np.float32) for view in views]
-    start = np.zeros(COUNT)
-    start[2:4] = (shape[1] - 1) / 2.0, (shape[0] - 1) / 2.0
     try:
-        matrix = cv2.initCameraMatrix2D(boards, points, shape[::-1], 1.0)
-        focal = float(matrix[0, 0])
+        focal = float(cv2.initCameraMatrix2D(boards, points, shape[::-1], 1.0)[0, 0])
     except cv2.error:
         focal = np.nan
     if not 0.2 * max(shape) < focal < 50.0 * max(shape):
         focal = float(max(shape))
-    start[:2] = focal
-    return start
+    if projection.kind == "pinhole":
+        return camera(focal)
+    few = views[:: max(1, len(views) // FOCAL_VIEWS)]
+    trials = [camera(one) for one in (focal, *(share * max(shape) for share in FOCAL_SHARES))]
+    return min(trials, key=lambda one: sum(_pose_square(view, one) for view in few))
 
 
-def first_state(views: Sequence[BoardView], intrinsics: Array) -> RigParameters:
+def _pose_square(view: BoardView, camera: Camera) -> float:
+    """Return the sum of squared residuals, px^2, of a view at its pose by `board_pose`; infinite without one."""
+    try:
+        rotation, translation = board_pose(view, camera)
+    except NotDetermined:
+        return np.inf
+    return float(np.sum((camera.project(view.board_mm @ rotation.T + translation) - view.image_px) ** 2))
+
+
+def splined(camera: Camera, shape: tuple[int, int]) -> Camera:
+    """Return a camera with a splined stereographic projection that projects as `camera` does, an equidistant one. The
+    spline ends at the corner of the frame that is farthest from the axis. `shape`: (rows, cols) of the frame.
+    """
+    ends = np.array([(x, y) for x in (0.0, shape[1] - 1.0) for y in (0.0, shape[0] - 1.0)])
+    z = camera.unproject(ends)[:, 2]
+    widest = float(np.rad2deg(np.arccos(np.clip(z[np.isfinite(z)].min(initial=1.0), -1.0, 1.0))))
+    if not np.isfinite(z).all():  # the polynomial has no inverse there: as without distortion
+        widest = float(np.rad2deg(np.max(np.linalg.norm(ends - camera.intrinsics[2:4], axis=1)) / camera.intrinsics[0]))
+    projection = Projection("splined_stereographic", float(np.clip(widest, 1.0, WIDEST_DEG)))
+    assert projection.spline_angle_deg is not None
+    angle = np.linspace(0.0, np.deg2rad(projection.spline_angle_deg), 200)[1:]
+    points = np.column_stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)])
+    start = np.concatenate([camera.intrinsics[:4], np.zeros(COUNT - 4)])
+    wanted = camera.project(points)[:, 0] - projection.project(points, start)[:, 0]
+    by_camera = projection.project_with_jacobian(points, start)[2][:, 0]
+    radial = [projection.names.index(name) for name in projection.coefficients if name.startswith("s")]
+    start[radial] = np.linalg.lstsq(by_camera[:, radial], wanted, rcond=1e-9)[0]
+    return Camera(projection, start)
+
+
+def first_state(views: Sequence[BoardView], camera: Camera) -> RigParameters:
     """Return the parameters of one camera to begin with, each view with a pose of its own."""
-    poses = [board_pose(view, intrinsics) for view in views]
+    poses = [board_pose(view, camera) for view in views]
     return RigParameters(
-        intrinsics=intrinsics[None, :],
+        projections=(camera.projection,),
+        intrinsics=camera.intrinsics[None, :],
         rotation=np.eye(3),
         translation_mm=np.zeros(3),
         warps_mm=np.zeros((1, 3)),

@@ -200,7 +200,7 @@ def _distorting(content: CameraFile) -> CameraFile:
     """Add the distortion of the camera's geometry as an effect, because named scenes are projected by a pinhole. A
     traced lens brings its own distortion."""
     camera = content.camera
-    straight = camera.geometry is None or not any(camera.geometry.distortion)
+    straight = camera.geometry is None or camera.geometry.is_ideal
     if straight or isinstance(camera.lens.imaging, TracedLens):
         return content
     return replace(content, effects=(*content.effects, Distortion(geometry=camera.geometry)))

@@ -10,6 +10,7 @@ from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
 from lab.formats.results.words import measured, plain_name, unit_of
 from sim.camera import Side
+from sim.scene.projection import Projection
 
 #: Fields of `NoiseFit` in the order of the table; the maker's value has the same field name.
 _NOISE = (
@@ -29,7 +30,6 @@ _NOISE = (
 #: Field of `NoiseFit` -> (name, unit).
 NOISE = {field: (plain_name(field), unit_of(field)) for field in _NOISE}
 #: Names of the distortion's coefficients, in OpenCV's order.
-DISTORTION = tuple(plain_name("distortion", place) for place in ("k1", "k2", "p1", "p2", "k3"))
 
 
 @dataclass(frozen=True)
@@ -109,14 +109,15 @@ def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[
 
 
 def geometry_figures(geometry: GeometryFit) -> Iterator[KeyFigure]:
-    """Pinhole camera matrix and distortion."""
+    """Camera matrix and distortion of the fitted projection."""
     matrix, matrix_std = geometry.camera_matrix, geometry.camera_matrix_std
     for place, row, col in (("fx", 0, 0), ("fy", 1, 1), ("cx", 0, 2), ("cy", 1, 2)):
         yield KeyFigure(
             plain_name("camera_matrix", place), "px", matrix[row][col], matrix_std[row][col] if matrix_std else None
         )
+    names = Projection(geometry.lens_projection, geometry.spline_angle_deg).coefficients
     for number, value in enumerate(geometry.distortion):
-        name = DISTORTION[number] if number < len(DISTORTION) else f"distortion {number}"
+        name = plain_name("distortion", names[number])
         yield KeyFigure(name, "1", value, geometry.distortion_std[number] if geometry.distortion_std else None)
     yield KeyFigure("reprojection error, rms", "px", geometry.rms_px)
 

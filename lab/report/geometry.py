@@ -337,10 +337,11 @@ def charts_by_side(fits: Mapping[Side, GeometryFit | None]) -> list[tuple[str, d
 def stereo_context(recordings: RecordingSet, stereo: StereoFit | None) -> dict[str, Any]:
     """Variables of the page for the pair: depth maps and a rectified pose."""
     if stereo is None:
-        return {"depth": [], "rectified": None, "row_rms_px": None, "rejected": ()}
+        return {"depth": [], "rectified": None, "row_rms_px": None, "rejected": (), "remarks": ()}
     return {
         "depth": [(depth, figure) for depth in stereo.depth if (figure := depth_map(depth)) is not None],
         "rectified": rectified_picture(recordings, stereo),
         "row_rms_px": stereo.rectification.row_rms_px if stereo.rectification else None,
         "rejected": stereo.rejected,
+        "remarks": stereo.remarks,
     }

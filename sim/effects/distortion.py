@@ -21,8 +21,8 @@ class Distortion(Effect):
     """Radial, of the third order: light lands at r (1 + k (r / R)^2), on top of what the camera's geometry says, R half
     the frame's diagonal, r from the optical axis.
 
-    `geometry` is for scenes that an ideal pinhole placed: its whole distortion (k1 k2 p1 p2 k3) acts on top. Scenes
-    that are projected by the camera's geometry have it already.
+    `geometry` is for scenes that an ideal pinhole placed: its whole projection acts on top, as the distance from the
+    pinhole's place. Scenes that are projected by the camera's geometry have it already.
     """
 
     name: ClassVar[str] = "distortion"
@@ -46,7 +46,7 @@ class Distortion(Effect):
 
     def on_image(self, image: Image) -> Image:
         camera = image.camera
-        bent = self.geometry is not None and any(self.geometry.distortion)
+        bent = self.geometry is not None and not self.geometry.is_ideal
         if self.corner_percent == 0.0 and not bent:
             return image
 

@@ -10,7 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sim.camera import Geometry
+from sim.scene.projection import Projection
 from sim.spectrum import FloatArray
+
+#: Sine of the angle to the plane of the pattern below which a ray doesn't meet it, and where it is put then, cells.
+PARALLEL, BEYOND_CELLS = 1e-9, 1e9
 
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
@@ -20,7 +24,7 @@ class Warp:
     """Pattern coordinates (u to the right, v down, in cells; cell [i, j] covers u = j..j+1, v = i..i+1) to camera px.
 
     `homography` maps (u, v, 1) to a pinhole's (x, y, w): x = col, y = row after division by w. With `geometry`, the
-    lens's Brown distortion follows: the camera matrix is inverted, the point distorted, and projected again.
+    lens's projection follows: the camera matrix is inverted, and the ray projected (`sim.scene.projection`).
     """
 
     homography: Matrix
@@ -53,7 +57,7 @@ class Warp:
     @property
     def is_straight(self) -> bool:
         """Return whether there is no distortion."""
-        return self.geometry is None or not any(self.geometry.distortion)
+        return self.geometry is None or self.geometry.is_ideal
 
     @property
     def is_upright(self) -> bool:
@@ -70,10 +74,10 @@ class Warp:
 
     def to_pattern(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Pattern (u, v) of camera points, the inverse of `to_camera` (to 1e-9 px)."""
-        x, y = np.asarray(col, float), np.asarray(row, float)
-        if self.geometry is not None:
-            x, y = undistort(x, y, self.geometry)
-        return _project(np.linalg.inv(np.asarray(self.homography)), x, y)
+        x, y, back = np.asarray(col, float), np.asarray(row, float), np.linalg.inv(np.asarray(self.homography))
+        if self.geometry is None:
+            return _project(back, x, y)
+        return _meet(back, rays(x, y, self.geometry), self.geometry)
 
     def grid_to_pattern(self, row: FloatArray, col: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pattern (u, v), each (len(row), len(col)), of the grid of ascending `row` and `col`; see `mapper`."""
@@ -85,17 +89,17 @@ class Warp:
         """Return a function from ascending camera `row` (px, within `rows`) to pattern (u, v) on their grid with
         ascending `col`.
 
-        The lens's distortion is smooth: it is inverted on nodes some 8 px apart and interpolated by cubic splines
-        (1e-5 px).
+        The rays are smooth: they are found on nodes some 8 px apart and interpolated by cubic splines (1e-5 px).
         """
         back = np.linalg.inv(np.asarray(self.homography))
         if self.is_straight:
             return lambda row: _project(back, col[None, :], row[:, None])
         assert self.geometry is not None
         y0, x0 = (np.linspace(low, high, max(8, int((high - low) / 8) + 2)) for low, high in (rows, (col[0], col[-1])))
-        straight_x, straight_y = undistort(*np.meshgrid(x0, y0), self.geometry)
-        x, y = _RowSpline.through(y0, x0, straight_x, col), _RowSpline.through(y0, x0, straight_y, col)
-        return lambda row: _project(back, x(row), y(row))
+        nodes = np.nan_to_num(rays(*np.meshgrid(x0, y0), self.geometry), nan=0.0)
+        geometry = self.geometry
+        parts = [_RowSpline.through(y0, x0, nodes[..., axis], col) for axis in range(3)]
+        return lambda row: _meet(back, np.stack([part(row) for part in parts], axis=-1), geometry)
 
 
 @dataclass(frozen=True)
@@ -131,51 +135,48 @@ def _project(homography: FloatArray, x: FloatArray, y: FloatArray) -> tuple[Floa
     return (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
 
 
-def _brown(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-    k1, k2, p1, p2, k3 = (*distortion, *(0.0,) * 5)[:5]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return (
-        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-    )
+def _meet(back: FloatArray, rays: FloatArray, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
+    """Return the pattern (u, v) that rays (..., 3) meet, with `back` (3, 3) the inverse of the homography.
 
-
-def _check_distortion(geometry: Geometry) -> None:
-    if len(geometry.distortion) > 5 and any(geometry.distortion[5:]):
-        raise ValueError(
-            f"distortion has {len(geometry.distortion)} coefficients, and the model takes k1 k2 p1 p2 k3: fit with "
-            "those five"
-        )
+    A fisheye's ray that doesn't meet the plane of the pattern is put far outside.
+    """
+    across = rays @ (back @ np.asarray(geometry.camera_matrix, float)).T
+    if geometry.projection == "pinhole":
+        return across[..., 0] / across[..., 2], across[..., 1] / across[..., 2]
+    ahead = across[..., 2] > PARALLEL * np.linalg.norm(across, axis=-1)
+    u, v = (np.where(ahead, across[..., k] / np.where(ahead, across[..., 2], 1.0), BEYOND_CELLS) for k in (0, 1))
+    return u, v
 
 
 def distort(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
-    """Pinhole px (x = col, y = row) to distorted px: OpenCV's k1 k2 p1 p2 k3."""
-    _check_distortion(geometry)
-    k = np.asarray(geometry.camera_matrix, float)
+    """Pinhole px (x = col, y = row) to px of the camera's projection."""
+    projection, k = Projection.of(geometry), np.asarray(geometry.camera_matrix, float)
     yn = (np.asarray(y, float) - k[1, 2]) / k[1, 1]
     xn = (np.asarray(x, float) - k[0, 2] - k[0, 1] * yn) / k[0, 0]
-    xd, yd = _brown(xn, yn, geometry.distortion)
+    coefficients = projection.intrinsics(k, geometry.distortion)[4:]
+    rays = np.stack(np.broadcast_arrays(xn, yn, 1.0), axis=-1)
+    xi, yi = projection.plane(rays.reshape(-1, 3))
+    xd, yd = (part.reshape(rays.shape[:-1]) for part in projection.distort(xi, yi, coefficients))
     return k[0, 0] * xd + k[0, 1] * yd + k[0, 2], k[1, 1] * yd + k[1, 2]
 
 
-def undistort(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
-    """Return the inverse of `distort`: Newton's method with a numerical Jacobian, to 1e-10 of the focal length."""
-    _check_distortion(geometry)
-    k = np.asarray(geometry.camera_matrix, float)
+def rays(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> FloatArray:
+    """Return the rays (..., 3) of px (x = col, y = row), of length 1 in front of a fisheye and with z = 1 of a pinhole.
+
+    Where a distortion folds, the ray is one that Newton's method ends at.
+    """
+    projection, k = Projection.of(geometry), np.asarray(geometry.camera_matrix, float)
     yd = (np.asarray(y, float) - k[1, 2]) / k[1, 1]
     xd = (np.asarray(x, float) - k[0, 2] - k[0, 1] * yd) / k[0, 0]
-    xn, yn = xd.copy(), yd.copy()
-    h = 1e-6
-    for _ in range(12):
-        fx, fy = _brown(xn, yn, geometry.distortion)
-        ax, ay = _brown(xn + h, yn, geometry.distortion)
-        bx, by = _brown(xn, yn + h, geometry.distortion)
-        j00, j10, j01, j11 = (ax - fx) / h, (ay - fy) / h, (bx - fx) / h, (by - fy) / h
-        det = j00 * j11 - j01 * j10
-        ex, ey = xd - fx, yd - fy
-        dx, dy = (j11 * ex - j01 * ey) / det, (j00 * ey - j10 * ex) / det
-        xn, yn = xn + dx, yn + dy
-        if max(np.max(np.abs(dx), initial=0.0), np.max(np.abs(dy), initial=0.0)) < 1e-12:
-            break
+    xi, yi, _ = projection.undistort(xd, yd, projection.intrinsics(k, geometry.distortion)[4:])
+    if projection.kind == "pinhole":
+        return np.stack([xi, yi, np.ones_like(xi)], axis=-1)
+    return projection.rays(xi, yi)
+
+
+def undistort(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
+    """Return the inverse of `distort`; infinite for a ray of 90 deg or more from the axis, which no pinhole has."""
+    k, ray = np.asarray(geometry.camera_matrix, float), rays(x, y, geometry)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xn, yn = (np.where(ray[..., 2] > 0.0, ray[..., axis] / ray[..., 2], np.inf) for axis in (0, 1))
     return k[0, 0] * xn + k[0, 1] * yn + k[0, 2], k[1, 1] * yn + k[1, 2]

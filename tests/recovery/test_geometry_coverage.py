@@ -14,7 +14,7 @@ from lab.fit.stereo import StereoPair, depth_std, solve_rig
 from lab.formats.results import CameraFit, FitResult
 from lab.measure.board_calibration import calibrate_robustly, cross_validation
 from lab.measure.board_detection import CornerFits
-from lab.measure.pinhole import difference, grid, grid_points, intrinsics_of, points_at
+from lab.measure.projection import Camera, difference, grid, grid_points, points_at
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 DRAWS, VARIANCE_DRAWS = 400, 800
@@ -55,7 +55,7 @@ def test_geometry_covers() -> None:
     at = poses(VIEWS)
     x, y = grid(SHAPE)
     image = grid_points(x, y)
-    truth = intrinsics_of(TRUTH.left, TRUTH.distortion_left)
+    truth = Camera.of(TRUTH.left, TRUTH.distortion_left)
     names = [*("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"), "bend x", "bend y", "twist"]
     scores: dict[str, list[float]] = {}
     errors, variances, halves, fits = [], [], [], []
@@ -74,7 +74,9 @@ def test_geometry_covers() -> None:
         for name, value, true, std in zip(names, values, [*truth[:9], *TRUTH.warp_mm], stds, strict=True):
             note(name, value - true, std)
         # the projection over the frame, against the truth, with the implied motion taken out
-        found = difference(truth, one.intrinsics, one.covariance, one.points, points_at(image, truth, 700.0))
+        found = difference(
+            truth, one.camera, (np.zeros((12, 12)), one.covariance), one.points, points_at(image, truth, 700.0)
+        )
         errors.append(found.vectors_px)
         variances.append(found.variances_px2)
         halves.append(cross_validation(one))
@@ -159,12 +161,14 @@ def test_projection_variance_is_that_of_many_solves() -> None:
     dominates."""
     x, y = grid(SHAPE)
     image = grid_points(x, y)
-    truth = intrinsics_of(TRUTH.left, TRUTH.distortion_left)
+    truth = Camera.of(TRUTH.left, TRUTH.distortion_left)
     at = poses(VIEWS)
     squares, stated = np.zeros(len(image)), np.zeros(len(image))
     for draw in range(VARIANCE_DRAWS):
         one = calibrate_robustly(seen(np.random.default_rng([8, draw]), at, noise_px=NOISE_PX, side="left"), SHAPE)
-        found = difference(truth, one.intrinsics, one.covariance, one.points, points_at(image, truth, 700.0))
+        found = difference(
+            truth, one.camera, (np.zeros((12, 12)), one.covariance), one.points, points_at(image, truth, 700.0)
+        )
         squares += np.sum(found.vectors_px**2, axis=1)
         stated += np.sum(found.variances_px2, axis=1)
         if draw + 1 in (200, 400, VARIANCE_DRAWS):

@@ -14,15 +14,16 @@ from lab.diagnose.measurements.block import Block, Label, Measurement, Predictio
 from lab.diagnose.measurements.pattern_fit import ACROSS, RADIAL, RADIAL3, Pattern, patterns
 from lab.errors import NotDetermined
 from lab.formats.results import Skipped
-from lab.measure.board_calibration import MODELS, Calibration, calibrate_robustly, free_intrinsics, observations_of
+from lab.measure.board_calibration import PROJECTIONS, Calibration, calibrate_robustly, free_intrinsics, observations_of
 from lab.measure.board_detection import BoardView, channel_corners, find_boards
 from lab.measure.bundle_adjustment import BundleAdjustment, Solution
-from lab.measure.pinhole import NAMES, intrinsics_of
+from lab.measure.projection import Camera
 from lab.measure.reads import SHIFT
 from lab.measure.study import Study
 from sim.camera import Side
 from sim.effects.base import Effects
 from sim.point import displaced_um
+from sim.scene.projection import Projection
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import Uniform
 
@@ -99,13 +100,14 @@ def board_block(study: Study) -> Block:
     known = study.camera.geometry
     views, state, shape = found.views, found.solution.state, found.shape
     if known is None:
-        free = found.solution.free[0] | free_intrinsics(MODELS[-1])
+        own = found.camera.projection
+        free = found.solution.free[0] | free_intrinsics(PROJECTIONS[own.kind], own)
     else:
         free = free_intrinsics(())
         # focal length and principal point as of these boards, distortion as of the earlier calibration
-        fixed = intrinsics_of(known.camera_matrix, known.distortion)
-        start = np.array([np.concatenate([state.intrinsics[0, :4], fixed[4:]])])
-        state = replace(state, intrinsics=start)
+        fixed = Camera.of(known.camera_matrix, known.distortion, Projection.of(known))
+        start = np.array([np.concatenate([state.intrinsics[0, :4], fixed.intrinsics[4:]])])
+        state = replace(state, projections=(fixed.projection,), intrinsics=start)
     bundle = BundleAdjustment(observations_of(views), free[None, :], shape)
     solution = bundle.solve(state)
     corners = _Corners.of(views, solution, bundle)
@@ -217,7 +219,6 @@ def _calibrated(
     return {
         f"boards:{name}": CALIBRATED_STD_PX / size * projected @ np.column_stack([dx, dy]).ravel()
         for name, (dx, dy, size) in terms.items()
-        if name in NAMES
     }
 
 

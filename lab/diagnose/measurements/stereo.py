@@ -23,7 +23,6 @@ from lab.formats.camera_model import camera_model
 from lab.measure.board_calibration import Calibration, calibrate_robustly
 from lab.measure.board_detection import BoardView
 from lab.measure.bundle_adjustment import board_pose
-from lab.measure.pinhole import project
 from lab.measure.study import Study
 from sim.camera import Side
 from sim.effects.base import Effects
@@ -412,7 +411,7 @@ def _gaps(
     turns, shifts = [], []
     poses = []
     for _, one, two in pairs:
-        (turn, shift), (turn_two, shift_two) = board_pose(one, left.intrinsics), board_pose(two, right.intrinsics)
+        (turn, shift), (turn_two, shift_two) = board_pose(one, left.camera), board_pose(two, right.camera)
         between = turn_two @ turn.T
         turns.append(Rotation.from_matrix(between).as_rotvec())
         shifts.append(shift_two - between @ shift)
@@ -423,7 +422,7 @@ def _gaps(
     gaps = []
     for (_, _, two), (turn, shift) in zip(pairs, poses, strict=True):
         points = (two.board_mm @ turn.T + shift) @ rotation.T + translation
-        gaps.append(float(((two.image_px - project(points, right.intrinsics)) @ across).mean()))
+        gaps.append(float(((two.image_px - right.camera.project(points)) @ across).mean()))
     return np.array(gaps), across
 
 

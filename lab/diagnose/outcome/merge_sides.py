@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import special
 
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.block import measurement_title
@@ -248,6 +249,17 @@ def _held_out(found: Sequence[SideFindings]) -> HeldOut | None:
     )
 
 
+def _agreement(held_out: HeldOut, policy: DecisionPolicy) -> str:
+    """Say whether held-out captures agree with the model, for the end of a sentence: by the probability that chi2 is as
+    large where they do.
+    """
+    chance = float(special.chdtrc(max(held_out.n, 1), held_out.chi2_after))
+    numbers = f"chi2 {held_out.chi2_after:.0f} of {held_out.n} numbers, p = {chance:.2g}"
+    if chance < policy.false_alarm_rate:
+        return f", but held-out captures do not agree with it ({numbers})"
+    return f", and held-out captures agree ({numbers})"
+
+
 def _summary(
     verdict: DiagnosisVerdict,
     lists: DiagnosisLists,
@@ -260,7 +272,7 @@ def _summary(
     if verdict == "nothing_judged":
         lines.append("These recordings determine no measurement, so nothing is said about the camera.")
     if verdict == "no_mismatch":
-        agree = ", and held-out captures agree" if held_out is not None else "; no captures are held out"
+        agree = "; no captures are held out" if held_out is None else _agreement(held_out, policy)
         lines.append(
             "The baseline explains everything that could be judged, at a false-alarm rate of "
             f"{100 * policy.false_alarm_rate:.0f} %{agree}."

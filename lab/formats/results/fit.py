@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from sim.camera import Side
+from sim.camera import ProjectionKind, Side
 from sim.parameters import Frozen
 
 
@@ -304,6 +304,7 @@ class DistortionModel(Frozen):
     """One of the distortion models that were tried, and its error on views that its fit hasn't used."""
 
     coefficients: tuple[str, ...]
+    lens_projection: ProjectionKind = "pinhole"
     held_out_rms_px: float
     chosen: bool
     reason: str
@@ -331,8 +332,8 @@ class CornerErrors(Frozen):
     """Departure of the corners from the model, px, as standard deviations of one coordinate, in two parts.
 
     `noise_px`: independent from corner to corner, the sampling error. `model_error_px`: correlated between neighbouring
-    corners (board, print, lens, motion), the error of the model; 0 where it isn't significant. Both are in
-    `covariance`."""
+    corners (board, print, lens, motion), the error of the model; 0 where it isn't significant. Both and `lens_px` are
+    in `covariance`."""
 
     noise_px: float
     model_error_px: float
@@ -340,6 +341,9 @@ class CornerErrors(Frozen):
     length_squares: tuple[float, float] | None = None
     #: Of a pair: correlation of the model error in the left frame with that in the right.
     between_cameras: float | None = None
+    #: Standard deviation, at the farthest corner, of the radial displacement by which the lens departs from its
+    #: projection, in every view alike; 0 where it isn't significant.
+    lens_px: float = 0.0
     #: Standard deviations of `parameters` by the sampling error alone.
     sampling_std: tuple[float, ...] = ()
 
@@ -390,8 +394,14 @@ class ChannelGeometry(Frozen):
 
 
 class GeometryFit(Frozen):
-    """OpenCV's pinhole model and distortion (`k1 k2 p1 p2 k3`), px."""
+    """Camera matrix, px, and distortion of a projection (`sim.scene.projection`).
 
+    `distortion` of a pinhole: OpenCV's `k1 k2 p1 p2 k3`; of an equidistant projection: `k1 k2 k3 k4` of OpenCV's
+    fisheye; of a splined stereographic one: `s1 s2 p1 p2 s3 s4 s5 s6`, its spline up to `spline_angle_deg` off the axis.
+    """
+
+    lens_projection: ProjectionKind = "pinhole"
+    spline_angle_deg: float | None = None
     camera_matrix: tuple[tuple[float, float, float], ...]
     camera_matrix_std: tuple[tuple[float, float, float], ...] | None = None
     distortion: tuple[float, ...]
@@ -444,7 +454,7 @@ class Rectification(Frozen):
     projection_left: Rows
     projection_right: Rows
     disparity_to_depth: Rows
-    row_rms_px: float
+    row_rms_px: float | None
 
 
 class StereoFit(Frozen):
@@ -459,8 +469,12 @@ class StereoFit(Frozen):
     rms_px: float
     pairs: int
     #: Intrinsics fitted jointly with the pose of the cameras, over the views of both.
+    lens_projection_left: ProjectionKind = "pinhole"
+    spline_angle_deg_left: float | None = None
     camera_matrix_left: tuple[tuple[float, float, float], ...] | None = None
     distortion_left: tuple[float, ...] | None = None
+    lens_projection_right: ProjectionKind = "pinhole"
+    spline_angle_deg_right: float | None = None
     camera_matrix_right: tuple[tuple[float, float, float], ...] | None = None
     distortion_right: tuple[float, ...] | None = None
     #: Rows and columns of `covariance`: "left fx" .., "right fx" .., the rotation about the right camera's axes, the
@@ -471,6 +485,7 @@ class StereoFit(Frozen):
     corner_errors: CornerErrors | None = None
     rejected: tuple[Skipped, ...] = ()
     rectification: Rectification | None = None
+    remarks: tuple[str, ...] = ()
     depth: tuple[DepthUncertainty, ...] = ()
 
 
@@ -638,7 +653,7 @@ class CameraFit(Frozen):
     @property
     def remarks(self) -> tuple[str, ...]:
         """What the recordings show beside the figures: repeats that drift first, then what the fits report."""
-        parts = (part.remarks for part in (self.noise, self.spectral) if part is not None)
+        parts = (part.remarks for part in (self.noise, self.spectral, self.geometry) if part is not None)
         return (*(drift.statement for drift in self.repeat_drifts), *(remark for own in parts for remark in own))
 
 

@@ -52,6 +52,8 @@ PLACES = {
     ("distortion", "p1"): "tangential distortion p1",
     ("distortion", "p2"): "tangential distortion p2",
     ("distortion", "k3"): "radial distortion k3",
+    ("distortion", "k4"): "radial distortion k4",
+    **{("distortion", f"s{k}"): f"radial distortion s{k}" for k in range(1, 7)},
 }
 #: End of a field's name -> unit.
 _UNITS = {

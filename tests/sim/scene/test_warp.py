@@ -74,7 +74,7 @@ def test_what_cannot_be_a_warp_is_refused() -> None:
     with pytest.raises(ValueError, match="invertible"):
         Warp.of(np.zeros((3, 3)))
     with pytest.raises(ValueError, match="k1 k2 p1 p2 k3"):
-        distort(0.0, 0.0, GEOMETRY.model_copy(update={"distortion": (0.0,) * 7 + (0.1,)}))
+        distort(0.0, 0.0, GEOMETRY.model_copy(update={"distortion": (0.0,) * 8 + (0.1,)}))
 
 
 # --- Knife edges in a plane at a pose, against straight edges and against the same edges drawn by area ----------------

@@ -20,7 +20,6 @@ from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.importers import read_dot_grids
 from lab.formats.recording_set import RecordingSet
-from lab.measure.pinhole import distortion_of, matrix_of
 from lab.measure.study import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
@@ -46,9 +45,9 @@ def judged(study: Study, known: Geometry | None) -> Verdict:
 
 @cache
 def calibrated() -> Geometry:
-    found = calibration_of(study_of(recorded())).intrinsics
-    a, b, c = (tuple(float(v) for v in row) for row in matrix_of(found))
-    return Geometry(camera_matrix=(a, b, c), distortion=tuple(float(v) for v in distortion_of(found)))  # type: ignore[arg-type]
+    found = calibration_of(study_of(recorded())).camera
+    a, b, c = (tuple(float(v) for v in row) for row in found.matrix)
+    return Geometry(camera_matrix=(a, b, c), distortion=tuple(float(v) for v in found.distortion))  # type: ignore[arg-type]
 
 
 def test_distortion_is_named_beside_an_earlier_calibration_and_never_by_itself() -> None:

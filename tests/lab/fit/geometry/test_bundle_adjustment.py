@@ -24,10 +24,11 @@ from lab.measure.bundle_adjustment import (
     Observation,
     RigParameters,
     Solution,
-    first_intrinsics,
+    first_camera,
     first_state,
 )
-from lab.measure.pinhole import intrinsics_of
+from lab.measure.projection import Camera
+from sim.scene.projection import PINHOLE
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 AT = poses(10)
@@ -63,8 +64,9 @@ def test_jacobian_is_that_of_the_residuals():
     sights = [Observation(view, pose=k % 2, camera=k // 2) for k, view in enumerate(views)]
     free = np.array([free_intrinsics(MODELS[-1])] * 2)
     problem = BundleAdjustment(sights, free, SHAPE)
-    start = first_state(views[:2], first_intrinsics(views[:2], SHAPE))
+    start = first_state(views[:2], first_camera(views[:2], SHAPE))
     state = RigParameters(
+        projections=(PINHOLE, PINHOLE),
         intrinsics=np.repeat(start.intrinsics, 2, axis=0), rotation=TRUTH.rotation, translation_mm=TRUTH.translation_mm,
         warps_mm=np.array([[0.1, 0.2, 0.3]]), rotations=start.rotations, translations_mm=start.translations_mm,
     )  # fmt: skip
@@ -104,7 +106,7 @@ def test_covariance_of_a_pair_is_that_of_repeated_solves():
             for k, view in enumerate(views)
         ]
         start = RigParameters(
-            np.array(matrices), truth.rotation, truth.translation_mm, np.array([truth.warp_mm]),
+            (PINHOLE, PINHOLE), np.array(matrices), truth.rotation, truth.translation_mm, np.array([truth.warp_mm]),
             np.array([turn for turn, _ in AT]), np.array([shift for _, shift in AT]),
         )  # fmt: skip
         found = BundleAdjustment(sights, free, SHAPE).solve(start)
@@ -151,7 +153,7 @@ def pulls(draw: int, *, with_ripple: bool) -> tuple[np.ndarray, np.ndarray]:
     views = rippled(rng) if with_ripple else seen(rng, AT_EIGHT, noise_px=NOISE_PX)
     alone = calibrate(views, SHAPE)
     whole = with_model_error(views, SHAPE, alone)
-    error = (alone.state.intrinsics[0] - intrinsics_of(TRUTH.left, TRUTH.distortion_left))[:4]
+    error = (alone.state.intrinsics[0] - Camera.of(TRUTH.left, TRUTH.distortion_left).intrinsics)[:4]
     return error / whole.std()[:4], error / alone.std()[:4]
 
 
