@@ -208,6 +208,7 @@ def test_a_block_that_makes_its_inputs_runs(page: str, block: str, desk: dict[st
     assert done.returncode == 0, f"{page}:\n{block}\n{done.stdout}\n{done.stderr}"
 
 
+@pytest.mark.extra
 def test_keys_and_service_on_postgresql(desk: dict[str, str], tmp_path: Path) -> None:
     """docs/reference/rest.md: the registry in PostgreSQL, by the one variable that it names; keys and the service."""
     text = text_of(ROOT / "docs" / "reference" / "rest.md")

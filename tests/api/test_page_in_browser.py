@@ -31,6 +31,8 @@ from tests.lab.calibration.test_life import fitted
 from tests.lab.fake_bench import Bench
 from tests.peers import missing
 
+pytestmark = pytest.mark.extra  # drives a browser
+
 PHONE, TABLET, DESK, WIDE = ({"width": wide, "height": 860} for wide in (420, 768, 1280, 1440))
 READ_NOISE_E = (2.0, 2.01, 2.15)
 LIMITS = 'valid_days = 90\n[[limit]]\nfigure = "noise read_noise_e"\ngood = [1.9, 2.05]\nwarn = [1.8, 2.2]\n'

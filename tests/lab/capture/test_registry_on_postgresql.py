@@ -30,6 +30,8 @@ from tests.lab import fake_bench
 from tests.lab.calibration.test_life import calibrated
 from tests.postgresql import database, postgresql
 
+pytestmark = pytest.mark.extra  # starts a PostgreSQL server
+
 DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
 
 
