@@ -214,7 +214,12 @@ def render_report(
         "rows": rows,
         "stated": any(figure.stated is not None for _, figures in rows for figure in figures.values()),
         "implausible": fit.warnings,
-        "remarks": [(side, remark) for side, camera in fit.cameras.items() for remark in camera.remarks],
+        "remarks": [
+            (side, remark)
+            for side, camera in fit.cameras.items()
+            for remark in camera.remarks
+            if camera.geometry is None or remark not in camera.geometry.remarks  # these stand beside the geometry
+        ],
         "drifts": [
             (side, drift, charts.repeat_drift(drift))
             for side, camera in fit.cameras.items()
