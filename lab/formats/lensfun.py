@@ -332,7 +332,7 @@ class _Calibrations:
 
     def __init__(self, name: str, lens: ET.Element, camera: CameraModel) -> None:
         self.name, self.element, self.camera = name, lens, camera
-        self.focal_mm, self.aperture = camera.lens.focal_length_mm, camera.lens.f_number
+        self.focal_mm, self.aperture = camera.lens.known_focal_length_mm, camera.lens.f_number
         self.remarks: list[str] = []
 
     def lens(self) -> LensfunLens:

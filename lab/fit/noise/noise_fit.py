@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy import special
@@ -187,11 +187,11 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
     remark_on_shading(e)
     remark_on_temperatures(e)
     principal = principal_figures(e)
+    figures: dict[str, Any] = principal | quantum_efficiency(e)
     from_variance, from_variance_std = dark_current_from_variance(e)
     dark = pixels is not None and e.levels.darks
     return NoiseFit(
-        **principal,
-        **quantum_efficiency(e),
+        **figures,
         conversion_gain_at_zero_dn_per_e=t.curve_gain * scale,
         conversion_gain_at_zero_dn_per_e_std=t.curve_gain_std * scale,
         variance_model_error_percent=100.0 * t.model_error,
