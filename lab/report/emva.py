@@ -670,7 +670,7 @@ def compared_estimates(noise: NoiseFit) -> Iterator[str]:
     for plane, own in noise.emva1288.items():
         joint = noise.channels.get(plane[0], noise)
         for field, (other, why) in BOTH_ESTIMATES.items():
-            scale = 10.0 ** (noise.gain_db / 20.0) if other == "conversion_gain_dn_per_e" else 1.0
+            scale = 10.0 ** ((noise.gain_db or 0.0) / 20.0) if other == "conversion_gain_dn_per_e" else 1.0
             first, first_std = getattr(own, field), getattr(own, f"{field}_std")
             source = joint if other in type(joint).model_fields else noise
             second, second_std = getattr(source, other), getattr(source, f"{other}_std")

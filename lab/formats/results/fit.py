@@ -85,7 +85,7 @@ class NoiseFit(ChannelNoise):
     #: By plane of the mosaic (`R`, `G1`, `G2`, `B`, or `Y`), by the letter of the standard.
     emva1288: dict[str, Emva1288] = {}
     #: Amplification at which flats and darks were recorded; `conversion_gain_dn_per_e` is given for 0 dB.
-    gain_db: float = 0.0
+    gain_db: float | None = None
     photon_transfer: PhotonTransfer | None = None
     #: What the recordings show of the bench, in sentences ("the lamp drifted by ...").
     remarks: tuple[str, ...] = ()
