@@ -14,11 +14,10 @@ import re
 import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from lab.capture.records import now
 from lab.errors import InputError
 from lab.plain_text import escaped
 
@@ -85,7 +84,7 @@ HALT_TOKEN_LIFETIME = timedelta(days=30)
 def create_halt_token(store: Store, key: StoredKey) -> str:
     """Register a token that allows a halt and nothing else, for the holder of `key`, and return it."""
     token = secrets.token_urlsafe(32)
-    store.add_halt_token(digest(token), key.sha256, now() + HALT_TOKEN_LIFETIME)
+    store.add_halt_token(digest(token), key.sha256, datetime.now(UTC) + HALT_TOKEN_LIFETIME)
     return token
 
 

@@ -68,28 +68,29 @@ def check_writable(file: Path | None) -> None:
         return
     if file.is_dir() or not file.parent.is_dir():
         raise InputError(f"{file}: can't be written; name a file in a folder that exists")
-    _check_takes_files(file.parent)
+    _check_takes_files(file.parent, file)
 
 
 def check_folder(folder: Path | None) -> None:
     """Refuse a folder of results that can't be made or written into, before the work. Raises as `check_writable`."""
     if folder is not None:
-        _check_takes_files(folder.absolute())
+        _check_takes_files(folder, folder)
 
 
 def check_output(path: Path) -> None:
     """Refuse a file or folder of results that can't be made with the folders above it, before the work. Raises as
     `check_writable`."""
-    _check_takes_files(path.absolute() if path.is_dir() else path.absolute().parent)
+    _check_takes_files(path if path.is_dir() else path.absolute().parent, path)
 
 
-def _check_takes_files(folder: Path) -> None:
-    """Raise where nothing can be written into a folder, or into the nearest one above it that exists."""
+def _check_takes_files(folder: Path, wanted: Path) -> None:
+    """Raise where what is wanted can't be written: nothing can be into its folder, or the nearest one above it that
+    exists."""
     from lab.capture.room import why_unwritable
 
     there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
     if not there.is_dir():
-        raise InputError(f"{folder}: can't be written into, {there} is no folder; name another place")
+        raise InputError(f"{wanted}: can't be written into a folder, {there} is none; name another place")
     if (why := why_unwritable(there)) is not None:
         raise why
 
