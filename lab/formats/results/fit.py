@@ -241,9 +241,11 @@ class Emva1288(Frozen):
 
 
 class Emva1288Points(Frozen):
-    """The measured points, one entry per level; dark values are at the level's exposure.
+    """The measured points, one entry per level; dark values are at the level's exposure. Empty standard uncertainties:
+    of a result of an earlier version.
 
-    `light` is in `light_unit`: photons per pixel, or the exposure where the flats don't state photons.
+    `signal_dn_std`, `excess_variance_dn2_std`: of mean and variance less dark. `light` is in `light_unit`: photons per
+    pixel, or the exposure where the flats don't state photons.
     """
 
     light_unit: Literal["photons", "s"]
@@ -254,9 +256,13 @@ class Emva1288Points(Frozen):
     dark_mean_dn: tuple[float, ...]
     dark_variance_dn2: tuple[float, ...]
     linearity_deviation_percent: tuple[float | None, ...]
+    signal_dn_std: tuple[float, ...] = ()
+    excess_variance_dn2_std: tuple[float, ...] = ()
     dark_exposure_s: tuple[float, ...] = ()
     dark_exposure_mean_dn: tuple[float, ...] = ()
+    dark_exposure_mean_dn_std: tuple[float, ...] = ()
     dark_exposure_variance_dn2: tuple[float, ...] = ()
+    dark_exposure_variance_dn2_std: tuple[float, ...] = ()
     #: The pair of stacks that the spatial figures come from, and how many images each has.
     stack_dark_exposure_s: float | None = None
     stack_dark_images: int | None = None
