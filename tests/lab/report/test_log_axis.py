@@ -13,7 +13,7 @@ from lab.report.charts import log_axis
         ([3.0, 70.0], ["5", "10", "20", "50"]),
         ([0.002, 30.0], ["0.01", "0.1", "1", "10"]),
         ([2.0, 3e7], ["10", "100", "1000", "10000", "100000", "10<sup>6</sup>", "10<sup>7</sup>"]),
-        ([0.0, -1.0, 4.0], ["5"]),  # values without a logarithm have no place
+        ([0.0, -1.0, 4.0, 6.0], ["5"]),  # values without a logarithm have no place
     ],
 )
 def test_ticks_are_whole_numbers(values: list[float], text: list[str]) -> None:
