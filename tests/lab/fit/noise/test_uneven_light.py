@@ -89,7 +89,7 @@ def test_two_estimates_of_the_gain_are_compared_and_the_line_knows_its_model_err
     noise, own = fitted(session)
     assert abs(own.system_gain_dn_per_e - session.gain) < 3.0 * own.system_gain_dn_per_e_std
     gains = [line for line in compared_estimates(noise) if "system gain" in line]
-    assert len(gains) == 1 and "combined standard deviations apart: nonlinearity and brighter-fatter" in gains[0]
+    assert len(gains) == 1 and "combined standard deviations apart: with nonlinearity or a brighter-fatter" in gains[0]
     assert noise.conversion_gain_dn_per_e is not None
     percent = 100.0 * (own.system_gain_dn_per_e / noise.conversion_gain_dn_per_e - 1.0)
     assert f"{'-' if percent < 0 else '+'}{abs(percent):.2g} %" in gains[0]
