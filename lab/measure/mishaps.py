@@ -191,15 +191,15 @@ def _judged(
     least = max(SAME_SATURATION * saturation, SAME_DN)
     found = []
     for temperature_c, line in lines.items():
-        mine = [number for number, dark in enumerate(darks) if rounded_c(dark.temperature_c) == temperature_c]
-        if len(mine) < LEAST_DARKS:
+        alike = [number for number, dark in enumerate(darks) if rounded_c(dark.temperature_c) == temperature_c]
+        if len(alike) < LEAST_DARKS:
             continue
-        own = np.array([line.at(darks[number].exposure_s) for number in mine])
-        away = np.abs(dark_mean[mine] - own)
+        own = np.array([line.at(darks[number].exposure_s) for number in alike])
+        away = np.abs(dark_mean[alike] - own)
         tolerance = max(DARK_SIGMA * 1.4826 * float(np.median(away)), least)
         found += [
             JudgedFrame(darks[number], float(dark_mean[number]), float(e), tolerance, bool(a > tolerance))
-            for number, e, a in zip(mine, own, away, strict=True)
+            for number, e, a in zip(alike, own, away, strict=True)
         ]
     light = light_of(flats, camera)
     below = np.array([_nearest(lines, flat.temperature_c).at(flat.exposure_s) for flat in flats])
