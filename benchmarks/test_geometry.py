@@ -61,10 +61,7 @@ def test_calibration_of_known_cameras(board: str, warp_mm: tuple[float, float, f
         if draw < 5:
             seconds["all"] += timed(lambda views=views: geometry_result(calibrate_robustly(views, SHAPE)))[1] / 5
         gauge = np.concatenate(
-            [
-                points_at(view.image_px, camera, d)
-                for view, d in zip(views, np.linspace(500, 850, VIEWS), strict=True)
-            ]
+            [points_at(view.image_px, camera, d) for view, d in zip(views, np.linspace(500, 850, VIEWS), strict=True)]
         )
         for name, found in (("ours", own.state.camera()), ("theirs", theirs)):
             left = difference(camera, found, (np.eye(12) * 1e-12,) * 2, gauge[::4], points_at(image, camera, 700.0))

@@ -36,6 +36,7 @@ from lab.formats.results import (
     Skipped,
     ViewResiduals,
 )
+from lab.formats.results.words import PROJECTION_NAMES
 from lab.measure.board_calibration import (
     DIFFERENCE_SIGMA,
     MIN_VIEWS,
@@ -51,18 +52,13 @@ from lab.measure.board_detection import MIN_CORNERS, BoardView, CornerFits, chan
 from lab.measure.bundle_adjustment import Solution, warp_prior_mm
 from lab.measure.projection import Camera, grid, grid_points
 from lab.one_blas_thread import one_blas_thread
-from sim.camera import ProjectionKind, Side
+from sim.camera import Side
 from sim.scene.projection import COUNT
 
 Array = NDArray[np.floating[Any]]
 HUBER_STD = 1.5  # standard deviations of a coordinate from which residuals lose weight
 MOST_ITERATIONS = 50
 
-PROJECTION_NAMES: dict[ProjectionKind, str] = {
-    "pinhole": "a pinhole with Brown's distortion",
-    "equidistant": "an equidistant fisheye (OpenCV's fisheye)",
-    "splined_stereographic": "a splined stereographic fisheye (radial spline)",
-}
 LARGEST_WARP_STD = 0.5  # of the standard deviation of the prior; above it, the views don't determine a warp
 
 

@@ -329,9 +329,7 @@ def triangulation_jacobian(solution: Solution, points: Array) -> tuple[Array, Ar
     first = int(free[0].sum())
     shared[:, :2, :first] = by_camera[:, :, free[0]]
     turned = points @ state.rotation.T
-    _, point_jacobian, by_camera = state.camera(1).project_with_jacobian(
-        turned + state.translation_mm
-    )
+    _, point_jacobian, by_camera = state.camera(1).project_with_jacobian(turned + state.translation_mm)
     by_point[:, 2:] = point_jacobian @ state.rotation
     at = solution.names.index(RIG[0])
     shared[:, 2:, first:at] = by_camera[:, :, free[1]]
@@ -430,7 +428,10 @@ def _rectified_rows(image: Array, camera: Camera, turn: Array, new: Array) -> Ar
     `turn` (3, 3): rotation of the camera to the rectified one; `new` (3, 4): projection of that.
     """
     rays = camera.unproject(image) @ np.asarray(turn).T
-    return np.where(rays[:, 2] > 0.0, new[1, 1] * rays[:, 1] / np.where(rays[:, 2] > 0.0, rays[:, 2], 1.0), np.nan) + new[1, 2]
+    return (
+        np.where(rays[:, 2] > 0.0, new[1, 1] * rays[:, 1] / np.where(rays[:, 2] > 0.0, rays[:, 2], 1.0), np.nan)
+        + new[1, 2]
+    )
 
 
 def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, tuple[Array, Array]]:

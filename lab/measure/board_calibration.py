@@ -151,9 +151,7 @@ def _projects_better(one: Array, other: Array) -> bool:
     return chance <= max(PROJECTION_FALSE_ALARM, 0.5 ** len(one))
 
 
-def _held_out_squares(
-    views: Sequence[BoardView], shape: tuple[int, int], model: _Model, solution: Solution
-) -> Array:
+def _held_out_squares(views: Sequence[BoardView], shape: tuple[int, int], model: _Model, solution: Solution) -> Array:
     """Return the sum of squared residuals, px^2, of each view (views,), predicted by the `model` of the other folds."""
     found = np.zeros(len(views))
     boards = {board_key(view): number for number, view in enumerate(first_view_of_boards(views))}

@@ -74,7 +74,9 @@ def test_geometry_covers() -> None:
         for name, value, true, std in zip(names, values, [*truth[:9], *TRUTH.warp_mm], stds, strict=True):
             note(name, value - true, std)
         # the projection over the frame, against the truth, with the implied motion taken out
-        found = difference(truth, one.camera, (np.zeros((12, 12)), one.covariance), one.points, points_at(image, truth, 700.0))
+        found = difference(
+            truth, one.camera, (np.zeros((12, 12)), one.covariance), one.points, points_at(image, truth, 700.0)
+        )
         errors.append(found.vectors_px)
         variances.append(found.variances_px2)
         halves.append(cross_validation(one))
@@ -164,7 +166,9 @@ def test_projection_variance_is_that_of_many_solves() -> None:
     squares, stated = np.zeros(len(image)), np.zeros(len(image))
     for draw in range(VARIANCE_DRAWS):
         one = calibrate_robustly(seen(np.random.default_rng([8, draw]), at, noise_px=NOISE_PX, side="left"), SHAPE)
-        found = difference(truth, one.camera, (np.zeros((12, 12)), one.covariance), one.points, points_at(image, truth, 700.0))
+        found = difference(
+            truth, one.camera, (np.zeros((12, 12)), one.covariance), one.points, points_at(image, truth, 700.0)
+        )
         squares += np.sum(found.vectors_px**2, axis=1)
         stated += np.sum(found.variances_px2, axis=1)
         if draw + 1 in (200, 400, VARIANCE_DRAWS):

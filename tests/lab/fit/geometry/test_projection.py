@@ -157,9 +157,7 @@ def test_error_operator_has_no_motion_left_in_it():
     for k in range(6):
         turn, shift = np.zeros(3), np.zeros(3)
         (turn if k < 3 else shift)[k % 3] = step
-        mode = (
-            CAMERA.project(points @ cv2.Rodrigues(turn)[0].T + shift) - CAMERA.project(points)
-        ).ravel() / step
+        mode = (CAMERA.project(points @ cv2.Rodrigues(turn)[0].T + shift) - CAMERA.project(points)).ravel() / step
         assert np.abs(mode @ operator).max() < 1e-4 * np.linalg.norm(mode) * np.linalg.norm(operator)
 
 
