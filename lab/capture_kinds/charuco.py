@@ -85,7 +85,7 @@ class StereoSequence(Sequence):
         return tuple(made)
 
 
-#: A camera's board has squares from a fifth of a millimetre, below which printers and macro lenses don't get, to a metre.
+#: Squares of a camera's board: from a fifth of a millimetre, below which printers don't get, to a metre.
 USUAL_SQUARES_MM = 0.2, 1000.0
 
 

@@ -8,8 +8,9 @@
   Jacobian and residuals give the full covariance. Errors that neighbouring corners share are an error of the model,
   and part of it;
 - `lab.measure.board_calibration`: outlying corners and views are left out, with the reason. Projection and
-  distortion are chosen by views that their fits haven't used: a richer model is refused where it predicts them worse. Two halves of the
-  views are calibrated separately; what they differ by beyond their uncertainties widens the covariance.
+  distortion are chosen by views that their fits haven't used: a richer model is refused where it predicts them worse.
+  Two halves of the views are calibrated separately; what they differ by beyond their uncertainties widens the
+  covariance.
 
 Lateral colour: the camera of each colour of a mosaic follows from where its corners lie beside those of the luminance
 (`channel_geometry`).
@@ -66,8 +67,8 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
     """Fit the camera of each colour to its corners, one entry of `corners` for each view.
 
     Poses and boards are the same for all colours, so that only differences count: scale, principal point and the
-    first two radial coefficients of each colour by least squares, dq = J dtheta. The radial shift of a colour is its own less that of green, against
-    the distance from the principal point, positive outwards.
+    first two radial coefficients of each colour by least squares, dq = J dtheta. The radial shift of a colour is its own
+    less that of green, against the distance from the principal point, positive outwards.
     """
     if not corners or "G" not in corners[0]:
         return ()

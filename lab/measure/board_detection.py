@@ -44,12 +44,10 @@ CENTROID_PASSES = 4
 
 MIN_CORNERS = 8  # of a view: a pose has six parameters
 WINDOW_PX = 9.0  # largest radius of the window of a corner
-
-
 LEAST_BEND_PX = 1e-3  # displacement of a corner by the curvature of its edges, below which they are taken as straight
 EDGE_SQUARES = 2  # on both sides of a corner, over which the curvature of an edge is measured
-#: Distance from the bent homography, from which a corner has no say in it: of the median distance, and of the spacing of
-#: the corners, by which those at the rim of a wide board may be off.
+#: Distance from the bent homography, from which a corner isn't used for it: of the median distance, and of the spacing
+#: of the corners, by which those at the rim of a wide board may be off.
 OUTLYING_GUESS, OUTLYING_SQUARES = 5.0, 0.05
 
 
@@ -77,10 +75,10 @@ def fit_corners(
         I = level + gradient . r + contrast E(d1) E(d2)
 
     E: a blurred edge, an error function of -1..1; d1, d2: distances from two lines through the corner, straight ones or
-    parabolas with the curvatures `bend_per_px` (2, n, 2), vectors (x, y) of the lines along `across` and `down`. `points` (n,
-    2), (x, y): the first guess, good to about 2 px. `across`, `down` (n, 2): directions of the axes of the board
-    there. `half_px` (n,): radius of the window. `clear(points) -> bool` says which pixels may be used. Trusted are
-    fits that converged near the guess, are sharp enough, and explain the picture.
+    parabolas with the curvatures `bend_per_px` (2, n, 2), vectors (x, y) of the lines along `across` and `down`.
+    `points` (n, 2), (x, y): the first guess, good to about 2 px. `across`, `down` (n, 2): directions of the axes of the
+    board there. `half_px` (n,): radius of the window. `clear(points) -> bool` says which pixels may be used. Trusted
+    are fits that converged near the guess, are sharp enough, and explain the picture.
     """
     points = np.array(points, dtype=float)
     count = len(points)
@@ -597,8 +595,8 @@ def edge_curvatures(board: Array, points: Array, square_mm: float) -> Array:
     (x, y) at its corners: `board` (n, 2), mm, seen at `points` (n, 2), px, NaN where one isn't known.
 
     A fit of straight edges to curved ones is off by about curvature times window^2 / 6: 0.02 px at half the frame of a
-    fisheye. A polynomial goes through the corners of the same edge up to two squares away, or the nearest four. Its part
-    along the edge is perspective's. 0 where fewer than four corners are known.
+    fisheye. A polynomial goes through the corners of the same edge up to two squares away, or the nearest four. Its
+    part along the edge is perspective's. 0 where fewer than four corners are known.
     """
     found = np.zeros((2, len(board), 2))
     known = np.isfinite(points).all(axis=1)

@@ -45,8 +45,8 @@ Progress = Callable[[str, float], None]
 BRIGHTEST_PERCENT, AUTO_SHARE = 1.0, 0.7
 #: Limits of the automatic exposure (s).
 SHORTEST_S, LONGEST_S = 1e-6, 3600.0
-#: Angle from the axis up to which scenes are placed by a pinhole. There the frame is drawn 1.4 focal lengths wide on each
-#: side; the search of the place that light comes from takes 40 steps of sin^2 of the angle each, to 1e-4 px.
+#: Angle from the axis up to which scenes are placed by a pinhole. There a scene is drawn 1.4 focal lengths wide on each
+#: side; the search of the place that light comes from takes up to 40 steps of sin^2 of the angle each, to 1e-4 px.
 WIDEST_SCENE_DEG = 55.0
 
 
@@ -223,9 +223,9 @@ def _check_field(camera: CameraModel, geometry: Geometry) -> None:
     angle_deg = np.rad2deg(np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]))
     if not np.all(angle_deg <= WIDEST_SCENE_DEG):
         raise InputError(
-            f"the corner of the frame sees {np.nanmax(angle_deg):.0f} deg off the axis ({geometry.projection} projection), "
-            f"and scenes are placed by a pinhole, up to {WIDEST_SCENE_DEG:g} deg: give a camera file with fewer rows and "
-            "columns"
+            f"the corner of the frame sees {np.nanmax(angle_deg):.0f} deg off the axis ({geometry.projection} "
+            f"projection), and scenes are placed by a pinhole, up to {WIDEST_SCENE_DEG:g} deg: give a camera file with "
+            "fewer rows and columns"
         )
 
 
