@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium peers names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
+.PHONY: aravis chromium ci-extra peers names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
 
 setup: $(STAMP)
 
@@ -57,7 +57,11 @@ run: $(STAMP)
 	$(BIN)/calibench run --out calibench-data $(ARGS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow and not extra" $(ARGS)
+
+# What CI runs beside `make test`: a browser, other programs, a database server, the wheel, whole sessions of the mock bench.
+ci-extra: $(STAMP)
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m "extra and not slow" $(ARGS)
 
 serve: $(STAMP)
 	$(BIN)/calibench serve $(ARGS)

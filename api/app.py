@@ -22,12 +22,13 @@ from api import errors, schemas
 from api.checks import DeviceChecks
 from api.errors import DefectMiddleware, Problem, answers, problem
 from api.idempotency import PARAMETER, Idempotency
-from api.keys import LOOPBACK, stored_keys
+from api.keys import LOOPBACK, Permission, create_halt_token, digest, halt_token_key, stored_keys
 from api.known_queries import check_query
 from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.pictures import Pictures
 from api.public_text import PublicText
+from api.room_watch import RoomWatch
 from api.routes import (
     calibrations,
     camera_models,
@@ -41,16 +42,17 @@ from api.routes import (
     twin,
 )
 from api.routes.stations import router as stations_router
-from api.schemas import Health, Login, Me
+from api.schemas import Health, Login, MayHalt, Me
 from api.security import (
     COOKIE,
+    HALT_COOKIE,
     Gate,
     SafeHeaders,
     SameHost,
     SmallBodies,
     TooManyFailures,
     address_of,
-    set_cookie,
+    set_cookies,
 )
 from api.service import READ, Here, Limits, Service
 from api.shared_answers import Shared, SharedAnswers
@@ -62,6 +64,7 @@ from lab.capture.session import Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
 from lab.challenge.kept import Challenges
+from lab.errors import CannotWrite, InputError, one_line
 from lab.jobs import JobRunner
 from lab.quick_look.process import QuickLook
 
@@ -93,7 +96,7 @@ TAGS = [
 #: Statuses that the service answers before a route is asked: a foreign Host, a method that the path hasn't, a body that
 #: is too large, a foreign Origin; and a defect.
 EVERYWHERE = (400, 405, 413, 500)
-EVERY_CHANGE = (*EVERYWHERE, 403)
+EVERY_CHANGE = (*EVERYWHERE, 403, 507)
 open_to_all = APIRouter()
 
 
@@ -108,14 +111,17 @@ def health() -> Health:
 
 @open_to_all.get("/healthz", tags=["access"], responses=answers(503))
 def ready(service: Here) -> Health:
-    """Whether the service can work: its registry answers and its data folder takes files. For a supervisor or a
-    balancer."""
+    """Whether the service can work: its registry answers, its data folder takes files, and its disk has room. Else 503
+    with the reason; halts, and what runs, don't need it. For a supervisor or a balancer."""
     try:
         service.store.under_way()
         with tempfile.TemporaryFile(dir=service.store.root):
             pass
-    except (OSError, SQLAlchemyError):
-        log.exception("not ready")
+        service.store.room.check()
+    except CannotWrite as error:
+        raise HTTPException(503, service.public(str(error))) from None
+    except (OSError, SQLAlchemyError) as error:
+        log.warning("not ready: %s", one_line(error))
         raise HTTPException(503, "the registry or the data folder can't be used; the service's log says more") from None
     return Health(version=version("calibench"))
 
@@ -131,19 +137,45 @@ def metrics(request: Request) -> Response:
 
 @open_to_all.post("/login", tags=["access"], responses=answers(401, 403, 413, 422, 429))
 async def login(service: Here, request: Request, asked: Login, response: Response) -> Me:
-    """Exchange a key for the page's cookie. An address that sends too many wrong keys is answered 429 for a while."""
+    """Exchange a key for the page's cookies: that of the login, and one that allows a halt alone, also after the login
+    has ended (see `GET /halt`). An address that sends too many wrong keys is answered 429 for a while."""
     key = await asyncio.to_thread(service.gate.check, asked.key.strip(), address_of(request))
     if key is None:
         raise HTTPException(401, "this key isn't valid; `calibench key create NAME` makes one")
-    set_cookie(response, service.gate.logins.open(key), secure=request.url.scheme == "https")
+    halt = None
+    if key.scope is not Permission.READ:
+        try:
+            halt = await asyncio.to_thread(create_halt_token, service.store, key)
+        except (
+            InputError,
+            CannotWrite,
+            SQLAlchemyError,
+        ) as error:  # a full disk: whoever is logged in halts with the login
+            log.warning("no halt token for the page of %s: %s", key.name, one_line(error))
+    set_cookies(response, service.gate.logins.open(key), halt, secure=request.url.scheme == "https")
     return Me(name=key.name, scope=key.scope)
 
 
 @open_to_all.post("/logout", status_code=204, tags=["access"])
 def logout(service: Here, request: Request, response: Response) -> None:
-    """Forget the page's login."""
+    """Forget the page's login, and that it may halt."""
     service.gate.logins.close(request.cookies.get(COOKIE, ""))
-    response.delete_cookie(COOKIE, path="/")
+    if halt := request.cookies.get(HALT_COOKIE):
+        with contextlib.suppress(InputError, CannotWrite, SQLAlchemyError):  # the browser forgets it in any case
+            service.store.remove_halt_token(digest(halt))
+    for name in (COOKIE, HALT_COOKIE):
+        response.delete_cookie(name, path="/")
+
+
+@open_to_all.get("/halt", tags=["access"])
+def may_halt(service: Here, request: Request) -> MayHalt:
+    """Whether this client may halt, by its key, its login or its halt token. Needs no key: for a page whose login has
+    ended."""
+    try:
+        key = service.gate.identify_for_halt(request)
+    except TooManyFailures:
+        key = None
+    return MayHalt(may_halt=key is not None and key.scope is not Permission.READ)
 
 
 @open_to_all.get("/", include_in_schema=False)
@@ -198,12 +230,13 @@ def create_app(
     folder.mkdir(parents=True, exist_ok=True)
     caps = limits or Limits()
 
-    rescue = recovery or Recovery(store, connect)
+    rescue, watch = recovery or Recovery(store, connect), RoomWatch(store)
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        rescue.resume_with(app.state.service.live.resume)
+        rescue.resume_with(app.state.service.live.resume, app.state.service.live.safety.note_found)
         rescue.start()
+        watch.start()
         app.state.service.waiting.start()
         app.state.service.then.start()
         yield
@@ -214,10 +247,15 @@ def create_app(
         app.state.service.jobs.close()  # first: a job that captures ends its session itself
         app.state.service.live.close()
         app.state.service.quick_look.close()
+        await asyncio.to_thread(watch.close)
 
     shared = Shared()
     live = LiveSessions(store, connect, shared.forget)
-    gate = Gate(lambda anew: stored_keys(store, anew), store.knows_keys)
+    gate = Gate(
+        lambda anew: stored_keys(store, anew),
+        store.knows_keys,
+        halt_token_key=lambda sha256: halt_token_key(store, sha256),
+    )
     jobs_of = jobs_runner or JobRunner(store)
     inbox = Inbox(store.root / "recordings")
     counted = Metrics({"sessions": store.count_states, "jobs": jobs_of.count_states})

@@ -42,21 +42,25 @@ def _sha256(document: Any) -> str:
 def certificate(store: Store, one: CalibrationRecord) -> Certificate:
     """Return the certificate of a calibration that was certified."""
     stated = one.model_dump(mode="json", include=_STATED)
+    if one.limits is not None and not one.limits.drafted_from:  # as those of before there was this key
+        del stated["limits"]["drafted_from"]
     fit = _sha256(store.result(one.id).document)
     return Certificate(stated=stated, fit_sha256=fit, sha256=_sha256({"stated": stated, "fit_sha256": fit}))
 
 
 def rejections(store: Store, found: CalibrationRecord) -> tuple[str, ...]:
-    """Return what speaks against a calibration's model: its session's newest diagnosis where that rejects it, or its
-    lack."""
+    """Return what speaks against a calibration, or its certificate: limits that were drafted from itself; its session's
+    newest diagnosis where that rejects the model, or its lack."""
+    dependence = None if found.limits is None else found.limits.dependence_on(found.id)
+    first = () if dependence is None else (dependence,)
     newest = store.newest_results(found.session_id)
     if "diagnose" not in newest:
-        return ("The session isn't diagnosed: nobody looked whether the model leaves something out.",)
+        return (*first, "The session isn't diagnosed: nobody looked whether the model leaves something out.")
     verdict = verdict_of(store, newest["diagnose"])
     if verdict in ("no_mismatch", "nothing_judged"):
-        return ()
+        return first
     badge, _, words = VERDICTS[verdict]
-    return (f"The diagnosis rejects the model ({badge}): {words[0].lower()}{words[1:]}",)
+    return (*first, f"The diagnosis rejects the model ({badge}): {words[0].lower()}{words[1:]}")
 
 
 def certificate_page(store: Store, one: CalibrationRecord, runs: tuple[RunRecord, ...]) -> str:
@@ -71,6 +75,7 @@ def certificate_page(store: Store, one: CalibrationRecord, runs: tuple[RunRecord
         version=metadata.version("calibench"),
         one=one,
         warnings=rejections(store, one),
+        is_independent=one.limits is None or one.limits.dependence_on(one.id) is None,
         verdict=verdict,
         others=[figure for figure in every if (figure.name, figure.side, figure.place) not in judged],
         runs=runs,

@@ -15,7 +15,7 @@ import typer
 from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
 from lab.cli.console import Terminated
 from lab.cli.sources import open_store, store_to_read
-from lab.errors import InputError
+from lab.errors import InputError, NoRoom
 
 if TYPE_CHECKING:
     from lab.capture.store import Store
@@ -45,9 +45,9 @@ def logging_config() -> dict[str, Any]:
     from uvicorn.config import LOGGING_CONFIG
 
     config = copy.deepcopy(LOGGING_CONFIG)
-    config["filters"] = {"hide_keys": {"()": "api.keys.HideKeys"}}
+    config["filters"] = {"hide_keys": {"()": "api.keys.HideKeys"}, "escape": {"()": "api.keys.EscapeControls"}}
     for handler in config["handlers"].values():
-        handler["filters"] = ["hide_keys"]
+        handler["filters"] = ["hide_keys", "escape"]
     for name in ("api", "lab"):
         config["loggers"][name] = {"handlers": ["default"], "level": "INFO", "propagate": False}
     return config
@@ -68,7 +68,7 @@ def _listening(host: str, port: int) -> socket.socket:
 @commands.command()
 def serve(
     host: Annotated[
-        str, typer.Option(help="where to listen; others than this computer need a key first")
+        str, typer.Option(metavar="HOST", help="where to listen; others than this computer need a key first")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="where to listen; 0: a free one")] = 8000,
     allow_host: Annotated[
@@ -89,16 +89,35 @@ def serve(
     tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM, the certificate's private key")] = None,
     data: Folder = None,
 ) -> None:
-    """Run the REST service and the operator's page. The first start on loopback makes a key and prints it."""
+    """Run the REST service and the operator's page. The first start on loopback makes a key and prints it.
+
+    Example: calibench serve --port 8000 --data calibench-data
+    """
     if (tls_certificate is None) != (tls_key is None):
         raise InputError("--tls-certificate and --tls-key belong together; give both")
     for file in (tls_certificate, tls_key):
         if file is not None and not os.access(file, os.R_OK):
             raise InputError(f"{file}: can't be read; give a PEM file")
     from lab.capture.recovery import Recovery
+    from lab.capture.room import Room
     from lab.capture.safe_at_start import made_safe_at_start
+    from lab.capture.settings import Settings
+    from lab.capture.tables import use_alone
 
-    store = open_store(data)
+    settings = Settings() if data is None else Settings(data=data)
+    if (lack := Room(settings.data).look()) is not None:
+        typer.echo(f"calibench: {lack}; until then halts and deletions work, and nothing new is started", err=True)
+    try:
+        store = open_store(data)
+    except NoRoom:
+        if settings.registry_file is None or not settings.registry_file.is_file():
+            raise
+        use_alone(settings.registry_file)
+        store = open_store(data)
+        typer.echo(
+            "calibench: no other process can use the registry until this one ends; restart it when there is room",
+            err=True,
+        )
     wanted = is_loopback(host) if create_first_key is None else create_first_key
     makes_key = wanted and not stored_keys(store)
     if not makes_key:
@@ -115,7 +134,7 @@ def serve(
 
         from api.app import create_app
 
-        if makes_key:
+        if makes_key and lack is None:
             _first_key(store)
         names = {name.strip("[]").lower() for name in [*(allow_host or []), host] if name not in _ANY}
         told = {name.lower() for name in webhook_host or []}
@@ -146,19 +165,28 @@ def create(
     scope: Annotated[Permission, typer.Option(help="what it allows; each includes read")] = Permission.READ,
     data: Folder = None,
 ) -> None:
-    """Make a key and print it. It can't be printed again."""
+    """Make a key and print it. It can't be printed again.
+
+    Example: calibench key create robot --scope operate
+    """
     typer.echo(create_key(open_store(data), name, scope))
 
 
 @key.command("list")
 def list_keys(data: Folder = None) -> None:
-    """Names and scopes of all keys."""
+    """Names and scopes of all keys.
+
+    Example: calibench key list
+    """
     for stored in stored_keys(store_to_read(data)):
         typer.echo(f"{stored.name}  {stored.scope}")
 
 
 @key.command("remove")
 def remove(name: Annotated[str, typer.Argument(help="name of the key's owner")], data: Folder = None) -> None:
-    """Remove a key and the logins of the operator's page that were made with it."""
+    """Remove a key and the logins of the operator's page that were made with it.
+
+    Example: calibench key remove robot
+    """
     store_to_read(data).remove_key(name)
     typer.echo(f"removed: {name}")

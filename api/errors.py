@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 from collections.abc import Callable, Mapping
@@ -13,10 +14,10 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException as RouterException
 from starlette.requests import ClientDisconnect
-from starlette.routing import compile_path
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from lab.errors import DeviceError, InputError
+from api.expected import Expected, paths_of
+from lab.errors import CannotWrite, DeviceError, InputError, NoRoom, failure_of_environment
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -67,6 +68,7 @@ _MEANINGS = {
     429: "too many keys that aren't valid; `Retry-After` says when another is looked at",
     500: "a defect of calibench; its log says more",
     503: "an instrument or the data folder failed",
+    507: "the data folder's disk is full: what to do",
 }
 
 
@@ -96,21 +98,50 @@ def _answer(status: int) -> Callable[[Request, Exception], Response]:
     return handler
 
 
-def _paths_of(request: Request) -> list[str]:
-    """Return the described paths that a request's path is one of."""
-    return [path for path in request.app.openapi()["paths"] if compile_path(path)[0].match(request.url.path)]
-
-
 def _unknown_in_path(request: Request, name: str) -> Response:
     """404: what a path names can't be there, as it isn't even formed as such names are. Says which list to look
     into."""
     paths = request.app.openapi()["paths"]
-    listed = next(path for path in _paths_of(request) if f"/{{{name}}}" in path).partition(f"/{{{name}}}")[0]
+    listed = next(path for path in paths_of(request) if f"/{{{name}}}" in path).partition(f"/{{{name}}}")[0]
     where = listed
     while where and "get" not in paths.get(where, {}):
         where = where.rpartition("/")[0]
     said = f"no {request.path_params[name][:60]!r} among the {listed.rpartition('/')[2].replace('-', ' ')}"
     return problem(404, request.app.state.public(f"{said}; see GET {re.sub('{.*?}', 'ID', where)}"))
+
+
+def _not_as_expected(request: Request, where: str, one: Mapping[str, Any]) -> str:
+    """Return one line for what pydantic found: the field, what was sent, what is expected, an example."""
+    expected = Expected(request)
+    if one["type"] == "value_error":  # of our own checks, which name the value
+        text = str(one["msg"]).removeprefix("Value error, ")
+        return f"{where}: {text}" if where else text
+    if where:
+        return f"{where}: {_of_field(expected, one)}"
+    sent = request.headers.get("content-type", "")
+    also = "" if "json" in sent else f", with the header Content-Type: application/json (it is {sent[:60]!r})"
+    what = "is missing" if one.get("input") is None else "isn't a JSON object"
+    return f"the body: {what}; send one, such as {expected.example()}{also}"
+
+
+def _of_field(expected: Expected, one: Mapping[str, Any]) -> str:
+    kind, given, place = str(one["type"]), one.get("input"), one["loc"]
+    field = expected.field(place)
+    give = f"; give {field}" if field else ""
+    # A key that was sent is never repeated.
+    shown = "what was sent" if place[-1] == "key" else json.dumps(given, ensure_ascii=False, default=str)[:60]
+    if kind == "extra_forbidden":
+        return f"there is no such field; those that there are: {', '.join(expected.names(place[:-1])) or 'none'}"
+    if kind == "string_too_long":
+        return f"{len(str(given))} characters, {one['ctx']['max_length']} at most; shorten it"
+    if kind == "string_pattern_mismatch":  # ids alone have patterns
+        return f"{str(given)[:60]!r} is no id: take one that the lists have, of letters, digits and hyphens"
+    if kind == "missing":
+        return f"is missing{give}"
+    if field and kind.endswith(("_type", "_parsing", "literal_error", "enum")):
+        return f"{shown} isn't taken{give}"
+    text = re.sub(r"^[A-Z]\w+ (should|must)", r"\1", str(one["msg"]))
+    return f"{shown} {text}{give}"
 
 
 def _invalid(request: Request, error: Exception) -> Response:
@@ -123,15 +154,9 @@ def _invalid(request: Request, error: Exception) -> Response:
             lines.append(f"the body isn't JSON: {one['ctx']['error']}, at character {one['loc'][-1]}")
             continue
         where = ".".join(str(part) for part in one["loc"] if part != "body")
-        said = str(one["msg"]).removeprefix("Value error, ")
-        given = one.get("input")
-        # A key that was sent is never repeated. What our own checks say names the value already.
-        if one["type"] == "string_pattern_mismatch":  # ids alone have patterns
-            said = f"{str(given)[:60]!r} is no id: take one that the lists have, of letters, digits and hyphens"
-        elif isinstance(given, int | float) and one["type"] != "value_error":
-            said = f"{given!r}: {said}"
-        if not any(line.startswith(f"{where}.") for line in lines):  # it follows from what is said of a part of it
-            lines.append(f"{where}: {said}" if where else said)
+        line = _not_as_expected(request, where, one)
+        if not any(other.startswith(f"{where}.") for other in lines):  # it follows from the line on a part of it
+            lines.append(line)
     return problem(422, request.app.state.public("; ".join(lines)))
 
 
@@ -142,17 +167,20 @@ def _refused(request: Request, error: Exception) -> Response:
     headers = dict(error.headers or {})
     if error.status_code == 405:
         paths = request.app.openapi()["paths"]
-        methods = [method.upper() for path in _paths_of(request) for method in paths[path]]
+        methods = [method.upper() for path in paths_of(request) for method in paths[path]]
         headers["allow"] = ", ".join(dict.fromkeys(methods)) or headers.get("allow", "GET")
         return problem(405, f"{request.method} isn't for this path; use {headers['allow']}", headers)
     said = str(error.detail)
     if said == HTTPStatus.NOT_FOUND.phrase:  # the router's own
         said = "there is no such path; /docs lists those that there are"
+    if error.status_code == 400 and error.__cause__ is not None:  # the framework's, of a body that it can't decode
+        said = f"the body can't be read as JSON in UTF-8; send one, such as {Expected(request).example()}"
     return problem(error.status_code, request.app.state.public(said), headers)
 
 
 class DefectMiddleware:
-    """Turns an unexpected exception into status 500. Its text stays in the log."""
+    """Turns a failure of the disk, the registry or the network into status 507 or 503, and an unexpected exception into
+    status 500, whose text stays in the log."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -171,6 +199,11 @@ class DefectMiddleware:
         except ClientDisconnect:  # there is nobody to answer
             log.info("%s %s: the client broke off", scope.get("method"), scope.get("path"))
         except Exception as error:
+            if (failure := failure_of_environment(error)) is not None and not begun:
+                log.warning("%s %s: %s", scope.get("method"), scope.get("path"), failure)
+                status = 507 if isinstance(failure, NoRoom) else 503
+                await problem(status, scope["app"].state.public(_one_line(failure)))(scope, receive, send)
+                return
             log.exception("%s %s: a defect", scope.get("method"), scope.get("path"))
             if begun:
                 raise
@@ -182,6 +215,8 @@ def install(app: FastAPI) -> None:
     """Turn exceptions of `lab` into answers."""
     app.add_exception_handler(InputError, _answer(422))
     app.add_exception_handler(DeviceError, _answer(503))
+    app.add_exception_handler(NoRoom, _answer(507))
+    app.add_exception_handler(CannotWrite, _answer(503))
     app.add_exception_handler(Conflict, _answer(409))
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(RouterException, _refused)

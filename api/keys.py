@@ -14,10 +14,12 @@ import re
 import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
 from lab.errors import InputError
+from lab.plain_text import escaped
 
 if TYPE_CHECKING:
     from lab.capture.store import Store
@@ -75,6 +77,25 @@ def create_key(store: Store, name: str, scope: Permission) -> str:
     return key
 
 
+#: How long a page can halt after its last login.
+HALT_TOKEN_LIFETIME = timedelta(days=30)
+
+
+def create_halt_token(store: Store, key: StoredKey) -> str:
+    """Register a token that allows a halt and nothing else, for the holder of `key`, and return it."""
+    token = secrets.token_urlsafe(32)
+    store.add_halt_token(digest(token), key.sha256, datetime.now(UTC) + HALT_TOKEN_LIFETIME)
+    return token
+
+
+def halt_token_key(store: Store, sha256: str) -> StoredKey | None:
+    """Return the key that the halt token of this hash was made for; None where it is no longer valid, or its key may
+    only read."""
+    found = store.key_of_halt_token(sha256)
+    key = None if found is None else StoredKey(found[0], Permission(found[1]), found[2])
+    return None if key is None or key.scope is Permission.READ else key
+
+
 def holder(key: str, stored: Iterable[StoredKey]) -> StoredKey | None:
     """Return the stored key that `key` is, or None; every stored key is compared, each in constant time."""
     mine = digest(key)
@@ -83,6 +104,29 @@ def holder(key: str, stored: Iterable[StoredKey]) -> StoredKey | None:
         if hmac.compare_digest(mine, candidate.sha256):
             found = candidate
     return found
+
+
+class EscapeControls(logging.Filter):
+    """Escapes control characters in log lines: a request, a file or an instrument could otherwise write on the terminal
+    of whoever reads the log, or begin a line of its own. Our own newlines and tracebacks stay."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Escape a record's texts; no record is dropped."""
+        if isinstance(record.args, tuple):  # kept one by one, as uvicorn's formatter unpacks them
+            record.args = tuple(_plain(one) for one in record.args)
+        text = record.getMessage()
+        if (plain := escaped(text, several_lines=True)) != text:
+            record.msg, record.args = plain, ()
+        if record.exc_info and record.exc_info[0] is not None:
+            record.exc_text = record.exc_text or logging.Formatter().formatException(record.exc_info)
+        if record.exc_text:  # a formatter takes it as it is
+            record.exc_text = escaped(record.exc_text, several_lines=True)
+        return True
+
+
+def _plain(argument: object) -> object:
+    """Return a text, or an exception's text, escaped; another value as it is."""
+    return escaped(str(argument)) if isinstance(argument, str | BaseException) else argument
 
 
 class HideKeys(logging.Filter):

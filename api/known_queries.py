@@ -1,4 +1,5 @@
-"""Query parameters that a route doesn't have are refused: a name that is mistyped would be ignored silently."""
+"""Query parameters that a route doesn't have are refused: a name that is mistyped would be ignored silently. So are
+control characters in a path or a query."""
 
 from __future__ import annotations
 
@@ -7,6 +8,8 @@ from typing import Any
 from fastapi import HTTPException, Request
 from fastapi.dependencies.models import Dependant
 from pydantic import BaseModel
+
+from lab.plain_text import complaints_of, escaped
 
 
 def _names(field: Any) -> list[str]:
@@ -22,8 +25,14 @@ def _query(dependant: Dependant) -> list[Any]:
 
 
 async def check_query(request: Request) -> None:
-    """Raise 422, naming those that there are, where a request with a valid key has a query parameter that its route
-    doesn't take."""
+    """Raise 404 or 422 for a control character, and 422, naming those that there are, where a request with a valid key
+    has a query parameter that its route doesn't take."""
+    for name, value in request.path_params.items():
+        for complaint in complaints_of(str(value)):
+            raise HTTPException(404, f"{name}: {complaint}")
+    for name, value in request.query_params.multi_items():
+        for complaint in (*complaints_of(name), *complaints_of(value)):
+            raise HTTPException(422, f"{escaped(name)[:60]}: {complaint}")
     if not request.query_params:
         return
     known = [name for field in _query(request.scope["route"].dependant) for name in _names(field)]

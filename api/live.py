@@ -22,7 +22,7 @@ from lab.capture.recovery import make_station_safe
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
-from lab.errors import Cancelled, DeviceError, InputError
+from lab.errors import Cancelled, CannotWrite, DeviceError, InputError
 from lab.pipeline import Capturer, CaptureRequest
 
 log = logging.getLogger(__name__)
@@ -83,7 +83,7 @@ class LiveSession:
     def _work(self, capture: CaptureSession) -> None:
         try:
             capture.run()
-        except (InputError, DeviceError) as error:
+        except (InputError, DeviceError, CannotWrite) as error:
             log.warning("session %s: %s", capture.id, error)
         except Exception:
             log.exception("session %s: a defect", capture.id)
@@ -167,6 +167,8 @@ class LiveSessions:
         self._store, self._connect, self._changed = store, connect, changed
         self.safety = KnownSafety(store, changed)
         self._live: dict[str, LiveSession] = {}
+        #: How many halts there were.
+        self.halts = 0
         self._lock = threading.Lock()
         self._closed = False
         self._held: list[frozenset[str]] = []  # addresses that sessions are kept off
@@ -222,10 +224,10 @@ class LiveSessions:
             live.begin(capture)
         return capture.id
 
-    def resume(self, session_id: str, moved: Station | None = None, in_turn: bool = False) -> None:
+    def resume(self, session_id: str, moved: Station | None = None, in_turn: int | None = None) -> None:
         """Continue a paused session, or a session that ended early. `moved`: the station, if its instruments have other
-        addresses now. `in_turn`: only where it still waits in the queue and isn't held. Raises Conflict for a session
-        that is running or finished."""
+        addresses now. `in_turn`: only while the number of halts is that, and it still waits in the queue and isn't
+        held. Raises Conflict for a session that is running or finished."""
         with self._lock:
             live = self.find(session_id)
             if live is not None and live.capture is not None:
@@ -242,7 +244,7 @@ class LiveSessions:
             station = moved or self._store.station(session_id)
             self._check_free(station)
             # After that: the run before, which is over, has said whether it ended badly.
-            if in_turn:
+            if in_turn is not None:
                 info = self._store.session(session_id)
                 if info.state != "queued" or info.error is not None:
                     raise Conflict(f"session {session_id} is {info.state} now: {info.error}")
@@ -255,7 +257,11 @@ class LiveSessions:
                 connect=self._connect,
                 asks_on_page=True,
             )
+            live.capture = capture  # from here on a halt reaches it
             self._live[session_id] = live
+            if in_turn not in (None, self.halts):
+                del self._live[session_id]
+                raise Conflict(f"session {session_id}: halted just now")
             live.begin(capture)
 
     def capturer(self, station: Station) -> Capturer:
@@ -314,6 +320,7 @@ class LiveSessions:
 
         Returns by session what is done when the shutter has answered, or can't.
         """
+        self.halts += 1
         wanted = None if station is None else station.addresses
         ended = {}
         for id, live in list(self._live.items()):

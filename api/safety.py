@@ -71,6 +71,10 @@ class KnownSafety:
                 self._known[key_of(station)] = safety
         self._changed()
 
+    def note_found(self, station: Station, found: SafeState) -> None:
+        """Keep what the instruments answered when they were made safe."""
+        self.note(station, StationSafety.of(found))
+
     def note_asked(self, station: Station) -> None:
         """Keep that the instruments are asked now."""
         self.note(station, StationSafety(state="halting", shutter="unknown", at=now()))

@@ -27,6 +27,7 @@ from lab.challenge.truth import SIZES
 from lab.formats.importers import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from lab.formats.results.diagnosis import DiagnosisVerdict
+from lab.plain_text import complaints_of
 from sim.camera import Cfa, Side
 
 #: Databases that forget the time zone give back UTC.
@@ -71,13 +72,24 @@ class Schema(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+class SeveralLines:
+    """Marks a text field that may have newlines and tabs, as notes do."""
+
+
 class Asked(Schema):
-    """Base of what a request's body asks: no value of another kind is converted."""
+    """Base of what a request's body or query asks: no value of another kind is converted, and no text of it, at any
+    depth, has a control character."""
 
     @model_validator(mode="before")
     @classmethod
-    def _of_their_kinds(cls, data: Any) -> Any:
-        for name, field in cls.model_fields.items() if isinstance(data, dict) else ():
+    def _plain_and_of_their_kinds(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        fields = cls.model_fields
+        lines = [name for name, field in fields.items() if any(isinstance(one, SeveralLines) for one in field.metadata)]
+        for complaint in complaints_of(data, several_lines=lines):
+            raise ValueError(complaint)
+        for name, field in fields.items():
             if name in data:
                 check_kind(name, data[name], field.annotation)
         return data
@@ -166,7 +178,7 @@ class CaptureStart(PlanAsked):
 
     station: str = Field(max_length=100)
     name: str = Field(default="", max_length=120)
-    notes: str = Field(default="", max_length=4000)
+    notes: Annotated[str, SeveralLines()] = Field(default="", max_length=4000)
     demands_certified: bool = Field(
         default=False, description="end the run when it has connected, unless the cameras have a certified calibration"
     )
@@ -257,6 +269,12 @@ class Halt(Asked):
     """What to halt."""
 
     station: str | None = Field(default=None, max_length=100, description="null: every station")
+
+
+class MayHalt(Schema):
+    """Whether the client may halt."""
+
+    may_halt: bool
 
 
 class HaltedStation(Schema):
@@ -458,7 +476,9 @@ class SessionWords(Asked):
     """What a session is called, and the notes of it; what is left out stays."""
 
     name: str | None = Field(default=None, max_length=120)
-    notes: str | None = Field(default=None, max_length=4000, description="a word that begins with # is a tag")
+    notes: Annotated[str | None, SeveralLines()] = Field(
+        default=None, max_length=4000, description="a word that begins with # is a tag"
+    )
 
 
 class StepDone(Asked):
@@ -629,6 +649,14 @@ class SentAs(Schema):
         default=None, gt=0, le=1e6, description="the checkerboard's squares, the dots' spacing"
     )
     tap: str = Field(default="", max_length=100, description="raw-folder, fits: this tap of the sensor alone")
+    only: str = Field(
+        default="",
+        max_length=400,
+        description="raw-folder, fits: frames alone whose headers state these settings, KEY=VALUE,...",
+    )
+    ignore: str = Field(
+        default="", max_length=400, description="raw-folder, fits: keywords of the headers that are wrong, KEY,..."
+    )
     camera: str = Field(default="", max_length=400, description="a picture's camera.toml inside the archive")
     exposure_s: float | None = Field(default=None, gt=0, le=1e6, description="a picture's exposure")
     transfer: Literal["linear", "srgb"] | None = Field(default=None, description="what a picture's codes are")

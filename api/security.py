@@ -2,7 +2,8 @@
 request bodies.
 
 A key is sent in the header `Authorization: Bearer KEY`, never in a URL. The operator's page exchanges it for a cookie
-that scripts can't read and other sites can't send.
+that scripts can't read and other sites can't send. A second cookie of this kind allows a halt and nothing else. It
+outlives the service, whose logins end with its process: the page can halt also before the key is typed again.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.errors import problem
 from api.failed_keys import FailedKeys
-from api.keys import Permission, StoredKey, digest, holder
+from api.keys import HALT_TOKEN_LIFETIME, Permission, StoredKey, digest, holder
 
 COOKIE = "calibench"
 COOKIE_LIFETIME_S = 12 * 3600.0
+HALT_COOKIE = "calibench_halt"
 
 
 # --- logins of the page -----------------------------------------------------------------------------------------------
@@ -77,6 +79,8 @@ class Gate:
     is_quick: Callable[[], bool] = lambda: False
     logins: Logins = field(default_factory=Logins)
     failures: FailedKeys = field(default_factory=FailedKeys)
+    #: The key that the halt token of a hash was made for; None: it isn't valid.
+    halt_token_key: Callable[[str], StoredKey | None] = lambda sha256: None
     #: SHA-256 of keys that were valid once: these are compared whatever their address did.
     _proven: set[str] = field(default_factory=set)
 
@@ -113,6 +117,12 @@ class Gate:
         # A key that was taken away takes its logins with it.
         return login if login is not None and login in self.keys(False) else None
 
+    def identify_for_halt(self, request: Request) -> StoredKey | None:
+        """Return the key of a request as `identify` does, else the key that its halt token was made for."""
+        found = self.identify(request)
+        token = request.cookies.get(HALT_COOKIE)
+        return found if found is not None or not token else self.halt_token_key(digest(token))
+
 
 def address_of(request: Request) -> str:
     """Return the address that a request came from; a proxy's where there is one."""
@@ -127,6 +137,15 @@ _BEARER = HTTPBearer(
 )
 _COOKIE = APIKeyCookie(
     name=COOKIE, scheme_name="login", auto_error=False, description="What `POST /login` gives the operator's page."
+)
+
+
+_HALT = APIKeyCookie(
+    name=HALT_COOKIE,
+    scheme_name="halt",
+    auto_error=False,
+    description="What `POST /login` gives the operator's page for a halt and nothing else, also after a "
+    "restart of the service.",
 )
 
 
@@ -145,7 +164,9 @@ class Demand:
         """Return the key of the request. `bearer` and `cookie` are parameters only so that OpenAPI lists the two
         schemes."""
         gate: Gate = request.app.state.gate
-        key = gate.identify(request)
+        return self._check(gate.identify(request))
+
+    def _check(self, key: StoredKey | None) -> StoredKey:
         if key is None:
             raise HTTPException(
                 401,
@@ -158,11 +179,31 @@ class Demand:
         return key
 
 
-def set_cookie(response: Response, token: str, *, secure: bool) -> None:
-    """Set the login's cookie: hidden from scripts, sent only to this service."""
-    response.set_cookie(
-        COOKIE, token, max_age=int(COOKIE_LIFETIME_S), httponly=True, samesite="strict", secure=secure, path="/"
-    )
+class DemandHalt(Demand):
+    """A dependency of a halt: a key as `Demand` has it, or a halt token."""
+
+    def __init__(self) -> None:
+        super().__init__(Permission.OPERATE, Permission.CALIBRATE)
+
+    def __call__(
+        self,
+        request: Request,
+        bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_BEARER)],
+        cookie: Annotated[str | None, Security(_COOKIE)],
+        halt: Annotated[str | None, Security(_HALT)] = None,
+    ) -> StoredKey:
+        gate: Gate = request.app.state.gate
+        return self._check(gate.identify_for_halt(request))
+
+
+def set_cookies(response: Response, login: str, halt: str | None, *, secure: bool) -> None:
+    """Set the cookies of a login and of a halt token: hidden from scripts, sent only to this service."""
+    life_s = HALT_TOKEN_LIFETIME.total_seconds()
+    for name, token, seconds in ((COOKIE, login, COOKIE_LIFETIME_S), (HALT_COOKIE, halt, life_s)):
+        if token is not None:
+            response.set_cookie(
+                name, token, max_age=int(seconds), httponly=True, samesite="strict", secure=secure, path="/"
+            )
 
 
 # --- hosts ------------------------------------------------------------------------------------------------------------
@@ -203,7 +244,12 @@ class SameHost:
             except ValueError:
                 origin_host = ""
             if origin_host != named[0].lower():
-                return problem(403, f"Origin {origin[:80]!r} is not this service")
+                own = f"http(s)://{named[0]}"
+                return problem(
+                    403,
+                    f"Origin: {origin[:80]!r} isn't this service's, which is {own!r} here; open the page under that "
+                    "address, or send no Origin",
+                )
         return None
 
 

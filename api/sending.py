@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,9 @@ from typing import Any
 from fastapi import HTTPException, Request
 
 from api.service import Service
-from api.unpacking import NoRoom, TooMuch, check_room
+from api.unpacking import TooMuch, check_room
 from api.upload import as_in_archive, check_size, receive
+from lab.errors import FULL, NoRoom
 
 #: What an archive may be; its own first bytes say which it is.
 ARCHIVES = ("application/zip", "application/x-tar", "application/gzip")
@@ -43,7 +43,7 @@ class Arrived:
 @contextlib.asynccontextmanager
 async def arrived(service: Service, request: Request, most_bytes: int) -> AsyncIterator[Arrived]:
     """The archive of a request's body, `most_bytes` at most, while it is used. Raises 422 for another kind of body, and
-    413 or 503 where the body, or what is done with it, goes beyond a cap or the disk."""
+    413 or 507 where the body, or what is done with it, goes beyond a cap or the disk."""
     sent = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if sent not in TYPES:
         raise HTTPException(422, f"Content-Type {sent[:60]!r}: send the archive itself, as {', '.join(ARCHIVES)}")
@@ -61,8 +61,8 @@ async def arrived(service: Service, request: Request, most_bytes: int) -> AsyncI
         except TooMuch as error:
             raise HTTPException(413, str(error), headers=closing) from None
         except NoRoom as error:
-            raise HTTPException(503, str(error), headers=closing) from None
+            raise HTTPException(507, str(error), headers=closing) from None
         except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            if error.errno not in FULL:
                 raise
-            raise HTTPException(503, "the data folder is full; make room", headers=closing) from None
+            raise HTTPException(507, "the data folder is full; make room", headers=closing) from None

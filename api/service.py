@@ -198,6 +198,15 @@ async def _service(request: Request) -> Service:  # not in a thread: it has noth
 
 
 Here = Annotated[Service, Depends(_service)]
+
+
+async def _check_room(service: Here) -> None:
+    """Raises NoRoom where the disk is full: of a change that is no safety, and no deletion."""
+    service.store.room.check()
+
+
+#: Of routes that keep something new.
+ROOM = Depends(_check_room)
 READ = Depends(Demand(Permission.READ))
 OPERATE = Depends(Demand(Permission.OPERATE))
 CALIBRATE = Depends(Demand(Permission.CALIBRATE))

@@ -24,7 +24,7 @@ from api.schemas import SessionStart, Then, ThenState
 from lab.calibration.life import calibration, rig_of
 from lab.capture.store import Store
 from lab.capture.tables import CalibrationRow, SessionRow
-from lab.errors import InputError
+from lab.errors import CannotWrite, InputError
 from lab.fit.compare import compare
 from lab.formats.results import FitResult
 from lab.jobs import JobRunner
@@ -137,6 +137,8 @@ class ThenRunner:
         while not self._ended.wait(LOOK_S):
             try:
                 self.look()
+            except CannotWrite as error:  # tried again
+                log.debug("looking at what follows: %s", error)
             except Exception:
                 log.exception("looking at what follows: a defect")
 

@@ -21,7 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-from lab.errors import InputError
+from lab.errors import InputError, NoRoom
+from lab.plain_text import complaint_of, escaped
 
 CHUNK = 1 << 20
 #: Bytes of an archive's list of files, per file that is allowed: a name of 200 and what `zip` or `tar` writes beside
@@ -33,15 +34,13 @@ RESERVE_BYTES = 1 << 30
 #: ones, pack less.
 MOST_RATIO, FREE_BYTES = 100, 64 << 20
 _GZIP = b"\x1f\x8b"
+#: Compressions of a .zip that aren't read.
+_METHODS = {9: "deflate64", zipfile.ZIP_BZIP2: "bzip2", zipfile.ZIP_LZMA: "lzma", 93: "zstd", 95: "xz", 98: "ppmd"}
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 
 
 class TooMuch(InputError):
     """More than the upper limit."""
-
-
-class NoRoom(Exception):
-    """The data folder's disk hasn't the room."""
 
 
 def check_room(folder: Path, wanted_bytes: int) -> None:
@@ -55,20 +54,24 @@ def check_room(folder: Path, wanted_bytes: int) -> None:
 
 
 def inside(name: str) -> PurePosixPath:
-    """Return a member's name as a path in the folder. Raises InputError for a path that leads out of it."""
+    """Return a member's name as a path in the folder. Raises InputError for a path that leads out of it, and for a name
+    that some system couldn't keep."""
     path = PurePosixPath(name)
     parts = path.parts
-    if (
-        not parts
-        or path.is_absolute()
-        or ".." in parts
-        or "\\" in name
-        or any(":" in part or any(ord(letter) < 32 for letter in part) or len(part.encode()) > 200 for part in parts)
-        or len(parts) > 10
-    ):
-        raise InputError(
-            f"archive: {name[:80]!r} isn't a path inside it; pack the files, or their folder, by themselves"
-        )
+    causes = {
+        "it has no name": not parts,
+        "it is absolute": path.is_absolute() or any(":" in part for part in parts[:1]),
+        "it leads out of the archive's folder": ".." in parts,
+        "it has a backslash": "\\" in name,
+        "it has a colon": any(":" in part for part in parts),
+        "it has a control character": complaint_of(name) is not None,
+        "a name of it is longer than 200 bytes": any(len(part.encode(errors="replace")) > 200 for part in parts),
+        "it lies more than 10 folders deep": len(parts) > 10,
+    }
+    for cause, holds in causes.items():
+        if holds:
+            words = f"'{escaped(name)[:80]}' isn't a path inside it ({cause})"
+            raise InputError(f"archive: {words}; pack the files, or their folder, by themselves")
     return path
 
 
@@ -89,6 +92,11 @@ class _Member:
 class _Archive(ABC):
     """An archive that is open. `members` raises InputError for what may not be in it."""
 
+    @property
+    def separator(self) -> str:
+        """What parts the names of folders."""
+        return "/"
+
     @abstractmethod
     def members(self) -> Iterator[_Member]:
         """Yield what it states to hold."""
@@ -103,13 +111,27 @@ class _Zip(_Archive):
         self._packed = packed
 
     def members(self) -> Iterator[_Member]:
+        separator = self.separator
         for one in self._packed.infolist():
             if stat.S_IFMT(one.external_attr >> 16) not in (0, stat.S_IFREG, stat.S_IFDIR):
                 raise _no_plain_file(one.filename)
             # Another compression could take any amount of memory to undo.
             if one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise InputError(f"archive: {one.filename[:80]!r} is neither stored nor deflated; pack it so")
-            yield _Member(one.filename, one.file_size, one.is_dir(), one)
+                method = _METHODS.get(one.compress_type, f"method {one.compress_type}")
+                raise InputError(
+                    f"archive: {one.filename[:80]!r} is compressed by {method}, neither stored nor deflated; pack it "
+                    "again with the ordinary compression of .zip (deflate)"
+                )
+            name = one.filename.replace(separator, "/")
+            yield _Member(name, one.file_size, name.endswith("/"), one)
+
+    @property
+    def separator(self) -> str:
+        """What parts the names of folders: a backslash in an archive of Windows that has no slash at all, against the
+        format."""
+        names = [one.filename for one in self._packed.infolist()]
+        windows = any("\\" in name for name in names) and not any("/" in name for name in names)
+        return "\\" if windows else "/"
 
     def open(self, member: _Member) -> IO[bytes]:
         return self._packed.open(member.entry)
@@ -204,19 +226,17 @@ def _opened(archive: Path, limit_bytes: int, limit_files: int) -> Iterator[_Arch
             yield _Tar(stack.enter_context(tarfile.open(fileobj=_Bounded(content, CHUNK, most), mode="r:")))
 
 
-def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> None:
-    """Unpack a .zip, .tar or .tar.gz into `folder`, which must not exist. Raises InputError, and TooMuch beyond a
-    limit."""
+def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> tuple[str, ...]:
+    """Unpack a .zip, .tar or .tar.gz into `folder`, which must not exist; returns remarks on what isn't taken as it is
+    in the archive. Raises InputError, and TooMuch beyond a limit."""
     try:
         with _opened(archive, limit_bytes, limit_files) as opened:
-            members = _checked(opened, folder.parent, limit_bytes, limit_files)
+            members, remarks = _checked(opened, folder.parent, limit_bytes, limit_files)
             check_ratio(archive, sum(member.size_bytes for member, _ in members))
             _write(opened, members, folder, limit_bytes)
+            return remarks
     except _BROKEN as error:
-        said = _said(error, folder)
-        raise InputError(
-            f"archive: can't be unpacked ({said}); send a .zip, .tar or .tar.gz with each file once, without a password"
-        ) from error
+        raise InputError(f"archive: {_why_broken(archive, error, folder)}") from error
 
 
 def most_bytes(archive: Path) -> int:
@@ -233,27 +253,68 @@ def check_ratio(archive: Path, stated_bytes: int) -> None:
         )
 
 
-def _said(error: Exception, folder: Path) -> str:
-    """Return what is wrong with an archive, in one line without the words of Python's readers."""
+#: First bytes of archives that aren't read, and their names.
+_OTHERS = {
+    b"7z\xbc\xaf": "a 7-Zip archive",
+    b"Rar!": "a RAR archive",
+    b"\xfd7zX": "compressed by xz",
+    b"BZh": "compressed by bzip2",
+    b"\x28\xb5\x2f\xfd": "compressed by zstd",
+}
+
+
+def _why_broken(archive: Path, error: Exception, folder: Path) -> str:
+    """Return why an archive can't be unpacked, and the remedy, without the words of Python's readers."""
+    with archive.open("rb") as file:
+        begin = file.read(4)
+    for first, name in _OTHERS.items():
+        if begin.startswith(first):
+            return f"it is {name}; send a .zip, .tar or .tar.gz"
     if isinstance(error, FileExistsError | NotADirectoryError | IsADirectoryError):
-        name = Path(str(error.filename)).relative_to(folder) if error.filename else ""
-        return f"{name} is there twice, or as a file and as a folder"[-120:]
-    text = re.sub(r"<ZipInfo filename='(.*?)'.*?>", r"'\1'", str(error))
-    return " ".join(text.replace(str(folder), "").split())[:120]
+        place = Path(str(error.filename)).relative_to(folder) if error.filename else ""
+        text = f"{place} is there twice, or as a file and as a folder"[-120:]
+        return f"can't be unpacked ({text}); pack each file once"
+    plain = re.sub(r"<ZipInfo filename='(.*?)'.*?>", r"'\1'", str(error))
+    text = " ".join(plain.replace(str(folder), "").split())[:120]
+    if begin[:2] == b"PK" and text == "File is not a zip file":
+        return "it is cut off: the list of files at the end of the .zip is missing; copy it anew and send it again"
+    if isinstance(error, EOFError) or "unexpected end of data" in text:
+        return "it is cut off before its end; copy it anew and send it again"
+    return f"can't be unpacked ({text}); send a .zip, .tar or .tar.gz with each file once, without a password"
 
 
-def _checked(opened: _Archive, room: Path, limit_bytes: int, limit_files: int) -> list[tuple[_Member, PurePosixPath]]:
-    """Return the archive's members and their paths, all checked by what the archive states of them."""
+def _is_of_the_system(path: PurePosixPath) -> bool:
+    """Return whether a file is one that macOS or Windows adds: resource forks, views of folders."""
+    return "__MACOSX" in path.parts or path.name.startswith("._") or path.name in _OF_SYSTEMS
+
+
+_OF_SYSTEMS = frozenset((".DS_Store", "Thumbs.db", "desktop.ini"))
+
+
+def _checked(
+    opened: _Archive, room: Path, limit_bytes: int, limit_files: int
+) -> tuple[list[tuple[_Member, PurePosixPath]], tuple[str, ...]]:
+    """Return the archive's members and their paths, all checked by what the archive states of them, and remarks."""
     checked: list[tuple[_Member, PurePosixPath]] = []
+    added: list[PurePosixPath] = []
     for member in opened.members():
-        if len(checked) == limit_files:
+        path = inside(member.name)
+        if _is_of_the_system(path):
+            added.append(path)
+        else:
+            checked.append((member, path))
+        if max(len(checked), len(added)) > limit_files:
             raise TooMuch(f"archive: more files than it may hold, {limit_files} at most; pack less")
-        checked.append((member, inside(member.name)))
     stated = sum(member.size_bytes for member, _ in checked)
     if stated > limit_bytes:
         raise TooMuch(f"archive: {stated} bytes unpacked, {limit_bytes} at most; pack less")
     check_room(room, stated)
-    return checked
+    remarks = []
+    if opened.separator != "/":
+        remarks.append("archive: its names have backslashes, which are taken as separators of folders")
+    if added:
+        remarks.append(f"archive: {len(added)} files that an operating system added are left out, such as {added[0]}")
+    return checked, tuple(remarks)
 
 
 def _write(opened: _Archive, members: list[tuple[_Member, PurePosixPath]], folder: Path, limit_bytes: int) -> None:

@@ -89,7 +89,10 @@ class Foreign:
     @staticmethod
     def _located(folder: Path, name: str, path: str, a_file: bool = True) -> Path:
         """Return a file or folder of the archive. Raises InputError where it isn't in it."""
-        found = folder / inside(path)
+        named = inside(path)
+        found = folder / named
+        if not found.exists() and named.parts[0] == folder.name:  # the one folder in which all of the archive is
+            found = folder.parent / named
         if not (found.is_file() or (found.is_dir() and not a_file)):
             raise InputError(f"{name} {path[:80]!r}: isn't in the archive; name it as in the archive")
         return found
@@ -139,7 +142,7 @@ class Inbox:
         InputError with all problems; nothing is kept then."""
         unpacked = place / "set"
         sent = unpacked if foreign is None else place / "sent"
-        unpack(archive, sent, limit_bytes, limit_files)
+        remarks = unpack(archive, sent, limit_bytes, limit_files)
         try:
             if foreign is None:
                 recordings = recording.read(_top(sent))
@@ -152,6 +155,7 @@ class Inbox:
                 recordings.warnings += tuple(found)
         except InputError as error:
             raise InputError(as_in_archive(str(error), place)) from None
+        recordings.warnings = (*remarks, *recordings.warnings)
         id = secrets.token_hex(8)
         unpacked.rename(self.root / id)
         os.utime(self.root / id)  # by which they are listed
@@ -203,7 +207,7 @@ def take_cameras(place: Path, archive: Path, limit_bytes: int) -> dict[Side, Cam
 def _top(folder: Path, holds: str | None = _MANIFEST) -> Path:
     """Return the folder that holds the file `holds`: `folder`, or the only folder in it. None: the only folder where no
     file is beside it."""
-    entries = [entry for entry in folder.iterdir() if entry.name != "__MACOSX"]
+    entries = list(folder.iterdir())
     inner = [entry for entry in entries if entry.is_dir()]
     here = (folder / holds).exists() if holds is not None else len(entries) > 1
     return inner[0] if not here and len(inner) == 1 else folder

@@ -13,9 +13,8 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import typer.main
-
-from lab.cli.entry import app, attach_service_and_mocks
+from lab.cli.entry import command_tree
+from lab.cli.help import help_and_example
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import TABLE, EffectDescription, as_toml, derived_visibility, effect_list
 from sim.effects.library import effect
@@ -152,8 +151,7 @@ def _effect_lines(one: EffectDescription) -> Iterator[str]:
 
 def command_page() -> str:
     """docs/reference/command-line.md."""
-    attach_service_and_mocks()
-    root = typer.main.get_command(app)
+    root = command_tree()
     lines = [
         "# Command line",
         "",
@@ -182,14 +180,15 @@ def command_page() -> str:
     ]
     commands = list(_commands(root, ""))
     lines += [
-        f"| [`{name}`](#{name.replace(' ', '-')}) | {_one_line(command.help).split('. ')[0].rstrip('.')} |"
-        for name, command in commands
+        f"| [`{name}`](#{name.replace(' ', '-')}) | {command.short_help.rstrip('.')} |" for name, command in commands
     ]
     for name, command in commands:
-        lines += ["", f"## {name}", "", _one_line(command.help), ""]
+        text, example = help_and_example(command)
+        lines += ["", f"## {name}", "", _one_line(text), ""]
         context = command.make_context(name, [], resilient_parsing=True)
         usage = " ".join(piece for piece in command.collect_usage_pieces(context))
         lines += ["```", f"calibench {name} {usage}", "```", ""]
+        lines += [f"Example: `{example}`", ""] if example else []
         rows = [record for p in command.params if p.name != "help" and (record := p.get_help_record(context))]
         if rows:
             lines += ["| option | |", "| --- | --- |"]

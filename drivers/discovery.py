@@ -16,7 +16,7 @@ from typing import Any
 import usb.core
 from serial.tools import list_ports
 
-from drivers.errors import Disconnected, InstrumentError, InUse
+from drivers.errors import PERMISSION_REMEDY, Disconnected, InstrumentError, InUse
 from drivers.instrument import Identity
 from drivers.registry import driver, drivers
 from drivers.transport import Transport
@@ -86,7 +86,7 @@ def _usb_device(device: usb.core.Device, where: str) -> Found | None:
     try:
         serial_number, product = device.serial_number or "", device.product or ""
     except (usb.core.USBError, ValueError):
-        serial_number, product = "", "no permission to ask: add a udev rule"
+        serial_number, product = "", f"no permission to ask; {PERMISSION_REMEDY}"
     what = f"{product or 'USB device'} ({device.idVendor:04x}:{device.idProduct:04x}) {serial_number}".strip()
     usb.util.dispose_resources(device)
     return Found(f"{where}{serial_number}", what, family, name, needs)

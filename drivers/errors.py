@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+#: What mends a refused permission for a port or a USB device.
+PERMISSION_REMEDY = (
+    "install deploy/70-calibench.rules as /etc/udev/rules.d/70-calibench.rules, join the group calibench and log in "
+    "again (docs/how-to/install-in-a-lab.md)"
+)
+
 
 class InstrumentError(Exception):
     """An instrument failed or can't be reached. The message is one line: which instrument, what happened, what to

@@ -9,20 +9,35 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import re
 import socket
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import ClassVar
 
 from drivers.errors import InstrumentError, InUse
 from drivers.instrument import Setting
 
+log = logging.getLogger(__name__)
 _lock = threading.Lock()
+_thread = threading.local()
+
+
+@contextmanager
+def making_safe() -> Iterator[None]:
+    """Within it, in this thread, an instrument is made safe also where nothing can be kept on disk: what it was set to
+    is kept in memory alone, for as long as its driver lives."""
+    before = getattr(_thread, "makes_safe", False)
+    _thread.makes_safe = True
+    try:
+        yield
+    finally:
+        _thread.makes_safe = before
 
 
 class Hold:
@@ -100,15 +115,25 @@ class FoundSettings:
         return self._values.get(name, otherwise)
 
     def note(self, name: str, value: Setting) -> None:
-        """Keep a value, once, before it is changed. Raises `InstrumentError` where it can't be kept."""
+        """Keep a value, once, before it is changed. Raises `InstrumentError` where it can't be kept, except within
+        `making_safe`."""
         if name not in self._values:
             self._values[name] = value
-            self._write()
+            try:
+                self._write()
+            except InstrumentError as error:
+                if not getattr(_thread, "makes_safe", False):
+                    raise
+                log.warning("%s; its instrument is made safe all the same", error)
 
     def forget(self, name: str) -> None:
-        """A value is set as it was found."""
+        """A value is set as it was found. Where the file can't be changed, it stays: whoever connects next sets the
+        value once more."""
         if self._values.pop(name, None) is not None:
-            self._write()
+            try:
+                self._write()
+            except InstrumentError as error:
+                log.warning("%s", error)
 
     def _write(self) -> None:
         fresh = self._file.with_suffix(f".{os.getpid()}")
@@ -127,8 +152,9 @@ class FoundSettings:
                     os.fsync(file.fileno())
                 fresh.replace(self._file)
         except OSError as error:
+            with suppress(OSError):
+                fresh.unlink(missing_ok=True)
             raise InstrumentError(
                 f"{self._who}: its settings can't be kept in {self._file} ({error.strerror}), to be restored later; "
-                "make room, or set "
-                "CALIBENCH_DATA to a folder of yours"
+                "make room, have its permissions changed, or set CALIBENCH_DATA to another folder"
             ) from error

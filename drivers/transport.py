@@ -13,7 +13,16 @@ from contextlib import contextmanager, suppress
 
 import serial
 
-from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, InUse, NoAnswer, Refused
+from drivers.errors import (
+    PERMISSION_REMEDY,
+    Disconnected,
+    Garbled,
+    InstrumentError,
+    Interrupted,
+    InUse,
+    NoAnswer,
+    Refused,
+)
 from drivers.instrument import Instrument, Recorder
 
 #: Longest time between two looks at whether `interrupt` was called.
@@ -79,10 +88,12 @@ class Transport:
                     f"{self.name}: this port is in use, by another program or another instrument of the station; "
                     "one port serves one instrument: close the other, or correct the address in the station file"
                 ) from error
-            raise Disconnected(
-                f"{self.name}: can't be opened ({reason}); check the cable, the power and the address in the station "
-                "file"
-            ) from error
+            remedy = (
+                PERMISSION_REMEDY
+                if number in (errno.EACCES, errno.EPERM)
+                else "check the cable, the power and the address in the station file"
+            )
+            raise Disconnected(f"{self.name}: can't be opened ({reason}); {remedy}") from error
 
     def close(self) -> None:
         """Close the connection; never raises."""

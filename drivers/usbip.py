@@ -28,7 +28,7 @@ from urllib.parse import urlsplit
 import usb.core
 from usb.backend import IBackend
 
-from drivers.errors import Disconnected, InstrumentError, InUse, NoAnswer
+from drivers.errors import PERMISSION_REMEDY, Disconnected, InstrumentError, InUse, NoAnswer
 
 VERSION = 0x0111
 OP_REQ_DEVLIST, OP_REP_DEVLIST = 0x8005, 0x0005
@@ -595,5 +595,5 @@ def translate(error: usb.core.USBError, who: str, doing: str) -> InstrumentError
     if error.errno == errno.EBUSY:
         return InUse(f"{who}: in use by another program or another instrument of the station; close that one")
     if error.errno == errno.EACCES:
-        return InstrumentError(f"{who}: no permission for this USB device; add a udev rule for it")
+        return InstrumentError(f"{who}: no permission for this USB device; {PERMISSION_REMEDY}")
     return InstrumentError(f"{who}: USB error while {doing}: {error}")

@@ -28,7 +28,7 @@ from lab.capture.records import JobState, now
 from lab.capture.store import Store
 from lab.capture.tables import JobRow
 from lab.challenge.kept import WORK, ChallengeWork, carry_out
-from lab.errors import Cancelled, DeviceError, InputError, NotDetermined
+from lab.errors import Cancelled, CannotWrite, DeviceError, InputError, NoRoom, NotDetermined, failure_of_environment
 from lab.pipeline import (
     STEPS,
     Capturer,
@@ -142,6 +142,9 @@ def run_job(
         except (InputError, DeviceError, NotDetermined) as error:
             _over(store, job_id, "failed", str(error))
         except Exception as error:
+            if (failure := failure_of_environment(error)) is not None:
+                _over(store, job_id, "failed", f"{failure}; then start the job again")
+                return
             _over(store, job_id, "failed", f"{type(error).__name__}: {error}; this is a defect of calibench, report it")
         else:
             _over(store, job_id, "done", None)
@@ -182,6 +185,17 @@ def _models(store: Store, request: PipelineRequest, camera_model: str) -> dict[S
 
 
 def _over(store: Store, job_id: str, state: JobState, error: str | None) -> None:
+    """Record how a job ended. On a full disk the reserve makes way for it; where even that isn't enough, the job stays
+    as it was until the next runner starts."""
+    try:
+        _record_end(store, job_id, state, error)
+    except CannotWrite:
+        store.room.give_up()
+        with contextlib.suppress(CannotWrite):
+            _record_end(store, job_id, state, error)
+
+
+def _record_end(store: Store, job_id: str, state: JobState, error: str | None) -> None:
     with store.transaction() as db:
         row = db.get_one(JobRow, job_id, with_for_update=True)
         row.state, row.error, row.finished = state, error, now()
@@ -230,7 +244,8 @@ class JobRunner:
         self._client: Any = None
         self._started: dict[str, Any] = {}  # Dask forgets a task whose future nobody holds
         self._starting = threading.Lock()
-        self.fail_orphans()
+        with contextlib.suppress(NoRoom):  # then the next runner does it
+            self.fail_orphans()
 
     def __enter__(self) -> JobRunner:
         return self
@@ -296,7 +311,7 @@ class JobRunner:
         of a pipeline, take the captures that tell the remaining rivals apart, within these limits. `station`: the one
         that made the recordings, for `resolve` on a set's folder (`lab.resolve.station_of`). `camera_model`: id of one
         that stands in for the fitted cameras of a validation or a diagnosis. Raises InputError for an unknown kind,
-        and for `resolve` or `camera_model` where the job can't take it.
+        and for `resolve` or `camera_model` where the job can't take it; NoRoom where the disk is full.
         """
         if kind not in KINDS:
             raise InputError(f"job {kind!r}: no such work; choose from {', '.join(KINDS)}")
@@ -306,6 +321,7 @@ class JobRunner:
             raise InputError(
                 f"camera_model: a job of the kind {kind} takes none; leave it out, or validate or diagnose with it"
             )
+        self.store.room.check()
         client = self._dask() if capturer is None else None
         job_id = secrets.token_hex(8)
         with self.store.transaction() as db:

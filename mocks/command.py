@@ -95,16 +95,20 @@ class _Unusable(Exception):
 
 @commands.command()
 def mock(
-    name: Annotated[str, typer.Argument(help=f"instrument: {', '.join(EVERY_INSTRUMENT)}")],
+    name: Annotated[str, typer.Argument(metavar="INSTRUMENT", help=f"instrument: {', '.join(EVERY_INSTRUMENT)}")],
     link: Annotated[Path | None, typer.Option(help="make this path a link to the pseudo-terminal")] = None,
     tcp: Annotated[
-        str, typer.Option(help="HOST:PORT to listen at instead (display: to connect to; USB instruments: for USB/IP)")
+        str,
+        typer.Option(
+            metavar="HOST:PORT", help="listen at it instead (display: to connect to; USB instruments: for USB/IP)"
+        ),
     ] = "",
     fault: Annotated[
         str,
         typer.Option(
+            metavar="SPEC",
             help="how to fail: KIND[=VALUE][@N[+]], as in half@3; late never half wrong error drop unplug, "
-            "a camera's frames also torn repeated missed"
+            "a camera's frames also torn repeated missed",
         ),
     ] = "",
     real_time: Annotated[
@@ -121,14 +125,19 @@ def mock(
     frames: Annotated[
         Path | None,
         typer.Option(
-            help="replay the frames *-left.npy and *-right.npy of this folder, in real time (u3v, u3v-stereo)"
+            metavar="DIR",
+            help="replay the frames *-left.npy and *-right.npy of this folder, in real time (u3v, u3v-stereo)",
         ),
     ] = None,
     folder: Annotated[
-        Path | None, typer.Option(help="the folder that the camera's software writes raw files into (tethered)")
+        Path | None,
+        typer.Option(metavar="DIR", help="the folder that the camera's software writes raw files into (tethered)"),
     ] = None,
 ) -> None:
-    """Serve one mock instrument on a pseudo-terminal, a TCP port or USB/IP; prints `ready ADDRESS` when it listens."""
+    """Serve one mock instrument on a pseudo-terminal, a TCP port or USB/IP; prints `ready ADDRESS` when it listens.
+
+    Example: calibench mock cornerstone260 --link monochromator
+    """
     from mocks.display import Page, browse
     from mocks.lamp import Lamp, LampClock
     from mocks.pr655 import PhotoResearch
@@ -277,14 +286,17 @@ def bench(
         float, typer.Option(min=0.0, help="real seconds for each second of the bench (0: no waiting)")
     ] = 0.0,
     fault: Annotated[
-        list[str] | None, typer.Option(help="INSTRUMENT:SPEC, as in spectroradiometer:half@3; may be repeated")
+        list[str] | None,
+        typer.Option(metavar="INSTRUMENT:SPEC", help="how it fails, as in spectroradiometer:half@3; may be repeated"),
     ] = None,
-    host: Annotated[str, typer.Option(help="where the stage and the cameras listen")] = "127.0.0.1",
-    advertise: Annotated[str, typer.Option(help="name of this computer for others; as --host if not given")] = "",
+    host: Annotated[str, typer.Option(metavar="HOST", help="where the stage and the cameras listen")] = "127.0.0.1",
+    advertise: Annotated[
+        str, typer.Option(metavar="HOST", help="name of this computer for others; as --host if not given")
+    ] = "",
     serial_over_tcp: Annotated[
         bool, typer.Option("--serial-over-tcp", help="the serial instruments listen at --host, too")
     ] = False,
-    display: Annotated[str, typer.Option(help="HOST:PORT at which the display driver will listen")] = "",
+    display: Annotated[str, typer.Option(metavar="HOST:PORT", help="at which the display driver will listen")] = "",
     with_parent: Annotated[bool, typer.Option("--with-parent", help="end when standard input is closed")] = False,
     conceal: Annotated[
         list[str] | None,
@@ -301,7 +313,10 @@ def bench(
         float, typer.Option(help="degrees by which the sensors get warmer during the first virtual minutes")
     ] = 0.0,
 ) -> None:
-    """Run the whole mock bench: prints one line an instrument, then `ready`."""
+    """Run the whole mock bench: prints one line an instrument, then `ready`.
+
+    Example: calibench bench --station bench.toml
+    """
     with _one_line_errors():
         faults = _bench_faults(fault or [])
         concealed = _concealed(conceal or [], healthy)

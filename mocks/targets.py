@@ -167,7 +167,7 @@ def board_pose(name: str) -> Pose:
 
 def mm_per_px(camera: HiddenCamera) -> float:
     """Size of a pixel at the targets' distance, by the data sheet."""
-    return float(DISTANCE_MM * camera.model.pixel_pitch_um * 1e-3 / camera.model.lens.focal_length_mm)
+    return float(DISTANCE_MM * camera.model.pixel_pitch_um * 1e-3 / camera.model.lens.known_focal_length_mm)
 
 
 def _edges(name: str, camera: HiddenCamera) -> tuple[PlaneEdge, ...]:

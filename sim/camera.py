@@ -24,17 +24,28 @@ TABLE_AGREEMENT = 0.02
 
 class Lens(Frozen):
     """The optics. `imaging` says how a point is imaged (default: diffraction limited at `f_number`), `illumination` how
-    the light falls off (default: cos^4 at `focal_length_mm`); a traced lens's table says both. Raises where a traced
-    lens is of another f-number or focal length.
+    the light falls off (default: cos^4 at `focal_length_mm`); a traced lens's table says both. `focal_length_mm`: None
+    where nobody says; the light then doesn't fall off. Raises where a traced lens is of another f-number or focal
+    length.
     """
 
     f_number: Annotated[float, Quantity("1", "working f-number", lower=0.5, upper=64.0)]
-    focal_length_mm: Annotated[float, Quantity("mm", "focal length", lower=0.1, upper=5000.0)]
+    focal_length_mm: Annotated[float | None, Quantity("mm", "focal length", lower=0.1, upper=5000.0)] = None
     transmittance: Annotated[
         float, Quantity("1", "share of the light on axis that the lens lets through", lower=0.0, upper=1.0)
     ] = 1.0
     imaging: Imaging = DiffractionLimited()
     illumination: Illumination = CosineFourth()
+
+    @property
+    def known_focal_length_mm(self) -> float:
+        """The focal length, mm. Raises ValueError where nobody says it."""
+        if self.focal_length_mm is None:
+            raise ValueError(
+                "focal_length_mm of the camera's lens is not set, and the scale of the image depends on it: write it "
+                "into the camera file below [lens], or name a prescription (--lens)"
+            )
+        return self.focal_length_mm
 
     @model_validator(mode="after")
     def _agrees_with_its_table(self) -> Self:
@@ -44,7 +55,7 @@ class Lens(Frozen):
                 ("f-number", self.f_number, table.f_number),
                 ("focal length in mm", self.focal_length_mm, table.focal_length_mm),
             ):
-                if abs(stated / traced - 1.0) > TABLE_AGREEMENT:
+                if stated is not None and abs(stated / traced - 1.0) > TABLE_AGREEMENT:
                     raise ValueError(
                         f"the lens's {name} is {stated:g}, beyond the limit of {100 * TABLE_AGREEMENT:g} % from the "
                         f"traced {traced:g}: state the traced value, or trace the prescription at the aperture you mean"

@@ -19,8 +19,8 @@ SOURCES = sorted(
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"`([^`\n]+)`")
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
-#: A page may name a file that it tells its reader to write.
-WRITTEN = re.compile(r"\b[Ww]rite\w* `([^`\n]+)`")
+#: A page may name a file that it tells its reader to write, or that a command of it writes.
+WRITTEN = re.compile(r"(?:\b[Ww]rite\w* `|--out )([^`\s]+)")
 FILE = re.compile(rf"(?:{'|'.join(ROOMS)})/[\w*./-]*\w/?")
 PYTHON_FILE = re.compile(r"[\w/]+\.py")
 PYTHON_NAME = re.compile(rf"(?:{'|'.join(ROOMS[:5])})(?:\.[A-Za-z]\w*)+")

@@ -15,9 +15,8 @@ from pathlib import Path
 import httpx
 import pytest
 from typer.core import TyperGroup
-from typer.main import get_command
 
-from lab.cli.entry import app, attach_service_and_mocks
+from lab.cli.entry import command_tree
 from tests.postgresql import database, postgresql
 from tests.test_docs import PAGES, ROOT, text_of
 
@@ -86,7 +85,7 @@ def calibench_commands() -> list[tuple[str, str]]:
 
 def complaint(words: list[str]) -> str:
     """What the command line says of a command that it doesn't take; a file that isn't there is no fault of a page."""
-    command, context, name = get_command(app), None, "calibench"
+    command, context, name = command_tree(), None, "calibench"
     try:
         while True:
             context = command.make_context(name, list(words), parent=context)
@@ -101,11 +100,6 @@ def complaint(words: list[str]) -> str:
             raise
         told = str(error.format_message())
         return "" if "does not exist" in told else told or "a command is missing"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def everything() -> None:
-    attach_service_and_mocks()
 
 
 def test_a_command_that_there_is_not_is_noticed() -> None:
@@ -124,6 +118,16 @@ def test_each_calibench_command_is_taken() -> None:
         if told := complaint(shlex.split(plain)):
             wrong.append(f"{page}: calibench {text}: {told}")
     assert wrong == []
+
+
+def test_each_example_of_a_help_is_taken() -> None:
+    pending, examples = [command_tree()], []
+    while pending:
+        command = pending.pop()
+        pending += getattr(command, "commands", {}).values()
+        examples += re.findall(r"Example: calibench (.+)", command.help or "")
+    assert len(examples) > 35
+    assert {text: found for text in examples if (found := complaint(shlex.split(text)))} == {}
 
 
 def test_each_target_is_the_makefile_s() -> None:
@@ -204,6 +208,7 @@ def test_a_block_that_makes_its_inputs_runs(page: str, block: str, desk: dict[st
     assert done.returncode == 0, f"{page}:\n{block}\n{done.stdout}\n{done.stderr}"
 
 
+@pytest.mark.extra
 def test_keys_and_service_on_postgresql(desk: dict[str, str], tmp_path: Path) -> None:
     """docs/reference/rest.md: the registry in PostgreSQL, by the one variable that it names; keys and the service."""
     text = text_of(ROOT / "docs" / "reference" / "rest.md")

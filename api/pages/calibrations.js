@@ -32,7 +32,7 @@ const certificate = (one) => named("a", "Certificate", one.name, { href: `${api}
 
 /** @param {Calibration} one */
 const who = (one) => {
-  const until = one.expires ? ` until ${one.expires.slice(0, 10)}` : "";
+  const until = one.expires ? ` until ${one.expires.slice(0, 10)}` : ", no end set";
   return one.certified_by && one.certified ? `${one.certified_by}, ${one.certified.slice(0, 10)}${until}` : "";
 };
 

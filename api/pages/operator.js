@@ -7,7 +7,7 @@ import "./inspector.js";
 import "./models.js";
 import "./recordings.js";
 import "./source.js";
-import { $, addView, address, ask, element, goTo, halt, may, mayHalt, post, put, query, reach, said, scopeIs, show, showView, told } from "./page.js";
+import { $, addView, address, ask, element, forgetHalt, goTo, halt, may, mayHalt, post, put, query, reach, said, scopeIs, show, showView, told } from "./page.js";
 import { asked as planned, showEstimate, showPlan, take } from "./plan.js";
 import { queueIs, showQueue } from "./queue.js";
 import { leaveStations, placeCards, showStations, stationsAre } from "./stations.js";
@@ -24,15 +24,24 @@ function showLogin() {
   leaveStations();
   $("login").hidden = false;
   for (const id of [...INSIDE, /** @type {const} */ ("halt")]) $(id).hidden = true;
-  $("who").textContent = $("halt-told").textContent = "";
+  $("who").textContent = "";
+  forgetHalt($("halt-told"));
   $("login-form").elements.key.focus();
+  offerHalt().catch(() => {});
+}
+
+// A page that was logged in halts also where its login has ended, as after a restart of the service.
+async function offerHalt() {
+  const { may_halt } = await (await reach("/halt")).json();
+  if ($("login").hidden) return;
+  $("halt").hidden = $("strip-bar").hidden = $("halt-hint").hidden = !may_halt;
 }
 
 async function enter() {
   const me = await ask("/me");
   scopeIs(me.scope);
   $("who").textContent = `${me.name} (${me.scope})`;
-  $("login").hidden = true;
+  $("login").hidden = $("halt-hint").hidden = true;
   for (const id of INSIDE) $(id).hidden = false;
   $("halt").hidden = !mayHalt();
   $("then").hidden = !may("admin");
@@ -143,7 +152,7 @@ function showStartButton(station) {
 }
 
 form.addEventListener("change", () => showStart());
-form.addEventListener("submit", told("live-problem", async () => {
+form.addEventListener("submit", told("start-problem", async () => {
   const fields = form.elements;
   const at = fields.not_before.value ? new Date(fields.not_before.value).toISOString() : null;
   const station = stations.find((s) => s.name === fields.station.value);

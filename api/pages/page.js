@@ -312,25 +312,30 @@ export const clock = (text) => `${time(text).slice(11)} UTC`;
 // A halt's answer has to come within this time (ms), or somebody goes to the bench.
 const HALT_MS = 2000;
 
-/** A station whose instruments tell whether light may get out.
- * @typedef {{name: string, safety: Safety}} Told */
-/** The halts that are told, by their places: which station (null: all), and when each had answered last before.
- * @type {Map<HTMLElement, {station: string | null, before: Map<string, string | undefined>}>} */
+/** A halt that is shown: its station (null: all), the stations that have to answer, when each had answered last before, what each has
+ * answered since, and whether the request itself is still to be answered.
+ * @typedef {{station: string | null, expected: Set<string>, before: Map<string, string | undefined>, answers: Map<string, Safety>,
+ *   pending: boolean}} ShownHalt */
+/** @type {Map<HTMLElement, ShownHalt>} */
 const halts = new Map();
 /** @type {Model<"StationState">[]} */
 let latest = [];
 
-/** Says in `place` what the stations' instruments have answered: NOT CONFIRMED for as long as one hasn't, and no longer.
+/** @param {string} name @param {Safety | undefined} safety @returns {[boolean, string]} whether it is safe, and the text */
+function answerOf(name, safety) {
+  if (!safety || safety.shutter === "unknown") return [false, `NOT CONFIRMED: go to the bench of ${name} (${safety?.words || (safety ? "its shutter is being asked" : "it hasn't answered")})`];
+  const shutter = `${name}: ${safety.shutter === "closed" ? `shutter closed ${clock(safety.at)}` : "no shutter"}`;
+  return safety.state === "not confirmed" ? [false, `${shutter}, but NOT CONFIRMED: go to the bench (${safety.words})`] : [true, shutter];
+}
+
+/** Shows one answer a station, each with its name. A station that hasn't answered is named, and those that aren't safe come first: no
+ * station's answer reads as that of all.
  * @param {HTMLElement} place
- * @param {Told[]} stations
- * @param {string} fallback */
-function sayHalt(place, stations, fallback) {
-  const open = stations.filter((one) => one.safety.shutter === "unknown");
-  const shut = stations.filter((one) => one.safety.shutter === "closed");
-  const words = open.map((one) => `NOT CONFIRMED: go to the bench of ${one.name} (${one.safety.words || "its shutter is being asked"})`);
-  if (shut.length) words.push(`shutter closed ${clock(shut[0].safety.at)}${stations.length > 1 ? `: ${shut.map((one) => one.name).join(", ")}` : ""}`);
-  place.classList.toggle("unsafe", open.length > 0);
-  const text = words.join("; ") || fallback;
+ * @param {ShownHalt} halt */
+function showHalt(place, { expected, answers }) {
+  const texts = [...expected].map((name) => answerOf(name, answers.get(name)));
+  const text = [false, true].flatMap((safe) => texts.filter((one) => one[0] === safe).map((one) => one[1])).join("; ");
+  place.classList.toggle("unsafe", texts.some(([safe]) => !safe));
   if (place.textContent !== text) place.textContent = text;
 }
 
@@ -340,32 +345,47 @@ export const forgetHalt = (place) => {
   place.textContent = "";
 };
 
-/** Tells every halt anew by what the stations' cards show. A station that hasn't answered since the halt says nothing of it.
+/** Shows every halt anew, by what the stations have answered since. A station on which a later session runs is no longer part of it.
  * @param {Model<"StationState">[]} stations */
 export function tellHalts(stations) {
   latest = stations;
-  for (const [place, { station, before }] of halts) {
-    const answered = stations.flatMap(({ name, safety }) =>
-      safety && (!station || name === station) && safety.at !== before.get(name) ? [{ name, safety }] : [],
-    );
-    if (answered.length) sayHalt(place, answered, "");
+  for (const [place, halt] of halts) {
+    for (const { name, safety, busy_with } of stations) {
+      if (!halt.expected.has(name)) continue;
+      if (safety && safety.at !== halt.before.get(name)) halt.answers.set(name, safety);
+      else if (!halt.pending && !safety && busy_with && halt.answers.delete(name)) halt.expected.delete(name);
+    }
+    if (!halt.expected.size) forgetHalt(place);
+    else if (!halt.pending && halt.answers.size) showHalt(place, halt);
   }
 }
 
 const haltNow = sends("post", HALT_MS);
 
-/** Halts a station, or all where none is named, and says beside the button in `place` what came of it.
+/** Halts a station, or all where none is named. What each station answers stands beside the button, in `place`, once the request is
+ * answered: before that, the answer of one station would read as that of all.
  * @param {HTMLElement} place
  * @param {string | null} station */
 export async function halt(place, station = null) {
+  const names = latest.filter((one) => !station || one.name === station).map((one) => one.name);
+  /** @type {ShownHalt} */
+  const shown = { station, expected: new Set(names), before: new Map(latest.map((one) => [one.name, one.safety?.at])), answers: new Map(), pending: true };
   place.className = "halted";
   place.textContent = "halting …";
-  halts.set(place, { station, before: new Map(latest.map((one) => [one.name, one.safety?.at])) });
+  halts.set(place, shown);
   try {
     const found = await haltNow("/halt", { station });
-    sayHalt(place, found.stations, "halted; no station here has a shutter");
+    if (halts.get(place) !== shown) return;
+    for (const { name, safety } of found.stations) {
+      shown.expected.add(name);
+      shown.answers.set(name, safety);
+    }
+    if (shown.expected.size) showHalt(place, shown);
+    else place.textContent = "halted; there is no station";
   } catch (error) {
     place.classList.add("unsafe");
-    place.textContent = `NOT CONFIRMED: go to the bench (${said(error)})`;
+    place.textContent = `NOT CONFIRMED: go to the bench${names.length ? ` of ${names.join(", ")}` : ""} (${said(error)})`;
+  } finally {
+    shown.pending = false;
   }
 }

@@ -24,8 +24,12 @@ let noted = ""; // its name and notes as the form has them
 const asks = asksBanner(() => $("session-title"), () => showView());
 $("session-asks").append(asks.whole);
 document.addEventListener("session-progress", ({ detail }) => {
-  if (shown === `sessions/${detail.id}`) asks.show(detail.id, detail.asks);
+  if (shown !== `sessions/${detail.id}`) return;
+  asks.show(detail.id, detail.asks);
+  if (detail.total) steps.textContent = `${detail.done} of ${detail.total}`; // as the head of the page has it
 });
+/** How many steps of the session that stands there are done. */
+const steps = element("span");
 
 /** @param {string} label @param {string | Node | null | undefined} value */
 const fact = (label, value) => (value ? [element("div", {}, element("dt", { textContent: label }), element("dd", {}, value))] : []);
@@ -37,13 +41,14 @@ function showHead(one) {
   $("session-title").textContent = name;
   const station = session?.station && element("a", { href: `#/sessions?search=${encodeURIComponent(session.station)}`, textContent: session.station });
   const cameras = Object.values(one.cameras).join(", ");
+  if (session) steps.textContent = `${Math.max(session.steps_done, session.progress?.done ?? 0)} of ${session.steps}`;
   const facts = [
     ...fact("Id", one.id),
     ...fact("State", session && element("span", { className: `state ${session.state}`, textContent: session.state })),
     ...fact("Station", station),
     ...fact("Cameras", cameras),
     ...fact("Begun (UTC)", time(session?.created)),
-    ...fact("Steps", session && `${session.steps_done} of ${session.steps}`),
+    ...fact("Steps done", session && steps),
     ...fact("Captures", String("counts" in one ? one.captures : one.captures.reduce((sum, each) => sum + each.captures, 0))),
     ...fact("Verdict", verdictWords(one.verdict)),
     ...fact("Calibration", one.results?.fit ? element("a", { href: `#/calibrations/${one.results.fit}`, textContent: one.results.fit }) : ""),

@@ -118,7 +118,7 @@ function showStrip(parts) {
   strip.state.textContent = parts.state.textContent;
   strip.state.className = parts.state.className;
   const [shutter, light] = [parts.shutter.textContent ?? "", parts.light.textContent];
-  const screen = session ? "in use" : safety?.state === "safe" ? "dark" : "not known";
+  const screen = session?.state === "packing" ? "not in use" : session ? "in use" : safety?.state === "safe" ? "dark" : "not known";
   const words = [`shutter ${shutter === "–" ? "not known" : shutter.startsWith("closed") ? "closed" : shutter}`, light === "–" ? "" : `light ${light}`, `screen ${screen}`];
   strip.facts.textContent = words.filter(Boolean).join(" · ");
   strip.facts.className = parts.shutter.className;
@@ -165,8 +165,8 @@ function showProgress(parts, p) {
   parts.seen = Date.now();
   showStrip(parts);
   parts.strip.asks.show(p.session, p.asks);
-  document.dispatchEvent(new CustomEvent("session-progress", { detail: { id: p.session, words: parts.step.textContent, asks: p.asks } }));
-  if (p.remark) parts.remarks.prepend(element("li", { textContent: `${p.what}: ${p.remark}` }));
+  document.dispatchEvent(new CustomEvent("session-progress", { detail: { id: p.session, words: parts.step.textContent, done: p.done, total: p.total, asks: p.asks } }));
+  if (p.remark && p.state !== "paused") parts.remarks.prepend(element("li", { textContent: `${p.what}: ${p.remark}` }));
 }
 
 /** @param {string} id @param {Parts} parts */
@@ -194,7 +194,8 @@ function showState(parts) {
   const words = session?.state ?? (unsafe ? "NOT CONFIRMED: go to the bench" : safety?.state === "halting" ? "halting" : "free");
   parts.state.textContent = connected ? words : "not known: no connection";
   parts.state.className = `state ${connected && !(unsafe && !session) ? (session?.state ?? "") : "unsafe"}`;
-  parts.problem.textContent = connected && unsafe && !session ? safety.words : "";
+  const waits = session?.state === "paused" ? session.error : ""; // for room on the disk
+  parts.problem.textContent = (connected && (unsafe && !session ? safety.words : waits)) || "";
 }
 
 document.addEventListener("connection", (event) => {

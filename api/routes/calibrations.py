@@ -131,10 +131,15 @@ def recordings_figures(service: Here, recordings_id: HexId) -> list[FigureOfFit]
 def drafted_limits(service: Here, calibration_id: HexId) -> DraftedLimits:
     """Limits drafted from what the same cameras had before: where the next calibration of an unchanged camera lies with
     99 %. They say what is usual; what a camera has to reach, somebody decides. Nothing is kept."""
-    found, number = life.drafted_limits(service.store, _known(service, calibration_id).id)
+    wanted = _known(service, calibration_id).id
+    found, whence = life.drafted_limits(service.store, wanted)
+    words = f"Drafted from {len(whence)} earlier calibrations of these cameras: what is usual for them."
+    if wanted in whence:
+        others = f" and {len(whence) - 1} earlier" if len(whence) > 1 else " alone"
+        words = f"Drafted from this calibration{others}: that it lies within them is not an independent check."
     standing = standing_limits(service.store.root)
     return DraftedLimits(
-        words=f"Drafted from {number} calibration{'s' if number > 1 else ''} of these cameras: what is usual for them.",
+        words=words,
         valid_days=standing.valid_days if standing else None,
         limits=tuple(
             DraftedLimit(

@@ -14,7 +14,7 @@ from api.kept_sets import challenge_folder
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers, page_of
 from api.routes.jobs import accepted
 from api.schemas import Challenge, ChallengeJobStart, ChallengeStart, Job
-from api.service import CALIBRATE, READ, Here, HexId, Service
+from api.service import CALIBRATE, READ, ROOM, Here, HexId, Service
 from lab.challenge.kept import ChallengeWork, KeptChallenge
 from lab.challenge.score import ChallengeScore
 from lab.challenge.truth import Truths
@@ -34,7 +34,7 @@ def _known(service: Service, challenge_id: str) -> KeptChallenge:
     return known(missing, lambda: service.challenges.challenge(challenge_id))
 
 
-@router.post("/challenges", status_code=202, dependencies=[CALIBRATE], responses=answers(401, 403, 422))
+@router.post("/challenges", status_code=202, dependencies=[CALIBRATE, ROOM], responses=answers(401, 403, 422))
 def make_challenge(service: Here, start: ChallengeStart, response: Response) -> Job:
     """Make a challenge, as `calibench challenge make` does, in processes of their own; the job's `challenge_id` is the
     challenge. Its seed is drawn by the service, and sealed with the truths."""

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import time
 from concurrent.futures import wait
 from datetime import datetime, timedelta
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Depends, HTTPException, Request, Response
 
 from api.errors import Conflict, answers
-from api.keys import Permission, StoredKey
+from api.keys import StoredKey
 from api.routes.sessions import check_then, registered, stored_session
-from api.safety import key_of
+from api.safety import StationSafety, key_of
 from api.schemas import Halt, Halted, HaltedStation, QueueEntry, QueuePlace, SessionStart, StoredSession
-from api.security import Demand
-from api.service import OPERATE, OVER, READ, Here, Service, SessionId
+from api.security import DemandHalt
+from api.service import OPERATE, OVER, READ, ROOM, Here, Service, SessionId
 from api.then import kept_request
 from lab.capture.catalogue import step_times
-from lab.capture.queue import hold_queue, leave_queue, put_into_queue, queue
+from lab.capture.queue import expected_times, leave_queue, put_into_queue, queue
 from lab.capture.records import now
 from lab.capture.station import Station
 from lab.capture.store import Store
-from lab.errors import InputError
+from lab.errors import InputError, one_line
 
 #: How long (s) a halt waits for the instruments' answers before it says that they haven't come.
 ANSWER_S = 1.5
@@ -42,21 +41,21 @@ def _told(service: Service) -> list[QueueEntry]:
     live, store = service.live, service.store
     waiting = [one for one in queue(store) if live.find(one.id) is None]
     at = now()
-    free: dict[str, datetime | None] = {}  # address -> when it is free; None: not known
+    busy_until: dict[str, datetime | None] = {}
     for session in live.running():
         left_s = session.latest.left_s if session.latest is not None else None
         until = None if left_s is None else at + timedelta(seconds=left_s)
-        free |= dict.fromkeys(session.station.addresses, until)
+        busy_until |= dict.fromkeys(session.station.addresses, until)
+    expected = expected_times(
+        waiting,
+        {one.id: store.station(one.id).addresses for one in waiting},
+        {one.id: _duration_s(store, one.id, int(at.timestamp()) // 3600) for one in waiting},
+        busy_until,
+        at,
+    )
     told = []
     for place, one in enumerate(waiting, start=1):
-        addresses = store.station(one.id).addresses
-        before = [free.get(address, at) for address in addresses]
-        start = end = None
-        if one.held is None and all(when is not None for when in before):
-            start = max(at, one.not_before or at, *(when for when in before if when is not None))
-            end = start + timedelta(seconds=_duration_s(store, one.id, int(at.timestamp()) // 3600))
-        if one.held is not None or one.not_before is None:  # who comes later on these instruments waits for it
-            free |= dict.fromkeys(addresses, end)
+        start, end = expected.get(one.id, (None, None))
         request = kept_request(store, one.id)
         told.append(
             QueueEntry(
@@ -106,7 +105,7 @@ def unqueue_session(service: Here, session_id: SessionId) -> list[QueueEntry]:
     return _told(service)
 
 
-@router.put("/sessions/{session_id}/request", dependencies=[OPERATE], responses=answers(401, 403, 404, 409, 422))
+@router.put("/sessions/{session_id}/request", dependencies=[OPERATE, ROOM], responses=answers(401, 403, 404, 409, 422))
 def change_request(
     service: Here, request: Request, session_id: SessionId, start: SessionStart, response: Response
 ) -> StoredSession:
@@ -133,46 +132,58 @@ def change_request(
     return stored_session(service, changed)
 
 
-def _stations(service: Service) -> dict[str, Station]:
-    """The stations by name, without those whose files can't be used."""
-    found = {}
+def _stations(service: Service) -> tuple[dict[str, Station], dict[str, str]]:
+    """Return the stations by name, and by the same names why the files of others can't be used."""
+    found, unusable = {}, {}
     for name in service.station_files():
-        with contextlib.suppress(InputError):
+        try:
             found[name] = service.station(name)
-    return found
+        except (InputError, OSError, HTTPException) as error:  # a file that is gone meanwhile: 404
+            unusable[name] = one_line(error)
+    return found, unusable
 
 
 @router.post("/halt", responses=answers(401, 403, 404, 422))
 def halt(
     service: Here,
-    key: Annotated[StoredKey, Depends(Demand(Permission.OPERATE, Permission.CALIBRATE))],
+    key: Annotated[StoredKey, Depends(DemandHalt())],
     asked: Halt | None = None,
 ) -> Halted:
     """End every session that this service runs now, also one that is packed, or those on one station: shutters close,
     screens go dark, each can be resumed. Stations on which nothing runs are made safe, too. What waits for the same
-    instruments is held until somebody releases it. Answers within 2 s; `stations` says whose shutter is closed, by its
-    own answer, and whose isn't confirmed by then."""
+    instruments is held until somebody releases it. Answers within 2 s, whatever the registry and the disk do;
+    `stations` has every station by its name: whose shutter is closed, by its own answer, and whose isn't confirmed by
+    then."""
     station = service.station(asked.station) if asked is not None and asked.station is not None else None
     until_s, live, why = time.monotonic() + ANSWER_S, service.live, f"halted by {key.name}"
     ended = live.halt(station, why)  # first: nothing that the registry does delays it
-    stations = (
-        _stations(service)
-        if asked is None or asked.station is None
-        else {asked.station: service.station(asked.station)}
-    )
-    busy = {key_of(session.station) for id in ended if (session := live.find(id)) is not None}
+    held = service.waiting.hold(why, station)
+    unusable: dict[str, str] = {}
+    if asked is None or asked.station is None or station is None:
+        stations, unusable = _stations(service)
+    else:
+        stations = {asked.station: station}
+    busy: dict[str, Station] = {}
+    for id in ended:
+        if (session := live.find(id)) is not None:
+            busy[key_of(session.station)] = session.station
+            if key_of(session.station) not in {key_of(one) for one in stations.values()}:  # it has no file any more
+                stations[f"session {id}"] = session.station
     answering = list(ended.values())
     for one in {key_of(one): one for one in stations.values()}.values():
         if key_of(one) not in busy:
             answering.append(live.make_safe(one))
-    with service.store.transaction() as db:
-        hold_queue(db, why, station.model_dump(mode="json") if station is not None else None)
+    wait([held], max(0.0, until_s - time.monotonic()))
     later = live.halt(station, why)  # what the queue began in between
     wait([*answering, *later.values()], max(0.0, until_s - time.monotonic()))
-    told = []
+    answers = [
+        HaltedStation(name=name, safety=StationSafety(state="not confirmed", shutter="unknown", at=now(), words=words))
+        for name, why_not in unusable.items()
+        if (words := service.public(f"its station file can't be used, so it wasn't asked: {why_not}"))
+    ]
     for name, one in stations.items():
         if (found := live.safety.find(one)) is None or (found.state == "halting" and found.shutter == "unknown"):
             live.safety.note_trouble(one, f"no answer of its shutter within {ANSWER_S:g} s; it is still being asked")
         if (safety := service.safety(one)) is not None:
-            told.append(HaltedStation(name=name, safety=safety))
-    return Halted(sessions=tuple(dict.fromkeys([*ended, *later])), stations=tuple(told))
+            answers.append(HaltedStation(name=name, safety=safety))
+    return Halted(sessions=tuple(dict.fromkeys([*ended, *later])), stations=tuple(answers))

@@ -69,6 +69,8 @@ def _foreign(asked: SentAs) -> Foreign | None:
         light=Path(asked.light) if asked.light else None,
         white_patch=Path(asked.white_patch) if asked.white_patch else None,
         tap=asked.tap or None,
+        only=asked.only or None,
+        ignore=asked.ignore or None,
     )
     return Foreign(asked.format, asked.path, statements)
 

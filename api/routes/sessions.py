@@ -34,7 +34,7 @@ from api.schemas import (
     StoredSession,
 )
 from api.security import Demand
-from api.service import ADMIN, OPERATE, OVER, READ, Here, RegistryId, Service, SessionId, missing_session
+from api.service import ADMIN, OPERATE, OVER, READ, ROOM, Here, RegistryId, Service, SessionId, missing_session
 from api.then import check_webhook, keep_request, kept_request, then_of
 from lab.calibration.overview import SessionOverview, overviews, sessions_of_verdict, tags_of
 from lab.capture.by_hand import left_by_hand
@@ -91,9 +91,10 @@ def list_stations(service: Here) -> list[StationState]:
 
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     fields = info.model_dump(exclude={"packed"}) | {"state": service.state(info)}
+    live = service.live.find(info.id)
     # The error of an earlier run doesn't concern this one.
-    runs = service.live.find(info.id) is not None
-    return fields | {"error": None if runs else service.public.or_none(info.error)}
+    error = info.error if live is None else live.capture.paused_by if live.capture is not None else None
+    return fields | {"error": service.public.or_none(error)}
 
 
 def _listed(service: Service, info: SessionInfo, told: dict[str, SessionOverview]) -> dict[str, Any]:
@@ -175,7 +176,7 @@ def list_sessions(
     "/sessions",
     status_code=201,
     tags=["sessions"],
-    dependencies=[OPERATE],
+    dependencies=[OPERATE, ROOM],
     responses=answers(401, 403, 404, 409, 422),
 )
 def start_session(service: Here, request: Request, start: SessionStart, response: Response) -> StoredSession:
@@ -219,7 +220,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
 @router.patch(
     "/sessions/{session_id}",
     tags=["sessions"],
-    dependencies=[OPERATE],
+    dependencies=[OPERATE, ROOM],
     responses=answers(401, 403, 404, 422),
 )
 def describe_session(service: Here, session_id: SessionId, asked: SessionWords) -> StoredSession:

@@ -21,7 +21,7 @@ from api.errors import Conflict, answers
 from api.kept_sets import KeptSet, sent_set, session_set
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers, page_of
 from api.schemas import PredictionStart, SetAsked, StoredPrediction
-from api.service import CALIBRATE, READ, Here, HexId, Service, camera_model
+from api.service import CALIBRATE, READ, ROOM, Here, HexId, Service, camera_model
 from lab.calibration import camera_models
 from lab.capture.catalogue import step_times
 from lab.errors import InputError
@@ -91,7 +91,9 @@ def _fields(service: Service, prediction_id: str, found: SealedPrediction) -> St
     )
 
 
-@router.post("/predictions", status_code=201, dependencies=[CALIBRATE], responses=answers(401, 403, 404, 409, 422))
+@router.post(
+    "/predictions", status_code=201, dependencies=[CALIBRATE, ROOM], responses=answers(401, 403, 404, 409, 422)
+)
 def make_prediction(service: Here, asked: PredictionStart, response: Response) -> StoredPrediction:
     """Predict the measured numbers of a session that hasn't been captured, with their covariance, and seal them, as
     `calibench twin predict` does. 422, in one line, for a change that the model can't carry."""

@@ -26,6 +26,7 @@ from drivers.monochromator.base import (
     lines_per_mm,
     order_sorting_filters,
 )
+from drivers.quantity import read_number
 from drivers.transport import Transport, WireInstrument, shown
 
 ERRORS = {
@@ -350,7 +351,7 @@ class Cornerstone260(WireInstrument, Monochromator):
     def _number(self, query: str) -> float:
         reply = self._ask(query)
         try:
-            return float(reply)
+            return read_number(reply)
         except ValueError:
             raise self._strange(query, reply) from None
 

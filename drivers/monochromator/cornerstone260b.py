@@ -28,6 +28,7 @@ from drivers.monochromator.base import (
     lines_per_mm,
     order_sorting_filters,
 )
+from drivers.quantity import read_number
 from drivers.transport import shown
 from drivers.usbip import open_device
 from drivers.usbtmc import UsbTmc
@@ -285,7 +286,7 @@ class Cornerstone260B(Monochromator):
     def _number(self, wire: UsbTmc, query: str) -> float:
         answer = wire.ask(query)
         try:
-            return float(answer)
+            return read_number(answer)
         except ValueError:
             raise self._strange(query, answer) from None
 

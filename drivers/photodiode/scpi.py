@@ -24,15 +24,14 @@ from drivers.calibration_file import read_calibration
 from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer, Refused
 from drivers.instrument import Identity, Recorder
 from drivers.photodiode.base import IrradianceMeasurement, Photodiode
+from drivers.quantity import read_quantity
 from drivers.transport import shown
 
 COLUMNS = ["wavelength_nm", "responsivity_a_per_w"]
 #: Bytes that are read at once.
 _PIECE = 4096
-#: What SCPI meters report instead of a reading beyond their range.
-_OVERLOAD = 9.8e37
 #: A reading or the number of an error: no identity begins so, a late answer to what was asked before does.
-_NUMBER = re.compile(r"\s*[+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?\s*A?\s*(?:,|$)")
+_NUMBER = re.compile(r"\s*[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\s*[^\W\d]{0,5}\s*(?:,|$)")
 _MOST_LATE = 3
 #: How long (s) a meter that has told its identity is silent, unless it tells it again to a connection before.
 _QUIET_S = 0.1
@@ -222,11 +221,14 @@ class ScpiPhotodiode(Photodiode):
         if self._stopped.is_set():
             raise Interrupted(f"{self._who}: the measurement was stopped; start again")
         answer = self._ask("READ?")
-        found = re.match(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)\s*A?", answer)
-        if not found:
-            raise self._strange("READ?", answer)
-        current_a = float(found[1])
-        if abs(current_a) >= _OVERLOAD:
+        try:
+            current_a = read_quantity(answer, "A")
+        except ValueError as reason:
+            raise Garbled(
+                f"{self._who}: answered 'READ?' with {shown(answer.encode('latin-1', 'replace'))}: {reason}; check "
+                "that a SCPI meter is at this address, and that `setup` has it measure a direct current"
+            ) from reason
+        if not math.isfinite(current_a):
             raise Refused(f"{self._who}: the current is beyond its range; dim the light or let it choose its range", 1)
         return current_a
 

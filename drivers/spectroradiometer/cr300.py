@@ -10,6 +10,7 @@ import math
 
 from drivers.errors import Garbled, Refused
 from drivers.instrument import Identity, Recorder
+from drivers.quantity import read_number, read_quantity
 from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiometer
 from drivers.transport import Transport, WireInstrument, shown
 from sim.spectrum import Spectrum
@@ -81,7 +82,7 @@ class Cr300(WireInstrument, Spectroradiometer):
 
     def _read_spectrum(self, header: str) -> Spectrum:
         try:
-            first_nm, last_nm, step_nm, count = (float(field) for field in header.split(","))
+            first_nm, last_nm, step_nm, count = (read_number(field) for field in header.split(","))
         except ValueError:
             raise self._strange("RM Spectrum", header) from None
         if not (2 <= count <= _MOST_VALUES and step_nm > 0 and math.isclose(first_nm + (count - 1) * step_nm, last_nm)):
@@ -90,17 +91,16 @@ class Cr300(WireInstrument, Spectroradiometer):
         for _ in range(int(count)):
             text = self._line("RM Spectrum")
             try:
-                values.append(float(text))
+                values.append(read_number(text))
             except ValueError:
                 raise self._strange("RM Spectrum", text) from None
         return Spectrum.of([first_nm + k * step_nm for k in range(int(count))], values)
 
     def _integration_time_s(self) -> float | None:
-        """`12.345 msec`; None where the unit is another."""
+        """`12.345 msec`; None where the unit is another, or none."""
         try:
-            value, _, unit = self._ask("RM Exposure").partition(" ")
-            scale = {"msec": 1e-3, "ms": 1e-3, "usec": 1e-6, "us": 1e-6, "sec": 1.0, "s": 1.0}.get(unit.strip().lower())
-            return None if scale is None else float(value) * scale
+            answer = self._ask("RM Exposure")
+            return read_quantity(answer, "s") if " " in answer.strip() else None
         except (Refused, ValueError):
             return None
 

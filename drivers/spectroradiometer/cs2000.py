@@ -9,10 +9,9 @@ nothing on a virtual one. The integration time (MEDR,0,0,1 is said to have it) i
 
 from __future__ import annotations
 
-import math
-
 from drivers.errors import Garbled, InstrumentError, Refused
 from drivers.instrument import Identity, Recorder
+from drivers.quantity import read_number
 from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiometer
 from drivers.transport import Transport, WireInstrument, shown
 from sim.spectrum import Spectrum
@@ -106,10 +105,10 @@ class Cs2000(WireInstrument, Spectroradiometer):
     def _values(self, query: str, count: int) -> list[float]:
         answer = self._ask(query)
         try:
-            values = [float(value) for value in answer.split(",")]
+            values = [read_number(value) for value in answer.split(",")]
         except ValueError:
             raise self._strange(query, answer) from None
-        if len(values) != count or not all(map(math.isfinite, values)):
+        if len(values) != count:
             raise self._strange(query, f"{len(values)} values, not {count} numbers")
         return values
 

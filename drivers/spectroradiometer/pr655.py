@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from drivers.errors import Garbled, NoAnswer, Refused
 from drivers.instrument import Identity, Recorder
+from drivers.quantity import read_number
 from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiometer
 from drivers.transport import Transport, WireInstrument, shown
 from sim.spectrum import Spectrum
@@ -106,8 +107,8 @@ class Pr655(WireInstrument, Spectroradiometer):
         """Wavelength and value of a line; nothing for a line of the header."""
         fields = line.split(",")
         try:
-            if len(fields) == 2 and FIRST_NM <= float(fields[0]) <= LAST_NM:
-                return {float(fields[0]): float(fields[1])}
+            if len(fields) == 2 and FIRST_NM <= read_number(fields[0]) <= LAST_NM:
+                return {read_number(fields[0]): read_number(fields[1])}
         except ValueError:
             pass
         if may_be_a_header:

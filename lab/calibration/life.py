@@ -396,7 +396,8 @@ def certify(
     """Certify a calibration against `limits`; what the same cameras had before is superseded.
 
     Raises InputError, a line for each, for figures that are bad or missing, and for those in the warning band unless
-    `accept_warnings`; and where it is certified or superseded already.
+    `accept_warnings`; and where it is certified or superseded already. Limits that are drafted ones are kept as such,
+    whoever sends them: a calibration always lies within those that were drafted from it.
     """
     wanted = calibration(store, id)
     if wanted.state != "candidate":
@@ -407,6 +408,10 @@ def certify(
     refused = ("bad", "missing") if accept_warnings else ("warn", "bad", "missing")
     if lines := [_refusal(wanted.id, one) for one in found if one.mark in refused]:
         raise InputError("\n".join(lines))
+    drafts, whence = drafted_limits(store, wanted.id)
+    bands = {(one.figure, one.side, one.place, one.good) for one in drafts}
+    is_drafted = any((one.figure, one.side, one.place, one.good) in bands for one in limits.limit)
+    limits = limits.model_copy(update={"drafted_from": whence if is_drafted else ()})
     at = now()
     with store.transaction() as db:
         row = db.get_one(CalibrationRow, wanted.id, with_for_update=True)
@@ -710,8 +715,9 @@ DRAFTED_FROM, DRAFTED_LEAST = 30, 3
 DRAFTED_COVERAGE = 1.0 - FALSE_ALARM_RATE
 
 
-def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], int]:
-    """Limits drafted from what the cameras of a calibration had before it, and from how many calibrations.
+def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], tuple[str, ...]]:
+    """Limits drafted from what the cameras of a calibration had before it, and the ids of the calibrations that they
+    were drafted from, the newest last.
 
     The ends are those of a prediction interval for the next calibration of an unchanged camera (Student's t, Hahn and
     Meeker 1991, section 4.8): mean +- t sqrt(s^2 (1 + 1/n)) with s at least the root mean square of the stated standard
@@ -752,7 +758,7 @@ def drafted_limits(store: Store, id: str) -> tuple[tuple[Limit, ...], int]:
         for (pattern, side, place), (low, high) in sorted(
             drafted.items(), key=lambda item: ([*DRAFTED].index(item[0][0]), str(item[0][1]), item[0][2])
         )
-    ), len(ids)
+    ), tuple(ids)
 
 
 def _usual(found: Sequence[Figure]) -> tuple[float, float]:

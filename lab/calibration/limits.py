@@ -140,10 +140,23 @@ def _ends(band: tuple[float | None, float | None]) -> tuple[float, float]:
 
 class CalibrationLimits(Frozen):
     """Limits of a laboratory. `valid_days`: how long a calibration that was certified against them may be used; None:
-    until it is superseded."""
+    until it is superseded. `drafted_from`: of a certificate's limits, the calibrations from which they, or some of
+    them, were drafted; empty where a laboratory set them."""
 
     valid_days: float | None = Field(default=None, gt=0.0, le=36_500.0)
     limit: tuple[Limit, ...] = Field(min_length=1, max_length=500)
+    drafted_from: tuple[str, ...] = Field(default=(), max_length=100)
+
+    def dependence_on(self, id: str) -> str | None:
+        """Return, in words, that these limits were drafted from the calibration that they judge; None: they weren't."""
+        if id not in self.drafted_from:
+            return None
+        others = len(self.drafted_from) - 1
+        whence = "this calibration alone" if not others else f"this calibration and {others} earlier"
+        return (
+            f"The limits were drafted from {whence}: that its figures lie within them is not an independent check. "
+            "Certify against limits of your own, or against those drafted from three earlier calibrations."
+        )
 
 
 class Judgement(Frozen):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import wait
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -188,6 +189,7 @@ class ShutterDevice(Device):
 
     async def pause(self) -> None:
         await self.stop()
+        self.value = False
 
     def resume(self) -> None:
         """Do nothing: after a pause, each step sets the bench and opens the shutter if it needs light."""
@@ -467,6 +469,7 @@ class CamerasDevice(Device):
             return level_of(raw, self.sheets[side]), stored
 
         found = {side: in_thread(partial(kept, side)) for side in frames}
+        wait(found.values())  # where one can't be written, the other's isn't written on while the step is taken again
         results = {side: future.result() for side, future in found.items()}
         self.levels = {side: level for side, (level, _) in results.items()}
         self.stored = {side: stored for side, (_, stored) in results.items() if stored is not None}

@@ -20,8 +20,13 @@ class Lock:
     def acquire(self, patience_s: float = 0.2) -> bool:
         """Try to take the lock for `patience_s`; whether it succeeded. It has to try, as `is_held` holds the lock for a
         moment."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
+        except OSError:  # a full or a read-only disk: a lock that is there can be taken all the same
+            if not self.path.exists():
+                raise
+            file = os.open(self.path, os.O_RDONLY)
         until = time.monotonic() + patience_s
         while True:
             try:

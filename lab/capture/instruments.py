@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.camera.base import SensorInfo
 from drivers.errors import InstrumentError
+from drivers.found_settings import making_safe
 from drivers.instrument import Instrument, Setting
 from drivers.monochromator.base import Monochromator
 from lab.capture.blocking_calls import STOP_S, in_thread
@@ -256,17 +257,18 @@ def made_safe(
     answered = threading.Event()
 
     def stopped(driver: Instrument) -> None:
-        if not isinstance(driver, Monochromator):
-            answered.wait(HEAD_START_S)
-            first(driver)
-            driver.stop()
-            return
-        try:
-            first(driver)
-            shut(driver)
-            on_shut()
-        finally:
-            answered.set()
+        with making_safe():  # whatever the disk does
+            if not isinstance(driver, Monochromator):
+                answered.wait(HEAD_START_S)
+                first(driver)
+                driver.stop()
+                return
+            try:
+                first(driver)
+                shut(driver)
+                on_shut()
+            finally:
+                answered.set()
 
     if drivers.monochromator is None:
         answered.set()

@@ -39,9 +39,14 @@ def migrate(engine: sa.Engine, folder: Path) -> None:
             command.upgrade(config, "head")
             connection.commit()
     except sa.exc.OperationalError as error:
+        words = " ".join(str(error.orig).split())
+        if engine.dialect.name == "sqlite":
+            raise InputError(
+                f"registry {engine.url.database}: can't be opened ({words}); end what else uses it, or name another "
+                "folder (--data, CALIBENCH_DATA)"
+            ) from error
         raise InputError(
-            f"registry {engine.url!r}: can't be reached ({' '.join(str(error.orig).split())}); start it, or correct "
-            "CALIBENCH_DATABASE_URL"
+            f"registry {engine.url!r}: can't be reached ({words}); start it, or correct CALIBENCH_DATABASE_URL"
         ) from error
     except sa.exc.DatabaseError as error:
         raise InputError(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import zlib
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -41,6 +42,22 @@ def _chunks(recordings: RecordingSet, captures: Sequence[Capture]) -> Generator[
         yield from pool.map(lambda capture: _chunk(recordings.frame(capture)), captures)
 
 
+@contextlib.contextmanager
+def _fresh(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file that is written. Where that fails, its content is given up first: HDF5 can't close a file on a full
+    disk, and would try again and again."""
+    file = h5py.File(path, "w")
+    try:
+        yield file
+        file.close()
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.truncate(path, 0)
+        with contextlib.suppress(OSError, RuntimeError):
+            file.close()
+        raise
+
+
 def write_nexus(
     path: Path,
     recordings: RecordingSet,
@@ -56,7 +73,7 @@ def write_nexus(
     first = {capture.frame: capture for capture in reversed(recordings.manifest.captures)}
     frames = [stored for stored in files if stored.role == "frame"]
     index: dict[str, int] = {}
-    with h5py.File(path, "w") as file:
+    with _fresh(path) as file:
         file.attrs["NX_class"] = "NXroot"
         file.attrs["default"] = "entry"
         entry = _group(file, "entry", "NXentry")

@@ -9,7 +9,8 @@ resumed and finishes.
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import sqlalchemy as sa
@@ -74,6 +75,41 @@ def put_into_queue(
         row.state, row.not_before, row.error = "queued", not_before, f"{HELD}{held}" if held else None
         for at, other in enumerate(others):
             other.queue_place = at
+
+
+def expected_times(
+    waiting: Sequence[QueuedSession],
+    addresses: Mapping[str, frozenset[str]],
+    duration_s: Mapping[str, float],
+    busy_until: Mapping[str, datetime | None],
+    at: datetime,
+) -> dict[str, tuple[datetime, datetime]]:
+    """Return when each session of the queue is expected to start and to end, as the queue starts them from `at` on.
+
+    `addresses`, `duration_s`: of each session. `busy_until`: of the instruments in use now, by address; None: not
+    known. A session that is held, or waits for an instrument of which that isn't known, isn't in the answer."""
+    found: dict[str, tuple[datetime, datetime]] = {}
+    until = dict(busy_until)
+    moments = [at]
+    while moments:
+        at = moments.pop(0)
+        taken = {address for address, end in until.items() if end is None or end > at}
+        for one in waiting:
+            if one.id in found:
+                continue
+            mine = addresses[one.id]
+            if one.held is None and (one.not_before is None or one.not_before <= at) and not mine & taken:
+                end = at + timedelta(seconds=duration_s[one.id])
+                found[one.id] = (at, end)
+                until |= dict.fromkeys(mine, end)
+                taken |= mine
+            elif one.not_before is None or one.held is not None:
+                taken |= mine  # who comes later on these instruments waits for it
+        left = [one for one in waiting if one.id not in found]
+        later = {end for end in until.values() if end is not None and end > at}
+        later |= {one.not_before for one in left if one.not_before is not None and one.not_before > at}
+        moments = sorted(later)[:1]
+    return found
 
 
 def leave_queue(store: Store, session_id: str) -> None:

@@ -20,7 +20,7 @@ from lab.capture.instruments import SafeState, Shutter, made_safe
 from lab.capture.records import now
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
-from lab.errors import DeviceError, InputError
+from lab.errors import CannotWrite, DeviceError, InputError
 
 log = logging.getLogger(__name__)
 #: Interval (s) between searches of the registry for sessions whose process died, and longest interval between attempts
@@ -85,7 +85,10 @@ class Recovery:
         self._made_safe = dict(made_safe or {})
         self._store, self._connect, self._clock = store, connect, clock
         self._resume: Callable[[str], None] | None = None
+        self._note: Callable[[Station, SafeState], None] | None = None
+        self._found: list[tuple[Station, SafeState]] = []  # of which nobody was informed yet
         self._waiting: list[str] = []  # sessions that are safe and will be resumed automatically
+        self._safe_since: dict[str, SafeState] = {}  # stations that were made safe, which couldn't be recorded yet
         self._next_try_s: dict[str, tuple[float, float]] = {}  # session -> (when, the pause before it)
         self._looked, self._ended = threading.Event(), threading.Event()
         self._wake = threading.Event()
@@ -97,9 +100,12 @@ class Recovery:
             self._thread.start()
         self._looked.wait(patience_s)
 
-    def resume_with(self, resume: Callable[[str], None]) -> None:
-        """Set the function that resumes a session; sessions that waited for it are resumed now."""
-        self._resume = resume
+    def resume_with(
+        self, resume: Callable[[str], None], note: Callable[[Station, SafeState], None] = lambda station, found: None
+    ) -> None:
+        """Set the functions that resume a session and that keep what a station's instruments have answered; sessions
+        that waited are resumed now."""
+        self._resume, self._note = resume, note
         self._wake.set()
 
     @property
@@ -117,9 +123,14 @@ class Recovery:
             self._made_safe.popitem()[1].release()
 
     def _work(self) -> None:
+        failed = False
         while not self._ended.is_set():
             try:
                 self.look()
+                failed = False
+            except CannotWrite as error:  # tried again
+                log.log(logging.DEBUG if failed else logging.WARNING, "sessions whose process ended: %s", error)
+                failed = True
             except Exception:
                 log.exception("looking for sessions whose process ended: a defect")
             self._looked.set()
@@ -133,6 +144,8 @@ class Recovery:
             at, _ = self._next_try_s.get(session_id, (0.0, 0.0))
             if self._clock() >= at and not self._ended.is_set():
                 self._recover(session_id)
+        while self._found and self._note is not None:
+            self._note(*self._found.pop(0))
         while self._waiting and self._resume is not None and not self._ended.is_set():
             session_id = self._waiting.pop()
             try:
@@ -152,8 +165,12 @@ class Recovery:
                 return  # it ended in good order, just now
             station = self._store.station(session_id)
             began = f"the process that ran it died (a crash, kill -9, a power cut), found {now():%Y-%m-%d %H:%M:%S} UTC"
-            complaints = () if is_safe else make_station_safe(station, self._connect).complaints
-            if complaints:
+            shutter: Shutter = "none" if station.monochromator is None else "closed"
+            safe = SafeState(shutter=shutter, at=now()) if is_safe else self._safe_since.get(session_id)
+            if safe is None:
+                safe = make_station_safe(station, self._connect)
+            self._found.append((station, safe))
+            if complaints := safe.complaints:
                 _, pause_s = self._next_try_s.get(session_id, (0.0, LOOK_S / 2))
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
                 self._next_try_s[session_id] = (self._clock() + pause_s, pause_s)
@@ -164,11 +181,13 @@ class Recovery:
                 self._store.set_state(session_id, "running", error=said)  # so that the next look finds it
                 log.error("session %s: %s", session_id, said)
                 return
+            self._safe_since.setdefault(session_id, safe)
             self._next_try_s.pop(session_id, None)
             then, again = self._what_next(session_id, station)
             left = left_by_session(self._store.root, session_id)
             then += "" if left is None else f"; {left.words}"
             self._store.set_state(session_id, "interrupted", error=f"{began}; its station was made safe; {then}")
+            del self._safe_since[session_id]
             log.warning("session %s: %s; its station was made safe; %s", session_id, began, then)
             if again:
                 self._waiting.append(session_id)

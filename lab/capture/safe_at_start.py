@@ -21,9 +21,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from drivers.found_settings import FoundSettings
+from drivers.found_settings import FoundSettings, making_safe
 from drivers.registry import driver
 from lab.capture.file_lock import Lock
+from lab.plain_text import escaped
 
 log = logging.getLogger(__name__)
 #: Longest time (s) that a registry which is locked is waited for.
@@ -102,13 +103,14 @@ class _Station:
 
     def _stop(self, instrument: Any, said: str = "") -> None:
         try:
-            try:
+            with contextlib.ExitStack() as whatever_the_disk_does:
+                whatever_the_disk_does.enter_context(making_safe())
+                whatever_the_disk_does.callback(instrument.close)
                 instrument.connect()
                 instrument.stop()
                 if said:
+                    _check_shut(instrument)
                     self._tell(said)
-            finally:
-                instrument.close()
             self._is_safe()
         except Exception:
             log.debug("session %s: an instrument wasn't made safe", self.session_id, exc_info=True)
@@ -192,13 +194,21 @@ def make_safe_at_start(arguments: Sequence[str]) -> None:
 
 
 def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    print(escaped(line), file=sys.stderr, flush=True)
 
 
 def made_safe_at_start() -> dict[str, Lock]:
     """Return the sessions whose stations `make_safe_at_start` made safe, with their locks, which are held. To be called
     before somebody else speaks to the same instruments."""
     return {name: lock for rescue in _at_start for name, lock in rescue.made_safe(INSTRUMENTS_S).items()}
+
+
+def _check_shut(monochromator: Any) -> None:
+    """Raise OSError where a monochromator says that its shutter is open, also after it was told to close it."""
+    if monochromator.shutter_is_open():
+        monochromator.close_shutter()
+        if monochromator.shutter_is_open():
+            raise OSError("the shutter is open though it was told to close")
 
 
 def _settings(entry: dict[str, Any]) -> dict[str, Any]:
@@ -209,10 +219,13 @@ def _under_way(registry: Path) -> list[tuple[str, dict[str, Any]]]:
     """(session, its station's document) of those that are recorded as running or paused."""
     if not registry.is_file():
         return []
-    try:
-        with contextlib.closing(sqlite3.connect(registry, timeout=REGISTRY_S)) as db:
-            rows = db.execute("SELECT id, station FROM sessions WHERE state IN ('running', 'paused')").fetchall()
-        return [(session_id, json.loads(station)) for session_id, station in rows]
-    except (sqlite3.Error, ValueError):  # an older revision, another file: the recovery says what
-        log.debug("%s: not read", registry, exc_info=True)
-        return []
+    # On a full or a read-only disk SQLite reads only what is taken as immutable, without what its log has.
+    for more in ("", "?immutable=1"):
+        try:
+            address = f"{registry.absolute().as_uri()}{more}"
+            with contextlib.closing(sqlite3.connect(address, uri=True, timeout=REGISTRY_S)) as db:
+                rows = db.execute("SELECT id, station FROM sessions WHERE state IN ('running', 'paused')").fetchall()
+            return [(session_id, json.loads(station)) for session_id, station in rows]
+        except (sqlite3.Error, ValueError):  # an older revision, another file: the recovery says what
+            log.debug("%s: not read", registry, exc_info=True)
+    return []

@@ -18,7 +18,7 @@ from drivers.registry import driver
 from drivers.transcript import TranscriptFile
 from lab.capture.instruments import contradiction
 from lab.capture.station import Address, Drivers, Station, drivers_of
-from lab.errors import DeviceError, InputError
+from lab.errors import DeviceError, InputError, cannot_write
 from lab.formats.recording_set import DataSheet
 
 #: Longest time (s) for the self-test of one instrument: a measurement of a dark source takes minutes.
@@ -116,9 +116,7 @@ def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
     try:
         recorder = TranscriptFile(file)
     except OSError as error:
-        raise InputError(
-            f"{file}: can't be written ({error.strerror}); name a file in a folder that is yours"
-        ) from error
+        raise cannot_write(file, error, "name another file") from error
     try:
         said = _said(name)
         try:

@@ -11,12 +11,14 @@ import asyncio
 import contextlib
 import json
 import logging
+import os
 import platform
 import signal
 import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -39,7 +41,7 @@ from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
 from lab.capture.take_step import Taken, adjust, repeats_ahead, take
 from lab.capture_kinds.base import Step
-from lab.errors import DeviceError, InputError
+from lab.errors import FULL, CannotWrite, DeviceError, InputError, lacks_room
 from lab.formats.recording_set import Snapshots, differences
 from sim.parameters import Frozen
 
@@ -52,6 +54,11 @@ bluesky.run_engine.__dict__["print"] = lambda *words, **_: log.debug(" ".join(ma
 
 #: How often (s) a waiting main thread wakes to let Python run signal handlers.
 WAKE_S = 0.1
+#: How often (s) a session that waits for room looks whether there is some.
+ROOM_S = 1.0
+#: How often a step is taken again, at most, where its files couldn't be written although the disk seems to have room
+#: (a quota).
+MOST_TRIES = 3
 
 #: In the error of a session whose run left an instrument out of its safe state.
 UNSAFE = "not brought into a safe state"
@@ -126,6 +133,14 @@ class _Writes:
             self._change.wait_for(lambda: self._under_way == 0)
 
 
+@dataclass(frozen=True)
+class _Lack:
+    """Room that the disk lacks: for so many bytes beside the reserve; in words."""
+
+    wanted_bytes: int
+    words: str
+
+
 class _Ended(Exception):
     """The run was ended from another thread."""
 
@@ -160,6 +175,9 @@ class CaptureSession:
         self._held = threading.Lock()  # while instruments are taken up, shut or let go
         self._ended_by: str | None = None
         self._resume_asked = False
+        self._lacks: _Lack | None = None  # the room on the disk that it has to wait for
+        #: Why it is paused, where nobody asked for that; None else.
+        self.paused_by: str | None = None
         self._began_s = time.monotonic()
         self._pace = _Pace()
         self._entries: list[JournalEntry] = []
@@ -280,20 +298,99 @@ class CaptureSession:
         try:
             if self._done < len(self._entries):
                 self._capture()
-            if self._ended_by is None:
-                self._tell("packing", "packing the session")
-                with contextlib.suppress(_Ended):
-                    self.store.close_session(self.id, self._tell_packing)
-                    self._tell("finished", "done")
-                    return
+            with contextlib.suppress(_Ended):
+                while self._ended_by is None:
+                    if self._pack():
+                        self._tell("finished", "done")
+                        return
+                    self._wait_until_resumed()
         except BaseException as error:
             said = str(error) or type(error).__name__
-            self.store.set_state(self.id, "failed", error=said + self._left_by_hand())
+            self._record_end("failed", said + self._left_by_hand())
             self._tell("failed", str(error), quietly=True)
             raise
         said = (self._ended_by or "") + self._left_by_hand()
-        self.store.set_state(self.id, "interrupted", error=said)
+        self._record_end("interrupted", said)
         self._tell("interrupted", said)
+
+    def _record_end(self, state: Literal["failed", "interrupted"], error: str) -> None:
+        """Record how the run ended. On a full disk the reserve makes way for it."""
+        try:
+            self.store.set_state(self.id, state, error=error)
+        except CannotWrite as why:
+            self.store.room.give_up()
+            try:
+                self.store.set_state(self.id, state, error=error)
+            except CannotWrite:
+                log.warning("session %s is %s (%s), which couldn't be recorded: %s", self.id, state, error, why)
+
+    def _pack(self) -> bool:
+        """Pack the session; whether there was room for it."""
+        self._tell("packing", "packing the session")
+        try:
+            self.store.close_session(self.id, self._tell_packing)
+        except Exception as error:
+            if not lacks_room(error):
+                raise
+            frames_bytes = sum(file.bytes for file in self.store.files(self.id) if file.role == "frame")
+            self._look_for_room(frames_bytes, error)
+            return False
+        return True
+
+    # --- room on the disk -----------------------------------------------------------------------------------------
+
+    def _look_for_room(self, wanted_bytes: int, error: BaseException | None = None) -> None:
+        """Note the room that the disk lacks, if it does. `error`: what failed because of that."""
+        lack = self.store.room.lack(wanted_bytes) or error
+        self._lacks = None if lack is None else _Lack(wanted_bytes, f"{lack}; the session goes on when there is room")
+
+    def _wait_until_resumed(self) -> None:
+        """Be paused until somebody resumes or ends the run, or until the disk has the room that it lacks. Raises
+        _Ended."""
+        lacks, self._lacks = self._lacks, None
+        self.paused_by = why = None if lacks is None else lacks.words
+        try:
+            self.store.set_state(self.id, "paused", error=why)
+        except CannotWrite as error:
+            log.warning("session %s: that it is paused couldn't be recorded: %s", self.id, error)
+        self._tell("paused", "paused: the shutter is closed", remark=why)
+        look_s = time.monotonic() + ROOM_S
+        with self._control:
+            while not self._control.wait_for(lambda: self._resume_asked or self._ended_by is not None, WAKE_S):
+                if lacks is not None and time.monotonic() >= look_s:
+                    if self.store.room.lack(lacks.wanted_bytes) is None:
+                        break
+                    look_s = time.monotonic() + ROOM_S
+            self._resume_asked = False
+        self.paused_by = None
+        self._check_goes_on()
+        self.store.set_state(self.id, "running")
+
+    def _take_with_room(
+        self, step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]], repeats: int
+    ) -> Generator[Msg, Any, Taken]:
+        """Take a step and keep what it took, once the disk has room for that: until then the run is paused, shutter
+        closed, screen dark. A step whose files a full disk didn't take is taken again."""
+        sheets = {side: camera.datasheet for side, camera in self.station.cameras.items()}
+        wanted_bytes = sum(2 * sheets[capture.side].rows * sheets[capture.side].cols for capture in step.captures)
+        failures = 0
+        while True:
+            if self._lacks is None:
+                self._look_for_room(wanted_bytes)
+            if self._lacks is not None:
+                yield Msg("pause", None, defer=True)
+                yield Msg("checkpoint")  # here it is paused
+            started = now()
+            try:
+                taken: Taken = yield from take(step, instruments, results, repeats)
+                yield Msg("in_a_thread", None, call=lambda t=taken, b=started: self._keep(step, t, b))
+            except Exception as error:
+                failures += self.store.room.lack(wanted_bytes) is None
+                if not lacks_room(error) or failures == MOST_TRIES or self._ended_by is not None:
+                    raise
+                self._look_for_room(wanted_bytes, _plain(error, ()))
+            else:
+                return taken
 
     def _left_by_hand(self) -> str:
         """Return what the session leaves changed by hand, as the end of a sentence; empty: nothing."""
@@ -347,10 +444,7 @@ class CaptureSession:
             self._drive(instruments)
         except BaseException as error:
             failure = error
-        self._writes.close()
-        self._asks = None
-        withdraw(self.store.folder(self.id))
-        self.safe = instruments.make_safe()
+        self.safe = instruments.make_safe()  # before any file is waited for
         mine = self._held.acquire(timeout=STOP_S)  # no driver that hangs holds the run up
         try:
             instruments.close()
@@ -358,6 +452,9 @@ class CaptureSession:
         finally:
             if mine:
                 self._held.release()
+        self._writes.close()
+        self._asks = None
+        withdraw(self.store.folder(self.id))
         if failure is not None and not (self._ended_by is not None and isinstance(failure, Exception)):
             raise _plain(failure, self.safe.complaints) from failure
         if self.safe.complaints:
@@ -398,7 +495,7 @@ class CaptureSession:
         """Run the plan to its end on a RunEngine of its own, across pauses."""
         engine = RunEngine({}, context_managers=[], during_task=_Wakeful())
         documents = self.store.folder(self.id) / "documents.jsonl"
-        engine.subscribe(lambda name, document: _append(documents, name, document))
+        engine.subscribe(_Documents(documents))
 
         async def in_a_thread(message: Any) -> Any:
             return await _awaited(message.kwargs["call"])
@@ -413,17 +510,11 @@ class CaptureSession:
                     go()
                 if engine.state != "paused":
                     return  # at its end, or aborted
-                self.store.set_state(self.id, "paused")
-                self._tell("paused", "paused: the shutter is closed")
-                with self._control:
-                    while not self._control.wait_for(lambda: self._resume_asked or self._ended_by is not None, WAKE_S):
-                        pass
-                    self._resume_asked = False
-                    ended = self._ended_by is not None
-                if ended:
+                try:
+                    self._wait_until_resumed()
+                except _Ended:
                     engine.abort(self._ended_by)
                     return
-                self.store.set_state(self.id, "running")
                 go = engine.resume
         except BaseException:
             if self._ended_by is not None:
@@ -457,9 +548,8 @@ class CaptureSession:
                 self._tell("running", step.what, step.sequence, to_do)
                 for question in instruments.questions(step):
                     self._tell("running", step.what, step.sequence, to_do, remark=question)
-                started, began_s = now(), time.monotonic()
-                taken: Taken = yield from take(step, instruments, results, following)
-                yield Msg("in_a_thread", None, call=lambda s=step, t=taken, b=started: self._keep(s, t, b))
+                began_s = time.monotonic()
+                taken = yield from self._take_with_room(step, instruments, results, following)
                 if _has_exposure(taken.result):
                     results[step.id] = taken.result
                 to_do[step.sequence] -= 1
@@ -537,7 +627,7 @@ class CaptureSession:
             elapsed_s=time.monotonic() - self._began_s,
             left_s=self._pace.left_s(to_do) if to_do else None,
             remark=remark,
-            bench=self._instruments.state() if self._instruments is not None else None,
+            bench=self._bench(),
             asks=self._asks,
         )
         self._told = progress
@@ -546,6 +636,12 @@ class CaptureSession:
         except Exception:
             if not quietly:
                 raise
+
+    def _bench(self) -> BenchState | None:
+        """Return the state of the instruments: while the run holds them, and after that as it left them."""
+        if self._instruments is not None:
+            return self._instruments.state()
+        return BenchState(shutter_open=False) if self.safe is not None and self.safe.shutter == "closed" else None
 
     @contextlib.contextmanager
     def _signals(self) -> Iterator[threading.Event]:
@@ -590,10 +686,26 @@ async def _awaited(call: Callable[[], Any]) -> Any:
     return await asyncio.wrap_future(in_thread(call))
 
 
-def _append(file: Path, name: str, document: dict[str, Any]) -> None:
-    """Append one of bluesky's documents to a file, as a line of JSON."""
-    with file.open("a", encoding="utf-8") as lines:
-        lines.write(json.dumps([name, document], default=str) + "\n")
+class _Documents:
+    """Appends bluesky's documents to a file, a line of JSON each. Those that a full disk doesn't take are kept until it
+    does."""
+
+    def __init__(self, file: Path) -> None:
+        self._file, self._kept = file, ""
+
+    def __call__(self, name: str, document: dict[str, Any]) -> None:
+        self._kept += json.dumps([name, document], default=str) + "\n"
+        content = self._kept.encode()
+        file = os.open(self._file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            while content:
+                content = content[os.write(file, content) :]
+        except OSError as error:
+            if error.errno not in FULL:
+                raise
+        finally:
+            self._kept = content.decode()
+            os.close(file)
 
 
 def _plain(error: BaseException, complaints: Sequence[str]) -> BaseException:
@@ -605,6 +717,8 @@ def _plain(error: BaseException, complaints: Sequence[str]) -> BaseException:
     tail = f"; {UNSAFE}: {'; '.join(unsafe)}" if unsafe else ""
     if isinstance(error, DeviceError | InstrumentError):
         return DeviceError(f"{error}{tail}")
+    if isinstance(error, CannotWrite):
+        return CannotWrite(f"{error}{tail}")
     if isinstance(error, OSError):
         where = error.filename or "the data folder"
         return InputError(f"{where}: can't be written ({error.strerror}); make room, then resume the session{tail}")

@@ -19,6 +19,7 @@ import hashlib
 import os
 import secrets
 import shutil
+import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -48,14 +49,26 @@ from lab.capture.records import (
     StoredFile,
     now,
 )
+from lab.capture.room import Room
 from lab.capture.session_files import PACK, SessionFiles, StoredPlace
 from lab.capture.settings import Settings
 from lab.capture.station import Station
-from lab.capture.tables import CaptureRow, FileRow, KeyRow, ResultRow, SessionRow, StepRow, open_engine, upgrade
+from lab.capture.tables import (
+    CaptureRow,
+    FileRow,
+    HaltTokenRow,
+    KeyRow,
+    ResultRow,
+    SessionRow,
+    StepRow,
+    open_engine,
+    upgrade,
+)
 from lab.capture_kinds.base import CAPTURES, Capture, Step
-from lab.errors import InputError
+from lab.errors import CannotWrite, InputError, NoRoom, cannot_write
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.spectrum_csv import format_spectrum
+from lab.plain_text import check_line, escaped
 from sim.camera import Side
 from sim.spectrum import Spectrum
 
@@ -75,14 +88,16 @@ class Store:
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(
-                f"{self.root}: can't be made ({error.strerror}); set CALIBENCH_DATA to a folder of yours"
-            ) from error
+            raise cannot_write(self.root, error, "set CALIBENCH_DATA to another folder") from error
+        self.room = Room(self.root)
         self._engine = open_engine(self.settings.url)
         self._read = sessionmaker(self._engine, expire_on_commit=False)
         self._write = sessionmaker(self._engine.execution_options(writes=True), expire_on_commit=False)
         self._keys: tuple[float, list[tuple[str, str, str]]] = (0.0, [])
-        upgrade(self._engine, self.root)
+        try:
+            upgrade(self._engine, self.root)
+        except NoRoom:  # once more, as the reserve has made way
+            upgrade(self._engine, self.root)
         FoundSettings.keep_in(self.root / "instruments")
 
     @classmethod
@@ -107,6 +122,25 @@ class Store:
         with self._write.begin() as session:
             yield session
 
+    def reuse_log(self) -> None:
+        """Have SQLite write its log from the beginning again, which needs no more room on a full disk. Raises
+        nothing."""
+        if self._engine.dialect.name != "sqlite":
+            return
+        with (
+            contextlib.suppress(sqlite3.Error, sa.exc.SQLAlchemyError, CannotWrite),
+            contextlib.closing(self._engine.raw_connection()) as taken,
+        ):
+            taken.cursor().execute("PRAGMA wal_checkpoint(PASSIVE)").close()
+
+    def look_for_room(self) -> NoRoom | None:
+        """Look whether the disk has room, and what is wrong where it hasn't. The reserve makes way on a full disk, and
+        is made again where there is room."""
+        lack = self.room.look()
+        if lack is not None:
+            self.reuse_log()
+        return lack
+
     # --- sessions -----------------------------------------------------------------------------------------------------
 
     def folder(self, session_id: str) -> Path:
@@ -129,9 +163,34 @@ class Store:
         demands_certified: bool = False,
     ) -> str:
         """Register a session with all its steps; nothing is captured yet. Returns its id. `demands_certified`: it runs
-        only with cameras that have a certified calibration."""
+        only with cameras that have a certified calibration. Raises NoRoom where the disk is full; then nothing of it
+        stays."""
+        check_line("name", name)
+        check_line("notes", notes, several_lines=True)
+        self.room.check()
+        self.room.keep()
         created = now()
         session_id = f"{created:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
+        try:
+            self._create(session_id, created, station, steps, plan, patterns, name, notes, demands_certified)
+        except BaseException:
+            shutil.rmtree(self.folder(session_id), ignore_errors=True)
+            raise
+        return session_id
+
+    def _create(
+        self,
+        session_id: str,
+        created: datetime,
+        station: Station,
+        steps: Sequence[Step],
+        plan: Mapping[str, Any] | None,
+        patterns: Mapping[str, NDArray[np.uint8]] | None,
+        name: str,
+        notes: str,
+        demands_certified: bool,
+    ) -> None:
+        """Write a session's first files and its rows."""
         files: list[StoredFile] = []
         cameras: dict[str, Any] = {}
         for side, camera in station.cameras.items():
@@ -167,7 +226,6 @@ class Store:
                 for at, step in enumerate(steps)
             )
             db.add_all(_file_row(session_id, file) for file in files)
-        return session_id
 
     def _row(self, db: Session, session_id: str) -> SessionRow:
         row = db.get(SessionRow, session_id)
@@ -212,7 +270,10 @@ class Store:
             return read
         with self.reading() as db:
             again = self._info(db, self._row(db, read.id))
-        return again.model_copy(update={"state": "interrupted"}) if again.state in ("running", "paused") else again
+        if again.state not in ("running", "paused"):
+            return again
+        why = again.error or "its run ended and nothing could be recorded of that (killed, or a full disk); resume it"
+        return again.model_copy(update={"state": "interrupted", "error": why})
 
     def session(self, session_id: str) -> SessionInfo:
         """One session."""
@@ -254,7 +315,9 @@ class Store:
             return db.scalars(_searched(sa.select(sa.func.count()).select_from(SessionRow), search, only)).one()
 
     def describe_session(self, session_id: str, name: str | None = None, notes: str | None = None) -> None:
-        """Give a session another name, or other notes; None leaves them."""
+        """Give a session another name, or other notes; None leaves them. Raises InputError for control characters."""
+        check_line("name", name or "")
+        check_line("notes", notes or "", several_lines=True)
         with self.transaction() as db:
             row = self._row(db, session_id)
             row.name = row.name if name is None else name
@@ -342,13 +405,21 @@ class Store:
         if not lock.acquire(patience_s=0.0):
             raise InputError(f"session {session_id}: a process runs it; abort it first")
         try:
-            with self.transaction() as db:
-                for table in (CaptureRow, FileRow, StepRow):
-                    db.execute(sa.delete(table).where(table.session_id == session_id))
-                db.execute(sa.delete(SessionRow).where(SessionRow.id == session_id))
+            try:
+                self._delete_rows(session_id)
+            except NoRoom:  # its files first: they make the room that the registry needs
+                shutil.rmtree(self.folder(session_id), ignore_errors=True)
+                self.reuse_log()
+                self._delete_rows(session_id)
         finally:
             lock.release()
         shutil.rmtree(self.folder(session_id), ignore_errors=True)
+
+    def _delete_rows(self, session_id: str) -> None:
+        with self.transaction() as db:
+            for table in (CaptureRow, FileRow, StepRow):
+                db.execute(sa.delete(table).where(table.session_id == session_id))
+            db.execute(sa.delete(SessionRow).where(SessionRow.id == session_id))
 
     # --- the journal --------------------------------------------------------------------------------------------------
 
@@ -504,8 +575,8 @@ class Store:
                 told["changes"] = changes
             cameras: Any = {side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()}
             manifest = Manifest(
-                name=row.name or session_id,
-                notes=row.notes,
+                name=escaped(row.name) or session_id,  # of before control characters were refused
+                notes=escaped(row.notes, several_lines=True),
                 **told,
                 cameras=cameras,
                 captures=tuple(_capture(session_id, one) for one in db.scalars(asked.order_by(CaptureRow.id))),
@@ -535,19 +606,23 @@ class Store:
             frames = [file for file in files if file.role == "frame"]
             partial = pack.with_name(f".{PACK}.partial")
             partial.unlink(missing_ok=True)
-            index = write_nexus(partial, recordings, info, self.runs(session_id), files, progress)
-            packed = SessionFiles(
-                folder,
-                {file.path: StoredPlace(file.sha256, file.side, index[file.path]) for file in frames},
-                pack=partial,
-            )
-            for number, file in enumerate(frames):
-                packed.frame(file.path, recordings.manifest.cameras["left"])
-                if progress:
-                    progress("checking the packed session", number / len(frames))
-            with partial.open("rb") as written:
-                os.fsync(written.fileno())
-            partial.rename(pack)
+            try:
+                index = write_nexus(partial, recordings, info, self.runs(session_id), files, progress)
+                packed = SessionFiles(
+                    folder,
+                    {file.path: StoredPlace(file.sha256, file.side, index[file.path]) for file in frames},
+                    pack=partial,
+                )
+                for number, file in enumerate(frames):
+                    packed.frame(file.path, recordings.manifest.cameras["left"])
+                    if progress:
+                        progress("checking the packed session", number / len(frames))
+                with partial.open("rb") as written:
+                    os.fsync(written.fileno())
+                partial.rename(pack)
+            except BaseException:  # on a full disk, what is unfinished takes the room that others wait for
+                partial.unlink(missing_ok=True)
+                raise
             with self.transaction() as db:
                 for path, at in index.items():
                     db.execute(
@@ -601,12 +676,18 @@ class Store:
     # --- keys ---------------------------------------------------------------------------------------------------------
 
     def keys(self, anew: bool = True) -> list[tuple[str, str, str]]:
-        """(name, scope, SHA-256) of every API key; unless `anew`, as another process may have left them `KEYS_S`
-        ago."""
+        """(name, scope, SHA-256) of every API key; unless `anew`, as another process may have left them `KEYS_S` ago.
+        Where the registry can't be read, as they were read last."""
         if anew or not self.knows_keys():
-            with self.reading() as db:
-                rows = db.scalars(sa.select(KeyRow).order_by(KeyRow.name))
-                self._keys = (time.monotonic() + KEYS_S, [(row.name, row.scope, row.sha256) for row in rows])
+            try:
+                with self.reading() as db:
+                    rows = db.scalars(sa.select(KeyRow).order_by(KeyRow.name))
+                    found = [(row.name, row.scope, row.sha256) for row in rows]
+            except (CannotWrite, sa.exc.SQLAlchemyError):  # a registry that can't be read doesn't stop a halt
+                if not self._keys[1]:
+                    raise
+                found = self._keys[1]
+            self._keys = (time.monotonic() + KEYS_S, found)
         return self._keys[1]
 
     def knows_keys(self) -> bool:
@@ -630,6 +711,26 @@ class Store:
                 raise InputError(f"no API key is called {name!r}; list them for their names")
             db.delete(row)
         self._keys = (0.0, [])
+
+    def add_halt_token(self, sha256: str, key_sha256: str, expires: datetime) -> None:
+        """Register a halt token by its hash, for the key of that hash, and remove those that have expired."""
+        with self.transaction() as db:
+            db.execute(sa.delete(HaltTokenRow).where(HaltTokenRow.expires < now()))
+            db.add(HaltTokenRow(sha256=sha256, key_sha256=key_sha256, expires=expires))
+
+    def key_of_halt_token(self, sha256: str) -> tuple[str, str, str] | None:
+        """Return (name, scope, SHA-256) of the key that a halt token was made for; None where the token is unknown or
+        expired, or its key removed."""
+        asked = sa.select(KeyRow).join(HaltTokenRow, HaltTokenRow.key_sha256 == KeyRow.sha256)
+        asked = asked.where(HaltTokenRow.sha256 == sha256, HaltTokenRow.expires > now())
+        with self.reading() as db:
+            row = db.scalars(asked).first()
+            return None if row is None else (row.name, row.scope, row.sha256)
+
+    def remove_halt_token(self, sha256: str) -> None:
+        """Remove a halt token, where there is one."""
+        with self.transaction() as db:
+            db.execute(sa.delete(HaltTokenRow).where(HaltTokenRow.sha256 == sha256))
 
 
 def _searched(asked: Any, search: str, only: Sequence[str] | None) -> Any:

@@ -6,10 +6,12 @@ import contextlib
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 import sqlalchemy as sa
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
+from lab.capture.room import Room, why_registry_unwritable
 from lab.errors import InputError
 
 
@@ -179,6 +181,17 @@ class KeyRow(Base):
     created: Mapped[datetime]
 
 
+class HaltTokenRow(Base):
+    """The hash of a token with which the operator's page halts, and of the key that it was made for (see
+    `api.security`)."""
+
+    __tablename__ = "halt_tokens"
+
+    sha256: Mapped[str] = mapped_column(sa.String(64), primary_key=True)
+    key_sha256: Mapped[str] = mapped_column(sa.ForeignKey("api_keys.sha256", ondelete="CASCADE"))
+    expires: Mapped[datetime]
+
+
 class IdempotentRow(Base):
     """A request with an idempotency key (see `api.idempotency`). `status` None: it isn't answered yet."""
 
@@ -192,6 +205,16 @@ class IdempotentRow(Base):
     body: Mapped[str | None] = mapped_column(sa.Text)
 
 
+#: Registries that this process uses alone.
+_alone: set[Path] = set()
+
+
+def use_alone(registry: Path) -> None:
+    """Have this process use a registry alone, from its next opening on: SQLite needs no room on the disk then to open
+    it. Other processes find it locked until this one ends."""
+    _alone.add(registry.resolve())
+
+
 # --- the database -----------------------------------------------------------------------------------------------------
 
 
@@ -201,6 +224,8 @@ def open_engine(url: str) -> sa.Engine:
         address = sa.make_url(url)
         if address.drivername in ("postgres", "postgresql"):
             address = address.set(drivername="postgresql+psycopg")
+        if address.get_backend_name() == "sqlite" and address.database and Path(address.database) in _alone:
+            address = address.set(database=f"file:{quote(address.database)}", query={"vfs": "unix-excl", "uri": "true"})
         # A connection that the server has closed, as after its restart, is replaced before it is used.
         engine = sa.create_engine(address, pool_pre_ping=address.get_backend_name() != "sqlite")
     except sa.exc.ArgumentError as error:
@@ -211,8 +236,9 @@ def open_engine(url: str) -> sa.Engine:
         ) from error
     except sa.exc.NoSuchModuleError as error:
         raise InputError(f"registry {address!r} can't be opened ({error}); correct CALIBENCH_DATABASE_URL") from error
-    if engine.dialect.name != "sqlite":
+    if engine.dialect.name != "sqlite" or address.database is None:
         return engine
+    registry = Path(unquote(address.database.removeprefix("file:")))
 
     @sa.event.listens_for(engine, "connect")
     def _pragmas(connection: Any, record: Any) -> None:
@@ -226,6 +252,20 @@ def open_engine(url: str) -> sa.Engine:
         writes = connection.get_execution_options().get("writes")
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
+    @sa.event.listens_for(engine, "handle_error")
+    def _explain(context: sa.ExceptionContext) -> None:
+        # Of a full disk, a read-only one and another user's folder, SQLite says no more than these.
+        words = str(context.original_exception)
+        if not any(one in words for one in ("disk is full", "disk I/O error", "unable to open", "readonly database")):
+            return
+        why = why_registry_unwritable(registry)
+        if "full" in words or "I/O" in words:
+            room = Room(registry.parent)
+            why = why or room.lack()
+            room.give_up()  # for what comes next: that a run has ended, that a session is deleted
+        if why is not None:
+            raise why from context.original_exception
+
     return engine
 
 
@@ -233,8 +273,19 @@ def open_engine(url: str) -> sa.Engine:
 VERSIONS = Path(__file__).parent / "migrations" / "versions"
 
 
+#: Where a generation of a backup is staged in a data folder, and the mark that its entries are being put in place
+#: (see `lab.capture.restore`).
+STAGED = Path(".restore")
+SWAPPING = STAGED / "complete"
+
+
 def upgrade(engine: sa.Engine, folder: Path) -> None:
-    """Bring the registry of the data folder to the newest revision. Raises InputError where it isn't a registry."""
+    """Bring the registry of the data folder to the newest revision. Raises InputError where it isn't a registry, and
+    where a restored one is only half in its place."""
+    if (folder / SWAPPING).exists():
+        raise InputError(
+            f"{folder}: a restore ended while it put files in place; call the same `calibench restore` again"
+        )
     newest = max(file.name.partition("_")[0] for file in VERSIONS.glob("[0-9]*.py"))
     with contextlib.suppress(sa.exc.SQLAlchemyError), engine.connect() as connection:
         if connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalars().all() == [newest]:

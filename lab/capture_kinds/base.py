@@ -147,6 +147,7 @@ class Capture(Open):
     )
     shares_frame: ClassVar[bool] = False  # several captures may describe one frame
     clipping_matters: ClassVar[bool] = True  # a clipped channel is worth a warning
+    codes_are_fitted: ClassVar[bool] = True  # with those of other captures: all have to be of one gain and offset
 
     id: CaptureId
     kind: str

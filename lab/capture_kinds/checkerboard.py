@@ -14,6 +14,7 @@ class CheckerboardCapture(PatternCapture):
     """A checkerboard on the screen, its first square dark."""
 
     shows: ClassVar[str] = "a checkerboard on the screen"
+    codes_are_fitted: ClassVar[bool] = False
 
     kind: Literal["checkerboard"]
 

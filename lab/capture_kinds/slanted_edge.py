@@ -219,6 +219,7 @@ class EdgeCapture(Capture):
     """
 
     shares_frame: ClassVar[bool] = True
+    codes_are_fitted: ClassVar[bool] = False  # its levels are free
 
     region: tuple[int, int, int, int] | None = None
     angle_deg: float | None = None

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import EXIT_CHECK, check_writable, out, write_json
+from lab.cli.console import EXIT_CHECK, check_writable, out, warn, write_json
 from lab.cli.sources import Json, StoreFolder, store_to_read
 from lab.errors import InputError
 
@@ -50,7 +50,10 @@ def _table(*headings: str) -> Table:
 
 @calibrations.command("list")
 def list_calibrations(data: StoreFolder = None) -> None:
-    """All calibrations, the newest first."""
+    """All calibrations, the newest first.
+
+    Example: calibench calibrations list
+    """
     from lab.calibration.life import calibrations as known
 
     table = _table("id", "of", "begun (UTC)", "state", "by", "until", "cameras")
@@ -65,7 +68,10 @@ def list_calibrations(data: StoreFolder = None) -> None:
 
 @calibrations.command()
 def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder = None) -> None:
-    """One calibration: its state, and its figures against the limits. Exit code 4 if a figure is bad or missing."""
+    """One calibration: its state, and its figures against the limits. Exit code 4 if a figure is bad or missing.
+
+    Example: calibench calibrations show 20261127-101500-7f3ad2
+    """
     from lab.calibration.life import calibration, figures
     from lab.calibration.limits import judged
     from lab.formats.results.words import shown_unit
@@ -103,7 +109,10 @@ def certify(
     ] = False,
     data: StoreFolder = None,
 ) -> None:
-    """Certify a candidate against limits; the same cameras' earlier calibration is superseded."""
+    """Certify a candidate against limits; the same cameras' earlier calibration is superseded.
+
+    Example: calibench calibrations certify 20261127-101500-7f3ad2 --limits limits.toml
+    """
     from lab.calibration import life
 
     store = store_to_read(data)
@@ -112,6 +121,8 @@ def certify(
     out.print(
         escape(f"{found.id}: certified by {found.certified_by}, {len(found.judgements)} figures within limits, {until}")
     )
+    if found.limits is not None and (dependence := found.limits.dependence_on(found.id)) is not None:
+        warn((dependence,))
 
 
 def _user() -> str:
@@ -133,7 +144,10 @@ def history(
     data: StoreFolder = None,
 ) -> None:
     """A figure of a camera over all its calibrations: bands and drift. Exit code 4 where the newest is bad or
-    drifted."""
+    drifted.
+
+    Example: calibench calibrations history left read_noise_e
+    """
     from lab.calibration.life import figure_names
     from lab.calibration.life import history as looked_up
     from lab.formats.results.words import plain_name, shown_unit, unit_of
@@ -141,7 +155,11 @@ def history(
     check_writable(json)
     store = store_to_read(data)
     if not figure:
-        for name, one, where in figure_names(store):
+        known = figure_names(store)
+        cameras = ", ".join(dict.fromkeys(name for name, _, _ in known)) or "none"
+        if camera and all(name != camera for name, _, _ in known):
+            raise InputError(f"camera {camera!r} has no calibration in {store.root}; cameras that have: {cameras}")
+        for name, one, where in known:
             if camera in ("", name):
                 read_as = ", ".join(part for part in (plain_name(one, where), shown_unit(unit_of(one))) if part)
                 out.print(escape("  ".join(part for part in (name, one, where, f"({read_as})") if part)))

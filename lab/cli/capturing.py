@@ -71,7 +71,10 @@ def capture(
     certified: Certified = False,
     conceal: Conceal = None,
 ) -> None:
-    """Run the sequences of a station and store the captures. Without a station file: on the mock bench."""
+    """Run the sequences of a station and store the captures. Without a station file: on the mock bench.
+
+    Example: calibench capture --station lab.toml --only dark --only flat
+    """
     from lab.capture.catalogue import parse_parameters
 
     store = open_store(out_folder)
@@ -125,7 +128,10 @@ def run(
     parameters: Set = None,
     conceal: Conceal = None,
 ) -> None:
-    """The main job: capture, fit, validate, diagnose, report. Without a station file: on the mock bench."""
+    """The main job: capture, fit, validate, diagnose, report. Without a station file: on the mock bench.
+
+    Example: calibench run --quick --out results
+    """
     from lab.capture.catalogue import parse_parameters
     from lab.report import words
     from lab.report.answers import answers
@@ -196,7 +202,10 @@ def sequences(
     data: StoreFolder = None,
 ) -> None:
     """The sequences: what each is for, its parameters with unit and bounds; with a station file, their values, captures
-    and time there."""
+    and time there.
+
+    Example: calibench sequences --station lab.toml
+    """
     from lab.capture.catalogue import catalogue, estimate, parse_parameters, step_times
     from lab.capture.plan import full_plan
     from lab.capture.station import read_station
@@ -219,14 +228,20 @@ def sequences(
 @commands.command("put-back")
 def put_back(
     session: Annotated[
-        str, typer.Argument(metavar="[SESSION]", help="say that what this session left changed is put back")
+        str, typer.Argument(metavar="SESSION", help="say that what this session left changed is put back")
     ] = "",
     data: StoreFolder = None,
 ) -> None:
-    """What sessions that ended early left changed by hand, and how to put it back; with SESSION: it is put back."""
+    """What sessions that ended early left changed by hand, and how to put it back; with SESSION: it is put back.
+
+    Example: calibench put-back 20261127-101500-7f3ad2
+    """
     from lab.capture.by_hand import left_by_hand, note_put_back
 
-    root = store_to_read(data).root
+    store = store_to_read(data)
+    root = store.root
+    if session:
+        store.session(session)
     left = {one.session: one for one in left_by_hand(root)}
     if session and session not in left:
         known = f"; those are {', '.join(left)}" if left else "; nothing is"
@@ -243,17 +258,19 @@ def put_back(
 
 @commands.command("confirm")
 def confirm_step(
-    session: Annotated[str, typer.Argument(metavar="[SESSION]", help="the session that waits")] = "",
-    target: Annotated[
-        str, typer.Argument(metavar="[TARGET]", help="what is there now, by the name it is asked by")
-    ] = "",
+    session: Annotated[str, typer.Argument(metavar="SESSION", help="the session that waits")] = "",
+    target: Annotated[str, typer.Argument(metavar="TARGET", help="what is there now, by the name it is asked by")] = "",
     data: StoreFolder = None,
 ) -> None:
-    """What sessions that the service runs wait for an operator to do; with SESSION and TARGET: it is done."""
+    """What sessions that the service runs wait for an operator to do; with SESSION and TARGET: it is done.
+
+    Example: calibench confirm 20261127-101500-7f3ad2 board-at-2-m
+    """
     from lab.capture.questions import confirm, question_of
 
     store = store_to_read(data)
     if session:
+        store.session(session)
         if not target:
             raise InputError(f"session {session}: give the target, too, as `calibench confirm` lists it")
         confirm(store, session, target, "the command line")

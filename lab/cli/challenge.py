@@ -73,7 +73,10 @@ def make_command(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Write sealed recording sets with concealed truths. Run it again to continue after an interruption."""
+    """Write sealed recording sets with concealed truths. Run it again to continue after an interruption.
+
+    Example: calibench challenge make --out cases --cases 20 --seed 1
+    """
     from lab.challenge.make import make
     from lab.challenge.proof import refuse_scored
     from lab.challenge.truth import FIRST_FRESH_SEED, FIRST_PROOF_SEED, purpose_of
@@ -114,7 +117,10 @@ def score_command(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Diagnose the cases without a result, open the seals, and score. Exit code 4 if a goal is missed."""
+    """Diagnose the cases without a result, open the seals, and score. Exit code 4 if a goal is missed.
+
+    Example: calibench challenge score cases --truths cases.truths.json
+    """
     from lab.challenge import proof, score, unlisted_score
     from lab.challenge.run import run_all
     from lab.challenge.truth import Seals, Truths, load, store
@@ -156,7 +162,10 @@ def calibrate_command(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Score tuning cases under changed decision rules and under the default ones; results are kept in DIR."""
+    """Score tuning cases under changed decision rules and under the default ones; results are kept in DIR.
+
+    Example: calibench challenge calibrate cases --truths cases.truths.json
+    """
     from lab.challenge.calibrate import answers, changed_policy, comparison, policies_without, refuse_proof, rule_table
     from lab.challenge.run import run_all
     from lab.challenge.score import broken_seals, score

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.segment import Segment
+from rich.text import Text
 
 from lab.errors import InputError
+from lab.plain_text import escaped, escaped_json
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -31,9 +33,26 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM: ends a command as Ctrl-C does."""
 
 
+class PlainConsole(Console):
+    """A console that escapes control characters of what it shows: stored names, files' texts and instruments' answers
+    can't write on the terminal. Its own colours stay."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Turn markup into a text, escaped before its width is measured."""
+        return super().render_str(escaped(text, several_lines=True), **options)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """Render as rich's console does, each text escaped."""
+        for segment in super().render(renderable, options):
+            if segment.control:
+                yield segment
+            else:
+                yield Segment(escaped(segment.text, several_lines=True), segment.style)
+
+
 # In a file or a pipe, a table keeps its width.
-out = Console(soft_wrap=True, highlight=False, emoji=False, width=None if sys.stdout.isatty() else 200)
-err = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
+out = PlainConsole(soft_wrap=True, highlight=False, emoji=False, width=None if sys.stdout.isatty() else 200)
+err = PlainConsole(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 
 def warn(lines: tuple[str, ...]) -> None:
@@ -43,29 +62,37 @@ def warn(lines: tuple[str, ...]) -> None:
 
 
 def check_writable(file: Path | None) -> None:
-    """Refuse a result's file that can't be written, before the work. Raises InputError."""
+    """Refuse a result's file that can't be written, before the work. Raises InputError, or CannotWrite where the disk
+    or its permissions are why."""
     if file is None or str(file) == "-":
         return
-    if file.is_dir() or not file.parent.is_dir() or not os.access(file.parent, os.W_OK):
-        raise InputError(f"{file}: can't be written; name a file in a folder that exists and is yours")
+    if file.is_dir() or not file.parent.is_dir():
+        raise InputError(f"{file}: can't be written; name a file in a folder that exists")
+    _check_takes_files(file.parent, file)
 
 
 def check_folder(folder: Path | None) -> None:
-    """Refuse a folder of results that can't be made or written into, before the work. Raises InputError."""
-    if folder is None:
-        return
-    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK):
-        raise InputError(f"{folder}: can't be written into; name a folder that is yours")
+    """Refuse a folder of results that can't be made or written into, before the work. Raises as `check_writable`."""
+    if folder is not None:
+        _check_takes_files(folder, folder)
 
 
 def check_output(path: Path) -> None:
-    """Refuse a file or folder of results that can't be made with the folders above it, before the work. Raises
-    InputError."""
-    above = path.absolute() if path.is_dir() else path.absolute().parent
-    there = next(one for one in (above, *above.parents) if one.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK):
-        raise InputError(f"{path}: can't be written; name a place that is yours")
+    """Refuse a file or folder of results that can't be made with the folders above it, before the work. Raises as
+    `check_writable`."""
+    _check_takes_files(path if path.is_dir() else path.absolute().parent, path)
+
+
+def _check_takes_files(folder: Path, wanted: Path) -> None:
+    """Raise where what is wanted can't be written: nothing can be into its folder, or the nearest one above it that
+    exists."""
+    from lab.capture.room import why_unwritable
+
+    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
+    if not there.is_dir():
+        raise InputError(f"{wanted}: can't be written into a folder, {there} is none; name another place")
+    if (why := why_unwritable(there)) is not None:
+        raise why
 
 
 def write_json(result: BaseModel, file: Path | None) -> None:
@@ -75,7 +102,7 @@ def write_json(result: BaseModel, file: Path | None) -> None:
     from lab.formats.result_file import result_json, write_result
 
     if str(file) == "-":
-        sys.stdout.write(result_json(result))
+        sys.stdout.write(escaped_json(result_json(result)))
     else:
         write_result(result, file)
 
@@ -85,7 +112,7 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: can't be made ({error.strerror}); name a folder that is yours") from error
+        raise InputError(f"{folder}: can't be made ({error.strerror}); name another folder") from error
 
 
 # --- The progress bar of long commands, on stderr where that is a terminal --------------------------------------------

@@ -76,7 +76,10 @@ def listed(
 
 @devices.command()
 def check(station_file: StationFile) -> None:
-    """Connect to each instrument of a station, use it once, and report whether it works. Exit code 3 if one doesn't."""
+    """Connect to each instrument of a station, use it once, and report whether it works. Exit code 3 if one doesn't.
+
+    Example: calibench devices check lab.toml
+    """
     from lab.capture.self_test import data_sheets, self_tests
     from lab.capture.station import drivers_of, read_station
 
@@ -100,7 +103,10 @@ def transcript(
     name: Annotated[str, typer.Argument(metavar="INSTRUMENT", help="monochromator, cameras.left, ...")],
     file: Annotated[Path, typer.Option("--out", metavar="FILE", help="the transcript to write")],
 ) -> None:
-    """Record the messages to and from an instrument while it is identified and used once."""
+    """Record the messages to and from an instrument while it is identified and used once.
+
+    Example: calibench devices transcript lab.toml monochromator --out monochromator.txt
+    """
     from lab.capture.self_test import record_transcript
     from lab.capture.station import read_station
 
@@ -120,6 +126,8 @@ def contract(
 
     FILE has a table [[instrument]] a driver: `driver` ("family.name"), and either `peer` ("module:callable", a mock) or
     `address` and the driver's settings (a real instrument).
+
+    Example: calibench devices contract drivers.toml
     """
     from drivers.contract.checks import check_driver
     from drivers.errors import InstrumentError
@@ -150,7 +158,10 @@ def init(
     usbip: UsbIp = "",
 ) -> None:
     """Write a station file of the connected instruments: cameras with pixels, colour filters and bit depth, others with
-    their addresses."""
+    their addresses.
+
+    Example: calibench station init lab.toml
+    """
     from drivers import discovery
     from drivers.errors import InstrumentError
     from lab.capture.self_test import station_text

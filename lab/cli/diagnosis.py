@@ -38,7 +38,10 @@ commands = typer.Typer()
 def validate(
     source: Source, json: Json = None, fit_file: FitFile = None, model: Model = None, data: StoreFolder = None
 ) -> None:
-    """Compare predictions with measurements that the fit didn't use. Exit code 4 if a check fails."""
+    """Compare predictions with measurements that the fit didn't use. Exit code 4 if a check fails.
+
+    Example: calibench validate my-camera --json validation.json
+    """
     from lab.formats.results import FitResult
 
     check_writable(json)
@@ -77,7 +80,10 @@ def diagnose(
     data: StoreFolder = None,
 ) -> None:
     """Name the physics that the camera model lacks and the recordings show. Exit code 2 if they determine no
-    measurement."""
+    measurement.
+
+    Example: calibench diagnose my-camera --json diagnosis.json
+    """
     if 0 < bootstrap < FEWEST_DRAWS or bootstrap < 0:
         raise InputError(
             f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, "
@@ -159,7 +165,10 @@ def report(
     data: StoreFolder = None,
 ) -> None:
     """Fit, validate, diagnose, and write one page with pictures. What is given, or with --stored is stored, isn't
-    computed again."""
+    computed again.
+
+    Example: calibench report my-camera --out report.html
+    """
     from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 
     check_writable(out_file)

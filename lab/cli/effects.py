@@ -39,11 +39,14 @@ commands = typer.Typer(
 
 @commands.command("list")
 def list_effects(
-    name: Annotated[str, typer.Argument(metavar="[NAME]", help="only this effect")] = "",
+    name: Annotated[str, typer.Argument(metavar="NAME", help="only this effect")] = "",
     json: Json = None,
 ) -> None:
     """The library of effects: its families, where each effect acts, its parameters, which measurements can show it, and
-    its rivals."""
+    its rivals.
+
+    Example: calibench effects list optical_low_pass_filter
+    """
     from lab.diagnose.visibility import EffectList, effect_description, effect_list
 
     check_writable(json)
@@ -73,7 +76,10 @@ def draft(
     data: StoreFolder = None,
 ) -> None:
     """Write a law that a diagnosis discovered as a new effect's file, with its test. Both pass the contract of effects
-    as they stand; existing files are kept."""
+    as they stand; existing files are kept.
+
+    Example: calibench effects draft diagnosis.json --law 1 --out code_step.py
+    """
     from lab.diagnose.effect_draft import draft as drafted
     from lab.diagnose.effect_draft import place_of_test
     from lab.formats.result_file import read_result

@@ -14,11 +14,12 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from lab.cli import calibrations, capturing, devices, diagnosis, effects, fitting, recordings, simulation
+from lab.cli import backups, calibrations, capturing, devices, diagnosis, effects, fitting, recordings, simulation
 from lab.cli.challenge import commands as challenge
 from lab.cli.console import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED, Terminated, err, out
+from lab.cli.help import complete_help
 from lab.cli.twin import commands as twin
-from lab.errors import DeviceError, InputError, failure_of_environment
+from lab.errors import CannotWrite, DeviceError, InputError, failure_of_environment
 
 app = typer.Typer(
     name="calibench",
@@ -29,7 +30,7 @@ app = typer.Typer(
 )
 
 
-for _group in (capturing, fitting, diagnosis, recordings, simulation):
+for _group in (capturing, fitting, diagnosis, recordings, backups, simulation):
     app.registered_commands += _group.commands.registered_commands
 app.add_typer(effects.commands)
 app.add_typer(challenge)
@@ -68,6 +69,12 @@ def attach_service_and_mocks() -> None:
         app.registered_groups += others.registered_groups
 
 
+def command_tree() -> Any:
+    """Return all commands, those of `api` and `mocks` among them, with their whole help."""
+    attach_service_and_mocks()
+    return complete_help(typer.main.get_command(app))
+
+
 @contextlib.contextmanager
 def _ended_as_by_ctrl_c() -> Iterator[None]:
     """Within it, SIGTERM interrupts as Ctrl-C does: a command ends the processes that it started."""
@@ -88,10 +95,10 @@ def _ended_as_by_ctrl_c() -> Iterator[None]:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     try:
-        attach_service_and_mocks()
+        commands = command_tree()
         with _ended_as_by_ctrl_c():
-            code = app(arguments, standalone_mode=False)
-    except (InputError, DeviceError) as error:
+            code = commands.main(arguments, prog_name="calibench", standalone_mode=False)
+    except (InputError, DeviceError, CannotWrite) as error:
         if os.environ.get("CALIBENCH_DEBUG"):
             traceback.print_exc()
         for line in str(error).splitlines():
@@ -102,12 +109,15 @@ def main(arguments: list[str] | None = None) -> int:
     except Exception as error:
         usage = getattr(error, "format_message", None)
         if usage is not None:
-            err.print(f"[red]calibench:[/] {escape(usage())} See `calibench --help`.")
+            context = getattr(error, "ctx", None)
+            command = context.command_path if context is not None else "calibench"
+            text = usage() if usage().endswith((".", "?")) else f"{usage()}."
+            err.print(f"[red]calibench:[/] {escape(text)} See `{command} --help`.")
             return EXIT_INPUT
         if os.environ.get("CALIBENCH_DEBUG"):
             traceback.print_exc()
         if (told := failure_of_environment(error)) is not None:
-            err.print(f"[red]calibench:[/] {escape(told)}")
+            err.print(f"[red]calibench:[/] {escape(str(told))}")
             return EXIT_INPUT
         text = " ".join(str(error).split())
         err.print(

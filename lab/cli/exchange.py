@@ -62,7 +62,9 @@ def import_lens(path: Path, options: ImportOptions, lens: str, to: Path) -> None
     if [name for name in options.stated() if name != "--camera"] or options.camera is None:
         raise InputError(f"--from {LENSFUN} takes --camera FILE, the camera to put the lens before, and --lens alone")
     content = read_camera(options.camera)
-    found = read_lensfun(path, content.camera.lens.focal_length_mm, content.camera.lens.f_number, lens)
+    if content.camera.lens.focal_length_mm is None:
+        raise InputError(f"{options.camera}: lens.focal_length_mm is not set; write the lens's, as {path} has several")
+    found = read_lensfun(path, content.camera, lens)
     try:
         made, remarks = with_lens(content, found)
     except InputError as error:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from lab.cli.console import EXIT_CHECK, check_folder, check_writable, err, make_folder, write_json
+from lab.cli.console import EXIT_CHECK, check_folder, check_writable, err, make_folder, warn, write_json
 from lab.cli.sources import Json, Source, StoreFolder, existing_store, recordings_of, run_here
 from lab.cli.tables import print_comparison, print_fit
 from lab.errors import NotDetermined
@@ -39,7 +39,10 @@ def fit(
     ] = None,
     data: StoreFolder = None,
 ) -> None:
-    """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo."""
+    """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo.
+
+    Example: calibench fit my-camera --json fit.json
+    """
     check_writable(json)
     check_folder(cameras)
     check_folder(maps)
@@ -75,18 +78,21 @@ def _write_maps(recordings: RecordingSet, folder: Path) -> None:
 
 
 def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) -> None:
-    """Write the camera files of a fit. A line on stderr names each value that was neither fitted nor stated."""
+    """Write the camera files of a fit. A line on stderr names each value that was neither fitted nor stated, and one
+    each that isn't the fitted one."""
     from lab.formats.camera_file import fitted_camera, write_camera
-    from lab.formats.camera_model import assumptions
+    from lab.formats.camera_model import assumed_noise, assumptions, limited_values
 
     make_folder(folder)
     for side, fitted in result.cameras.items():
-        write_camera(folder / f"{side}.toml", fitted_camera(recordings, side, fitted))
-        taken = "; ".join(
-            f"{one.quantity} taken as {one.value}" for one in assumptions(recordings.camera(side), fitted)
-        )
+        content = fitted_camera(recordings, side, fitted)
+        write_camera(folder / f"{side}.toml", content)
+        stated = recordings.camera(side)
+        assumed = (*assumptions(stated, fitted), *assumed_noise(stated, fitted, content.camera))
+        taken = "; ".join(f"{one.quantity} taken as {one.value}" for one in assumed)
         note = f" (neither fitted nor stated: {taken})" if taken else ""
         err.print(escape(f"camera: {folder / f'{side}.toml'}{note}"))
+        warn(tuple(f"{folder / f'{side}.toml'}: {line}" for line in limited_values(fitted)))
 
 
 @commands.command()
@@ -108,7 +114,10 @@ def compare(
     ] = None,
     data: StoreFolder = None,
 ) -> None:
-    """Compare two calibrations: figures that changed beyond their uncertainty, and instruments that changed."""
+    """Compare two calibrations: figures that changed beyond their uncertainty, and instruments that changed.
+
+    Example: calibench compare fit-january.json fit-june.json
+    """
     from lab.fit.compare import FailRule, failures
     from lab.fit.compare import compare as compared
     from lab.formats.recording_set import differences

@@ -1,4 +1,4 @@
-"""`calibench import`, `export`, `sessions` and `backup`."""
+"""`calibench import`, `export` and `sessions`."""
 
 from __future__ import annotations
 
@@ -69,6 +69,13 @@ def import_(
     dots: Annotated[str, typer.Option(metavar="ROWSxCOLS", help="dot-grid: dots of the plane grid")] = "",
     square_mm: Annotated[float, typer.Option(help="side of the checkerboard's squares, or spacing of the dots")] = 0.0,
     tap: Annotated[str, typer.Option(metavar="NAME", help="raw-folder, fits: this tap of the sensor alone")] = "",
+    only: Annotated[
+        str,
+        typer.Option(metavar="KEY=VALUE,...", help="raw-folder, fits: frames alone whose headers state these settings"),
+    ] = "",
+    ignore: Annotated[
+        str, typer.Option(metavar="KEY,...", help="raw-folder, fits: keywords of the headers that are wrong")
+    ] = "",
     camera: Annotated[
         Path | None,
         typer.Option(
@@ -100,7 +107,10 @@ def import_(
         str, typer.Option(metavar="NAME", help="lensfun: the model of the lens, where the file has several")
     ] = "",
 ) -> None:
-    """Turn another format into a recording set; spectra into CSV, a lens into a camera file."""
+    """Turn another format into a recording set; spectra into CSV, a lens into a camera file.
+
+    Example: calibench import --from raw-folder frames --out my-camera
+    """
     from lab.formats import recording_set
     from lab.formats.importers import read_foreign
     from lab.formats.importers.single_picture import ImportOptions, chart_corners, grid
@@ -119,6 +129,8 @@ def import_(
         light=light,
         white_patch=white_patch,
         tap=tap or None,
+        only=only or None,
+        ignore=ignore or None,
     )
     if lens and kind != LENSFUN:
         raise InputError(f"--from {kind} doesn't take --lens")
@@ -168,7 +180,10 @@ def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> 
 
 @commands.command()
 def sessions(data: StoreFolder = None) -> None:
-    """List the stored sessions."""
+    """List the stored sessions.
+
+    Example: calibench sessions --data calibench-data
+    """
     table = Table(box=None, pad_edge=False)
     for heading in ("session", "name", "created", "state", "steps done"):
         table.add_column(heading)
@@ -218,7 +233,10 @@ def export(
     channel: Annotated[str, typer.Option(metavar="R|G|B", help="pyxel: whose efficiency (without: green's)")] = "",
     data: StoreFolder = None,
 ) -> None:
-    """Write a stored session as a recording set; spectra and cameras in the formats of other programs."""
+    """Write a stored session as a recording set; spectra and cameras in the formats of other programs.
+
+    Example: calibench export 20261127-101500-7f3ad2 --to my-camera
+    """
     from lab.formats import recording_set
 
     if kind != TILED:  # a catalogue may be a server's
@@ -241,31 +259,20 @@ def export(
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
-@commands.command()
-def backup(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="the backup: new, or one of this data folder")],
-    data: StoreFolder = None,
-) -> None:
-    """Copy the data folder while it is in use. The copy is a data folder itself: to restore, use it in place of the
-    other."""
-    from lab.capture.backup import back_up
-
-    made = back_up(store_to_read(data), folder)
-    mib = made.copied_bytes / (1 << 20)
-    out.print(f"{made.sessions} sessions, {made.files} files of them; {made.copied} files copied, {mib:.1f} MiB")
-
-
 # --- `calibench kinds` ------------------------------------------------------------------------------------------------
 
 
 @commands.command()
 def kinds(
     source: Annotated[
-        str, typer.Argument(metavar="[SOURCE]", help="count the captures in a recording set or a stored session")
+        str, typer.Argument(metavar="SOURCE", help="count the captures in a recording set or a stored session")
     ] = "",
     data: StoreFolder = None,
 ) -> None:
-    """The kinds of capture: the scene, and the sequence that takes them."""
+    """The kinds of capture: the scene, and the sequence that takes them.
+
+    Example: calibench kinds my-camera
+    """
     from lab.capture_kinds.base import CAPTURES
 
     counted = Counter(capture.kind for capture in recordings_of(source, data).captures()) if source else None

@@ -37,7 +37,10 @@ def lens(
     ] = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Evaluate a lens prescription: first-order quantities, illumination, distortion, MTF, PSF."""
+    """Evaluate a lens prescription: first-order quantities, illumination, distortion, MTF, PSF.
+
+    Example: calibench lens double-gauss.zmx --report lens
+    """
     from lab.predict.lens import parse_glasses, trace_prescription
     from lab.workers import Workers
 
@@ -135,7 +138,10 @@ def simulate(
         Path | None, typer.Option("--write-camera", metavar="FILE", help="write the camera as a file to start from")
     ] = None,
 ) -> None:
-    """Simulate one raw frame, with a preview (NAME.preview.png) and a record (NAME.json) beside it."""
+    """Simulate one raw frame, with a preview (NAME.preview.png) and a record (NAME.json) beside it.
+
+    Example: calibench simulate slanted-edge --exposure-s 0.01 --out edge.dng
+    """
     from lab.predict import simulate as simulation
 
     if scene == "list":

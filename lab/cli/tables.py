@@ -87,10 +87,11 @@ def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
     if fit.stereo is not None:
         for figure in stereo_figures(fit.stereo):
             out.print(f"{figure.name}: {figure.text}")
+    for line in fit.warnings:
+        out.print(f"[yellow]warning:[/] {escape(line)}")
     for side, camera in fit.cameras.items():
-        for part in (camera.noise, camera.spectral, camera.geometry):
-            for remark in part.remarks if part else ():
-                out.print(f"{side}: {escape(remark)}")
+        for remark in camera.remarks:
+            out.print(f"{side}: {escape(remark)}")
     for remark in fit.stereo.remarks if fit.stereo is not None else ():
         out.print(f"stereo: {escape(remark)}")
     print_skipped(fit.skipped)
@@ -98,7 +99,7 @@ def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
 
 def _print_emva1288(fit: FitResult) -> None:
     """The standard's own figures of each camera, by plane of its mosaic, and what the standard's recordings lack."""
-    from lab.report.emva import table_rows
+    from lab.report.emva import compared_estimates, table_rows
 
     for side, camera in fit.cameras.items():
         if camera.noise is None or not camera.noise.emva1288:
@@ -112,6 +113,8 @@ def _print_emva1288(fit: FitResult) -> None:
         out.print(table)
         for remark in dict.fromkeys(remark for plane in planes.values() for remark in plane.remarks):
             out.print(f"{side}: EMVA 1288: {escape(remark)}")
+        for line in compared_estimates(camera.noise):
+            out.print(f"{side}: {escape(line)}")
         out.print()
 
 

@@ -51,7 +51,10 @@ def predict(
     data: StoreFolder = None,
 ) -> None:
     """Predict the measured numbers of a session that hasn't been captured, with their covariance, and seal them by
-    hash."""
+    hash.
+
+    Example: calibench twin predict camera.toml --plan my-camera --change f_number=8 --out f8.json
+    """
     from lab.twin.changes import parse_changes
     from lab.twin.predict import predict as predicted
     from lab.twin.sealed import seal
@@ -100,7 +103,10 @@ def score(
     ] = None,
     data: StoreFolder = None,
 ) -> None:
-    """Open a sealed prediction against the recordings: deviations, intervals, and names that don't survive."""
+    """Open a sealed prediction against the recordings: deviations, intervals, and names that don't survive.
+
+    Example: calibench twin score f8.json session-at-f8
+    """
     from lab.twin.score import score as scored
     from lab.twin.sealed import open_seal
 
@@ -144,7 +150,10 @@ def budget(
     data: StoreFolder = None,
 ) -> None:
     """Which effects and parameters, at their present uncertainty, matter for a use, how much each adds to its variance,
-    and which sequence of a station would reduce its error most for a minute of lab time."""
+    and which sequence of a station would reduce its error most for a minute of lab time.
+
+    Example: calibench twin budget camera.toml --use mtf
+    """
     from lab.capture.catalogue import step_times
     from lab.capture.station import read_station
     from lab.formats.camera_file import read_camera

@@ -118,4 +118,5 @@ def examine(
         progress("done", 1.0)
     improved = {findings.side: findings.improved for findings in found if findings.improved is not None}
     doubts = tuple(findings.doubt for findings in found if findings.doubt is not None)
-    return Diagnosis(merged(recordings.source, found, policy), improved, doubts)
+    warnings = fit.warnings if fit is not None else ()
+    return Diagnosis(merged(recordings.source, found, policy, warnings), improved, doubts)

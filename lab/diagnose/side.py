@@ -33,6 +33,7 @@ from lab.diagnose.outcome.mismatches import (
     corrected_by_laws,
     described,
     family_corrections,
+    impossible_efficiency,
     in_light_of_laws,
     left_to_smooth,
     located,
@@ -171,6 +172,7 @@ def diagnose_side(
             fitted,
             levels_are_judged=any(b.measurement is PHOTON_TRANSFER for b in model.blocks),
         ),
+        *impossible_efficiency(side, fitted),
         *(() if departure is None else (departure,)),
     )
     models = side_models(side, verdict.models, policy)

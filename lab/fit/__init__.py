@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal, TypeVar, get_args
 
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, Skipped, StereoFit
+from lab.formats.results.plausible import implausible_figures
 from lab.one_blas_thread import one_blas_thread
 from lab.side_processes import in_processes
 from sim.camera import Side
@@ -79,12 +81,15 @@ def fit_recording_set(
     found, refused = _step(pair, None) if paired else (None, ())
     if paired:
         told(None, "stereo")
-    return FitResult(
+    result = FitResult(
         source=recordings.source,
         cameras=cameras,
         stereo=found,
         skipped=(*(skipped for one in fitted.values() for skipped in one.skipped), *refused),
     )
+    squares_mm = [capture.square_mm for capture in recordings.captures(CharucoCapture)]
+    warnings = implausible_figures(result, recordings.manifest.cameras, squares_mm)
+    return result.model_copy(update={"warnings": warnings})
 
 
 def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told: Callable[[Step], None]) -> SideFit:
@@ -96,6 +101,8 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
     from lab.fit.noise.noise_fit import fit_noise
     from lab.fit.psf.recordings import fit_psf_field
     from lab.fit.spectral.recordings import fit_spectral
+    from lab.measure.mishaps import exchanged_frames
+    from lab.measure.repeats import find_drifts
 
     skipped: list[Skipped] = []
 
@@ -113,16 +120,19 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as pool:
         geometry = pool.submit(pinhole)
         edges_left_out: list[str] = []
-        levels = step("noise", lambda: fit_noise(recordings, side))
+        exchanged = exchanged_frames(recordings, side)
+        drifts = find_drifts(recordings, side, left_out=() if exchanged is None else exchanged.captures)
+        levels = step("noise", lambda: fit_noise(recordings, side, drifts))
         kernels = step("psf", lambda: fit_psf_field(recordings, side))
         camera = CameraFit(
             noise=levels,
-            spectral=step("spectral", lambda: fit_spectral(recordings, side, levels)),
+            spectral=step("spectral", lambda: fit_spectral(recordings, side, levels, drifts)),
             mtf=step("mtf", lambda: fit_mtf(recordings, side, levels, edges_left_out)) or (),
             psf=kernels.kernels if kernels else (),
             psf_field=kernels.parts if kernels else (),
             psf_symmetry=kernels.symmetry if kernels else None,
             geometry=geometry.result(),
+            repeat_drifts=drifts,
         )
     if camera.mtf:  # else the first is the reason why there is none
         skipped.extend(Skipped(step="mtf", reason=reason, side=side) for reason in edges_left_out)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.capture_kinds.charuco import CharucoCapture, square_doubt
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
@@ -67,8 +67,8 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
     """Fit the camera of each colour to its corners, one entry of `corners` for each view.
 
     Poses and boards are the same for all colours, so that only differences count: scale, principal point and the
-    first two radial coefficients of each colour by least squares, dq = J dtheta. The radial shift of a colour is its own
-    less that of green, against the distance from the principal point, positive outwards.
+    first two radial coefficients of each colour by least squares, dq = J dtheta. The radial shift of a colour is its
+    own less that of green, against the distance from the principal point, positive outwards.
     """
     if not corners or "G" not in corners[0]:
         return ()
@@ -303,9 +303,7 @@ def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
 
 
 def _projection_remarks(calibration: Calibration) -> list[str]:
-    """Say that another projection than a pinhole was chosen and why, and what a lens departs from its projection by;
-    and where the stated squares are improbable.
-    """
+    """Say that another projection than a pinhole was chosen and why, and what a lens departs from its projection by."""
     kind = calibration.camera.projection.kind
     name = PROJECTION_NAMES[kind]
     remarks = []
@@ -322,8 +320,7 @@ def _projection_remarks(calibration: Calibration) -> list[str]:
             f"The lens departs from {name} by about {calibration.solution.lens_px:.3f} px (standard deviation, along "
             "the radius at the farthest corner). The standard uncertainties include it."
         )
-    sizes = dict.fromkeys(view.capture.square_mm for view in calibration.views)
-    return [*remarks, *(doubt for size in sizes if (doubt := square_doubt(size)) is not None)]
+    return remarks
 
 
 def _remarks(solution: Solution, validation: CrossValidation | None, of_pictures: float | None) -> list[str]:

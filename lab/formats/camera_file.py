@@ -21,7 +21,7 @@ import sys
 import tomllib
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from lab.errors import InputError
-from lab.formats.camera_model import camera_model
+from lab.formats.camera_model import camera_model, remarks_on_values
 from lab.formats.model_posterior import ModelPosterior
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
@@ -59,13 +59,14 @@ CURVES = ("quantum_efficiency", "quantum_efficiency_std")
 @dataclass(frozen=True)
 class CameraFile:
     """The content of a camera file: the model, the effects that act in it, the prescription of a traced lens, and how
-    well its parameters are known together (None: nobody says)."""
+    well its parameters are known together (None: nobody says). `remarks`: comments of the file, which aren't read."""
 
     name: str
     camera: CameraModel
     effects: tuple[Effect, ...] = ()
     prescription: Path | None = None
     posterior: ModelPosterior | None = None
+    remarks: tuple[str, ...] = field(default=(), compare=False)
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -319,6 +320,7 @@ def write_camera(file: Path, content: CameraFile) -> None:
 def _lines(file: Path, content: CameraFile) -> Iterator[str]:
     camera = content.camera
     yield HEADER
+    yield from (f"# {' '.join(remark.split())}" for remark in content.remarks)
     yield f"format = {_text(FORMAT)}"
     yield f"version = {VERSION}"
     yield f"name = {_text(content.name)}"
@@ -431,14 +433,15 @@ def _text(value: Any) -> str:
 
 def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> CameraFile:
     """Return the camera that a fit found (`lab.formats.camera_model.camera_model`), with the fit's uncertainties, to be
-    written as a file."""
+    written as a file; its remarks say which values nobody stated or fitted, and which aren't the fitted ones."""
     model = camera_model(recordings, side, fit)
     std = {}
     for key in read_quantities(CameraModel) if fit.noise is not None else ():
         value = getattr(fit.noise, f"{key}_std", None)
         if value is not None:
             std[key] = float(value)
-    return CameraFile(f"{recordings.manifest.name} {side}", model.model_copy(update={"std": std}))
+    remarks = remarks_on_values(recordings.camera(side), fit, model)
+    return CameraFile(f"{recordings.manifest.name} {side}", model.model_copy(update={"std": std}), remarks=remarks)
 
 
 # --- the camera without a file ----------------------------------------------------------------------------------------

@@ -8,6 +8,8 @@ import numpy as np
 
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import CameraFit
+from lab.formats.results.plausible import FIGURES
+from lab.formats.results.words import measured, unit_of
 from sim.camera import CameraModel, Geometry, Lens, Side
 from sim.spectrum import Spectrum
 
@@ -75,7 +77,7 @@ def camera_model(
         quantum_efficiency_std=spread,
         lens=Lens(
             f_number=camera.f_number if camera.f_number is not None else 8.0,
-            focal_length_mm=camera.focal_length_mm if camera.focal_length_mm is not None else 5000.0,
+            focal_length_mm=camera.focal_length_mm,
             transmittance=camera.lens_transmittance if camera.lens_transmittance is not None else 1.0,
         ),
         geometry=geometry,
@@ -100,10 +102,77 @@ def assumptions(camera: DataSheet, fit: CameraFit | None = None) -> tuple[Assume
     if fit is not None and fit.spectral is not None:
         unknown -= set(fit.spectral.quantum_efficiency)
     if unknown:
-        measured = _measured_efficiency(fit)
-        through = f", scaled to {measured[1]:.4g} as measured at {measured[0]:g} nm" if measured else ""
-        found.append(Assumed("quantum_efficiency", f"typical curves{through}"))
+        found.append(Assumed("quantum_efficiency", f"typical curves{_how_scaled(fit)}"))
     return tuple(found)
+
+
+def _how_scaled(fit: CameraFit | None) -> str:
+    """Say what a measured quantum efficiency does to the typical curve of a MONO sensor."""
+    noise = fit.noise if fit is not None else None
+    if noise is None or noise.quantum_efficiency is None:
+        return ""
+    nm = noise.quantum_efficiency_wavelength_nm
+    found = measured(noise.quantum_efficiency, noise.quantum_efficiency_std)
+    if nm is None:
+        return f" (the measured {found} isn't used: the wavelength of its light isn't stated)"
+    at_nm = _measured_efficiency(fit)
+    if at_nm is None:
+        return f" (the measured {found} at {nm:g} nm isn't used: it is beyond 0..1)"
+    limited = ", limited to 1" if _peak_level(*at_nm) > 1.0 or at_nm[1] != noise.quantum_efficiency else ""
+    return f", scaled to {at_nm[1]:.4g} as measured at {nm:g} nm{limited}"
+
+
+#: Figures of the noise that a model needs, whether or not they are known.
+NOISE_FIGURES = (
+    "black_level_dn",
+    "conversion_gain_dn_per_e",
+    "full_well_e",
+    "read_noise_e",
+    "dark_current_e_per_s",
+    "dsnu_e",
+    "prnu_percent",
+)
+
+
+def assumed_noise(camera: DataSheet, fit: CameraFit | None, model: CameraModel) -> tuple[Assumed, ...]:
+    """Return the figures of the noise that `camera_model` takes though neither this data sheet nor the fit has them."""
+    noise = fit.noise if fit is not None else None
+    return tuple(
+        Assumed(name, f"{getattr(model, name):.6g}")
+        for name in NOISE_FIGURES
+        if getattr(noise, name, None) is None and getattr(camera, name) is None
+    )
+
+
+def limited_values(fit: CameraFit | None) -> tuple[str, ...]:
+    """Return a line for each fitted value that a camera can't have and `camera_model` therefore changes, or that
+    `read_camera` refuses."""
+    found = []
+    noise, spectral = (fit.noise, fit.spectral) if fit is not None else (None, None)
+    for name in ("black_level_dn", "dark_current_e_per_s"):
+        value = getattr(noise, name, None)
+        if value is not None and value < 0.0:
+            text = measured(value, getattr(noise, f"{name}_std"), unit_of(name))
+            found.append(f"{name}: the fitted {text} is below the limit of 0; written as 0")
+    for channel, curve in (spectral.quantum_efficiency if spectral is not None else {}).items():
+        if (below := sum(value < 0.0 for value in curve)) > 0:
+            found.append(
+                f"quantum_efficiency.{channel}: {below} of {len(curve)} fitted values are below the limit of 0, down "
+                f"to {min(curve):.2g}; written as 0"
+            )
+        if max(curve) > 1.0:
+            found.append(
+                f"quantum_efficiency.{channel}: fitted values up to {max(curve):.4g} are above the limit of 1 electron "
+                "a photon; a camera file with them is refused: correct the stated light and fit again"
+            )
+    return tuple(found)
+
+
+def remarks_on_values(camera: DataSheet, fit: CameraFit | None, model: CameraModel) -> tuple[str, ...]:
+    """Return a line for each value of a model that nobody stated or fitted, and for each that isn't the fitted one."""
+    assumed = (*assumptions(camera, fit), *assumed_noise(camera, fit, model))
+    taken = (f"{one.quantity}: neither fitted nor stated; taken as {one.value}" for one in assumed)
+    return (*taken, *limited_values(fit))
 
 
 def _curves(
@@ -128,20 +197,28 @@ def _curves(
             peak, width = TYPICAL_SENSITIVITY_NM[channel]
             grid = np.arange(380.0, 781.0, 5.0)
             shape = np.exp(-0.5 * ((grid - peak) / width) ** 2)
-            level = 0.5
-            if channel == "Y" and (measured := _measured_efficiency(fit)) is not None:
-                level = measured[1] / float(np.exp(-0.5 * ((measured[0] - peak) / width) ** 2))
-            curves[channel] = Spectrum.of(grid, np.clip(level * shape, 0.0, 1.0))
+            at_nm = _measured_efficiency(fit) if channel == "Y" else None
+            level = 0.5 if at_nm is None else _peak_level(*at_nm)
+            curves[channel] = Spectrum.of(grid, np.minimum(level * shape, 1.0))
     return curves, spread
 
 
 def _measured_efficiency(fit: CameraFit | None) -> tuple[float, float] | None:
-    """Wavelength (nm) and quantum efficiency that the noise fit measured by stated photon numbers; None where it has
-    none."""
+    """Wavelength (nm) and quantum efficiency that the noise fit measured by stated photon numbers, at most 1; None
+    where it has none, or an impossible one."""
     noise = fit.noise if fit is not None else None
     if noise is None or noise.quantum_efficiency is None or noise.quantum_efficiency_wavelength_nm is None:
         return None
-    return noise.quantum_efficiency_wavelength_nm, noise.quantum_efficiency
+    value, std = noise.quantum_efficiency, noise.quantum_efficiency_std
+    if value <= 0.0 or FIGURES["quantum_efficiency"].is_above(value, std):
+        return None
+    return noise.quantum_efficiency_wavelength_nm, min(value, 1.0)
+
+
+def _peak_level(wavelength_nm: float, efficiency: float) -> float:
+    """Return the peak of the typical curve of a MONO sensor that has this efficiency at this wavelength."""
+    peak, width = TYPICAL_SENSITIVITY_NM["Y"]
+    return efficiency / float(np.exp(-0.5 * ((wavelength_nm - peak) / width) ** 2))
 
 
 def _continued(fitted: Spectrum, stated: Spectrum) -> Spectrum:

@@ -1,8 +1,9 @@
 """Spectra in CGATS text, as ArgyllCMS and makers' programs exchange them: `.sp` (one or several spectra) and `.ti3`.
 
-CGATS.17 is a header of keywords, a list of fields, and rows of data. Argyll's keywords `SPECTRAL_START_NM`,
-`SPECTRAL_END_NM` and `SPECTRAL_BANDS` give evenly spaced wavelengths, `SPECTRAL_NORM` the value that stands for 1, and
-`MEAS_TYPE` the quantity. Radiances are in mW sr^-1 m^-2 nm^-1 there, in W sr^-1 m^-2 nm^-1 here."""
+CGATS.17 has tables: a header of keywords, a list of fields, and rows of data each. Argyll's keywords
+`SPECTRAL_START_NM`, `SPECTRAL_END_NM` and `SPECTRAL_BANDS` give evenly spaced wavelengths, `SPECTRAL_NORM` the value
+that stands for 1, and `MEAS_TYPE` the quantity. Radiances are in mW sr^-1 m^-2 nm^-1 there, in W sr^-1 m^-2 nm^-1 here.
+"""
 
 from __future__ import annotations
 
@@ -138,6 +139,20 @@ def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
     except csv.Error as error:
         raise InputError(f"isn't CSV ({one_line(error)}); write one row a line") from error
     words = [(number, word) for number, row in enumerate(rows, start=1) for cell in row for word in cell.split()]
+    commas = has_decimal_commas(words)
+    made = io.StringIO()
+    writer = csv.writer(made, lineterminator="\n")
+    for row_cells in rows:
+        writer.writerow([_with_points(cell) for cell in row_cells])
+    name = "semicolons" if separator == ";" else "tabs"
+    return made.getvalue(), (f"read with {name} between cells" + (" and decimal commas" if commas else ""),)
+
+
+def has_decimal_commas(words: Sequence[tuple[int, str]]) -> bool:
+    """Return whether the numbers among the words of a table, each with its row, have decimal commas.
+
+    Raises InputError where numbers of both kinds stand in it, or where a comma may separate decimals or thousands.
+    """
     commas = [one for one in words if COMMA_NUMBER.fullmatch(one[1])]
     points = [one for one in words if POINT_NUMBER.fullmatch(one[1])]
     if commas and points:
@@ -152,12 +167,7 @@ def plain_csv(text: str) -> tuple[str, tuple[str, ...]]:
             f"row {row}: {number} may be {number.replace(',', '.')} or {number.replace(',', '')}; write it with a "
             "decimal point or without the comma"
         )
-    made = io.StringIO()
-    writer = csv.writer(made, lineterminator="\n")
-    for row_cells in rows:
-        writer.writerow([_with_points(cell) for cell in row_cells])
-    name = "semicolons" if separator == ";" else "tabs"
-    return made.getvalue(), (f"read with {name} between cells" + (" and decimal commas" if commas else ""),)
+    return bool(commas)
 
 
 def _with_points(cell: str) -> str:
@@ -249,8 +259,16 @@ _WRITTEN: dict[Quantity, tuple[str, float, float]] = {
     "transmittance": ("TRANSMISSIVE", 100.0, 1.0),
     "sensitivity": ("SENSITIVITY", 1.0, 1.0),
 }
-#: Names of a field that holds a wavelength: Argyll's, and those of makers' programs.
-_FIELD = re.compile(r"(?:SPEC(?:TRAL)?_(?:NM_?)?|NM_?)(\d+(?:\.\d+)?)", re.I)
+#: Names of a field that holds a wavelength: Argyll's, and those of makers' programs. PCT: its values are percent.
+_FIELD = re.compile(
+    r"(?:SPEC(?:TRAL)?_(?:NM_?|DEC_?|(?P<percent>PCT_?))?|NM_?|R_?)(?P<last>\d{3,4}(?:\.\d+)?)"
+    r"|(?P<first>\d{3,4}(?:\.\d+)?)_?NM",
+    re.I,
+)
+#: Keywords that state the condition of a measurement (M0, M1, ...), by which the tables of a file differ.
+_CONDITION = ("FILTER", "MEASUREMENT_SOURCE", "MEASUREMENT_CONDITION")
+#: A reflectance or transmittance above this is in percent: fluorescent papers stay below 1.5.
+MOST_SHARE = 2.0
 #: Most bands that Argyll reads.
 MOST_BANDS = 601
 #: A step between wavelengths may differ from the mean by this share and count as even.
@@ -281,7 +299,7 @@ def get_quantity(name: str) -> Quantity:
 
 
 def read_cgats(file: Path) -> CgatsSpectra:
-    """Read the spectra of a CGATS file's first table.
+    """Read the spectra of a CGATS file's tables.
 
     Raises InputError, one line that begins with the file, where it isn't CGATS or holds no spectra.
     """
@@ -294,32 +312,148 @@ def read_cgats(file: Path) -> CgatsSpectra:
 
 
 def parse_cgats(text: str) -> CgatsSpectra:
-    """Return the spectra in CGATS text. Its InputError leaves the path to the caller."""
-    keywords, fields, rows = _table(text)
-    columns = {at: float(match[1]) for at, field in enumerate(fields) if (match := _FIELD.fullmatch(field))}
-    if len(columns) < 2:
+    """Return the spectra in CGATS text. Its InputError leaves the path to the caller.
+
+    A spectrum has its SAMPLE_NAME where these differ, else its SAMPLE_ID, or both; of several tables, the table's
+    condition or number before it where the names don't differ.
+    """
+    tables = _tables(text)
+    remarks: list[str] = []
+    read: list[tuple[str, CgatsSpectra]] = []
+    for number, table in enumerate(tables, start=1):
+        try:
+            found = _spectra(table)
+        except InputError as error:
+            raise InputError(f"table {number}: {error}" if len(tables) > 1 else str(error)) from error
+        if found is None:
+            remarks.append(f"table {number} is left out: it has no spectral fields")
+            continue
+        remarks += found.remarks
+        read.append((table.condition or f"table {number}", found))
+    if not read:
         raise InputError("has no fields SPEC_nnn of two wavelengths or more; give a file with spectral data")
+    quantities = {one.quantity for _, one in read}
+    if len(quantities) > 1:
+        stated = ", ".join(sorted(name or "not stated" for name in quantities))
+        raise InputError(f"its {len(read)} tables are of several quantities ({stated}); give one file a quantity")
+    names = [name for _, one in read for name in one.spectra]
+    if len(set(names)) == len(names):
+        spectra = {name: value for _, one in read for name, value in one.spectra.items()}
+    else:
+        titles = [title for title, _ in read]
+        if len(set(titles)) < len(titles):
+            titles = [f"table {number}" for number in range(1, len(read) + 1)]
+        spectra = {
+            f"{title} {name}": value
+            for title, (_, one) in zip(titles, read, strict=True)
+            for name, value in one.spectra.items()
+        }
+        remarks.append(f"{len(read)} tables with the same samples: named {', '.join(titles)}")
+    return CgatsSpectra(spectra, quantities.pop(), tuple(dict.fromkeys(remarks)))
+
+
+@dataclass(frozen=True)
+class _Table:
+    """One table of a file: keywords of its header, names of its fields, and its rows."""
+
+    keywords: Mapping[str, str]
+    fields: list[str]
+    rows: list[list[str]]
+
+    @property
+    def condition(self) -> str:
+        """The condition of its measurement (M0, M1, ...), or nothing."""
+        stated = next((self.keywords[key] for key in _CONDITION if key in self.keywords), "")
+        return stated.rpartition("=")[2].strip()
+
+
+def _spectra(table: _Table) -> CgatsSpectra | None:
+    """Return the spectra of one table, None where it has none."""
+    keywords, fields, rows = table.keywords, table.fields, table.rows
+    matches = {at: match for at, field in enumerate(fields) if (match := _FIELD.fullmatch(field))}
+    if len(matches) < 2:
+        return None
+    columns = {at: float(match["last"] or match["first"]) for at, match in matches.items()}
+    remarks: list[str] = []
+    words = [(number, row[at]) for number, row in enumerate(rows, start=1) for at in columns]
+    if has_decimal_commas(words):
+        rows = [[_with_points(cell) if at in columns else cell for at, cell in enumerate(row)] for row in rows]
+        remarks.append("read with decimal commas")
     wavelength_nm = _wavelengths(keywords, list(columns.values()))
-    norm = _number(keywords.get("SPECTRAL_NORM", "1"), "SPECTRAL_NORM")
-    if not norm > 0:
-        raise InputError(f"SPECTRAL_NORM is {norm:g}, not above the limit of 0; correct it")
+    values = np.array(
+        [
+            [_number(row[at], f"row {number}, {fields[at]}") for at in columns]
+            for number, row in enumerate(rows, start=1)
+        ]
+    )
     stated = keywords.get("MEAS_TYPE", "").upper()
     quantity = next((name for name, (said, _, _) in _WRITTEN.items() if said == stated), None)
-    factor = 1.0 / norm / (_WRITTEN[quantity][2] if quantity else 1.0)
-    remarks = () if quantity else ("MEAS_TYPE isn't stated: values over the norm, their unit unknown",)
-    name_at = next((fields.index(key) for key in ("SAMPLE_ID", "SAMPLE_NAME", "SampleID") if key in fields), None)
-    spectra: dict[str, Spectrum] = {}
-    for number, row in enumerate(rows, start=1):
-        name = str(number) if name_at is None else row[name_at]
-        if name in spectra:
-            raise InputError(f"SAMPLE_ID {name} stands twice; number the samples")
-        values = [_number(row[at], f"row {number}, {fields[at]}") * factor for at in columns]
-        spectra[name] = Spectrum.of(wavelength_nm, values)
-    return CgatsSpectra(spectra, quantity, remarks)
+    norm, more = _norm(keywords, quantity, all(match["percent"] for match in matches.values()), float(values.max()))
+    values = values / norm / (_WRITTEN[quantity][2] if quantity else 1.0)
+    names, others = _sample_names(fields, rows)
+    return CgatsSpectra(
+        {name: Spectrum.of(wavelength_nm, row) for name, row in zip(names, values.tolist(), strict=True)},
+        quantity,
+        (*remarks, *more, *others),
+    )
 
 
-def _table(text: str) -> tuple[dict[str, str], list[str], list[list[str]]]:
-    """Keywords, names of the fields, and rows of the first table."""
+def _norm(
+    keywords: Mapping[str, str], quantity: Quantity | None, percent: bool, greatest: float
+) -> tuple[float, tuple[str, ...]]:
+    """Return the value that stands for 1, and remarks on where it comes from. `percent`: the fields' names say so."""
+    if "SPECTRAL_NORM" in keywords:
+        norm = _number(keywords["SPECTRAL_NORM"], "SPECTRAL_NORM")
+        if not norm > 0:
+            raise InputError(f"SPECTRAL_NORM is {norm:g}, not above the limit of 0; correct it")
+    else:
+        norm = 100.0 if percent else 1.0
+    if quantity in ("reflectance", "transmittance") and greatest / norm > MOST_SHARE:
+        if "SPECTRAL_NORM" in keywords:
+            impossible = (
+                f"a {quantity} of {greatest / norm:g} is above the limit of {MOST_SHARE:g}; check SPECTRAL_NORM"
+            )
+            return norm, (impossible,)
+        if greatest > 100.0 * MOST_SHARE:
+            raise InputError(f"a {quantity} of {greatest:g} is neither a share nor percent; state SPECTRAL_NORM")
+        return 100.0, (f"SPECTRAL_NORM isn't stated: values up to {greatest:g} are taken as percent of {quantity}",)
+    remarks = ["the fields SPECTRAL_PCT are percent: divided by 100"] if percent and norm == 100.0 else []
+    if quantity is None:
+        remarks.append("MEAS_TYPE isn't stated: values over the norm, their unit unknown")
+        if greatest / norm > MOST_SHARE:
+            remedy = 'add the lines MEAS_TYPE "REFLECTIVE" and SPECTRAL_NORM "100" to its header'
+            remarks.append(f"values reach {greatest / norm:g}: if they are percent of a reflectance, {remedy}")
+    return norm, tuple(remarks)
+
+
+def _sample_names(fields: list[str], rows: list[list[str]]) -> tuple[list[str], tuple[str, ...]]:
+    """Return a name for each row, and a remark where the numbers of the samples repeat."""
+
+    def column(*known: str) -> list[str] | None:
+        at = next((at for at, field in enumerate(fields) if field.upper() in known), None)
+        return None if at is None else [row[at] for row in rows]
+
+    def differ(names: list[str] | None) -> bool:
+        return names is not None and len(set(names)) == len(names) and all(names)
+
+    numbers, called = column("SAMPLE_ID", "SAMPLEID"), column("SAMPLE_NAME", "SAMPLENAME")
+    if called is not None and differ(called):
+        repeated = "SAMPLE_ID repeats: spectra are named by SAMPLE_NAME"
+        return called, (repeated,) if numbers is not None and not differ(numbers) else ()
+    if called is not None and numbers is not None and any(called):
+        numbers = [f"{number} {name}".strip() for number, name in zip(numbers, called, strict=True)]
+    numbers = numbers or called
+    if numbers is None:
+        return [str(number) for number in range(1, len(rows) + 1)], ()
+    if not differ(numbers):
+        twice = next(name for name in numbers if numbers.count(name) > 1 or not name)
+        raise InputError(f"SAMPLE_ID {twice} stands twice; number the samples")
+    return numbers, ()
+
+
+def _tables(text: str) -> list[_Table]:
+    """Return the tables of a file. One without a header or a list of fields has those of the table before."""
+    tables: list[_Table] = []
     keywords: dict[str, str] = {}
     fields: list[str] = []
     data: list[str] = []
@@ -336,16 +470,26 @@ def _table(text: str) -> tuple[dict[str, str], list[str], list[list[str]]]:
         elif first == "END_DATA_FORMAT":
             part = "head"
         elif first == "END_DATA":
-            break
+            tables.append(_table(keywords, fields, data, tables))
+            part, keywords, fields, data = "head", {}, [], []
         elif part == "BEGIN_DATA_FORMAT":
             fields += words
         elif part == "BEGIN_DATA":
             data += words
-    else:
+    if not tables or fields or data:
         raise InputError("isn't a whole CGATS file: it has no END_DATA; give one, or copy it again")
+    return tables
+
+
+def _table(keywords: dict[str, str], fields: list[str], data: list[str], before: list[_Table]) -> _Table:
+    fields = fields or (before[-1].fields if before else [])
     if not fields or not data or len(data) % len(fields):
         raise InputError(f"has {len(data)} values for {len(fields)} fields, not whole rows; copy it again")
-    return keywords, fields, [data[at : at + len(fields)] for at in range(0, len(data), len(fields))]
+    sets = keywords.get("NUMBER_OF_SETS", "")
+    rows = [data[at : at + len(fields)] for at in range(0, len(data), len(fields))]
+    if sets.isdigit() and int(sets) != len(rows):
+        raise InputError(f"NUMBER_OF_SETS is {sets}, and {len(rows)} rows are there; copy it again, or correct it")
+    return _Table(keywords or (before[-1].keywords if before else {}), fields, rows)
 
 
 def _words(line: str, number: int) -> list[str]:

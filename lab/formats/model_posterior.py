@@ -30,6 +30,7 @@ class FirstEstimates(Frozen):
     dark_current_std_dn_per_s: float
     level_jitter_dn: float  # standard deviation of a dark frame's mean
     lamp_jitter: float  # relative standard deviation of a flat frame's mean
+    code_step_dn: float = 1.0  # step of the codes
 
 
 class StoredEffect(Frozen):

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.errors import InputError
+from lab.errors import InputError, cannot_write
 from sim.camera import CameraModel
 from sim.parameters import Frozen, Quantity
 from sim.scene.colorchecker import reflectances
@@ -58,9 +58,7 @@ def replacing(file: Path) -> Iterator[Path]:
     try:
         handle, name = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
     except OSError as error:
-        raise InputError(
-            f"{file}: can't be written ({error.strerror}); name a file in a folder that exists and is yours"
-        ) from error
+        raise cannot_write(file, error, "name a file in a folder that exists") from error
     os.close(handle)
     partial = Path(name)
     try:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lab.errors import InputError, one_line
 from lab.formats.cgats import parse_cgats
-from lab.formats.importers.images import decoded
+from lab.formats.pictures import read_picture as read_samples
 from lab.formats.spectrum_csv import parse_curve
 from sim.camera import CameraModel
 from sim.scene import Scene, SpectralImage
@@ -204,7 +204,7 @@ def read_picture(file: Path) -> NDArray[np.uint8]:
     if not file.is_file():
         raise InputError(f"{file}: no such file; give one of {' '.join(PICTURES)}")
     with _about(file):
-        image = decoded(file)
+        image = read_samples(file)
     if image.ndim == 2:
         image = np.repeat(image[:, :, None], 3, axis=2)
     if image.ndim != 3 or image.shape[2] not in (3, 4):
@@ -214,7 +214,7 @@ def read_picture(file: Path) -> NDArray[np.uint8]:
         raise InputError(f"{file}: its samples are {image.dtype}, not 8 or 16 bit; save it as 8-bit RGB")
     if image.shape[2] == 4 and np.any(image[:, :, 3] != full):
         raise InputError(f"{file}: is transparent in places; put it on a background and save it as RGB")
-    codes = image[:, :, 2::-1]  # OpenCV's order is blue, green, red
+    codes = image[:, :, :3]
     if full != 255:
         codes = np.rint(codes / 257.0)
     return np.ascontiguousarray(codes, dtype=np.uint8)

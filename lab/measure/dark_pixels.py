@@ -26,11 +26,15 @@ VISIBLE_DN2 = 0.24  # below: rounding hides the noise
 
 
 def stack_of(
-    recordings: RecordingSet, captures: Sequence[DarkCapture] | Sequence[FlatCapture], bad: BoolArray | None = None
+    recordings: RecordingSet,
+    captures: Sequence[DarkCapture] | Sequence[FlatCapture],
+    bad: BoolArray | None = None,
+    step_dn: float = 1.0,
 ) -> Stack:
-    """Return the repeats of one level as a stack; every frame is read once. `bad` (rows, cols): pixels to leave out."""
+    """Return the repeats of one level as a stack; every frame is read once. `bad` (rows, cols): pixels to leave out;
+    `step_dn`: step of the codes."""
     camera = recordings.camera(captures[0].side)
-    stack = Stack(camera.cfa, camera.saturation_dn, bad)
+    stack = Stack(camera.cfa, camera.saturation_dn, bad, step_dn)
     for capture in captures:
         stack.add(recordings.frame(capture))
     return stack
@@ -42,10 +46,11 @@ class DarkPixels:
 
     `squares` (rows, cols), `freedom`: pooled sum of squared temporal deviations, DN^2, and its degrees of freedom.
     `longest`, `shortest` (rows, cols): mean frames of the longest and the shortest exposure, DN. `bad`: mask of
-    defective pixels.
+    defective pixels. `step_dn`: step of the codes.
     """
 
     cfa: Cfa
+    step_dn: float = 1.0
     bad: BoolArray | None = None
     squares: Float32Array | None = None
     freedom: int = 0
@@ -117,7 +122,8 @@ def read_noise_distribution(dark: DarkPixels, gain_dn_per_e: float) -> ReadNoise
     good = dark.squares if dark.bad is None else dark.squares[~dark.bad]
     variance = good.ravel().astype(float) / dark.freedom
     mean, count, nu = float(variance.mean()), variance.size, dark.freedom
-    if mean < VISIBLE_DN2:
+    quantisation_dn2 = QUANTISATION_DN2 * dark.step_dn**2
+    if mean < VISIBLE_DN2 * dark.step_dn**2:
         return None
     # Noisy pixels are counted, not averaged: the tail would dominate
     limit = mean * special.chdtri(nu, NOISY_CHANCE / count) / nu
@@ -129,8 +135,8 @@ def read_noise_distribution(dark: DarkPixels, gain_dn_per_e: float) -> ReadNoise
     influence = rest - 2.0 * measured * (regular / middle - 1.0)  # influence function of one pixel
     spread2_std = float(influence.std()) / np.sqrt(count) / (1.0 + 2.0 / nu)
     spread, spread_std = root(spread2, spread2_std)
-    rounding = middle / (middle - QUANTISATION_DN2)  # the variance of rounding is common to all pixels
-    noise = np.sqrt(np.maximum(variance - QUANTISATION_DN2, 0.0)) / gain_dn_per_e
+    rounding = middle / (middle - quantisation_dn2)  # the variance of rounding is common to all pixels
+    noise = np.sqrt(np.maximum(variance - quantisation_dn2, 0.0)) / gain_dn_per_e
     pixels, edges = np.histogram(noise, HISTOGRAM_BINS, (0.0, float(np.percentile(noise, 99.9)) * 1.2))
     return ReadNoiseDistribution(
         degrees_of_freedom=nu,

@@ -19,6 +19,7 @@ from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import NoiseFit
+from lab.measure.code_step import count_codes, step_of
 from lab.measure.edge_finding import Region, region_planes
 from lab.measure.edge_mtf import DEFAULT_FREQUENCY_CY_PER_PX, EdgeMtf, planes_mtf
 from sim.camera import Cfa
@@ -196,7 +197,8 @@ def measure_edge(
     mean = np.mean([f.astype(float) for f in frames], axis=0) if len(frames) > 1 else frames[0]
     planes = region_planes(mean, region, camera.cfa, channel, black)
     frequency = DEFAULT_FREQUENCY_CY_PER_PX if frequency_cy_per_px is None else frequency_cy_per_px
-    return planes_mtf(planes, frequency, code=1.0, frames=len(frames))
+    code = step_of(np.sum([count_codes(frame) for frame in frames], axis=0))
+    return planes_mtf(planes, frequency, code=code, frames=len(frames))
 
 
 def edges_of(recordings: RecordingSet, capture: SlantedEdgeCapture) -> tuple[FoundEdge, ...]:

@@ -52,14 +52,18 @@ class DarkSignal:
         return np.asarray(found)
 
     def _own(self, exposure_s: float) -> MeasuredLevel | None:
-        """Darks of that exposure, the first where there are several."""
-        alike = (level for level in self.darks if abs(level.exposure_s - exposure_s) <= 1e-6 * exposure_s)
+        """Darks of that exposure that don't drift, the first where there are several."""
+        alike = (
+            level
+            for level in self.darks
+            if level.drift is None and abs(level.exposure_s - exposure_s) <= 1e-6 * exposure_s
+        )
         return next(alike, None)
 
 
 def mean_and_std(levels: Sequence[MeasuredLevel], names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
     """Mean of each level over the planes `names`, DN, and its standard deviation: by temporal noise and rounding,
-    increased where repeats differ by more.
+    increased where repeats differ by more, and by a drift of the repeats.
     """
     means, stds, rounding, excess, freedom = [], [], [], 0.0, 0
     for level in levels:
@@ -68,17 +72,19 @@ def mean_and_std(levels: Sequence[MeasuredLevel], names: Sequence[str]) -> tuple
         rounding.append(max(plane.mean_rounding_std for plane in own))  # the errors of the planes are correlated
         frames = np.average([plane.frame_means for plane in own], axis=0, weights=pixels)
         variance = np.average([plane.temporal_variance for plane in own], weights=pixels)
-        noise = max(float(variance), QUANTISATION_DN2) if np.isfinite(variance) else float("nan")
+        noise = max(float(variance), QUANTISATION_DN2 * own[0].step_dn ** 2) if np.isfinite(variance) else float("nan")
         means.append(float(frames.mean()))
         stds.append(np.sqrt(noise / pixels.sum()))
         if len(frames) > 1:
-            excess += float(np.sum((frames - frames.mean()) ** 2) / stds[-1] ** 2)
-            freedom += len(frames) - 1
+            rest, free = level.scatter(frames)
+            excess += float(np.sum(rest**2) / stds[-1] ** 2)
+            freedom += free
     known = np.array(stds)
     if np.isnan(known).any():
         known = np.where(np.isnan(known), np.nanmax(known) if np.isfinite(known).any() else 1.0, known)
     frame_std = known * np.sqrt(chi2_factor(excess, freedom))
-    return np.array(means), np.hypot(frame_std / np.sqrt([level.repeats for level in levels]), rounding)
+    std = np.hypot(frame_std / np.sqrt([level.repeats for level in levels]), rounding)
+    return np.array(means), np.hypot(std, [level.drift_std_dn for level in levels])
 
 
 def dark_lines(recorded: RecordedLevels, remarks: Remarks) -> dict[str | None, DarkLine]:
@@ -113,7 +119,7 @@ def refuse_light_darks(recorded: RecordedLevels, dark: DarkSignal) -> None:
         for name in recorded.names:
             expected = dark.lines[name].at(level.exposure_s)
             short = expected - level.plane[name].mean
-            if short > max(DARKER_SHARE * (recorded.white_dn - expected), 1.0):
+            if short > max(DARKER_SHARE * (recorded.white_dn - expected), recorded.step_dn):
                 raise NotDetermined(
                     "noise",
                     f"a flat of {level.exposure_s:g} s has {level.plane[name].mean:.0f} DN and is darker than darks "
@@ -179,9 +185,12 @@ def _clipped_flats(recorded: RecordedLevels, dark: DarkSignal, name: str) -> tup
         ratio = excess / signal if signal > 0 else np.nan
         typical = float(np.median(ratios)) if ratios else np.nan
         at_white = plane.clipped_share > CLIPPED_LIMIT
-        piled = plane.piled_share > max(PILED_LIMIT, PILED_PIXELS / plane.pixels) and plane.temporal_variance > 4.0
+        piled = (
+            plane.piled_share > max(PILED_LIMIT, PILED_PIXELS / plane.pixels)
+            and plane.temporal_variance > 4.0 * plane.step_dn**2
+        )
         saturates = signal > 0.2 * (recorded.white_dn - dark.lines[name].black) and (
-            ratio < 0.5 * typical or plane.temporal_variance < 0.01
+            ratio < 0.5 * typical or plane.temporal_variance < 0.01 * plane.step_dn**2
         )
         if at_white:
             plateau = recorded.white_dn

@@ -13,7 +13,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.dark import DarkCapture
 from lab.formats.recording_set import DataSheet
+from lab.formats.results import RepeatDrift
 from lab.measure.rounding import (
     HIDDEN_DN2,
     QUANTISATION_DN2,
@@ -222,16 +225,16 @@ def shading(image: NDArray[F], degree: int = SHADING_DEGREE) -> NDArray[F]:
 DEFECT_SIGMA = 8.0  # a normal pattern of a million pixels doesn't reach that far
 
 
-def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa) -> BoolArray:
+def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa, step_dn: float = 1.0) -> BoolArray:
     """Pixels of a mean frame (rows, cols) beyond 8 robust standard deviations of their plane, as a mask (rows, cols).
 
-    Robust: 1.4826 times the median modulus of the residual from the smooth surface.
+    Robust: 1.4826 times the median modulus of the residual from the smooth surface. `step_dn`: step of the codes.
     """
     bad = np.zeros(image.shape, bool)
     for name, plane in planes(image, cfa).items():
         rest = plane - np.median(plane)
-        # Most pixels of a rounded plane may be equal: the least scale is then that of rounding, else a tenth of a DN
-        least = np.sqrt(QUANTISATION_DN2) if not np.median(np.abs(rest)) > 0 else 0.1
+        # Most pixels of a rounded plane may be equal: the least scale is then that of rounding, else a tenth of a step
+        least = step_dn * (np.sqrt(QUANTISATION_DN2) if not np.median(np.abs(rest)) > 0 else 0.1)
         for _ in range(2):  # glow widens the first scale, hot pixels distort the first surface
             limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), least)
             rest = rest - shading(np.clip(rest, -limit, limit))
@@ -317,7 +320,8 @@ class PlaneStatistics:
     `temporal_variance_of_all` include defects, as in EMVA 1288. `adjacent_covariance`, `diagonal_covariance`: temporal
     covariance of a pixel with one of its four neighbours along rows and columns, and across corners, on the mosaic (of
     any plane). `shading_rows`, `shading_columns`: mean of the smooth surface over the first and the last tenth of the
-    rows (columns), over `mean`, dark included.
+    rows (columns), over `mean`, dark included. `shading_span`: highest less lowest value of that surface, DN, and its
+    standard deviation by the pixels' scatter. `step_dn`: step of the codes.
     """
 
     pixels: int
@@ -344,6 +348,8 @@ class PlaneStatistics:
     covariance_std: float = np.nan
     shading_rows: tuple[float, float] = (1.0, 1.0)
     shading_columns: tuple[float, float] = (1.0, 1.0)
+    shading_span: tuple[float, float] = (0.0, 0.0)
+    step_dn: float = 1.0
 
     @property
     def repeats(self) -> int:
@@ -354,8 +360,8 @@ class PlaneStatistics:
     def mean_std(self) -> float:
         """Standard deviation of `mean` by temporal noise and by rounding, DN."""
         variance = self.temporal_variance / self.repeats
-        if self.temporal_variance < HIDDEN_DN2:  # the mean of each pixel is rounded: repeats don't help
-            variance = max(variance, QUANTISATION_DN2)
+        if self.temporal_variance < HIDDEN_DN2 * self.step_dn**2:  # each pixel's mean is rounded: repeats don't help
+            variance = max(variance, QUANTISATION_DN2 * self.step_dn**2)
         return float(np.hypot(np.sqrt(variance / self.pixels), self.mean_rounding_std))
 
     @property
@@ -367,7 +373,7 @@ class PlaneStatistics:
     @property
     def mean_rounding_std(self) -> float:
         """Standard deviation of `mean` by rounding, DN, which no averaging reduces."""
-        return float(rounding_std_dn(variance_before_rounding(self.spread)))
+        return float(rounding_std_dn(variance_before_rounding(self.spread, self.step_dn), self.step_dn))
 
 
 @dataclass(frozen=True)
@@ -377,6 +383,7 @@ class MeasuredLevel:
     `light` is proportional to the photons among the levels of the same `lamp`. `captures`: ids of the frames.
     `light_std`, `light_calibration_std`: relative standard uncertainties of `light`, of its own, and common to all
     levels of the lamp. `temperature_c`: to a degree where it groups darks; `sensor_c`: the frames' mean, not rounded.
+    `drift`: of the repeats over time, where there is one.
     """
 
     exposure_s: float
@@ -388,11 +395,27 @@ class MeasuredLevel:
     light_std: float = 0.0
     light_calibration_std: float = 0.0
     sensor_c: float | None = None
+    drift: RepeatDrift | None = None
 
     @property
     def repeats(self) -> int:
         """Number of frames."""
         return next(iter(self.plane.values())).repeats
+
+    @property
+    def drift_std_dn(self) -> float:
+        """Standard uncertainty of the mean by a drift of the repeats, DN."""
+        return 0.0 if self.drift is None else self.drift.level_dn_std
+
+    def scatter(self, frame_means: FloatArray) -> tuple[FloatArray, int]:
+        """Return frame means (n,) less their mean and less the drift in proportion, and the degrees of freedom."""
+        rest = frame_means - frame_means.mean()
+        if self.drift is None or set(self.captures) != set(self.drift.captures):
+            return rest, rest.size - 1
+        at = dict(zip(self.drift.captures, self.drift.curve_dn, strict=True))
+        curve = np.array([at[name] for name in self.captures])
+        curve -= curve.mean()
+        return rest - float(curve @ rest) / float(curve @ curve) * curve, rest.size - 2
 
 
 _NONE = np.zeros((0, 0), bool)
@@ -402,11 +425,11 @@ class Stack:
     """Repeats of one level, read one after the other.
 
     `mean`, `squares` (rows, cols): mean and sum of squared deviations over the repeats, by pixel. `bad` (rows, cols):
-    pixels to leave out.
+    pixels to leave out. `step_dn`: step of the codes.
     """
 
-    def __init__(self, cfa: Cfa, white_dn: float, bad: BoolArray | None) -> None:
-        self.cfa, self.white_dn = cfa, white_dn
+    def __init__(self, cfa: Cfa, white_dn: float, bad: BoolArray | None, step_dn: float = 1.0) -> None:
+        self.cfa, self.white_dn, self.step_dn = cfa, white_dn, step_dn
         self.period = step(cfa)
         self.bad = bad if bad is not None and bad.any() else None
         self.count = 0
@@ -436,7 +459,14 @@ class Stack:
         means = sums[1] / np.maximum(self._good, 1)
         highest, top, zero = counts[0].astype(float), counts[1] / self._sizes, counts[2] / self._sizes
         self._shares.append(
-            np.stack([np.where(highest >= self.white_dn, top, 0.0), top, np.where(means < 50, zero, 0.0), highest])
+            np.stack(
+                [
+                    np.where(highest >= self.white_dn, top, 0.0),
+                    top,
+                    np.where(means < 50 * self.step_dn, zero, 0.0),
+                    highest,
+                ]
+            )
         )
         self._frame_means.append(means)
         self._means_of_all.append(sums[0] / self._sizes)
@@ -513,7 +543,7 @@ class Stack:
         )
         spatial = (sums[2] - sums[1] ** 2 / pixels) / (pixels - 1)
         if np.isfinite(variance):
-            variance_std = float(np.hypot(variance_std, variance_rounding_std(variance, spatial - share)))
+            variance_std = float(np.hypot(variance_std, variance_rounding_std(variance, spatial - share, self.step_dn)))
         pattern, outliers = (sums[4] - sums[3] ** 2 / pixels) / (pixels - 1), 0
         good = (cols, rows) if bad.size == 0 else (cols - bad.sum(axis=1), rows - bad.sum(axis=0))
         rows_mean, cols_mean = (
@@ -541,6 +571,10 @@ class Stack:
         shares = np.mean([share[:3, phase] for share in self._shares], axis=0)
         adjacent, diagonal, covariance_std = self._covariances(phase, variance)
         tenth = max(rows // 10, 1), max(cols // 10, 1)
+        # In a corner, where it is least certain, a surface of k x l Legendre polynomials has the leverage k^2 l^2 / n:
+        # the sum of 2 i + 1 over an axis is the square of their number. The span is the difference of two such values.
+        corner_std = order[0] * order[1] * float(np.sqrt(max(pattern, 0.0) / pixels))
+        span = float(surface.max() - surface.min()), float(np.sqrt(2.0)) * corner_std
         return PlaneStatistics(
             pixels=pixels,
             mean=float(np.mean([means[phase] for means in self._frame_means])),
@@ -569,6 +603,8 @@ class Stack:
                 float(surface[:, : tenth[1]].mean() / first[0]),
                 float(surface[:, -tenth[1] :].mean() / first[0]),
             ),
+            shading_span=span,
+            step_dn=self.step_dn,
         )
 
     def _covariances(self, phase: int, variance: float) -> tuple[float, float, float]:
@@ -659,6 +695,21 @@ class RecordedLevels:
         """Highest code."""
         return self.camera.saturation_dn
 
+    @property
+    def step_dn(self) -> float:
+        """Step of the codes, DN."""
+        return self.flats[0].plane[self.names[0]].step_dn
+
+    @property
+    def quantisation_dn2(self) -> float:
+        """Variance of rounding to the step of the codes, DN^2."""
+        return QUANTISATION_DN2 * self.step_dn**2
+
+    @property
+    def hidden_dn2(self) -> float:
+        """Variance, DN^2, below which rounding to the step of the codes hides the noise."""
+        return HIDDEN_DN2 * self.step_dn**2
+
     @classmethod
     def of(
         cls,
@@ -673,9 +724,7 @@ class RecordedLevels:
         """Choose the darks of the temperature at which most flats (or else most darks) were taken."""
         bright = tuple(sorted(flats, key=lambda level: (level.light, level.exposure_s)))
         every = tuple(sorted(darks, key=lambda level: level.exposure_s))
-        present = [level.temperature_c for level in every]
-        wanted = [rounded_c(level.temperature_c) for level in bright]
-        temperature = max(dict.fromkeys(present), key=lambda t: (wanted.count(t), present.count(t)), default=None)
+        temperature = usual_c([level.temperature_c for level in every], [level.temperature_c for level in bright])
         own = tuple(level for level in every if level.temperature_c == temperature)
         clipped = any(level.plane[name].zero_share > BLACK_CLIPPED_SHARE for level in own for name in names)
         if clipped:
@@ -684,6 +733,28 @@ class RecordedLevels:
                 "raise the black level"
             )
         return cls(camera, gain_db, defects, names, bright, every, () if clipped else own, temperature, clipped)
+
+
+def usual_c(dark_c: Sequence[float | None], bright_c: Sequence[float | None]) -> float | None:
+    """Return the temperature, to a degree, of the darks (`dark_c`) at which most bright captures were taken, or else
+    most darks."""
+    present = [rounded_c(one) for one in dark_c]
+    wanted = [rounded_c(one) for one in bright_c]
+    return max(dict.fromkeys(present), key=lambda t: (wanted.count(t), present.count(t)), default=None)
+
+
+#: Darks within this of the usual temperature belong to it: their dark current differs by 10 % (it doubles in some 7 C),
+#: and a sensor that stands between two whole degrees keeps all of its darks.
+NEAR_C = 1.0
+
+
+def darks_near(darks: Sequence[DarkCapture], bright: Sequence[Capture]) -> list[DarkCapture]:
+    """Return the darks of the temperature at which most of the captures `bright` were taken, or else most darks; all
+    where none is stated."""
+    usual = usual_c([dark.temperature_c for dark in darks], [capture.temperature_c for capture in bright])
+    if usual is None:
+        return [dark for dark in darks if dark.temperature_c is None]
+    return [dark for dark in darks if dark.temperature_c is not None and abs(dark.temperature_c - usual) <= NEAR_C]
 
 
 def rounded_c(temperature_c: float | None) -> float | None:

@@ -1,12 +1,12 @@
-"""Captures that aren't what they are said to be: copies of a frame, frames exchanged between levels, a mosaic without
-colours."""
+"""Captures that contradict what is stated of them: copies of a frame, frames exchanged between levels, a mosaic without
+colours. Nothing is exchanged or restated here: what is found is a proposal."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from scipy import stats
@@ -15,8 +15,10 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import Frame, RecordingSet
+from lab.measure.code_step import count_codes, step_of
 from lab.measure.level_lines import CLIPPED_LIMIT, robust_response
+from lab.measure.levels import rounded_c
 from lab.measure.stated_light import light_of, most_frequent_gain_db
 from sim.camera import Side
 from sim.spectrum import FloatArray
@@ -74,14 +76,20 @@ def copied_frames(recordings: RecordingSet, side: Side, captures: Sequence[Captu
             continue
         mark = hashlib.blake2b(frame.tobytes(), digest_size=16).digest()
         twin = first.setdefault(mark, capture)
-        if twin is not capture and twin.frame != capture.frame:
+        if twin is not capture and twin.frame != capture.frame and _is_noisy(frame):
             found.append((capture, twin))
     return CopiedFrames(side, tuple(found))
 
 
+def _is_noisy(frame: Frame) -> bool:
+    """Return whether a frame has a standard deviation of `NOISELESS_DN` steps of its codes, and can't be equal to
+    another by chance."""
+    return float(frame.std(dtype=np.float32)) >= NOISELESS_DN * step_of(count_codes(frame))
+
+
 # --- exchanged frames ----------------------------------------------------------------------------------------------
 # Frames of a photon-transfer series that stand under each other's captures: two levels, or a dark and a flat,
-# exchanged in an index.
+# exchanged in an index. The exchange is proposed and never done: the captures concerned are left out.
 
 
 SEED = 1288  # of the subsets of captures that the robust law draws
@@ -95,6 +103,11 @@ SAME_SATURATION, SAME_DN = 1e-3, 1.0  # the same beside it, of saturation, and a
 APART = 3.0  # times that by which two levels that count as exchanged differ
 DARK_SIGMA = 6.0  # of the darks about their line
 SATURATED = 0.98  # of the highest mean, from which on a flat may saturate
+#: Darks of one temperature (to a degree) that are judged: a line has two numbers, and one dark may be off it.
+LEAST_DARKS = 4
+#: Flats whose temperatures lie in one chain of smaller gaps were taken at one set point: a camera that warms up changes
+#: by less from flat to flat, set points of a cooler differ by more.
+SET_POINT_C = 2.0
 
 
 @dataclass(frozen=True)
@@ -115,10 +128,9 @@ class JudgedFrame:
 
 @dataclass(frozen=True)
 class ExchangedFrames:
-    """Pairs of captures, each of which holds the other's frame; `corrected`: the recordings with these put back."""
+    """Pairs of captures, each of which has the level of the other's setting and not its own."""
 
     pairs: tuple[tuple[JudgedFrame, JudgedFrame], ...]
-    corrected: RecordingSet
 
     @property
     def captures(self) -> tuple[str, ...]:
@@ -137,19 +149,19 @@ class ExchangedFrames:
             groups.setdefault((_setting(a.capture), _setting(b.capture)), []).append((a, b))
         pairs = "; ".join(f"{_told([a for a, _ in own])}, and {_told([b for _, b in own])}" for own in groups.values())
         return (
-            f"Captures of the {side} camera hold each other's frames: {pairs}; they are read as exchanged: exchange "
-            "these frames, or what is "
-            "stated of them."
+            f"Captures of the {side} camera seem to hold each other's frames: {pairs}; they are left out: if the "
+            "frames were exchanged, exchange these frames, or what is stated of them."
         )
 
 
 def exchanged_frames(recordings: RecordingSet, side: Side) -> ExchangedFrames | None:
-    """Darks and flats of one side whose frames are exchanged in pairs; None where none is found.
+    """Darks and flats of one side whose frames seem exchanged in pairs; None where none is found.
 
-    Each flat has an expected level by the response that the others of its lamp follow (`robust_response`, over
-    captures), each dark by the others' line over the exposure (Theil and Sen). Two captures are exchanged where both
-    are off their levels and each has that of the other's setting. Levels nearer than `APART` tolerances can't be told
-    apart. At most a quarter of a lamp's captures may be wrong."""
+    Each flat has an expected level by the response that the others of its lamp and set point of the temperature follow
+    (`robust_response`, over captures), each dark by the line over the exposure of the darks of its temperature (Theil
+    and Sen). What another temperature explains is no evidence. Two captures seem exchanged where both are off their
+    levels and each has that of the other's setting. Levels nearer than `APART` tolerances can't be told apart. At most
+    a quarter of a lamp's captures may be wrong."""
     flats = recordings.captures(FlatCapture, side)
     if not flats:
         return None
@@ -167,13 +179,13 @@ def exchanged_frames(recordings: RecordingSet, side: Side) -> ExchangedFrames | 
         if apart and {id(a), id(b)} <= free and a.fits(b) and b.fits(a):
             pairs.append((a, b))
             free -= {id(a), id(b)}
-    return ExchangedFrames(tuple(pairs), _put_back(recordings, pairs)) if pairs else None
+    return ExchangedFrames(tuple(pairs)) if pairs else None
 
 
 def _judged(
     recordings: RecordingSet, side: Side, darks: Sequence[DarkCapture], flats: Sequence[FlatCapture]
 ) -> list[JudgedFrame]:
-    """Every dark, and every flat of a lamp whose response the others tell."""
+    """Every dark of a temperature, and every flat of a lamp and set point, whose level the others determine."""
     camera = recordings.camera(side)
     looked_at = []
     for capture in (*darks, *flats):
@@ -181,22 +193,25 @@ def _judged(
         looked_at.append((float(frame.mean()), float(np.mean(frame >= camera.saturation_dn)) > CLIPPED_SHARE))
     mean, clipped = (np.array(values) for values in zip(*looked_at, strict=True))
     dark_mean, flat_mean = mean[: len(darks)], mean[len(darks) :]
-    exposure = np.array([dark.exposure_s for dark in darks])
-    slope, black = 0.0, float(np.median(dark_mean))
-    if np.unique(exposure).size > 1:
-        slope, black = (float(v) for v in stats.theilslopes(dark_mean, exposure)[:2])
-    own = black + slope * exposure
-    saturation = max(float(mean.max()) - black, 1.0)
+    lines = _dark_lines(darks, dark_mean)
+    saturation = max(float(mean.max()) - min(line.black for line in lines.values()), 1.0)
     least = max(SAME_SATURATION * saturation, SAME_DN)
-    away = np.abs(dark_mean - own)
-    tolerance = max(DARK_SIGMA * 1.4826 * float(np.median(away)), least)
-    found = [
-        JudgedFrame(dark, float(m), float(e), tolerance, bool(a > tolerance))
-        for dark, m, e, a in zip(darks, dark_mean, own, away, strict=True)
-    ]
+    found = []
+    for temperature_c, line in lines.items():
+        alike = [number for number, dark in enumerate(darks) if rounded_c(dark.temperature_c) == temperature_c]
+        if len(alike) < LEAST_DARKS:
+            continue
+        own = np.array([line.at(darks[number].exposure_s) for number in alike])
+        away = np.abs(dark_mean[alike] - own)
+        tolerance = max(DARK_SIGMA * 1.4826 * float(np.median(away)), least)
+        found += [
+            JudgedFrame(darks[number], float(dark_mean[number]), float(e), tolerance, bool(a > tolerance))
+            for number, e, a in zip(alike, own, away, strict=True)
+        ]
     light = light_of(flats, camera)
-    below = black + slope * np.array([flat.exposure_s for flat in flats])
-    lamps = [(flat.radiance, light[flat.id].lamp) for flat in flats]
+    below = np.array([_nearest(lines, flat.temperature_c).at(flat.exposure_s) for flat in flats])
+    points = _set_points(flats)
+    lamps = [(flat.radiance, light[flat.id].lamp, point) for flat, point in zip(flats, points, strict=True)]
     for lamp in dict.fromkeys(lamps):
         mine = np.array([one == lamp for one in lamps])
         amount = np.array([light[flat.id].amount for flat, is_mine in zip(flats, mine, strict=True) if is_mine])
@@ -226,15 +241,47 @@ def _judged(
     return found
 
 
-def _put_back(recordings: RecordingSet, pairs: Sequence[tuple[JudgedFrame, JudgedFrame]]) -> RecordingSet:
-    """Return the recordings with the frames of each pair exchanged."""
-    frame_of: dict[str, str] = {}
-    for a, b in pairs:
-        frame_of |= {a.capture.id: b.capture.frame, b.capture.id: a.capture.frame}
-    captures = tuple(
-        c.model_copy(update={"frame": frame_of[c.id]}) if c.id in frame_of else c for c in recordings.manifest.captures
-    )
-    return recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
+@dataclass(frozen=True)
+class _RobustLine:
+    """Dark means of one temperature against exposure."""
+
+    black: float  # DN
+    dn_per_s: float
+
+    def at(self, exposure_s: float) -> float:
+        """Return the dark mean at an exposure, DN."""
+        return self.black + self.dn_per_s * exposure_s
+
+
+def _dark_lines(darks: Sequence[DarkCapture], mean_dn: FloatArray) -> dict[float | None, _RobustLine]:
+    """Return the line of Theil and Sen by temperature, deg C."""
+    by_c: dict[float | None, list[int]] = {}
+    for number, dark in enumerate(darks):
+        by_c.setdefault(rounded_c(dark.temperature_c), []).append(number)
+    lines = {}
+    for temperature_c, own in by_c.items():
+        exposure = np.array([darks[number].exposure_s for number in own])
+        slope, black = 0.0, float(np.median(mean_dn[own]))
+        if np.unique(exposure).size > 1:
+            slope, black = (float(v) for v in stats.theilslopes(mean_dn[own], exposure)[:2])
+        lines[temperature_c] = _RobustLine(black, slope)
+    return lines
+
+
+def _nearest(lines: dict[float | None, _RobustLine], temperature_c: float | None) -> _RobustLine:
+    """Return the line of the nearest temperature, the first where none is stated."""
+    stated = [known for known in lines if known is not None]
+    if temperature_c is None or not stated:
+        return next(iter(lines.values()))
+    return lines[min(stated, key=lambda known: abs(known - temperature_c))]
+
+
+def _set_points(flats: Sequence[FlatCapture]) -> list[int]:
+    """Number of the chain of temperatures, with gaps up to `SET_POINT_C`, that each flat is in; -1 where none is
+    stated."""
+    known = sorted(flat.temperature_c for flat in flats if flat.temperature_c is not None)
+    first = [warmer for cooler, warmer in pairwise(known) if warmer - cooler > SET_POINT_C]
+    return [-1 if flat.temperature_c is None else sum(flat.temperature_c >= start for start in first) for flat in flats]
 
 
 def _told(alike: Sequence[JudgedFrame]) -> str:
@@ -245,7 +292,8 @@ def _told(alike: Sequence[JudgedFrame]) -> str:
 
 
 def _setting(capture: Capture) -> str:
-    return f"{capture.kind}, {capture.exposure_s:.4g} s"
+    at = "" if capture.temperature_c is None else f", {capture.temperature_c:.4g} deg C"
+    return f"{capture.kind}, {capture.exposure_s:.4g} s{at}"
 
 
 # --- alike planes --------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.flat import FlatCapture
 from lab.formats.results import NoiseFit
 from lab.measure.plane_means import channel_pixels
-from lab.measure.rounding import variance_before_rounding
+from lab.measure.rounding import QUANTISATION_DN2, rounding_std_dn, rounding_waves_dn, variance_before_rounding
 from lab.measure.stated_light import most_frequent_gain_db
 from sim.sensor import mosaic
 from sim.sensor.lines import Lines
@@ -179,18 +179,18 @@ def sound_pixels(study: Study) -> NDArray[np.bool_]:
     warmest = max(groups, key=lambda g: (g[0].temperature_c or 0.0, g[0].exposure_s))
     for group in (longest, warmest) if longest is not warmest else (longest,):
         frames = [study.recordings.frame(c).astype(np.float32) for c in group[:MEDIAN_OF]]
-        away, local = from_surroundings([f - np.float32(f.mean(dtype=np.float64)) for f in frames])
+        away, local = from_surroundings([f - np.float32(f.mean(dtype=np.float64)) for f in frames], study.step_dn)
         sound &= np.abs(away) <= DEFECTIVE * local
     return sound
 
 
-def from_surroundings(frames: list[Image]) -> tuple[Image, Image]:
+def from_surroundings(frames: list[Image], step_dn: float = 1.0) -> tuple[Image, Image]:
     """Departures (rows, cols) of the pixels of the frames' lower median from their local mean, without the means of
-    rows and columns; and their local standard deviation, DN."""
-    level = [f - row_means(f)[:, None] for f in frames]
+    rows and columns; and their local standard deviation, DN. `step_dn`: step of the codes."""
+    level = [f - row_means(f, step_dn)[:, None] for f in frames]
     median: Image = np.sort(np.array(level), axis=0)[(len(frames) - 1) // 2]
 
-    std = robust_std(median)
+    std = robust_std(median, step_dn)
     flat, _ = without_lines(median, np.clip(median, -CLIP * std, CLIP * std))
     step = 2
     for r in range(step):
@@ -202,24 +202,26 @@ def from_surroundings(frames: list[Image]) -> tuple[Image, Image]:
     # a second pass, so that hot pixels in a glow don't shift the mean around them
     around += ndimage.uniform_filter(steep, SMOOTH_PX, mode="mirror")
     away = flat - around
-    local = np.sqrt(np.maximum(local_variance(np.square(away), 1), 0.25)) * np.sqrt(SMOOTH_PX**2 / (SMOOTH_PX**2 - 1.0))
+    local = np.sqrt(np.maximum(local_variance(np.square(away), 1), 0.25 * step_dn**2)) * np.sqrt(
+        SMOOTH_PX**2 / (SMOOTH_PX**2 - 1.0)
+    )
     return away, local
 
 
-def robust_std(image: Image) -> float:
-    """Standard deviation of the pixels within five standard deviations of 0, by iteration; at least a quarter of a
-    code."""
+def robust_std(image: Image, step_dn: float = 1.0) -> float:
+    """Standard deviation of the pixels within five standard deviations of 0, by iteration; at least a quarter of the
+    step of the codes."""
     low, high = np.quantile(image.ravel()[:: max(image.size // 200_000, 1)], [0.02, 0.98])
-    std = max(float(high - low) / 4.107, 0.3)
+    std = max(float(high - low) / 4.107, 0.3 * step_dn)
     for _ in range(3):
         inside = image[np.abs(image) < 5.0 * std]
-        std = max(float(inside.std(dtype=np.float64)), 0.25)
+        std = max(float(inside.std(dtype=np.float64)), 0.25 * step_dn)
     return std
 
 
-def row_means(image: Image) -> Image:
+def row_means(image: Image, step_dn: float = 1.0) -> Image:
     """Means (rows,) of the rows, pixels clipped at `CLIP` standard deviations."""
-    std = robust_std(image)
+    std = robust_std(image, step_dn)
     return np.asarray(np.clip(image, -CLIP * std, CLIP * std).mean(axis=1))
 
 
@@ -252,6 +254,7 @@ def local_variance(squares: Image, freedom: int) -> Image:
 
 
 STATED_BLACK_SHARE, STATED_BLACK_DN = 0.03, 2.0  # standard deviation of a stated black level, relative and absolute
+# of codes of a step of 1 DN; codes of a larger step have as many steps
 BLACK_FLOOR_DN = 0.01  # standard deviation of a frame's mean beside noise
 USUAL_JITTER_DN = 0.02  # usual standard deviation of a dark frame's mean, from repeat to repeat
 USUAL_JITTER_FREEDOM = 2.0  # degrees of freedom that count for the usual one
@@ -281,13 +284,29 @@ class NoiseFigures:
     jitter_lamp: float  # relative standard deviation of a flat frame's mean, from repeat to repeat
     black_std: float  # standard deviation of `black`
     dark_std: float  # standard deviation of `dark_dn_per_s`
+    step_dn: float = 1.0  # of the codes
 
     def spread_dn2(self, signal_dn: FloatArray) -> FloatArray:
         """Variance (DN^2) of pixels at a signal before rounding: shot noise, read noise (0 where rounding hides it),
         PRNU."""
         return np.asarray(
-            self.gain * signal_dn + variance_before_rounding(self.read_dn**2) + (self.prnu * signal_dn) ** 2
+            self.gain * signal_dn
+            + variance_before_rounding(self.read_dn**2, self.step_dn)
+            + (self.prnu * signal_dn) ** 2
         )
+
+    def rounding_std_dn(self, signal_dn: FloatArray) -> FloatArray:
+        """Standard deviation (DN) of means of pixels at a signal by rounding to the step of the codes."""
+        return rounding_std_dn(self.spread_dn2(signal_dn), self.step_dn)
+
+    def rounding_waves_dn(self, level_dn: FloatArray) -> list[FloatArray]:
+        """Errors (DN) that rounding may leave in means at levels above black, one standard deviation each."""
+        return rounding_waves_dn(level_dn, self.spread_dn2(level_dn), self.step_dn)
+
+    @property
+    def quantisation_dn2(self) -> float:
+        """Variance of rounding to the step of the codes, DN^2."""
+        return QUANTISATION_DN2 * self.step_dn**2
 
 
 def noise_figures(study: Study) -> NoiseFigures:
@@ -349,8 +368,8 @@ def _as_stated(study: Study) -> NoiseFigures:
     return NoiseFigures(
         black=black, dark_dn_per_s=0.0, dark_c=study.temperature_c, gain=1.0, gain_is_known=False, read_dn=1.0,
         prnu=USUAL_PRNU,
-        jitter_dn=BLACK_FLOOR_DN, jitter_freedom=0.0, jitter_lamp=USUAL_LAMP, black_std=black_std,
-        dark_std=max(expected * (stated.conversion_gain_dn_per_e or 1.0), 0.5),
+        jitter_dn=BLACK_FLOOR_DN * study.step_dn, jitter_freedom=0.0, jitter_lamp=USUAL_LAMP, black_std=black_std,
+        dark_std=max(expected * (stated.conversion_gain_dn_per_e or 1.0), 0.5), step_dn=study.step_dn,
     )  # fmt: skip
 
 
@@ -396,7 +415,8 @@ def _from_darks(study: Study, stated: NoiseFigures) -> NoiseFigures:
         own_dn2 = read**2 / recordings.frame(first[0]).size
     jitter, freedom = _jitter(study, darks, frames_mean, own_dn2)
     return replace(
-        stated, black=black, dark_dn_per_s=dark, dark_c=dark_c, read_dn=read, jitter_dn=max(jitter, BLACK_FLOOR_DN),
+        stated, black=black, dark_dn_per_s=dark, dark_c=dark_c, read_dn=read,
+        jitter_dn=max(jitter, BLACK_FLOOR_DN * study.step_dn),
         jitter_freedom=freedom,
         black_std=black_std, dark_std=dark_std,
     )  # fmt: skip
@@ -494,22 +514,21 @@ def _jitter(
     `USUAL_JITTER_DN`^2 + `own_dn2`, that of a frame's mean by its pixels' noise, counts as `USUAL_JITTER_FREEDOM`
     degrees of freedom."""
     repeats = []
+    usual_dn2 = (USUAL_JITTER_DN * study.step_dn) ** 2 + own_dn2
     for group, mean in zip(groups, means, strict=True):
         if len(group) > 1:
             time = np.array([study.elapsed_s(c) for c in group])
-            repeats.append(
-                RepeatedMeans(tuple(group), mean - mean.mean(), time - time.mean(), USUAL_JITTER_DN**2 + own_dn2)
-            )
+            repeats.append(RepeatedMeans(tuple(group), mean - mean.mean(), time - time.mean(), usual_dn2))
     repeats = steady(repeats)
     freedom = sum(len(r.away) - 1 for r in repeats)
     if freedom == 0:
-        return UNKNOWN_JITTER_DN, 0.0
+        return UNKNOWN_JITTER_DN * study.step_dn, 0.0
     rest, elapsed = np.concatenate([r.away for r in repeats]), np.concatenate([r.elapsed_s for r in repeats])
     if freedom > 2 and np.any(elapsed):
         rest = rest - elapsed * float(elapsed @ rest) / float(elapsed @ elapsed)
         freedom -= 1
     total = freedom + USUAL_JITTER_FREEDOM
-    usual = USUAL_JITTER_FREEDOM * (USUAL_JITTER_DN**2 + own_dn2)
+    usual = USUAL_JITTER_FREEDOM * usual_dn2
     return float(np.sqrt((rest @ rest + usual) / total)), total
 
 

@@ -11,7 +11,6 @@ from scipy import fft
 
 from lab.capture_kinds.chart import ChartCapture
 from lab.measure.plane_means import channel_pixels
-from lab.measure.rounding import rounding_std_dn
 from lab.measure.study import CLIPPED_SHARE, Study, held_out_of, mean_frame
 from sim.camera import CameraModel
 from sim.effects.base import Effects
@@ -153,7 +152,7 @@ def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> F
     names = np.array([p.name for p in points])
     channel = np.array([p.channel for p in points])
     temporal = (noise.gain * signal + noise.read_dn**2) / pixels / repeats
-    digits = rounding_std_dn(noise.spread_dn2(signal))
+    digits = noise.rounding_std_dn(signal)
     fixed = np.sqrt((noise.prnu * signal) ** 2 / pixels + digits**2)
     same = names[:, None] == names
     covariance = np.diag(temporal + noise.jitter_dn**2) + same * (channel[:, None] == channel) * np.outer(fixed, fixed)

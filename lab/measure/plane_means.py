@@ -12,7 +12,7 @@ from sim.camera import Cfa
 from sim.sensor.mosaic import phases, step
 from sim.spectrum import FloatArray
 
-ROUNDING_STD_DN = 0.3  # standard deviation that rounding to whole codes adds to a pixel: 1 / sqrt(12)
+ROUNDING_STD_DN = 0.3  # standard deviation that rounding to a step of 1 DN adds to a pixel: 1 / sqrt(12)
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,12 @@ class PlaneMean:
     std_dn: float  # between the pixels
     pixels: int
     clipped_share: float
+    step_dn: float = 1.0  # of the codes
 
     @property
     def mean_std_dn(self) -> float:
         """Standard deviation of the mean, with the pixels' own scatter and rounding."""
-        return float(np.hypot(self.std_dn, ROUNDING_STD_DN) / np.sqrt(self.pixels))
+        return float(np.hypot(self.std_dn, ROUNDING_STD_DN * self.step_dn) / np.sqrt(self.pixels))
 
 
 def channel_pixels(frame: NDArray[Any], cfa: Cfa, channel: str) -> FloatArray:
@@ -37,14 +38,15 @@ def channel_pixels(frame: NDArray[Any], cfa: Cfa, channel: str) -> FloatArray:
     return np.concatenate([np.asarray(frame[r::period, c::period], float).ravel() for r, c in phases(cfa)[channel]])
 
 
-def plane_means(frame: NDArray[Any], cfa: Cfa, saturation_dn: float) -> dict[str, PlaneMean]:
+def plane_means(frame: NDArray[Any], cfa: Cfa, saturation_dn: float, step_dn: float = 1.0) -> dict[str, PlaneMean]:
     """Return the mean of each channel.
 
     `frame` (rows, cols), DN, begins on a whole period of the mosaic; a pixel of `saturation_dn` or more is clipped.
+    `step_dn`: step of the codes.
     """
     found = {}
     for channel in phases(cfa):
         values = channel_pixels(frame, cfa, channel)
         clipped = float(np.mean(values >= saturation_dn))
-        found[channel] = PlaneMean(float(values.mean()), float(values.std()), values.size, clipped)
+        found[channel] = PlaneMean(float(values.mean()), float(values.std()), values.size, clipped, step_dn)
     return found

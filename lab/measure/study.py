@@ -17,6 +17,7 @@ from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
+from lab.measure.code_step import CodeStep, find_code_step
 from lab.measure.mishaps import CopiedFrames, copied_frames
 from lab.measure.noise_figures import NoiseFigures, noise_figures
 from lab.measure.plane_means import plane_means
@@ -68,6 +69,10 @@ class Study:
         #: Captures that are left out, as their frames weren't taken anew.
         self.copies: CopiedFrames = copied_frames(recordings, side)
         self.recordings = recordings.without(self.copies.ids) if self.copies.ids else recordings
+        code = find_code_step(self.recordings, side) if noise is None else CodeStep(noise.step_dn)
+        #: Step of the codes, DN.
+        self.step_dn = code.step_dn
+        camera = camera.model_copy(update={"white_level_dn": code.highest_dn(camera.white_level_dn)})
         self.side, self.camera = side, camera
         #: Clipping level: the converter's highest code, or the full well where that is lower.
         self.saturation_dn = min(camera.white_level_dn, saturation_dn or camera.white_level_dn)

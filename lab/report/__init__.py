@@ -16,7 +16,7 @@ from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.measurements.block import measurement_title
 from lab.effect_titles import at_beginning, effect_title
-from lab.errors import InputError
+from lab.errors import cannot_write
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
 from lab.formats.recording_set.manifest import told
@@ -44,6 +44,7 @@ from sim.camera import Side
 
 __all__ = ["Provenance", "installed_versions", "provenance_of", "render_report", "write_report"]
 KERNELS_A_SIDE = 12
+DRIFTS_A_SIDE = 6  # the most significant of each kind come first
 
 
 @dataclass(frozen=True)
@@ -212,11 +213,17 @@ def render_report(
         **diagnosis_page.context(diagnosis, sides),
         "rows": rows,
         "stated": any(figure.stated is not None for _, figures in rows for figure in figures.values()),
+        "implausible": fit.warnings,
         "remarks": [
             (side, remark)
             for side, camera in fit.cameras.items()
-            for part in (camera.noise, camera.spectral)
-            for remark in (part.remarks if part else ())
+            for remark in camera.remarks
+            if camera.geometry is None or remark not in camera.geometry.remarks  # these stand beside the geometry
+        ],
+        "drifts": [
+            (side, drift, charts.repeat_drift(drift))
+            for side, camera in fit.cameras.items()
+            for drift in camera.repeat_drifts[:DRIFTS_A_SIDE]
         ],
         "transfer": {side: charts.photon_transfer(noise) if noise else None for side, noise in noises.items()},
         "sheets": list(data_sheets(recordings, fit)),
@@ -315,5 +322,5 @@ def write_page(file: Path, page: str) -> Path:
         with replacing(file) as partial:
             partial.write_text(page, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{file}: can't be written ({error.strerror}); name a place that is yours") from error
+        raise cannot_write(file, error, "name another place") from error
     return file

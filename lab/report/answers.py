@@ -107,7 +107,8 @@ def effect_line(effect: NamedEffect) -> str:
 
 
 def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
-    """Sentences: the named effects, mismatches without a name, and cameras without a mismatch."""
+    """Sentences: implausible figures, the named effects, mismatches without a name, and cameras without a mismatch."""
+    yield from (f"Warning: {line}." for line in fit.warnings)
     if diagnosis is None:
         return
     yield from (effect_line(effect) for effect in diagnosis.effects[:NAMED])
@@ -205,8 +206,12 @@ def _worst(checks: Iterable[Check]) -> dict[Side, list[Check]]:
     return sides
 
 
-def to_do(diagnosis: DiagnosisResult | None, left_out: int, warnings: int) -> Iterator[str]:
+def to_do(
+    diagnosis: DiagnosisResult | None, left_out: int, warnings: int, implausible: Sequence[str] = ()
+) -> Iterator[str]:
     """Sentences: the next capture, what to check, and which model to predict with."""
+    if implausible:
+        yield "Settle the warnings about figures first: what depends on a wrong statement is wrong, too."
     if diagnosis is None:
         yield "Diagnose the recordings: calibench diagnose."
     else:
@@ -215,7 +220,7 @@ def to_do(diagnosis: DiagnosisResult | None, left_out: int, warnings: int) -> It
         yield from dict.fromkeys(item.check for item in diagnosis.unexplained if item.check)
         if diagnosis.effects:
             yield "Predict with the improved camera model, which holds the named effects; not with the baseline."
-        if diagnosis.verdict == "no_mismatch":
+        if diagnosis.verdict == "no_mismatch" and not implausible:
             yield "Nothing: the baseline holds. Compare the next calibration with this one: calibench compare."
         if diagnosis.verdict == "nothing_judged":
             yield "Take the captures that the steps under Left out ask for."
@@ -328,7 +333,7 @@ def answers(
         ("What was found", list(found(fit, diagnosis))),
         ("How sure", list(certainty(diagnosis))),
         ("What it means", list(meaning(diagnosis, validation, both))),
-        ("What to do", list(to_do(diagnosis, left_out, warnings))),
+        ("What to do", list(to_do(diagnosis, left_out, warnings, fit.warnings))),
     ]
 
 

@@ -6,8 +6,9 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,7 +18,15 @@ import numpy as np
 
 from lab.diagnose.measurements.block import measurement_title
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import Check, DiagnosisResult, NoiseFit, PatchComparison, ResidualCurve, SpectralFit
+from lab.formats.results import (
+    Check,
+    DiagnosisResult,
+    NoiseFit,
+    PatchComparison,
+    RepeatDrift,
+    ResidualCurve,
+    SpectralFit,
+)
 from lab.formats.results.words import measured, plain_number
 from lab.predict.validate import SensitivityCurve
 from sim.camera import Side
@@ -33,6 +42,8 @@ RESIDUAL_SIGMA = 5.0
 #: Share of the abscissa that a strip takes at least to have a label.
 LABELLED_SHARE = 0.1
 FADED = 0.22  # opacity of an uncertainty band
+#: Decades up to which a logarithmic axis has ticks at 1, 2 and 5, and its margin, a share of its length.
+FEW_DECADES, LOG_MARGIN = 2.5, 0.04
 
 
 def _faded(colour: str, opacity: float = FADED) -> str:
@@ -55,6 +66,26 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
     } | more
 
 
+def log_axis(title: str, values: Iterable[float], **more: Any) -> dict[str, Any]:
+    """Return a logarithmic axis that holds `values`, with whole numbers at its ticks: 1, 2, 5, 10, 20, ... within
+    `FEW_DECADES`, powers of ten beyond. Values of 0 or below have no place on it."""
+    exponents = [math.log10(value) for value in values if value is not None and 0.0 < value < math.inf]
+    low, high = (min(exponents), max(exponents)) if exponents else (0.0, 1.0)
+    margin = max(LOG_MARGIN * (high - low), 0.05)
+    low, high = low - margin, high + margin
+    steps = (1, 2, 5) if high - low <= FEW_DECADES else (1,)
+    ticks = [step * 10.0**power for power in range(math.floor(low), math.ceil(high) + 1) for step in steps]
+    shown = [tick for tick in ticks if low <= math.log10(tick) <= high]
+    return axis(
+        title,
+        type="log",
+        range=[low, high],
+        tickvals=shown,
+        ticktext=[f"{tick:g}" if 1e-4 <= tick < 1e6 else f"10<sup>{math.log10(tick):.0f}</sup>" for tick in shown],
+        **more,
+    )
+
+
 def layout(height: int, **more: Any) -> dict[str, Any]:
     """Return a figure's layout in the report's style."""
     return {
@@ -68,7 +99,7 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
     } | more
 
 
-def _bars(std: Sequence[float | None], colour: str) -> dict[str, Any]:
+def error_bars(std: Sequence[float | None], colour: str) -> dict[str, Any]:
     return {"type": "data", "array": list(std), "color": colour, "thickness": 1, "width": 2}
 
 
@@ -107,8 +138,8 @@ def photon_transfer(noise: NoiseFit) -> Figure | None:
                     "name": channel if used else f"{channel}, not used",
                     "x": [points.signal_dn[k] for k in at],
                     "y": [points.variance_dn2[k] for k in at],
-                    "error_x": _bars([points.signal_dn_std[k] for k in at], colour),
-                    "error_y": _bars([points.variance_dn2_std[k] for k in at], colour),
+                    "error_x": error_bars([points.signal_dn_std[k] for k in at], colour),
+                    "error_y": error_bars([points.variance_dn2_std[k] for k in at], colour),
                     "marker": {"color": colour, "size": 6, "symbol": "circle" if used else "circle-open"},
                 }
             )
@@ -136,6 +167,38 @@ def photon_transfer(noise: NoiseFit) -> Figure | None:
     }
 
 
+def repeat_drift(drift: RepeatDrift) -> Figure:
+    """Means of repeats over time, with the fitted curve where it changes and its standard uncertainty, DN; of several
+    settings in common, departures from each setting's mean."""
+    curve, half = np.array(drift.curve_dn), np.array(drift.curve_dn_std)
+    abscissa = "elapsed time, s" if drift.elapsed_s is not None else "number of the repeat"
+    x = list(drift.elapsed_s) if drift.elapsed_s is not None else [float(k + 1) for k in range(len(curve))]
+    points: Trace = {
+        "type": "scatter",
+        "mode": "markers",
+        "name": "mean of a frame" if drift.is_of_one_setting else "mean departure of a repeat",
+        "x": x,
+        "y": list(drift.mean_dn),
+        "error_y": error_bars([drift.scatter_dn] * len(x) if drift.is_of_one_setting else half.tolist(), BEFORE),
+        "marker": {"color": BEFORE, "size": 6},
+    }
+    data = [points]
+    if drift.is_of_one_setting:
+        at = [k for k, name in enumerate(drift.captures) if name in drift.changing]
+        along = [x[k] for k in at]
+        line: Trace = {
+            "type": "scatter",
+            "mode": "lines",
+            "name": drift.shape.replace("_", "-"),
+            "x": along,
+            "y": curve[at].tolist(),
+            "line": {"color": AFTER, "width": 2},
+        }
+        data = [band(along, curve[at], half[at], AFTER), line, points]
+    title = "mean, DN" if drift.is_of_one_setting else "departure, DN"
+    return {"data": data, "layout": layout(260, xaxis=axis(abscissa), yaxis=axis(title))}
+
+
 def linearity(noise: NoiseFit) -> Figure | None:
     """Deviation from the straight line of the response, per cent of the line."""
     points = noise.photon_transfer
@@ -157,7 +220,7 @@ def linearity(noise: NoiseFit) -> Figure | None:
                     "name": channel,
                     "x": [points.signal_dn[k] for k in at],
                     "y": [points.linearity_residual_percent[k] for k in at],
-                    "error_y": _bars(
+                    "error_y": error_bars(
                         [100 * points.signal_dn_std[k] / max(abs(points.signal_dn[k]), 1e-9) for k in at], colour
                     ),
                     "marker": {"color": colour, "size": 5},
@@ -443,7 +506,7 @@ def patch_comparison(patches: Sequence[PatchComparison], improved: Sequence[Patc
                 "name": "measured",
                 "x": names,
                 "y": [unit * patch.measured_dn for patch in mine],
-                "error_y": _bars(std, "@fg"),
+                "error_y": error_bars(std, "@fg"),
                 "marker": {"color": CHANNEL.get(channel, "#888888"), "size": 6},
             }
         )
@@ -578,7 +641,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
             "name": "measured",
             "x": list(curve.x),
             "y": list(curve.measured),
-            "error_y": _bars(curve.measured_std, "@fg"),
+            "error_y": error_bars(curve.measured_std, "@fg"),
             "marker": {"color": "@fg", "size": 4},
         }
     ]

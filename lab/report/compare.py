@@ -11,7 +11,7 @@ import numpy as np
 from lab.formats.results import Change, ComparisonResult, ProjectionChange
 from lab.formats.results.words import measured
 from lab.report import page_environment, write_page
-from lab.report.charts import AFTER, BEFORE, ChartData, Figure, axis, layout, plotly_base64
+from lab.report.charts import AFTER, BEFORE, ChartData, Figure, axis, layout, log_axis, plotly_base64
 from lab.report.geometry import frame_layout, lines_of_vectors
 
 SHOWN = 40  # rows of the chart: those that changed, and the most significant of the rest
@@ -49,9 +49,7 @@ def significances(comparison: ComparisonResult) -> Figure | None:
         "data": [bars],
         "layout": layout(
             70 + 17 * len(rows),
-            xaxis=axis(
-                "significance, sigma", type="log", range=[float(np.log10(LEAST_SIGMA)), float(np.log10(1.3 * high))]
-            ),
+            xaxis=log_axis("significance, sigma", [LEAST_SIGMA, high]),
             yaxis=axis("", automargin=True, tickfont={"size": 10}),
             shapes=[
                 {

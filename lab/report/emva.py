@@ -17,10 +17,10 @@ from lab.errors import NotDetermined
 from lab.fit.noise.pixel_maps import pixel_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelNoise, Emva1288, Emva1288Points, FitResult, NoiseFit, PixelDefects
-from lab.formats.results.words import measured
+from lab.formats.results.words import measured, plain_number
 from lab.measure.dark_pixels import stack_of
 from lab.measure.stated_light import light_of
-from lab.report.charts import AFTER, BEFORE, CHANNEL, Figure, Trace, axis, layout
+from lab.report.charts import AFTER, BEFORE, CHANNEL, Figure, Trace, axis, error_bars, layout, log_axis
 from lab.report.figures import NOISE
 from lab.report.pictures import MAPS, map_picture, photograph_data_uri
 from sim.camera import Side
@@ -62,6 +62,15 @@ def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: 
         "y": list(y),
         "line": {"color": colour, "width": 1.6, "dash": dash},
     } | more
+
+
+def values_along(data: Sequence[Trace], key: str) -> list[float]:
+    """Return the coordinates `key` (x, y) of all traces, and the ends of their error bars."""
+    found = [float(value) for trace in data for value in trace[key]]
+    for trace in data:
+        std = trace.get(f"error_{key}", {}).get("array", [])
+        found += [value + sign * one for value, one in zip(trace[key], std, strict=False) for sign in (-1.0, 1.0)]
+    return found
 
 
 def floats(values: NDArray[np.floating[Any]]) -> list[float]:
@@ -176,7 +185,7 @@ def _spectrogram(name: str, image: FloatArray, left: float, unit: str) -> EmvaPl
             "layout": layout(
                 320,
                 xaxis=axis("frequency, cycles/px", range=[0.0, 0.5]),
-                yaxis=axis(f"rms amplitude, {unit}", type="log"),
+                yaxis=log_axis(f"rms amplitude, {unit}", values_along(data, "y")),
                 margin={"l": 56, "r": 14, "t": 46, "b": 44},
             ),
         },
@@ -221,9 +230,9 @@ def _histogram(name: str, image: FloatArray, left: float, unit: str, step: float
             "layout": layout(
                 320,
                 xaxis=axis(f"deviation from the mean, {unit}", domain=[0.0, 0.47]),
-                yaxis=axis("pixels", type="log", range=[-0.3, float(np.log10(max(counts.max(), 2))) + 0.3]),
+                yaxis=log_axis("pixels", [1.0, *floats(counts.astype(float))]),
                 xaxis2=axis(f"absolute deviation, {unit}", domain=[0.58, 1.0], anchor="y2", rangemode="tozero"),
-                yaxis2=axis("share of pixels, %", type="log", anchor="x2"),
+                yaxis2=log_axis("share of pixels, %", [100.0 / moduli.size, 100.0], anchor="x2"),
                 margin={"l": 56, "r": 14, "t": 46, "b": 44},
             ),
         },
@@ -294,7 +303,14 @@ def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
         "Photon transfer",
         {
             "data": [
-                markers("measured", floats(signal), floats(excess), colour),
+                markers(
+                    "measured",
+                    floats(signal),
+                    floats(excess),
+                    colour,
+                    error_x=error_bars(points.signal_dn_std, colour),
+                    error_y=error_bars(points.excess_variance_dn2_std, colour),
+                ),
                 curve(
                     f"K = {measured(own.system_gain_dn_per_e, own.system_gain_dn_per_e_std, 'DN/e')}",
                     [0.0, 0.7 * top],
@@ -326,7 +342,13 @@ def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
             "Responsivity",
             {
                 "data": [
-                    markers("measured", floats(light), floats(signal), colour),
+                    markers(
+                        "measured",
+                        floats(light),
+                        floats(signal),
+                        colour,
+                        error_y=error_bars(points.signal_dn_std, colour),
+                    ),
                     curve(
                         f"R = {measured(slope, own.responsivity_dn_per_photon_std, 'DN/photon')}",
                         [0.0, reach],
@@ -362,6 +384,11 @@ def _snr(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> E
             else light <= (own.saturation_capacity_photons or np.inf)
         )
     noise = np.sqrt(np.where(seen, points.variance_dn2, 1.0))
+    snr, snr_std = signal[seen] / noise[seen], np.zeros(int(seen.sum()))
+    if points.signal_dn_std:
+        of_signal = np.array(points.signal_dn_std)[seen] / signal[seen]
+        of_variance = np.array(points.excess_variance_dn2_std)[seen] / noise[seen] ** 2
+        snr_std = snr * np.hypot(of_signal, 0.5 * of_variance)
     dark_e = own.temporal_dark_noise_dn / gain if own.temporal_dark_noise_dn is not None else 0.0
     first = own.sensitivity_threshold_photons if photons else own.sensitivity_threshold_e
     full = own.saturation_capacity_photons if photons else own.saturation_capacity_e
@@ -370,7 +397,7 @@ def _snr(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> E
     electrons = efficiency * at
     model = electrons / np.sqrt(dark_e**2 + electrons)
     data = [
-        markers("measured", floats(x[seen]), floats(signal[seen] / noise[seen]), colour),
+        markers("measured", floats(x[seen]), floats(snr), colour, error_y=error_bars(floats(snr_std), colour)),
         curve("linear model", floats(at), floats(model), "@fg"),
     ]
     if own.dsnu_e is not None and own.prnu_percent is not None:
@@ -391,8 +418,8 @@ def _snr(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> E
             "data": data,
             "layout": layout(
                 340,
-                xaxis=axis(label, type="log"),
-                yaxis=axis("SNR", type="log"),
+                xaxis=log_axis(label, values_along(data, "x")),
+                yaxis=log_axis("SNR", values_along(data, "y")),
                 margin={"l": 56, "r": 14, "t": 46, "b": 44},
             ),
         },
@@ -411,6 +438,11 @@ def _linearity(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str
     x = light[at]
     # The line's own values: signal = line (1 + deviation).
     line = signal[at] / (1.0 + np.array(deviation, float) / 100.0)
+    deviation_std = (
+        [100.0 * points.signal_dn_std[k] / own_line for k, own_line in zip(at, line, strict=True)]
+        if (points.signal_dn_std)
+        else []
+    )
     yield EmvaPlot(
         "Linearity",
         {
@@ -424,6 +456,7 @@ def _linearity(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str
                     colour,
                     mode="markers+lines",
                     yaxis="y2",
+                    error_y=error_bars(deviation_std, colour),
                 )
                 | {"line": {"color": colour, "width": 1}, "showlegend": False},
             ],
@@ -448,7 +481,14 @@ def _dark_current(own: Emva1288, colour: str) -> Iterator[EmvaPlot]:
         "Dark signal against exposure",
         {
             "data": [
-                markers("mean", points.dark_exposure_s, points.dark_exposure_mean_dn, colour, showlegend=False),
+                markers(
+                    "mean",
+                    points.dark_exposure_s,
+                    points.dark_exposure_mean_dn,
+                    colour,
+                    showlegend=False,
+                    error_y=error_bars(points.dark_exposure_mean_dn_std, colour),
+                ),
                 markers(
                     "variance",
                     points.dark_exposure_s,
@@ -456,6 +496,7 @@ def _dark_current(own: Emva1288, colour: str) -> Iterator[EmvaPlot]:
                     BEFORE,
                     yaxis="y2",
                     showlegend=False,
+                    error_y=error_bars(points.dark_exposure_variance_dn2_std, BEFORE),
                 ),
             ],
             "layout": layout(
@@ -489,7 +530,10 @@ def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
                     }
                 ],
                 "layout": layout(
-                    310, xaxis=axis("temporal dark noise, e"), yaxis=axis("pixels", type="log"), bargap=0.05
+                    310,
+                    xaxis=axis("temporal dark noise, e"),
+                    yaxis=log_axis("pixels", [0.7, *spread.pixels]),
+                    bargap=0.05,
                 ),
             },
             f"Over {spread.degrees_of_freedom} degrees of freedom a pixel; median {spread.median_e:.3g} e, 99 % below "
@@ -530,7 +574,9 @@ def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
         "Dark current against temperature",
         {
             "data": data,
-            "layout": layout(310, xaxis=axis("temperature, °C"), yaxis=axis("dark current, e/s", type="log")),
+            "layout": layout(
+                310, xaxis=axis("temperature, °C"), yaxis=log_axis("dark current, e/s", values_along(data, "y"))
+            ),
         },
         caption,
         of_plane=False,
@@ -564,6 +610,10 @@ TABLE = {
     "prnu_row_percent": ("of rows", "PRNU1288.row", "%", 1.0),
     "prnu_column_percent": ("of columns", "PRNU1288.col", "%", 1.0),
     "prnu_pixel_percent": ("of pixels", "PRNU1288.pixel", "%", 1.0),
+    "light_nonuniformity_percent": ("nonuniformity of the light, highest less lowest", "ΔE", "%", 1.0),
+    "shading_percent": ("low-frequency part of the PRNU (shading)", "", "%", 1.0),
+    "row_gain_percent": ("PRNU of rows, shading removed", "", "%", 1.0),
+    "column_gain_percent": ("PRNU of columns, shading removed", "", "%", 1.0),
     "dark_current_from_mean_e_per_s": ("dark current, from means", "μ_I.mean", "e/s", 1.0),
     "dark_current_from_variance_e_per_s": ("dark current, from variances", "μ_I.var", "e/s", 1.0),
 }
@@ -624,15 +674,80 @@ def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[EmvaSheet]
                 *spatial_plots(recordings, side, own, plotted),
                 *joint_fit_plots(noise),
             ),
-            remarks=tuple(
-                remark if len(which) == len(names) else f"{', '.join(which)}: {remark}"
-                for remark, which in grouped.items()
+            remarks=(
+                *(
+                    remark if len(which) == len(names) else f"{', '.join(which)}: {remark}"
+                    for remark, which in grouped.items()
+                ),
+                *compared_estimates(noise),
             ),
             channels=tuple(noise.channels) if len(noise.channels) > 1 else (),
             channel_rows=tuple(_channel_rows(noise)),
             maps=tuple(_maps(recordings, side)),
             defects=_defect_sentence(noise.defects),
         )
+
+
+#: Field of `Emva1288` -> (field of the joint fit, why the two may differ).
+BOTH_ESTIMATES = {
+    "system_gain_dn_per_e": (
+        "conversion_gain_dn_per_e",
+        "with nonlinearity or a brighter-fatter effect, the standard's line to 70 % of saturation has another slope than "
+        "the curve has at zero signal",
+    ),
+    "quantum_efficiency": ("quantum_efficiency", "each is the responsivity over its own K"),
+    "temporal_dark_noise_e": ("read_noise_e", "each has its own K; the joint fit has the defective pixels left out"),
+    "saturation_capacity_e": (
+        "full_well_e",
+        "the standard takes the level of the largest variance, the joint fit the highest code reached",
+    ),
+    "dark_current_from_mean_e_per_s": ("dark_current_e_per_s", "each has its own K and set of pixels"),
+    "linearity_error_percent": ("linearity_error_percent", "each has its own levels and weights"),
+    "dsnu_e": ("dsnu_e", "the standard counts defective pixels"),
+    "prnu_percent": ("prnu_percent", "the standard counts shading and defective pixels"),
+}
+#: Combined standard deviations from which on a difference of two estimates is worth a line of its own.
+APART_SIGMA = 2.0
+
+
+def compared_estimates(noise: NoiseFit) -> Iterator[str]:
+    """Yield by how much the standard's figures and the joint fit's differ, in per cent and in combined standard
+    deviations (which are too large where both use the same noise), and why they may: the system gain always, the
+    others where they are apart."""
+    for plane, own in noise.emva1288.items():
+        joint = noise.channels.get(plane[0], noise)
+        for field, (other, why) in BOTH_ESTIMATES.items():
+            scale = 10.0 ** ((noise.gain_db or 0.0) / 20.0) if other == "conversion_gain_dn_per_e" else 1.0
+            first, first_std = getattr(own, field), getattr(own, f"{field}_std")
+            source = joint if other in type(joint).model_fields else noise
+            second, second_std = getattr(source, other), getattr(source, f"{other}_std")
+            if not first or not second or not first_std or not second_std:
+                continue
+            second, second_std = scale * second, scale * second_std
+            sigma = abs(first - second) / float(np.hypot(first_std, second_std))
+            if sigma < APART_SIGMA and field != "system_gain_dn_per_e":
+                continue
+            name, unit = NOISE[other]
+            yield (
+                f"two estimates of the {name} ({plane}): EMVA 1288 {measured(first, first_std, unit)}, joint fit "
+                f"{measured(second, second_std, unit)}, {_percent(first / second - 1.0)} % or {sigma:.1f} combined "
+                f"standard deviations apart: {why}"
+            )
+        mean, variance = own.dark_current_from_mean_e_per_s, own.dark_current_from_variance_e_per_s
+        stds = own.dark_current_from_mean_e_per_s_std, own.dark_current_from_variance_e_per_s_std
+        if mean is not None and variance is not None and stds[0] is not None and stds[1] is not None:
+            sigma = abs(mean - variance) / float(np.hypot(stds[0], stds[1]))
+            if sigma >= APART_SIGMA:
+                yield (
+                    f"two estimates of the dark current ({plane}): from means {measured(mean, stds[0], 'e/s')}, from "
+                    f"variances {measured(variance, stds[1], 'e/s')}, {sigma:.1f} combined standard deviations apart: "
+                    "a black level that follows the exposure moves the means alone, excess noise the variances alone"
+                )
+
+
+def _percent(share: float) -> str:
+    """Return a signed share in per cent, to two digits and without a power of ten."""
+    return f"{'-' if share < 0 else '+'}{plain_number(abs(100.0 * share), 2)}"
 
 
 def table_rows(found: dict[str, Emva1288]) -> Iterator[EmvaRow]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lab.errors import InputError
+from lab.errors import cannot_write
 from lab.fit.noise.pixel_maps import PixelMaps
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import DataSheet
@@ -180,5 +180,5 @@ def write_maps(folder: Path, maps: PixelMaps) -> tuple[str, ...]:
                 partial.write_bytes(content)
             names.append(name)
     except OSError as error:
-        raise InputError(f"{folder}: can't be written ({error.strerror}); name a folder that is yours") from error
+        raise cannot_write(folder, error, "name another folder") from error
     return tuple(names)

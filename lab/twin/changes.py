@@ -120,6 +120,10 @@ def carried(content: CameraFile, changes: Changes) -> CameraFile:
             )
     if changes.distance_mm is not None:
         focal_mm = content.camera.lens.focal_length_mm
+        if focal_mm is None:
+            raise InputError(
+                f"distance_mm={changes.distance_mm:g}: the model's focal length isn't known; state focal_length_mm"
+            )
         if changes.distance_mm <= 2.0 * focal_mm:
             raise InputError(
                 f"distance_mm={changes.distance_mm:g}: isn't above twice the focal length, {focal_mm:g} mm; give a "
@@ -155,5 +159,6 @@ def light_factor(content: CameraFile, changes: Changes) -> float:
     if changes.distance_mm is None:
         return factor
     lens = content.camera.lens
-    magnification = lens.focal_length_mm / (changes.distance_mm - lens.focal_length_mm)
+    focal_mm = lens.known_focal_length_mm
+    magnification = focal_mm / (changes.distance_mm - focal_mm)
     return float(factor * irradiance_factor(lens.f_number, magnification) / irradiance_factor(lens.f_number))

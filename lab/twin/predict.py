@@ -32,6 +32,7 @@ from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
 from lab.measure.noise_figures import BLACK_FLOOR_DN, USUAL_LAMP, NoiseFigures
 from lab.measure.patches import reflectance_covariance
+from lab.measure.rounding import QUANTISATION_DN2
 from lab.measure.study import Study
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.changes import Changes, carried, doubling_std_c, reference_temperature_c
@@ -277,12 +278,13 @@ def _study(
     if now_c is not None and reference_c is not None and camera.dark_current_doubling_c is not None:
         rise = now_c - reference_c
         growth_std = abs(np.log(2.0) * rise / camera.dark_current_doubling_c**2) * doubling_std_c(content)
+    rounding_dn2 = QUANTISATION_DN2 * first.code_step_dn**2
     noise = NoiseFigures(
         black=camera.black_level_dn, dark_dn_per_s=dark * gain, dark_c=reference_c, gain=gain, gain_is_known=True,
-        read_dn=float(np.hypot(np.sqrt(max(first.read_noise_dn**2 - 1.0 / 12.0, 0.0)) * amplified, 12.0**-0.5)),
+        read_dn=float(np.sqrt(max(first.read_noise_dn**2 - rounding_dn2, 0.0) * amplified**2 + rounding_dn2)),
         prnu=0.01 * camera.prnu_percent, jitter_dn=max(first.level_jitter_dn, BLACK_FLOOR_DN), jitter_freedom=0.0,
         jitter_lamp=first.lamp_jitter, black_std=first.black_level_std_dn,
-        dark_std=first.dark_current_std_dn_per_s * amplified * growth,
+        dark_std=first.dark_current_std_dn_per_s * amplified * growth, step_dn=first.code_step_dn,
     )  # fmt: skip
     seen: CameraModel = camera.model_copy(
         update={

@@ -80,7 +80,7 @@ class SidePrediction(Frozen):
 
     camera: DataSheet
     captures: tuple[AnyCapture, ...]
-    lens: dict[str, float]
+    lens: dict[str, float | None]
     numbers: tuple[PredictedNumber, ...]
     covariance: tuple[float, ...]
     names: tuple[PredictedName, ...] = ()

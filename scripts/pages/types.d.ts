@@ -44,7 +44,7 @@ declare global {
   interface DocumentEventMap {
     "logged-out": Event;
     connection: CustomEvent<boolean>;
-    "session-progress": CustomEvent<{ id: string; words: string; asks?: Model<"Question"> | null }>;
+    "session-progress": CustomEvent<{ id: string; words: string; done: number; total: number; asks?: Model<"Question"> | null }>;
   }
 
   type Scope = Model<"Me">["scope"];

@@ -165,16 +165,20 @@ def from_axis_um(x_um: ArrayLike, y_um: ArrayLike, camera: CameraModel) -> tuple
 
 
 def sin_theta(camera: CameraModel, row: ArrayLike, col: ArrayLike) -> FloatArray:
-    """Sine of the chief ray's angle atan(r / focal length) at the sensor, for points in px that broadcast."""
+    """Sine of the chief ray's angle atan(r / focal length) at the sensor, for points in px that broadcast; 0 where the
+    focal length isn't known."""
+    focal_mm = camera.lens.focal_length_mm
+    if focal_mm is None:
+        return np.zeros(np.broadcast_shapes(np.shape(row), np.shape(col)))
     row0, col0 = optical_axis_px(camera)
     pitch_mm = camera.pixel_pitch_um * 1e-3
     square = ((np.asarray(row, float) - row0) ** 2 + (np.asarray(col, float) - col0) ** 2) * pitch_mm**2
-    return np.sqrt(square / (square + camera.lens.focal_length_mm**2))
+    return np.sqrt(square / (square + focal_mm**2))
 
 
 def relative_illumination(camera: CameraModel, row: ArrayLike, col: ArrayLike) -> FloatArray:
     """Light relative to the optical axis at points in px that broadcast: by `Lens.illumination`, by cos^4 where that
-    isn't stated."""
+    isn't stated, the same everywhere where the focal length isn't known either."""
     row0, col0 = optical_axis_px(camera)
     row, col = np.asarray(row, float), np.asarray(col, float)
     law = camera.lens.illumination
@@ -186,5 +190,6 @@ def relative_illumination(camera: CameraModel, row: ArrayLike, col: ArrayLike) -
     pitch_mm = camera.pixel_pitch_um * 1e-3
     if isinstance(law, RadialIllumination):
         return law.at(pitch_mm * np.sqrt(square))
-    scale = (pitch_mm / camera.lens.focal_length_mm) ** 2
+    focal_mm = camera.lens.focal_length_mm
+    scale = 0.0 if focal_mm is None else (pitch_mm / focal_mm) ** 2
     return 1.0 / (1.0 + scale * square) ** 2

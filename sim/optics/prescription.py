@@ -33,7 +33,7 @@ class Aperture(Frozen):
 
 class GlassName(Frozen):
     """A medium as a file names it: a catalogue's glass, or a model glass by nd, Vd and the deviation of its partial
-    dispersion.
+    dispersion. Of a catalogue's glass, `index_d` and `abbe_d` are what the file states with its name, 0: nothing.
     """
 
     name: str

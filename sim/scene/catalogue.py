@@ -62,8 +62,10 @@ class View:
 
     @classmethod
     def of(cls, camera: CameraModel, distance_mm: float) -> Self:
-        """Return the view of a camera, whatever its lens's distortion."""
-        return cls(camera.rows, camera.cols, camera.pixel_pitch_um, camera.lens.focal_length_mm, distance_mm)
+        """Return the view of a camera, whatever its lens's distortion. Raises ValueError where nobody says the focal
+        length."""
+        focal_mm = camera.lens.known_focal_length_mm
+        return cls(camera.rows, camera.cols, camera.pixel_pitch_um, focal_mm, distance_mm)
 
     @property
     def magnification(self) -> float:

@@ -80,14 +80,16 @@ class Running:
 
 
 @contextmanager
-def serving(root: Path, *, limits: Limits | None = None, delay_s: float = 0.0) -> Iterator[Running]:
-    """The service in a thread of its own, with a key of each scope."""
+def serving(
+    root: Path, *, limits: Limits | None = None, delay_s: float = 0.0, keys: dict[str, str] | None = None, port: int = 0
+) -> Iterator[Running]:
+    """The service in a thread of its own, with a key of each scope: those of before, or fresh ones."""
     store, bench = Store(root), Bench(delay_s)
-    keys = {scope.value: create_key(store, scope.value, scope) for scope in Permission}
+    keys = keys or {scope.value: create_key(store, scope.value, scope) for scope in Permission}
     app = create_app(store, limits=limits, connect=bench.drivers)
     app.state.gate.failures = FailedKeys(most=1e6)  # all tests come from one address
     (store.root / "stations" / "fakes.toml").write_text(STATION)
-    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="warning", ws="none", timeout_graceful_shutdown=2))
+    server = uvicorn.Server(uvicorn.Config(app, port=port, log_level="warning", ws="none", timeout_graceful_shutdown=2))
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
@@ -105,11 +107,12 @@ def serving(root: Path, *, limits: Limits | None = None, delay_s: float = 0.0) -
 
 
 @contextmanager
-def served(data: Path, *options: str) -> Iterator[tuple[str, subprocess.Popen[str], Path]]:
-    """The service as its own process: its address, the process, the file of its output."""
+def served(data: Path, *options: str, log: Path | None = None) -> Iterator[tuple[str, subprocess.Popen[str], Path]]:
+    """The service as its own process: its address, the process, the file of its output (by default beside the
+    data)."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    output = data.with_suffix(".log")
+    output = (log or data).with_suffix(".log")
     arguments = ["serve", "--data", str(data), "--port", str(port), *options]
     with output.open("w") as file:
         code = "import sys; from lab.cli import main; sys.exit(main(sys.argv[1:]))"

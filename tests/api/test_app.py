@@ -113,8 +113,11 @@ def test_every_route_says_what_it_answers(shared: Running) -> None:
 def test_all_but_logins_and_health_state_their_security(shared: Running) -> None:
     schemes = shared.app.openapi()["components"]["securitySchemes"]
     assert schemes["key"]["scheme"] == "bearer" and schemes["login"]["in"] == "cookie"
+    assert schemes["halt"]["in"] == "cookie"
     for _, path, one in operations(shared):
         wanted = [{"key": []}, {"login": []}] if path.startswith("/api/") or path == "/metrics" else None
+        if path == "/api/v1/halt" and wanted is not None:
+            wanted = [*wanted, {"halt": []}]
         assert one.get("security") == wanted, path
 
 

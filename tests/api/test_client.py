@@ -70,7 +70,7 @@ def test_what_is_refused_is_an_exception_with_the_services_line(shared: Running)
 
 
 #: What a client of a program has no use for: the page's login.
-OF_THE_PAGE = {("POST", "/login"), ("POST", "/logout")}
+OF_THE_PAGE = {("POST", "/login"), ("POST", "/logout"), ("GET", "/halt")}
 #: Methods of the client that ask, and how; an archive's path gets the ending of the file that it is written to.
 ASKS = {"_get": "GET", "_pages": "GET", "_events": "GET", "_fetched": "GET", "_post": "POST", "_send": "POST"}
 

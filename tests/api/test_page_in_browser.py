@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import re
 import shutil
+import threading
 import zipfile
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -20,14 +21,17 @@ import pytest
 from api.client import ServiceClient
 from lab.capture.by_hand import ByHand, left_by_hand
 from lab.capture.queue import put_into_queue
-from lab.capture.station import read_station
+from lab.capture.station import Drivers, Station, read_station
 from lab.formats.camera_file import CameraFile, default_camera, write_camera
 from lab.formats.recording_set import packed
 from tests.api.conftest import STATION, Running, serving, until_state
 from tests.api.routes.test_confirm import PERSON, begun, confirm
 from tests.api.routes.test_findings import diagnosis
 from tests.lab.calibration.test_life import fitted
+from tests.lab.fake_bench import Bench
 from tests.peers import missing
+
+pytestmark = pytest.mark.extra  # drives a browser
 
 PHONE, TABLET, DESK, WIDE = ({"width": wide, "height": 860} for wide in (420, 768, 1280, 1440))
 READ_NOISE_E = (2.0, 2.01, 2.15)
@@ -38,6 +42,14 @@ DROP = """async ([name, content]) => {
     const data = new DataTransfer();
     data.items.add(new File([Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0))], name));
     document.getElementById("PLACE").dispatchEvent(new DragEvent("drop", {dataTransfer: data, bubbles: true, cancelable: true})) }"""  # noqa: E501
+#: Keeps every text that the answer of a halt ever shows.
+ALL_TEXTS = """() => { window.haltTexts = []; const place = document.getElementById("halt-told");
+    new MutationObserver(() => window.haltTexts.push(place.textContent)).observe(place, {childList: true, characterData: true, subtree: true}) }"""  # noqa: E501
+#: Has the page show what the stations' instruments have answered by now.
+REFRESH = """async () => (await import("/static/page.js")).tellHalts(await (await fetch("/api/v1/stations")).json())"""
+#: Has nothing follow the sessions that are started: a pipeline by default.
+NOTHING_FOLLOWS = """() => { const then = document.querySelector("#start-form select[name=then]");
+    window.followed = then.value; then.value = ""; then.dispatchEvent(new Event("change", {bubbles: true})) }"""
 #: The views by their addresses, and what stands in each when it is complete. Words in capitals: ids.
 VIEWS = {
     "/": "#plan-words:has-text('3 sequences')",
@@ -134,6 +146,7 @@ class Watched:
         self.page.press("input[name=key]", "Enter")
         self.page.wait_for_selector("#view-desk:not([hidden])")
         self.page.wait_for_selector("#strip li .state:not(:empty)")
+        self.page.evaluate(NOTHING_FOLLOWS)
 
     def go(self, address: str, there: str = "") -> None:
         """Go to a view; `there`: what stands in it then."""
@@ -601,6 +614,7 @@ def test_what_waits_is_edited_and_copied_with_what_follows(browser: Any, lab: Ru
     page = watched.page
     watched.log_in(lab)
     page.wait_for_selector("#plan-words:has-text('3 sequences')")
+    assert page.evaluate("window.followed") == "pipeline"  # a session that is started gets its report
     page.fill("#start-form input[name=name]", "for the night")
     page.fill("#start-form input[name=notes]", "cold #night")
     page.fill("#start-form input[name=not_before]", "2999-01-01T20:00")
@@ -733,6 +747,84 @@ def test_a_halt_is_answered_beside_its_button_also_without_a_network(browser: An
     page.wait_for_selector("#halt-told:not(.unsafe):has-text('shutter closed')")
     watched.complaints = [line for line in watched.complaints if "ERR_INTERNET_DISCONNECTED" not in line]
     watched.close()
+
+
+def test_no_station_s_answer_reads_as_that_of_all(
+    browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the shutter of the station that runs still hangs, the idle one has answered already."""
+    hangs, go_on, drivers = threading.Event(), threading.Event(), Bench.drivers
+
+    def hanging(self: Bench, asked: Station | None = None) -> Drivers:
+        made = drivers(self, asked)
+        if asked is not None and asked.name == "a bench of fakes":
+            assert made.monochromator is not None
+            stop = made.monochromator.stop
+
+            def late() -> None:
+                if halted.is_set():
+                    hangs.set()
+                    assert go_on.wait(30.0)
+                stop()
+
+            monkeypatch.setattr(made.monochromator, "stop", late)
+            monkeypatch.setattr(made.monochromator, "close_shutter", late)
+        return made
+
+    halted = threading.Event()
+    monkeypatch.setattr(Bench, "drivers", hanging)
+    with serving(tmp_path, delay_s=0.05) as running:
+        other = STATION.replace('address = "', 'address = "other ').replace("a bench of fakes", "another bench")
+        (running.store.root / "stations" / "other.toml").write_text(other)
+        watched = Watched(browser, running)
+        page = watched.page
+        watched.log_in(running)
+        page.fill("#start-form input[name=name]", "hangs")
+        page.select_option("#start-station", "fakes")
+        page.click("#start")
+        page.wait_for_selector(".station.busy progress")
+        page.evaluate(ALL_TEXTS)
+        halted.set()
+        page.keyboard.press("F9")
+        assert hangs.wait(30.0)
+        service = running.app.state.service
+        while (found := service.live.safety.find(service.station("other"))) is None or found.state != "safe":
+            page.wait_for_timeout(20)
+        page.evaluate(REFRESH)
+        page.wait_for_selector("#halt-told.unsafe:has-text('go to the bench of fakes')")
+        told = page.inner_text("#halt-told")
+        assert "other: shutter closed" in told
+        go_on.set()
+        page.wait_for_selector(
+            "#halt-told:not(.unsafe):has-text('fakes: shutter closed'):has-text('other: shutter closed')"
+        )
+        # Never one answer alone, and none without its station's name.
+        for text in page.evaluate("window.haltTexts"):
+            assert text in ("", "halting …") or all(f"{name}" in text for name in ("fakes", "other")), text
+        watched.close()
+
+
+def test_a_page_halts_after_a_restart_of_the_service(browser: Any, tmp_path: Path) -> None:
+    with serving(tmp_path) as running:
+        watched = Watched(browser, running)
+        page, keys, port = watched.page, running.keys, int(running.url.rpartition(":")[2])
+        watched.log_in(running, "operate")
+    page.wait_for_selector("#lost:has-text('No connection')")
+    with serving(tmp_path, keys=keys, port=port) as running:
+        page.wait_for_selector("#login:not([hidden])")
+        page.wait_for_selector("#halt-hint:not([hidden])")
+        running.bench.opened = True
+        assert watched.can_halt() and watched.faults() == []
+        page.keyboard.press("F9")
+        page.wait_for_selector("#halt-told:not(.unsafe):has-text('fakes: shutter closed')")
+        assert not running.bench.opened
+        watched.log_in(running, "operate")
+        assert page.is_hidden("#halt-hint")
+        page.click("#logout")
+        page.wait_for_selector("#login:not([hidden])")
+        assert page.is_hidden("#halt")
+        watched.complaints = []  # of the time without a service
+        watched.close()
 
 
 def test_a_key_that_may_only_read_gets_no_button_that_fails(browser: Any, lab: Running, ids: dict[str, str]) -> None:

@@ -43,6 +43,8 @@ def test_after_kill_9_of_the_service_the_shutter_is_closed_at_its_next_start(sta
         # Before the service was loaded, and before what it prints then.
         assert output.read_text().startswith(f"session {session_id}: its process ended without a word; its shutter was")
         assert not shutter_is_open(stations / "bench.toml")
+        known = until(client, "/api/v1/stations/bench", lambda now: now["safety"] is not None)["safety"]
+        assert (known["state"], known["shutter"]) == ("safe", "closed")
         assert client.post(f"/api/v1/sessions/{session_id}/resume").status_code == 202
         until_state(client, session_id, "finished", patience_s=60.0)
     store = Store(data)

@@ -5,9 +5,12 @@ from __future__ import annotations
 import gzip
 import io
 import tarfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from api.client import ServiceClient, ServiceProblem
@@ -152,3 +155,108 @@ def test_an_archive_that_broke_off_is_refused(running: Running, folder: Path, tm
                 client.send_recordings(archive)
             assert refused.value.status == 422, end
         assert list(client.recordings()) == []
+
+
+# --- archives as operating systems make them --------------------------------------------------------------------------
+
+
+def zipped(to: Path, files: dict[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -> Path:
+    with zipfile.ZipFile(to, "w", compression) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return to
+
+
+def frames_of(rng: np.random.Generator, shape: tuple[int, int], number: int) -> dict[str, bytes]:
+    """Dark frames with an index and a camera, as a person keeps them."""
+    files, index = {"camera.toml": b'cfa = "MONO"\nbit_depth = 12\n'}, ["frame,kind,exposure_s"]
+    for k in range(number):
+        buffer = io.BytesIO()
+        np.save(buffer, np.rint(rng.normal(100, 3, shape)).astype(np.uint16))
+        files[f"dark_{k}.npy"] = buffer.getvalue()
+        index.append(f"dark_{k}.npy,dark,{0.01 * (k + 1):g}")
+    files["index.csv"] = "\n".join(index).encode()
+    return files
+
+
+ADDED = {"__MACOSX/set/._dark_0.npy": b"\0\5\x16\7", "set/.DS_Store": b"\0\0\0\1Bud1", "set/Thumbs.db": b"\xd0\xcf"}
+
+
+@pytest.mark.parametrize("shape", [(24, 32), (40, 16), (9, 50)])
+@pytest.mark.parametrize(
+    ("name", "change", "remark"),
+    [
+        ("windows", lambda files: {f"set\\{name}": one for name, one in files.items()}, "backslashes"),
+        ("deep", lambda files: {f"a\\b\\{name}": one for name, one in files.items()}, "backslashes"),
+        ("mac", lambda files: {f"set/{name}": one for name, one in files.items()} | ADDED, "3 files that an operating"),
+        (
+            "capitals",
+            lambda files: {name.upper() if name.endswith("npy") else name: one for name, one in files.items()},
+            "dark_0.npy is taken to be DARK_0.NPY",
+        ),
+        ("plain", lambda files: files, None),
+    ],
+)
+def test_archives_of_all_systems_are_taken_and_what_was_changed_is_told(
+    shared: Running, tmp_path: Path, name: str, change: Any, remark: str | None, shape: tuple[int, int]
+) -> None:
+    files = frames_of(np.random.default_rng(shape[0]), shape, 3)
+    archive = zipped(tmp_path / f"{name}.zip", change(files))
+    query = {"format": "raw-folder"} | ({"path": "a/b"} if name == "deep" else {})
+    with shared.client("calibrate") as client:
+        headers = {"Content-Type": "application/zip"}
+        answer = client.post("/api/v1/recordings", params=query, content=archive.read_bytes(), headers=headers)
+        assert answer.status_code == 201 and answer.json()["captures"] == 3, answer.text
+        told = [line for line in answer.json()["warnings"] if "archive: " in line or "taken to be" in line]
+        assert len(told) == (remark is not None) and (remark is None or remark in told[0])
+        id = answer.json()["id"]
+        stored = client.get(f"/api/v1/recordings/{id}/captures").json()
+        fetched = [np.load(io.BytesIO(client.get(one["frame"]).content)) for one in stored]
+        expected = [np.load(io.BytesIO(files[f"dark_{k}.npy"])) for k in range(3)]
+        assert all(np.array_equal(a, b) for a, b in zip(fetched, expected, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({"..\\..\\evil.txt": b"x"}, "leads out of the archive's folder"),
+        ({"set\\..\\..\\evil.txt": b"x", "set\\a": b""}, "leads out of the archive's folder"),
+        ({"\\evil.txt": b"x"}, "it is absolute"),
+        ({"C:\\evil.txt": b"x"}, "it is absolute"),
+        ({"a/b.npy": b"x", "a\\c.npy": b"x"}, "it has a backslash"),
+        ({"a/b\x1b[2J.npy": b"x"}, "it has a control character"),
+        ({"__MACOSX/../../evil.txt": b"x"}, "leads out of the archive's folder"),
+    ],
+)
+def test_no_separator_leads_out_of_the_folder(tmp_path: Path, files: dict[str, bytes], said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        unpack(zipped(tmp_path / "a.zip", files), tmp_path / "set", MOST_BYTES, MOST_FILES)
+    assert said in str(caught.value) and "pack the files" in str(caught.value) and "\x1b" not in str(caught.value)
+    assert not (tmp_path / "set").exists() and not (tmp_path / "evil.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (lambda file: zipped(file, {"a": bytes(99)}, zipfile.ZIP_LZMA).read_bytes(), "compressed by lzma, neither"),
+        (lambda file: zipped(file, {"a": bytes(99)}, zipfile.ZIP_BZIP2).read_bytes(), "compressed by bzip2, neither"),
+        (lambda file: zipped(file, {"a": bytes(9999)}).read_bytes()[:-40], "it is cut off: the list of files"),
+        (lambda file: gzip.compress(tar_of(99))[:-30], "it is cut off before its end"),
+        (lambda file: tar_of(2000)[:1024], "it is cut off before its end"),
+        (lambda file: b"7z\xbc\xaf\x27\x1c" + bytes(99), "it is a 7-Zip archive; send a .zip"),
+        (lambda file: b"\xfd7zXZ\0" + bytes(99), "it is compressed by xz; send a .zip"),
+    ],
+)
+def test_the_cause_and_the_remedy_of_what_cannot_be_unpacked(tmp_path: Path, content: Any, said: str) -> None:
+    archive = tmp_path / "sent"
+    archive.write_bytes(content(tmp_path / "made.zip"))
+    with pytest.raises(InputError) as caught:
+        unpack(archive, tmp_path / "set", MOST_BYTES, MOST_FILES)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def tar_of(size: int) -> bytes:
+    made = io.BytesIO()
+    with tarfile.open(fileobj=made, mode="w:") as archive:
+        archive.addfile(member("a.npy", size=size), io.BytesIO(np.random.default_rng(1).bytes(size)))
+    return made.getvalue()

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.extra  # builds and installs the wheel
+
 CHECKOUT = Path(__file__).parents[2]
 PACKAGES = ("api", "drivers", "lab", "mocks", "sim")
 

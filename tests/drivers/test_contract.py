@@ -13,11 +13,21 @@ from tests.peers import missing
 
 #: Each call on a silent GigE camera takes the library seconds.
 SLOW = {("camera", "aravis")}
+#: At their other end stands another program or a maker's library.
+OTHERS = {("camera", name) for name in ("alpaca", "basler", "gentl", "gphoto2", "indi", "micromanager")} | {
+    ("light_source", name) for name in ("alpaca", "indi")
+}
+
+
+def _marks(driver: tuple[str, str]) -> list[pytest.MarkDecorator]:
+    if driver in SLOW:
+        return [pytest.mark.slow]
+    return [pytest.mark.extra] if driver in OTHERS else []
 
 
 @pytest.mark.parametrize(
     ("family", "name"),
-    [pytest.param(*one, marks=[pytest.mark.slow] if one in SLOW else []) for one in drivers()],
+    [pytest.param(*one, marks=_marks(one)) for one in drivers()],
     ids=lambda part: part,
 )
 def test_it_keeps_the_contract(family: str, name: str) -> None:

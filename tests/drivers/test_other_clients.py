@@ -39,6 +39,8 @@ from mocks.usb2000plus import PIXELS, MockUsb2000Plus, calibration_csv
 from mocks.wire import Pty, Tcp
 from tests.peers import missing
 
+pytestmark = pytest.mark.extra  # others' clients
+
 
 def client(name: str) -> Any:
     """The module of that name."""

@@ -14,6 +14,8 @@ from mocks.peers import LinePeer
 from mocks.specbos1211 import MockSpecbos1211
 from tests.peers import missing
 
+pytestmark = pytest.mark.extra  # Argyll's spotread
+
 #: Where there is no /dev/bus/usb, Argyll takes every device in /dev for a USB device, and waits for its description: at
 #: a serial line without end. So it is shown a /dev of its own: the mock's line, and a USB bus with nothing on it.
 #: It knows a line on which an instrument may be by its name.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import socket
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import serial
 
 from drivers.errors import Disconnected, InstrumentError, Interrupted, NoAnswer
 from drivers.instrument import Identity
@@ -180,3 +182,14 @@ def test_a_stop_is_not_ended_by_another_stop(line: Line) -> None:
     assert failures == []
     lamp._met = False  # its close would stop it once more
     lamp.close()
+
+
+def test_a_refused_permission_names_the_udev_rules(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise serial.SerialException(errno.EACCES, "could not open port /dev/ttyUSB0: Permission denied")
+
+    monkeypatch.setattr(serial, "serial_for_url", refuse)
+    with pytest.raises(Disconnected) as caught:
+        Transport("/dev/ttyUSB0", "toy").open()
+    assert "(Permission denied); install deploy/70-calibench.rules" in str(caught.value)
+    assert (Path(__file__).parents[2] / "deploy" / "70-calibench.rules").is_file()

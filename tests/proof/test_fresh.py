@@ -53,7 +53,7 @@ def fresh_seed() -> int:
 
 SEED = fresh_seed()
 
-pytestmark = pytest.mark.timeout(900)  # among the first that run: several diagnoses each
+pytestmark = [pytest.mark.extra, pytest.mark.timeout(900)]  # several diagnoses on a seed of the day
 
 
 def diagnosed(kind: Kind, index: int, law: type[Law] | None = None) -> tuple[Case, SaltedTruth, str, DiagnosisResult]:

@@ -42,6 +42,8 @@ from sim.camera import Side
 from sim.effects.library import effects as library
 from sim.effects.library import typical
 
+pytestmark = pytest.mark.extra  # whole sessions of the mock bench
+
 
 @pytest.mark.slow
 def test_a_weak_blur_is_settled_over_the_wire(tmp_path: Path) -> None:

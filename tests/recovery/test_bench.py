@@ -14,6 +14,8 @@ import pytest
 from mocks.truth import hidden_truth
 from sim.detection import responsivity
 
+pytestmark = pytest.mark.extra  # a whole session of the mock bench
+
 TRUTH = hidden_truth(1)  # the seed of a bench that is told none
 SIDES = ("left", "right")
 

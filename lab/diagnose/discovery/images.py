@@ -22,7 +22,6 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 Image = NDArray[np.floating]
-LEAST_NOISE_DN2 = 1.0 / 12.0  # of a frame: that of rounding
 NO_SETTING = {"id", "frame", "time", "temperature_c", "dummy_frames"}  # what repeats differ by
 LEAST_LEVELS = 2  # from which on the response's change by level is determined
 
@@ -66,20 +65,20 @@ class _Sums:
         mean, squares, below, right = every
         return cls(0, mean, 0, squares, below, right)
 
-    def add_contrast(self, away: Image) -> None:
+    def add_contrast(self, away: Image, step_dn: float) -> None:
         """Add a difference of frames with the variance of one; what rows and columns share is no part of it."""
-        away = _pixels_alone(away)
+        away = _pixels_alone(away, step_dn)
         self.contrasts += 1
         self.squares += np.square(away)
         self.below += away[:-1] * away[1:]
         self.right += away[:, :-1] * away[:, 1:]
 
 
-def _pixels_alone(away: Image) -> Image:
+def _pixels_alone(away: Image, step_dn: float = 1.0) -> Image:
     """Return a difference of frames with outlying pixels at `CLIP` standard deviations, less what rows and columns
-    share."""
+    share. `step_dn`: step of the codes."""
     away = away - np.float32(away.mean(dtype=float))  # the light may be another
-    std = robust_std(away)
+    std = robust_std(away, step_dn)
     clipped = np.clip(away, -CLIP * std, CLIP * std)
     clipped -= clipped.mean(axis=1, keepdims=True)
     clipped -= clipped.mean(axis=0, keepdims=True)
@@ -115,14 +114,14 @@ def _summed(study: Study, condition: DarkCondition) -> dict[bool, _Sums]:
         sums.frames += 1
         sums.mean += (frame - sums.mean) / np.float32(sums.frames)
         if k:
-            sums.add_contrast(away * np.float32(np.sqrt(k / (k + 1.0))))
+            sums.add_contrast(away * np.float32(np.sqrt(k / (k + 1.0))), study.step_dn)
     return own
 
 
 def _joined(study: Study, sums: Sequence[tuple[float, _Sums]]) -> DarkImages:
     """Return the images of all exposures, weighted by their noise."""
     exposure_s = np.array([t for t, _ in sums])
-    read_dn2 = max(study.noise.read_dn**2, LEAST_NOISE_DN2)
+    read_dn2 = max(study.noise.read_dn**2, study.noise.quantisation_dn2)
     shot_dn2 = study.noise.gain * max(study.noise.dark_dn_per_s, 0.0) * exposure_s
     weight = np.array([one.frames for _, one in sums]) / (read_dn2 + shot_dn2)
     weight /= weight.sum()
@@ -135,7 +134,7 @@ def _joined(study: Study, sums: Sequence[tuple[float, _Sums]]) -> DarkImages:
         by_time = weight * (exposure_s - middle) / spread
         slope = _clipped(np.tensordot(by_time.astype(np.float32), means, 1))
         offset = mean - np.float32(middle) * slope
-    images = DarkImages(_clipped(mean), _clipped(offset), slope)
+    images = DarkImages(_clipped(mean, study.step_dn), _clipped(offset, study.step_dn), slope)
     paired = [one for _, one in sums if one.contrasts and one.squares.any()]
     if not paired:
         return images
@@ -148,9 +147,9 @@ def _joined(study: Study, sums: Sequence[tuple[float, _Sums]]) -> DarkImages:
     return replace(images, variance=squares, below=below, right=right)
 
 
-def _clipped(image: Image) -> Image:
+def _clipped(image: Image, step_dn: float = 1.0) -> Image:
     """Return an image with outlying pixels at `CLIP` standard deviations from its median."""
-    middle, std = float(np.median(image)), robust_std(image)
+    middle, std = float(np.median(image)), robust_std(image, step_dn)
     return np.clip(image, middle - CLIP * std, middle + CLIP * std)
 
 

@@ -26,8 +26,8 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-#: Common divisor of all codes from which on the codes were shifted: one stuck bit gives 2, two stuck bits are taken as
-#: a shift.
+#: Step of the codes, DN, from which on they were shifted or scaled: one stuck bit gives 2, two stuck bits are taken
+#: as a shift.
 SHIFTED_FROM = 4
 LEAST_NOISE = 3.0  # standard deviation of the light's noise, codes; below, noise doesn't smooth the histogram
 LEAST_COUNT = 30.0  # of a code that is looked at
@@ -72,14 +72,6 @@ def code_block(study: Study) -> Block:
     """Code-density test of all uniform light: steps (DN) by the code, combs of a few codes' period, and the variance of
     the counts about a smooth curve."""
     counts = study.once(counted)
-    joined = int(np.bitwise_or.reduce(np.flatnonzero(sum(c.count for c in counts.values()))))
-    apart = joined & -joined  # the largest power of two that divides every code
-    if apart >= SHIFTED_FROM:
-        raise NotDetermined(
-            "code_density",
-            f"every code is a multiple of {apart}, as of a converter of {apart.bit_length() - 1} bits less whose "
-            "codes were shifted: its steps aren't judged; write the frames as they left the converter",
-        )
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
     sets: dict[bool, tuple[CodeCounts, sparse.csr_array, list[_Part]]] = {}
@@ -198,7 +190,14 @@ def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
 
 
 def counted(study: Study) -> dict[bool, _Counts]:
-    """Counts of all flat and narrowband frames without gain in dB: seen (False) and held out (True)."""
+    """Counts of all flat and narrowband frames without gain in dB: seen (False) and held out (True). Raises
+    NotDetermined where codes lie `SHIFTED_FROM` or more apart."""
+    if study.step_dn >= SHIFTED_FROM:
+        raise NotDetermined(
+            "code_density",
+            f"codes lie {study.step_dn:.5g} DN apart, as those of fewer bits that were shifted or scaled: their steps "
+            "aren't judged; write the frames as they left the converter",
+        )
     size = int(study.camera.white_level_dn) + 1
     counts = {out: _Counts(np.zeros(size), np.zeros(size), [], []) for out in (False, True)}
     out = set(study.once(held_out_flats))

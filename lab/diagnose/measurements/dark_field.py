@@ -52,7 +52,7 @@ def dark_field_block(study: Study) -> Block:
     pattern += (row[:, None] == row) * line_dn2["rows"] * rows / study.camera.rows
     pattern += (col[:, None] == col) * line_dn2["columns"] * cols / study.camera.cols
     covariance = np.kron(np.ones((len(points), len(points))), pattern) + np.diag(
-        np.repeat(changing, count) + CELL_FLOOR_DN**2
+        np.repeat(changing, count) + (CELL_FLOOR_DN * study.step_dn) ** 2
     )
     exposures = np.array([f.condition.exposure_s for f, *_ in points])
     half = 0.5 * np.hypot(rows, cols)

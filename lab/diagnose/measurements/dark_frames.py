@@ -196,12 +196,12 @@ def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDA
         held_out = k >= len(condition.seen)
         frame -= np.float32(level)
         if k:
-            changing.setdefault(held_out, _Contrasts(mean.shape)).add(
+            changing.setdefault(held_out, _Contrasts(mean.shape, study.step_dn)).add(
                 (frame - mean) * np.float32(np.sqrt(k / (k + 1.0)))
             )
         mean += (frame - mean) / np.float32(k + 1)
         if with_pattern:
-            fixed.setdefault(held_out, _Mean(mean.shape)).add(frame, capture.id)
+            fixed.setdefault(held_out, _Mean(mean.shape, study.step_dn)).add(frame, capture.id)
     return DarkStatistics(
         condition,
         means,
@@ -214,7 +214,8 @@ class _Contrasts:
     """What contrasts tell of the temporal noise. They are added one by one and not kept: a condition may have hundreds
     of frames."""
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
+    def __init__(self, shape: tuple[int, ...], step_dn: float) -> None:
+        self._step_dn = step_dn
         self._squares: Image = np.zeros(shape, np.float32)  # sum of squared contrasts without row and column noise
         self._variance: list[float] = []
         self._pixel: list[float] = []
@@ -225,13 +226,13 @@ class _Contrasts:
         self._along: dict[Lines, list[tuple[FloatArray, FloatArray, FloatArray]]] = {"rows": [], "columns": []}
 
     def add(self, contrast: Image) -> None:
-        std = robust_std(contrast)
+        std = robust_std(contrast, self._step_dn)
         cut = np.clip(contrast, -CLIP * std, CLIP * std)
         rest, spare = without_lines(contrast, cut)
         for lines, value in spare.items():
             self._excess[lines].append(value)
         self._variance.append(float(np.mean(np.square(cut), dtype=np.float64)))
-        own = robust_std(rest)
+        own = robust_std(rest, self._step_dn)
         self._pixel.append(float(np.mean(np.square(np.clip(rest, -CLIP * own, CLIP * own)), dtype=np.float64)))
         self._squares += np.square(rest)
         self._cells.append(float(np.mean(np.square(cell_means(cut)))))
@@ -260,7 +261,8 @@ class _Contrasts:
 class _Mean:
     """The mean of frames that are added one by one. Only the first `MEDIAN_OF` are kept, for their median."""
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
+    def __init__(self, shape: tuple[int, ...], step_dn: float) -> None:
+        self._step_dn = step_dn
         self._total: Image = np.zeros(shape, np.float32)
         self._first: list[Image] = []
         self._captures: list[str] = []
@@ -273,19 +275,19 @@ class _Mean:
 
     def pattern(self) -> DarkPattern:
         mean = self._total / np.float32(len(self._captures))
-        return _pattern(mean, self._first, tuple(self._captures))
+        return _pattern(mean, self._first, tuple(self._captures), self._step_dn)
 
 
-def _pattern(mean: Image, part: list[Image], captures: tuple[str, ...]) -> DarkPattern:
+def _pattern(mean: Image, part: list[Image], captures: tuple[str, ...], step_dn: float) -> DarkPattern:
     """Return the fixed pattern of the mean of the frames of `captures`, and of the median of `part`, the first of
     them."""
-    away, local = from_surroundings(part)
+    away, local = from_surroundings(part, step_dn)
     z = away / local
     edges = np.array([-np.inf, -TAIL_EDGES[1], -TAIL_EDGES[0], *TAIL_EDGES, np.inf])
     counts = np.histogram(z, edges)[0].astype(float)
     low, high = np.quantile(z, [0.005, 0.995])
     # spectra and cells are of the mean frame, with defective pixels clipped
-    std = robust_std(mean)
+    std = robust_std(mean, step_dn)
     smooth = ndimage.uniform_filter(np.clip(mean, -8.0 * std, 8.0 * std), SMOOTH_PX, mode="mirror")
     spread = np.sqrt(local_variance(np.square(mean - smooth), 1))
     mean = smooth + np.clip(mean - smooth, -CLIP * spread, CLIP * spread)
@@ -344,8 +346,8 @@ def too_coarse(frames: Sequence[DarkStatistics], limit_dn: float) -> str:
     """Return the reason why dark frames of so little noise aren't judged, in one line."""
     noise = min(np.sqrt(c.pixel_dn2) for f in frames for c in f.changing.values())
     return (
-        f"the temporal noise of dark frames is {noise:.2f} DN, below the limit of {limit_dn} DN: codes are too coarse "
-        "to show how it is distributed; a higher gain would"
+        f"the temporal noise of dark frames is {noise:.2f} DN, below the limit of {limit_dn:g} DN: codes are too "
+        "coarse to show how it is distributed; a higher gain would"
     )
 
 

@@ -15,6 +15,7 @@ from lab.diagnose.measurements.line_means import LineMeans
 from lab.errors import NotDetermined
 from lab.measure.noise_figures import BLACK_FLOOR_DN, STATED_BLACK_DN, STATED_BLACK_SHARE
 from lab.measure.reads import DARK_CURRENT, LAG, LINES
+from lab.measure.rounding import QUANTISATION_DN2
 from lab.measure.study import Study
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
@@ -80,7 +81,8 @@ def dark_level_block(study: Study) -> Block:
         return Prediction(mean, study.free_offsets(exposures) | lines.jacobian(effects))
 
     # noise of less than about half a code doesn't dither: rounding moves the mean, by its place between two codes
-    coarse = np.array([_rounding_dn(f) for f in frames for _ in f.condition.captures])
+    coarse = np.array([_rounding_dn(f, noise.step_dn) for f in frames for _ in f.condition.captures])
+    floor_dn = BLACK_FLOOR_DN * noise.step_dn
     same = np.array([[a[1] is b[1] for b in captures] for a in captures])
     # the coordinate of smoothness: 10 degrees count as twice the range of exposures
     reach = float(max(np.ptp(exposures), 1e-3))
@@ -92,8 +94,7 @@ def dark_level_block(study: Study) -> Block:
     )
     return Block(
         measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
-        covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse,
-        coarse),
+        covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + floor_dn**2)) + same * np.outer(coarse, coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
         reads=LAG | DARK_CURRENT | {"signal.offset_dn", "signal.exposure_offset_dn", "codes.codes"},
         scattered_by=LINES, predict=predict,
@@ -101,12 +102,14 @@ def dark_level_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _rounding_dn(frames: DarkStatistics) -> float:
-    """Largest shift of a mean by rounding, DN: exp(-2 pi^2 variance) / pi, with the variance before rounding."""
+def _rounding_dn(frames: DarkStatistics, step_dn: float) -> float:
+    """Largest shift of a mean by rounding to `step_dn`, DN: exp(-2 pi^2 variance) / pi of the step, with the variance
+    before rounding in its squares."""
     changing = next((c.variance_dn2 for c in frames.changing.values()), None)
     if changing is None:
-        return 0.1
-    return float(np.exp(-2.0 * np.pi**2 * max(changing - 1.0 / 12.0, 0.0)) / np.pi)
+        return 0.1 * step_dn
+    bare = max(changing / step_dn**2 - QUANTISATION_DN2, 0.0)
+    return float(step_dn * np.exp(-2.0 * np.pi**2 * bare) / np.pi)
 
 
 def black_level_block(study: Study) -> Block:

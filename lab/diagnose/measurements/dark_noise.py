@@ -18,7 +18,7 @@ from sim.uniform import Uniform
 
 VARIANCE_FLOOR = 0.004  # relative standard deviation of a temporal variance beside chance
 CARRIED_STD = 0.3  # relative prior standard deviation of what frames before leave: the mean level measures it
-LEAST_NOISE_DN = 0.4  # below, codes are too coarse to measure temporal noise
+LEAST_NOISE_DN = 0.4  # of codes of a step of 1 DN; below, codes are too coarse to measure temporal noise
 
 
 def dark_noise_block(study: Study) -> Block:
@@ -32,8 +32,9 @@ def dark_noise_block(study: Study) -> Block:
     if not points:
         raise NotDetermined("dark_noise", "no two dark frames of the same exposure and temperature")
     value = np.array([c.variance_dn2 for *_, c in points])
-    if np.sqrt(value.min()) < LEAST_NOISE_DN:
-        raise NotDetermined("dark_noise", too_coarse([f for f, *_ in points], LEAST_NOISE_DN))
+    least_dn = LEAST_NOISE_DN * study.step_dn
+    if np.sqrt(value.min()) < least_dn:
+        raise NotDetermined("dark_noise", too_coarse([f for f, *_ in points], least_dn))
     size = study.camera.rows * study.camera.cols
     noise = study.noise
     exposures = np.array([f.condition.exposure_s for f, *_ in points])
@@ -45,8 +46,9 @@ def dark_noise_block(study: Study) -> Block:
         ]
     )
     # noise of less than about half a code: rounding changes its variance, by the level's place between two codes
-    bare = np.maximum(value - 1.0 / 12.0, 0.0)
-    coarse = (4.0 * bare + 0.1) * np.exp(-2.0 * np.pi**2 * bare)
+    step_dn2 = noise.step_dn**2
+    bare = np.maximum(value - noise.quantisation_dn2, 0.0) / step_dn2
+    coarse = step_dn2 * (4.0 * bare + 0.1) * np.exp(-2.0 * np.pi**2 * bare)
     covariance = np.diag(
         2.0 * value**2 / (size * count) + 2.0 * lines / count + (VARIANCE_FLOOR * value) ** 2 + coarse**2
     )

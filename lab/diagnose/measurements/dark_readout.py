@@ -41,7 +41,8 @@ from sim.uniform import Uniform
 
 BANDS = 6  # of a spectrum across lines
 POWER_FLOOR = 0.02  # relative standard deviation of a band's power: a healthy read-out isn't exactly white
-LEAST_LINE_DN = 0.3  # temporal noise of a pixel below which codes are too coarse
+LEAST_FREQUENCIES = 2  # below the level band: `Bands` makes no band of fewer
+LEAST_LINE_DN = 0.3  # of codes of a step of 1 DN: temporal noise of a pixel below which codes are too coarse
 
 
 def temporal_line_block(lines: Lines, study: Study) -> Block:
@@ -52,7 +53,7 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
     """
     frames = study.once(dark_frames)
     name = "row_noise" if lines == "rows" else "column_noise"
-    fine = fine_conditions(f"dark_{name}", frames, LEAST_LINE_DN)
+    fine = fine_conditions(f"dark_{name}", frames, LEAST_LINE_DN * study.step_dn)
     parts = by_part(fine)
     frequency = next(iter(parts.values()))[0].lines[lines][0]
     # narrow bands at low frequencies tell a ripple of a few cycles a frame from correlated row noise
@@ -132,7 +133,9 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
     parity = np.array([part.parity_dn[lines] for part in first.fixed.values()])
     scatter = np.array([4.0 * _line_dn2(part, lines, length) * length / size for part in first.fixed.values()])
     # powers are squares: lines themselves have the root of the powers' correlation
-    parity_cov = np.sqrt(np.outer(scatter, scatter) * correlation) + np.eye(pieces) * CELL_FLOOR_DN**2
+    parity_cov = (
+        np.sqrt(np.outer(scatter, scatter) * correlation) + np.eye(pieces) * (CELL_FLOOR_DN * study.step_dn) ** 2
+    )
     n = len(covariance)
     whole = np.zeros((n + pieces, n + pieces))
     whole[:n, :n], whole[n:, n:] = covariance, parity_cov
@@ -188,7 +191,7 @@ def correlation_block(study: Study) -> Block:
     The means of the lines are excluded. 0 where pixels are independent. Raises NotDetermined where codes are too coarse
     or frames too small.
     """
-    fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN)
+    fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN * study.step_dn)
     value, variance, labels = [], [], []
     along: list[tuple[str, Bands, FloatArray, float]] = []  # lines, bands, frequencies, DN^2 of white noise
     for out, part in by_part(fine).items():
@@ -196,7 +199,7 @@ def correlation_block(study: Study) -> Block:
         weight = np.array([min(c.contrasts, 6) for c in part], float)
         for lines in ("rows", "columns"):
             frequency = part[0].along[lines][0]
-            if len(frequency) < 1:
+            if len(frequency) < LEAST_FREQUENCIES:
                 continue
             power = np.average([c.along[lines][1] for c in part], axis=0, weights=weight)
             modes = np.sum([c.along[lines][2] for c in part], axis=0)
@@ -212,7 +215,7 @@ def correlation_block(study: Study) -> Block:
         raise NotDetermined(
             "dark_correlation",
             f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share is measured from "
-            f"{int(np.ceil(1.0 / LEVEL_BAND[0]))} px a side on",
+            f"{int(np.ceil(LEAST_FREQUENCIES / LEVEL_BAND[0]))} px along rows or columns on",
         )
 
     def predict(effects: Effects) -> Prediction:
@@ -375,7 +378,7 @@ def dark_readout(study: Study) -> DarkReadOut | None:
         if len(condition.captures) < 2:
             continue
         lines, own, mean = _read(study, condition, step)
-        if own <= LEAST_LINE_DN**2:
+        if own <= (LEAST_LINE_DN * study.step_dn) ** 2:
             continue
         power = lines.sum(0) + (power if contrasts else 0.0)
         pixel_dn2, contrasts = pixel_dn2 + len(lines) * own, contrasts + len(lines)

@@ -88,7 +88,7 @@ def defective_pixel_block(study: Study) -> Block:
         found = []
         for (f, _, part), (moving, fixed) in zip(points, own, strict=True):
             classes = _defect_classes(Uniform(study.camera, effects), study.noise.gain, f.condition.exposure_s)
-            if moving < LEAST_COUNTED_DN:
+            if moving < LEAST_COUNTED_DN * study.step_dn:
                 classes = [c for c in classes if c.jump_dn == 0.0]
             skew = times * part.skewness * (part.spread_dn / moving) ** 3
             found.append(
@@ -120,10 +120,10 @@ def _pixel_noise(study: Study, frames: DarkStatistics, part: DarkPattern) -> tup
     """(temporal, fixed) standard deviation of single pixels, DN. fixed^2 = spread^2 of the median frame - its temporal
     variance. Of a single frame, all counts as temporal."""
     moving = next((c.pixel_dn2 for c in frames.changing.values()), None)
-    left = _order_moments(part.of_median)[1]
+    left, least = _order_moments(part.of_median)[1], 0.05 * study.step_dn
     if moving is None:
-        return max(part.spread_dn, 0.05), 0.0
-    return max(float(np.sqrt(moving)), 0.05), float(np.sqrt(max(part.spread_dn**2 - left * moving, 0.0)))
+        return max(part.spread_dn, least), 0.0
+    return max(float(np.sqrt(moving)), least), float(np.sqrt(max(part.spread_dn**2 - left * moving, 0.0)))
 
 
 def _order_moments(n: int) -> tuple[float, float]:
@@ -200,7 +200,7 @@ def flickering_pixel_block(study: Study) -> Block:
 
     Raises NotDetermined without repeats, and where codes are too coarse.
     """
-    fine = fine_conditions("flickering_pixels", study.once(dark_frames), LEAST_COUNTED_DN)
+    fine = fine_conditions("flickering_pixels", study.once(dark_frames), LEAST_COUNTED_DN * study.step_dn)
     draws = _JumpDraws.of(fine)
     parts = {out: [(k, f) for k, f in enumerate(fine) if out in f.changing] for out in by_part(fine)}
     size = study.camera.rows * study.camera.cols

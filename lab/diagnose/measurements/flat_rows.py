@@ -230,7 +230,7 @@ def _any_row_noise(study: Study, levels: Sequence[_Level]) -> DarkRowPower:
     stated_e = study.stated.read_noise_e
     read_dn2 = min(level.pixel_dn2 for level in levels)  # the darkest level's at most
     if stated_e is not None and study.noise.gain_is_known:
-        read_dn2 = min(read_dn2, (study.noise.gain * stated_e) ** 2 + 1.0 / 12.0)
+        read_dn2 = min(read_dn2, (study.noise.gain * stated_e) ** 2 + study.noise.quantisation_dn2)
     seen = [level for level in levels if not level.held_out]
     power = np.array([level.power for level in seen])  # (levels, bands)
     design = np.array([[level.row_share, 1.0 / level.variance] for level in seen])

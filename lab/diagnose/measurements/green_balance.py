@@ -158,7 +158,7 @@ def _by_level(study: Study, levels: Sequence[FlatLevel], rows_dn2: float) -> lis
         signal = u.mean["G2"]
         if signal <= 0:
             continue
-        dn2 = (_shot_dn2(study, signal) + rows_dn2) / len(u.ratios) + 2.0 * BLACK_FLOOR_DN**2
+        dn2 = (_shot_dn2(study, signal) + rows_dn2) / len(u.ratios) + 2.0 * (BLACK_FLOOR_DN * study.step_dn) ** 2
         std = float(np.sqrt(dn2)) / signal
         c = u.captures[0]
         mean = {"R": u.mean["R"], "G": 0.5 * (u.mean["G1"] + signal), "B": u.mean["B"]}
@@ -182,7 +182,7 @@ def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
             signal = own["G2"]
             if signal < 5.0:
                 continue
-            dn2 = _shot_dn2(study, signal) + rows_dn2 + 2.0 * BLACK_FLOOR_DN**2
+            dn2 = _shot_dn2(study, signal) + rows_dn2 + 2.0 * (BLACK_FLOOR_DN * study.step_dn) ** 2
             found.append(
                 _Ratio(
                     green_ratio(study, frame), float(np.sqrt(dn2)) / signal, capture.wavelength_nm,

@@ -18,7 +18,6 @@ from lab.errors import NotDetermined
 from lab.formats.results import CameraFit, InconsistentLevel
 from lab.measure.noise_figures import RepeatedMeans, level_std, repeated_levels, steady, weighted_median
 from lab.measure.reads import DARK_CURRENT, LAG, LINES, acting
-from lab.measure.rounding import rounding_std_dn
 from lab.measure.stated_light import stated_light
 from lab.measure.study import Study, held_out_flats
 from sim.effects.base import Effects
@@ -241,7 +240,7 @@ def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], 
     repeats = (group[:, None] == group) & (channel_of[:, None] == channel_of)
     covariance = np.diag((noise.gain * signal + noise.read_dn**2) / pixels)
     covariance += repeats * np.outer(signal, signal) * LEVEL_FLOOR**2
-    rounding = rounding_std_dn(noise.spread_dn2(signal))
+    rounding = noise.rounding_std_dn(signal)
     covariance += repeats * np.outer(rounding, rounding)
     same = np.array([[a[0].id == b[0].id for b in points] for a in points])
     lamp = signal * level_std(study, groups)[group]

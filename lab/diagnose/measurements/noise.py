@@ -43,7 +43,10 @@ def variance_block(study: Study) -> Block:
     factor = np.array([p[0].gain for p in points])
     covariance = np.diag(np.square(value) * (np.square([p[4] for p in points]) + VARIANCE_FLOOR**2))
     noise = study.noise
-    rounding = [variance_rounding_std(v, (noise.prnu * level) ** 2) for v, level in zip(value, signal, strict=True)]
+    rounding = [
+        variance_rounding_std(v, (noise.prnu * level) ** 2, noise.step_dn)
+        for v, level in zip(value, signal, strict=True)
+    ]
     covariance += np.diag(np.square(rounding))
     settings = sorted(set(factor.tolist()))
 

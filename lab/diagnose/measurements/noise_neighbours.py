@@ -50,7 +50,7 @@ def neighbour_block(study: Study) -> Block:
         for r in points:
             gain = noise.gain * r.gain
             electrons = np.array([max(s, 0.0) / gain for s in r.signal.values()])
-            read = max(noise.read_dn**2 - 1.0 / 12.0, 0.1 * noise.read_dn**2) / noise.gain**2
+            read = max(noise.read_dn**2 - noise.quantisation_dn2, 0.1 * noise.read_dn**2) / noise.gain**2
             parts.append(
                 correlations(
                     camera.cfa,
@@ -58,7 +58,7 @@ def neighbour_block(study: Study) -> Block:
                     np.maximum(model.shot_e2(electrons), 0.0),
                     solve_passed_share(model.neighbour_correlation(electrons)),
                     read,
-                    1.0 / 12.0 / gain**2,
+                    noise.quantisation_dn2 / gain**2,
                     kernel,
                     read_kernel,
                 )

@@ -20,7 +20,6 @@ from lab.errors import NotDetermined
 from lab.measure.patches import Surroundings, halo_light, harmonics
 from lab.measure.plane_means import channel_pixels
 from lab.measure.reads import REFLECTIONS, SHOWN, acting
-from lab.measure.rounding import rounding_std_dn
 from lab.measure.study import Study, held_out_of, mean_frame
 from sim.camera import CameraModel
 from sim.effects.base import Effects
@@ -196,7 +195,7 @@ def _dark_squares(
                          added, use, Surroundings.of(harmonics(added), use), 0.5 * float(endless - ends),
                          means[0] - means[1], float(full[bright].mean()),
                          float(black[plane][use].mean()) - noise.black,
-                         float(np.linalg.norm(rounding_std_dn(noise.spread_dn2(lights)))))
+                         float(np.linalg.norm(noise.rounding_std_dn(lights))))
         )  # fmt: skip
     return found
 

@@ -28,7 +28,6 @@ from lab.measure.edge_finding import Region
 from lab.measure.edge_mtf import ROUGHNESS_SHARE, EdgeGeometry, EdgeMtf
 from lab.measure.edges import check_phases, find_edges, measure_edge
 from lab.measure.reads import acting
-from lab.measure.rounding import rounding_waves_dn
 from lab.measure.study import Study, held_out_of
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
@@ -273,18 +272,17 @@ class MeasuredEdge:
 def measured_edges(study: Study, kind: type[EdgeCapture]) -> list[MeasuredEdge]:
     """All edges of the captures of a kind, by region and channel. Edges are searched for where no region is stated.
 
-    Raises NotDetermined where f-number or pixel pitch isn't stated, without slanted-edge captures, and where no edge is
-    measured."""
+    Raises NotDetermined, with the name of the kind, where f-number or pixel pitch isn't stated, without captures of
+    the kind, and where no edge is measured."""
+    step = (SLANTED_EDGE if kind is SlantedEdgeCapture else STOPPED_EDGE).name
     if not study.diffraction_is_known:
-        raise NotDetermined(
-            "slanted_edge", "f-number or pixel pitch isn't stated: no diffraction to hold the edges against"
-        )
+        raise NotDetermined(step, "f-number or pixel pitch isn't stated: no diffraction to hold the edges against")
     groups = study.groups(
         kind,
         lambda c: (f_number_of(c), c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm),
     )
     if not groups:
-        raise NotDetermined("slanted_edge", "no slanted-edge captures")
+        raise NotDetermined(step, f"no {step} captures")
     edges: list[MeasuredEdge] = []
     reasons = []
     for i, group in enumerate(groups):
@@ -299,7 +297,7 @@ def measured_edges(study: Study, kind: type[EdgeCapture]) -> list[MeasuredEdge]:
                 for region in regions:
                     try:
                         measured = measure_edge(study.recordings, part, channel, None, PLAIN, region)
-                        check_phases("slanted_edge", study.stated.cfa, channel, region, measured.angle_deg)
+                        check_phases(step, study.stated.cfa, channel, region, measured.angle_deg)
                     except NotDetermined as refused:
                         reasons.append(refused.reason)
                         continue
@@ -309,7 +307,7 @@ def measured_edges(study: Study, kind: type[EdgeCapture]) -> list[MeasuredEdge]:
                         MeasuredEdge(tuple(part), channel, measured, part[0].id in out, region, direction, share)
                     )  # fmt: skip
     if not edges:
-        raise NotDetermined("slanted_edge", reasons[0])
+        raise NotDetermined(step, reasons[0])
     return edges
 
 
@@ -536,7 +534,7 @@ class _Edges:
         """
         contrast = np.array([e.measured.light_level - e.measured.dark_level for e in self.edges])[:, None]
         level_dn = np.maximum(self._light_profile * contrast, 0.0)
-        waves = rounding_waves_dn(level_dn, self._study.noise.spread_dn2(level_dn))
+        waves = self._study.noise.rounding_waves_dn(level_dn)
         base = self.predict(())
         return np.array([self._numbers(self._reported((), wave / contrast)) - base for wave in waves]).reshape(
             -1, *base.shape

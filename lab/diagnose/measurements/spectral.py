@@ -19,7 +19,6 @@ from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_
 from lab.errors import NotDetermined
 from lab.measure.patches import Patch, halo_light, patch_covariance, patch_levels
 from lab.measure.reads import DARK_CURRENT, LAG, LINES, acting
-from lab.measure.rounding import rounding_std_dn
 from lab.measure.study import Study, held_out_of
 from sim.effects.base import Effect, Effects
 from sim.point import even_share, wide_contrast
@@ -318,7 +317,7 @@ def _narrowband_covariance(
     frame = np.array([c.id for c, *_ in points])
     setting = np.array([f"{c.wavelength_nm} {c.exposure_s} {channel}" for c, channel, *_ in points])
     reading = np.array([c.radiance for c, *_ in points])
-    digits = rounding_std_dn(noise.spread_dn2(signal))
+    digits = noise.rounding_std_dn(signal)
     own = np.sqrt((NARROWBAND_FLOOR * signal) ** 2 + rounded**2 + digits**2)
     expected = curves.rates(()) * exposures
     radiometer = signal * _reading_std(points, signal, shot, expected)

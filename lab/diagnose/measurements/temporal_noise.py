@@ -115,7 +115,7 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
     correlation = _correlations(frames, freedom, cfa)
     covariance = independent_correlations(first.shape, freedom, cfa)[1]
     clean = {name: share < 0.1 * CLIPPED_SHARE for name, share in clipped.items()}
-    moving = min(variance.values()) > LEAST_DN2
+    moving = min(variance.values()) > LEAST_DN2 * study.step_dn**2
     if not (moving and (all(clean.values()) or not lit)):
         correlation = np.full(len(PAIRS), np.nan)
     # correlation of the noise widens the standard deviations

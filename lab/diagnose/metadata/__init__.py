@@ -1,7 +1,8 @@
 """Misstated metadata: statements about a camera or its captures that the recordings contradict.
 
 They are looked for before any effect, as a wrong statement would be taken for physics. A finding is reported with the
-value that the recordings fit, and the diagnosis continues with that value.
+value that the recordings fit, and the diagnosis continues with that value. Frames or lights that seem exchanged are
+left out: the exchange is proposed and not made.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ _CHECKS = (
 def misstatements(
     recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
 ) -> tuple[RecordingSet, tuple[Misstatement, ...]]:
-    """Return the recordings with wrong statements of a side replaced by the values that fit, and what was replaced."""
+    """Return the recordings with wrong statements of a side replaced by the values that fit, less the captures that
+    contradict theirs without such a value; and the findings."""
     found: list[Misstatement] = []
     for check in _CHECKS:
         one = check(recordings, side, policy)

@@ -17,14 +17,15 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.dark_frames import TEMPERATURE_STEP_C
 from lab.diagnose.measurements.dark_level import BLACK_LEVEL, DARK
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
-from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
+from lab.diagnose.metadata.misstatement import LEFT_OUT, Misstatement, restated_camera
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.formats.recording_set.files import Frame
 from lab.formats.results import Skipped
+from lab.measure.code_step import find_code_step
 from lab.measure.level_lines import DARKER_SHARE
 from lab.measure.mishaps import exchanged_frames
-from lab.measure.rounding import rounding_std_dn
+from lab.measure.rounding import QUANTISATION_DN2, rounding_std_dn
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
@@ -73,7 +74,8 @@ def misstated_exposure_unit(
 def misplaced_frames(
     recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
 ) -> Misstatement | None:
-    """Pairs of darks and flats that hold each other's frames (`lab.measure.mishaps`); None where none is found."""
+    """Pairs of darks and flats that seem to hold each other's frames (`lab.measure.mishaps`); None where none is
+    found. They are left out."""
     found = exchanged_frames(recordings, side)
     if found is None:
         return None
@@ -87,7 +89,8 @@ def misplaced_frames(
         chi2_corrected=0.0,
         n=len(every),
         captures=found.captures,
-        corrected=found.corrected,
+        corrected=recordings.without(set(found.captures)),
+        correction=LEFT_OUT,
     )
 
 
@@ -122,6 +125,7 @@ def exchanged_kinds(
         n=1,
         captures=captures,
         corrected=recordings.without(set(captures)),
+        correction=LEFT_OUT,
     )
 
 
@@ -184,7 +188,6 @@ def misstated_bit_depth(
 
 LEAST_EXPOSURES, LEAST_REPEATS = 3, 2  # of dark frames: a line has two numbers, and repeats tell the scatter
 FLOOR_DN = 0.02  # standard deviation of an exposure's mean dark level beside the scatter of its repeats
-ROUNDED_DN2 = 1.0 / 12.0  # variance of a pixel by rounding, its least
 
 
 @dataclass(frozen=True)
@@ -218,9 +221,10 @@ def misstated_dark_exposure(
     levels, count = np.unique(exposure, return_counts=True)
     if len(levels) < LEAST_EXPOSURES or count.min() < LEAST_REPEATS:
         return None
-    mean, noise = np.array([_mean_and_variance(recordings.frame(c)) for c in alike]).T
+    step_dn = find_code_step(recordings, side).step_dn
+    mean, noise = np.array([_mean_and_variance(recordings.frame(c), step_dn) for c in alike]).T
     table = _drifts(exposure, [c.time.timestamp() if c.time is not None else None for c in alike])
-    found = _candidates(exposure, mean, noise, table, _floor_dn(recordings, alike), policy)
+    found = _candidates(exposure, mean, noise, table, _floor_dn(recordings, alike, step_dn), policy)
     if not found:
         return None
     nearest = min(found, key=lambda one: abs(np.log(one.factor)))
@@ -254,20 +258,20 @@ def _near(temperature_c: float | None, usual_c: float) -> bool:
     return temperature_c is not None and abs(temperature_c - usual_c) <= TEMPERATURE_STEP_C
 
 
-def _mean_and_variance(frame: Frame) -> tuple[float, float]:
+def _mean_and_variance(frame: Frame, step_dn: float) -> tuple[float, float]:
     """Mean of a frame, DN, and the variance of that mean by the spread of its pixels, DN^2."""
-    return float(frame.mean()), max(float(frame.var()), ROUNDED_DN2) / frame.size
+    return float(frame.mean()), max(float(frame.var()), QUANTISATION_DN2 * step_dn**2) / frame.size
 
 
-def _floor_dn(recordings: RecordingSet, darks: Sequence[DarkCapture]) -> FloatArray:
+def _floor_dn(recordings: RecordingSet, darks: Sequence[DarkCapture], step_dn: float) -> FloatArray:
     """Standard deviation (exposures,) of a mean level beside the scatter of its repeats: rounding, where the temporal
     noise of two repeats is too small to dither, and `FLOOR_DN`."""
     before_rounding = []
     for exposure_s in sorted({c.exposure_s for c in darks}):
         one, other = [recordings.frame(c) for c in [c for c in darks if c.exposure_s == exposure_s][:2]]
         between = np.subtract(one, other, dtype=float)
-        before_rounding.append(max(0.5 * float(between.var()) - ROUNDED_DN2, 0.0))
-    return np.asarray(np.hypot(FLOOR_DN, rounding_std_dn(np.array(before_rounding))))
+        before_rounding.append(max(0.5 * float(between.var()) - QUANTISATION_DN2 * step_dn**2, 0.0))
+    return np.asarray(np.hypot(FLOOR_DN * step_dn, rounding_std_dn(np.array(before_rounding), step_dn)))
 
 
 def _drifts(exposure: FloatArray, times: list[float | None]) -> FloatArray:
@@ -391,6 +395,8 @@ def unchecked(recordings: RecordingSet, side: Side) -> Iterator[Skipped]:
         if name == own or (not name.startswith("camera ") and side == recordings.sides[0]):
             for told in one.departures:
                 yield Skipped(step="instrument_settings", side=side if name == own else None, reason=told)
+    for line in find_code_step(recordings, side).lines:
+        yield Skipped(step="code_step", side=side, reason=line)
     camera = recordings.camera(side)
     highest = 0
     for capture in recordings.captures(side=side):

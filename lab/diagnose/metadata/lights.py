@@ -5,21 +5,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.chart import ChartCapture
+from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.block import Measurement
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.measurements.spectral import CHART, NARROWBAND
-from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
+from lab.diagnose.metadata.misstatement import LEFT_OUT, Misstatement, restated_camera
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.errors import InputError
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Frame, RecordingSet
+from lab.measure.levels import darks_near
 from lab.measure.mishaps import ALIKE, alike_planes
 from lab.measure.patches import patch_boxes
 from sim.camera import CameraModel, Cfa, Side
@@ -116,9 +118,11 @@ def _rates(
 
 
 def _dark_levels(recordings: RecordingSet, side: Side) -> dict[float, float]:
-    """Exposure -> mean of its first dark frame, DN; without dark frames, 0 s -> the stated black level."""
+    """Exposure -> mean of its first dark frame, DN, of the temperature at which most lights were taken; without dark
+    frames, 0 s -> the stated black level."""
     first: dict[float, Capture] = {}
-    for dark in recordings.captures("dark", side):
+    lit = [*recordings.captures(NarrowbandCapture, side), *recordings.captures(ChartCapture, side)]
+    for dark in darks_near(recordings.captures(DarkCapture, side), lit):
         first.setdefault(dark.exposure_s, dark)
     found = {exposure_s: float(recordings.frame(dark).mean()) for exposure_s, dark in first.items()}
     return found or {0.0: recordings.camera(side).black_level_dn or 0.0}
@@ -324,13 +328,14 @@ def _told_exchange(
         shape="two stated lights contradict their captures, and each fits the other's",
         check=f"The captures {of[0]} of the {side} camera, stated with {names[0]}, fit {names[1]}, and {of[1]}, "
         f"stated with {names[1]}, fit {names[0]} "
-        f"(rms {100 * best.before:.1f} % as stated, {100 * best.after:.1f} % exchanged): exchange the two lights, or "
-        "the frames.",
+        f"(rms {100 * best.before:.1f} % as stated, {100 * best.after:.1f} % exchanged): they are left out; "
+        "if they were exchanged, exchange the two lights, or the frames.",
         chi2_stated=(best.before / typical) ** 2,
         chi2_corrected=(best.after / typical) ** 2,
         n=2,
         captures=captures,
-        corrected=_exchanged(recordings, *lights),
+        corrected=recordings.without(set(captures)),
+        correction=LEFT_OUT,
     )
 
 
@@ -340,19 +345,6 @@ def _rms(first: float, second: float) -> float:
 
 def _name(light: LitPlanes) -> str:
     return light.radiance if light.wavelength_nm is None else f"{light.wavelength_nm:g} nm"
-
-
-def _exchanged(recordings: RecordingSet, one: LitPlanes, other: LitPlanes) -> RecordingSet:
-    """Return the recordings with the statements of the two lights exchanged."""
-    keys = ("radiance", "wavelength_nm", "bandwidth_nm")
-    by_id = {c.id: c for c in recordings.manifest.captures}
-    update: dict[str, dict[str, Any]] = {}
-    for mine, theirs in ((one, other), (other, one)):
-        for number, name in enumerate(mine.captures):
-            source = by_id[theirs.captures[number % len(theirs.captures)]]
-            update[name] = {key: getattr(source, key) for key in keys if hasattr(source, key)}
-    captures = tuple(c.model_copy(update=update.get(c.id, {})) for c in recordings.manifest.captures)
-    return recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
 
 
 # --- A sensor without colour filters that is stated with a mosaic -----------------------------------------------------

@@ -10,6 +10,9 @@ from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Unexplained
 from sim.camera import Side
 
+#: What the improved model says of captures that aren't used.
+LEFT_OUT = "the captures are left out"
+
 
 @dataclass(frozen=True)
 class Misstatement:
@@ -23,7 +26,8 @@ class Misstatement:
     chi2_corrected: float  # of these, with the value that fits
     n: int
     captures: tuple[str, ...]
-    corrected: RecordingSet  # the recordings with the value that fits
+    corrected: RecordingSet  # the recordings with the value that fits, or without the captures
+    correction: str = "the value that fits is taken in its place"
 
     def told(self, side: Side) -> Unexplained:
         """Return the misstatement as an item of a result."""
@@ -38,7 +42,7 @@ class Misstatement:
             chi2_after=self.chi2_corrected,
             n=self.n,
             captures=self.captures,
-            correction="the value that fits is taken in its place",
+            correction=self.correction,
             check=self.check,
         )
 

@@ -21,7 +21,7 @@ from lab.diagnose.measurements.spectral import freed_curve
 from lab.diagnose.outcome.model_posterior import model_posterior
 from lab.errors import NotDetermined
 from lab.formats.camera_file import CameraFile
-from lab.formats.camera_model import camera_model
+from lab.formats.camera_model import camera_model, remarks_on_values
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, ResidualPicture
 from lab.formats.results.diagnosis import IN_CURVES
@@ -121,7 +121,9 @@ def improved_model(
     gain_db = most_frequent_gain_db(recordings.captures(FlatCapture, side))
     is_corrected = any(one.kind == "noise" for one in corrections)
     posterior = model_posterior(model, effects, improved, kernels, gain_db, is_corrected)
-    return CameraFile(name, improved, tuple(acting), posterior=posterior), tuple(corrections)
+    of_side = fit.cameras.get(side) if fit else None
+    remarks = () if taken else remarks_on_values(recordings.camera(side), of_side, camera)
+    return CameraFile(name, improved, tuple(acting), posterior=posterior, remarks=remarks), tuple(corrections)
 
 
 def _nearest_form(effect: Effect, estimates: Mapping[str, float]) -> Effect:

@@ -39,8 +39,11 @@ LEAST_CAPTURES = (
 )
 
 
-def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -> DiagnosisResult:
-    """One result of all sides. An effect that several sides show is one entry, with its weighted mean parameters."""
+def merged(
+    source: str, found: Sequence[SideFindings], policy: DecisionPolicy, warnings: Sequence[str] = ()
+) -> DiagnosisResult:
+    """One result of all sides. An effect that several sides show is one entry, with its weighted mean parameters.
+    `warnings`: of the fit, which the summary repeats."""
     lists = DiagnosisLists.joined([f.lists for f in found])
     effects = tuple(_named(found, policy))
     verdict: DiagnosisVerdict = "unexplained"
@@ -66,7 +69,8 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
         next_captures=offered,
         threshold=max((f.threshold for f in found if f.threshold is not None), default=None),
         false_alarm_rate=policy.false_alarm_rate if any(f.is_judged for f in found) else None,
-        summary=tuple(_summary(verdict, lists, effects, held_out, policy)),
+        summary=(*_summary(verdict, lists, effects, held_out, policy), *(f"Warning: {line}." for line in warnings)),
+        warnings=tuple(warnings),
         policy=policy.told(),
     )
 

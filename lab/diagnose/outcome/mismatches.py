@@ -35,6 +35,8 @@ from lab.formats.results import (
     VetoedName,
     ViewResiduals,
 )
+from lab.formats.results.plausible import FIGURES
+from lab.formats.results.words import measured
 from lab.measure.board_detection import MIN_CORNERS
 from lab.measure.gaussian import Gaussian, chi2
 from sim.camera import Side
@@ -400,6 +402,36 @@ def misstated_light(side: Side, fit: CameraFit | None, *, levels_are_judged: boo
     exposures = () if levels_are_judged or fit is None or fit.noise is None else fit.noise.inconsistent_levels
     wrong = (*misstated_levels(fit), *(one for one in exposures if one.light_unit == "s" and one.captures))
     return tuple(_told_light(side, level) for level in wrong)
+
+
+def impossible_efficiency(side: Side, fit: CameraFit | None) -> tuple[Unexplained, ...]:
+    """Return one item where the stated numbers of photons make more electrons than photons: a quantum efficiency above
+    1, of the camera or of its best plane, by more than its uncertainty."""
+    noise, limits = (None if fit is None else fit.noise), FIGURES["quantum_efficiency"]
+    if noise is None:
+        return ()
+    every = [(noise.quantum_efficiency, noise.quantum_efficiency_std)]
+    every += [(one.quantum_efficiency, one.quantum_efficiency_std) for one in noise.emva1288.values()]
+    found = [(value, std) for value, std in every if value is not None and std and limits.is_above(value, std)]
+    if not found:
+        return ()
+    value, std = found[0]
+    sigma = (value - 1.0) / std
+    return (
+        Unexplained(
+            side=side,
+            measurement=PHOTON_TRANSFER.name,
+            axis=PHOTON_TRANSFER.axis,
+            where=f"quantum efficiency {measured(value, std)}",
+            shape="the stated numbers of photons are fewer than the electrons",
+            significance_sigma=round(sigma, 2),
+            chi2_before=sigma**2,
+            chi2_after=0.0,
+            n=1,
+            correction="none: the quantum efficiency isn't used",
+            check="Correct the numbers of photons (of one pixel in one exposure), or record single raw frames.",
+        ),
+    )
 
 
 def _told_light(side: Side, level: InconsistentLevel) -> Unexplained:

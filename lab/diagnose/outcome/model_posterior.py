@@ -132,6 +132,7 @@ def _first(noise: NoiseFigures) -> FirstEstimates:
     return FirstEstimates(
         dark_temperature_c=noise.dark_c,
         read_noise_dn=noise.read_dn,
+        code_step_dn=noise.step_dn,
         black_level_std_dn=noise.black_std,
         dark_current_std_dn_per_s=noise.dark_std,
         level_jitter_dn=noise.jitter_dn,

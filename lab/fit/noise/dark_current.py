@@ -11,7 +11,6 @@ from lab.errors import NotDetermined
 from lab.fit.noise.evaluation import Evaluation, in_electrons, transfer_of
 from lab.formats.results import DarkCurrentLaws
 from lab.measure.level_lines import mean_and_std
-from lab.measure.rounding import HIDDEN_DN2, QUANTISATION_DN2
 from lab.measure.weighted_lines import chi2_factor, dark_line, least_squares
 from sim.parameters import Frozen
 
@@ -109,8 +108,8 @@ def temperature_law(found: Sequence[tuple[float, float, float]], gain_error: flo
 
 
 def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
-    """Read noise, e, and its standard deviation: sqrt(floor - 1/12 DN^2) / K, the floor a weighted mean over the
-    planes.
+    """Read noise, e, and its standard deviation: sqrt(floor - s^2 / 12) / K with the step s of the codes, the floor a
+    weighted mean over the planes.
 
     None where darks have no repeats, or where rounding hides the noise.
     """
@@ -119,7 +118,7 @@ def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
         if any(level.repeats > 1 for level in e.levels.darks):
             e.remarks.add(
                 "repeated dark frames are all alike: rounding hides the read noise, which is below "
-                f"{0.4 / t.gain:.2f} e"
+                f"{0.4 * e.levels.step_dn / t.gain:.2f} e"
             )
         return None, None
     count = t.floor.size
@@ -127,16 +126,16 @@ def read_noise(e: Evaluation) -> tuple[float | None, float | None]:
     weight = 1.0 / np.diag(own)
     weight /= weight.sum()
     floor = float(weight @ t.floor)
-    if floor < HIDDEN_DN2:
+    if floor < e.levels.hidden_dn2:
         e.remarks.add(
             f"the temporal noise of dark frames is {np.sqrt(max(floor, 0)):.2f} DN, where rounding hides it: the read "
             "noise is below "
-            f"{0.4 / t.gain:.2f} e; a higher gain would show it"
+            f"{0.4 * e.levels.step_dn / t.gain:.2f} e; a higher gain would show it"
         )
         return None, None
     between = float(np.sum((t.floor - floor) ** 2 / np.diag(own)))
     gradient = np.zeros(2 + count)
-    noise = float(np.sqrt(floor - QUANTISATION_DN2))
+    noise = float(np.sqrt(floor - e.levels.quantisation_dn2))
     gradient[0] = -noise / t.gain**2
     gradient[2:] = weight / (2.0 * noise * t.gain)
     widened = t.covariance.copy()
@@ -165,7 +164,7 @@ def dark_signal_hidden(e: Evaluation) -> bool:
     Where neither noise nor pattern spreads the values over codes, their means don't follow the signal.
     """
     spread = min(level.plane[name].spread for level in e.levels.darks for name in e.levels.names)
-    if spread >= HIDDEN_DN2:
+    if spread >= e.levels.hidden_dn2:
         return False
     e.remarks.add(
         f"noise and pattern of the darks spread over {np.sqrt(spread):.2f} DN only, so rounding decides their means: "
@@ -207,7 +206,9 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
         own = [level.plane[name] for level in repeated]
         variance = np.array([plane.temporal_variance for plane in own])
         std = np.array([plane.temporal_variance_std for plane in own])
-        if variance.min() < HIDDEN_DN2:
+        # a charge that drifts changes the shot noise by the gain times its change
+        std = np.hypot(std, e.transfer.gain * np.array([level.drift_std_dn for level in repeated]))
+        if variance.min() < e.levels.hidden_dn2:
             return None, None
         line = dark_line(exposure, variance, std)
         if line.rate is not None:
@@ -243,6 +244,34 @@ def dark_temperature_c(e: Evaluation) -> float | None:
     return sum(exposure_s * sensor_c for exposure_s, sensor_c in known) / total_s if total_s > 0 else None
 
 
+def remark_on_temperatures(e: Evaluation) -> None:
+    """Remark on flats that were taken at another temperature than the darks that are subtracted: more than a degree
+    apart, to which levels are grouped, and where a dark current that is significant (three standard deviations) would
+    change a mean by more than three of its own, the scatter of the light included."""
+    dark_c = dark_temperature_c(e)
+    if dark_c is None:
+        return
+    found: list[tuple[float, float, float]] = []
+    for level in e.levels.flats:
+        rise_c = 0.0 if level.temperature_c is None else level.temperature_c - dark_c
+        for name, plane in level.plane.items():
+            line = e.dark.lines[name]
+            if abs(rise_c) <= 1.0 or line.rate is None or line.rate < 3.0 * math.sqrt(line.covariance[1, 1]):
+                continue
+            signal_dn = plane.mean - line.black
+            std_dn = math.hypot(0.0 if math.isnan(plane.mean_std) else plane.mean_std, e.light_scatter * signal_dn)
+            change_dn = line.rate * level.exposure_s * (2.0 ** (rise_c / DOUBLING_C) - 1.0)
+            if abs(change_dn) > 3.0 * std_dn and signal_dn > 0.0:
+                found.append((abs(change_dn) / signal_dn, change_dn, dark_c + rise_c))
+    if found:
+        share, change_dn, flat_c = max(found)
+        e.remarks.add(
+            f"flats at {flat_c:.1f} °C have darks at {dark_c:.1f} °C subtracted: their own dark signal differs by "
+            f"{change_dn:+.2g} DN, {100.0 * share:.2g} % of the signal, if it doubles every {DOUBLING_C:g} °C; "
+            "take darks at the temperature of the flats"
+        )
+
+
 def dark_current_temperature(e: Evaluation) -> DarkCurrentLaws | None:
     """Dark current at every temperature with darks of two exposures, and the laws through those significantly above
     0.
@@ -255,6 +284,11 @@ def dark_current_temperature(e: Evaluation) -> DarkCurrentLaws | None:
         if line.rate is not None:
             std = float(np.sqrt(line.covariance[1, 1]))
             found.append((temperature, line.rate / e.transfer.gain, std / e.transfer.gain))
-            own_value = ", the value given" if temperature == e.levels.temperature_c else ""
-            e.remarks.add(f"the dark current at {temperature:g} deg C is {found[-1][1]:.4g} e/s{own_value}")
-    return temperature_law(found, e.transfer.gain_std / e.transfer.gain) if found else None
+    if not found:
+        return None
+    laws = temperature_law(found, e.transfer.gain_std / e.transfer.gain)
+    columns = (laws.temperature_c, laws.dark_current_e_per_s, laws.dark_current_e_per_s_std)
+    for temperature, current, std in zip(*columns, strict=True):
+        own_value = ", the value given" if temperature == e.levels.temperature_c else ""
+        e.remarks.add(f"the dark current at {temperature:g} deg C is {current:.4g} ± {std:.2g} e/s{own_value}")
+    return laws

@@ -16,18 +16,24 @@ import numpy as np
 from scipy import special
 
 from lab.formats.results import Emva1288, Emva1288Points
-from lab.measure.levels import BoolArray, MeasuredLevel, PlaneStatistics, SpatialVariance
+from lab.formats.results.words import measured
+from lab.measure.levels import BoolArray, MeasuredLevel, SpatialVariance
 from lab.measure.rounding import QUANTISATION_DN2
 from lab.measure.weighted_lines import DarkLine, chi2_factor, dark_line, linearity, root
 from sim.spectrum import FloatArray
 
-HIDDEN_DN2 = 0.24  # temporal variance below which rounding hides the noise
+HIDDEN_DN2 = 0.24  # temporal variance below which rounding hides the noise, of a step of the codes of 1 DN
 HIDDEN_DN = 0.40  # the limit that is stated then
 LEAST_SIGNAL = 0.01  # of the range of the line: below, the variance is that of the dark
 EXCESS_CHANCE = 0.01  # probability below which variances aren't on a straight line
 SIGNIFICANT_SIGMA = 3.0  # standard deviations by which two slopes of one line differ
 LINE_LIMIT = 0.7  # of saturation: range of responsivity and system gain
 LINEARITY_RANGE = (0.05, 0.95)  # of saturation
+#: Highest less lowest irradiance over its mean that the standard allows.
+LARGEST_NONUNIFORMITY_PERCENT = 3.0
+#: Standard deviations of what rows or columns share, from which on it is reported: of 8 such numbers (four planes),
+#: one is beyond by chance in 0.03 % of all cameras.
+LINE_SIGMA = 4.0
 SPATIAL_IMAGES = 16  # with fewer, the row and column parts contain temporal noise; the standard asks for more
 
 
@@ -39,6 +45,7 @@ class EmvaInput:
     `spatial`: levels that the spatial figures may come from, all flats where it is empty. `in_photons`: `light` counts
     photons per pixel. `saturation_dn`: signal above dark taken for saturation where the flats don't reach it.
     `variance_error`, `lamp_error`: relative errors of a temporal variance beyond sampling, and of a mean.
+    `gain_dn_per_e`: by which a drift of a dark's charge changes its variance.
     """
 
     plane: str
@@ -50,6 +57,7 @@ class EmvaInput:
     variance_error: float = 0.0
     lamp_error: float = 0.0
     spatial: tuple[MeasuredLevel, ...] = ()
+    gain_dn_per_e: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -66,7 +74,7 @@ class Measured:
 
 
 class EmvaLevels:
-    """Means and variances by level, and the same less dark, (levels,) each."""
+    """Means and variances by level, and the same less dark, (levels,) each; `step_dn`: step of the codes."""
 
     def __init__(self, given: EmvaInput) -> None:
         self.given = given
@@ -74,11 +82,15 @@ class EmvaLevels:
         own = [level.plane[given.plane] for level in self.flats]
         self.darks = [level for level in given.darks if level.repeats > 1]
         dark = [level.plane[given.plane] for level in self.darks]
+        self.step_dn = max((plane.step_dn for plane in (*own, *dark)), default=1.0)
         self.dark_exposure = np.array([level.exposure_s for level in self.darks])
         self.dark_variance = np.array([plane.temporal_variance for plane in dark])
-        self.dark_variance_std = np.array([plane.temporal_variance_std for plane in dark])
+        drift_dn = np.array([level.drift_std_dn for level in self.darks])
+        self.dark_variance_std = np.hypot(
+            np.array([plane.temporal_variance_std for plane in dark]), given.gain_dn_per_e * drift_dn
+        )
         self.dark_mean = np.array([plane.mean for plane in dark])
-        self.dark_mean_std = mean_std(dark)
+        self.dark_mean_std = np.hypot(mean_std(self.darks, given.plane), drift_dn)
         self.mean_line = dark_line(self.dark_exposure, self.dark_mean, self.dark_mean_std)
         self.variance_line = dark_line(self.dark_exposure, self.dark_variance, np.maximum(self.dark_variance_std, 1e-9))
         self.exposure = np.array([level.exposure_s for level in self.flats])
@@ -147,16 +159,19 @@ class EmvaLevels:
         return Measured(value, math.sqrt(square) / norm)
 
 
-def mean_std(planes: Sequence[PlaneStatistics]) -> FloatArray:
-    """Standard deviations of means of a plane: temporal noise and rounding, increased where repeats differ by more."""
+def mean_std(levels: Sequence[MeasuredLevel], name: str) -> FloatArray:
+    """Standard deviations of the means of a plane: temporal noise and rounding, increased where repeats differ by more
+    than by a drift."""
     noise, excess, freedom = [], 0.0, 0
-    for plane in planes:
-        variance = plane.temporal_variance if np.isfinite(plane.temporal_variance) else QUANTISATION_DN2
-        noise.append(math.sqrt(max(variance, QUANTISATION_DN2) / plane.pixels))
+    planes = [level.plane[name] for level in levels]
+    for level, plane in zip(levels, planes, strict=True):
+        least = QUANTISATION_DN2 * plane.step_dn**2
+        variance = plane.temporal_variance if np.isfinite(plane.temporal_variance) else least
+        noise.append(math.sqrt(max(variance, least) / plane.pixels))
         if plane.repeats > 1:
-            frames = np.array(plane.frame_means)
-            excess += float(np.sum((frames - frames.mean()) ** 2)) / noise[-1] ** 2
-            freedom += plane.repeats - 1
+            rest, free = level.scatter(np.array(plane.frame_means))
+            excess += float(np.sum(rest**2)) / noise[-1] ** 2
+            freedom += free
     widened = np.array(noise) * math.sqrt(chi2_factor(excess, freedom))
     repeats = np.sqrt([plane.repeats for plane in planes])
     return np.hypot(widened / repeats, [plane.mean_rounding_std for plane in planes])
@@ -222,6 +237,7 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
     found |= _dark_current(at, gain, remarks)
     stacks = _stacks(given, at, saturation, remarks)
     found |= _spatial(given.plane, stacks, gain)
+    found |= _evenness(given.plane, stacks, found, remarks)
     values_of = {name: value.value for name, value in found.items()}
     values_of |= {f"{name}_std": value.std for name, value in found.items()}
     values_of |= _calibration(at, found, remarks)
@@ -278,16 +294,22 @@ def _saturation(at: EmvaLevels, given: EmvaInput, remarks: list[str]) -> tuple[f
 def _widened_gain(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list[str]) -> Measured:
     """Return the system gain with what its line leaves of the variances in its standard deviation."""
     std = np.hypot(at.variance_std, at.below(at.dark_variance_std, None))
-    ratio = mean_ratio(at.signal[used], (at.variance - at.below_variance)[used], std[used], gain)
+    signal = at.signal[used]
+    ratio = mean_ratio(signal, (at.variance - at.below_variance)[used], std[used], gain)
     if ratio is None:
         return gain
+    # Of a variance K x (1 + a x), the line has K (1 + a A) and the mean ratio K (1 + a B), with A and B the means of x
+    # that each weighs: the line's distance from the gain at zero signal is A / (A - B) times that of the two.
+    high = signal > LEAST_SIGNAL * np.max(signal)
+    line_at, ratio_at = float(np.sum(signal**3) / np.sum(signal**2)), float(np.mean(signal[high]))
+    error = (gain.value - ratio) * line_at / max(line_at - ratio_at, 1e-9 * line_at)
     remarks.append(
         "the temporal variances don't lie on the standard's straight line by more than noise: the line has "
-        f"{gain.value:.4g} DN/e, the "
-        f"mean of variance over signal {ratio:.4g} DN/e; the difference is in the uncertainties of K and of what is "
+        f"{gain.value:.4g} DN/e, the mean of variance over signal {ratio:.4g} DN/e, a parabola at zero signal "
+        f"{gain.value - error:.4g} DN/e; the line's difference from that is in the uncertainties of K and of what is "
         "divided by it"
     )
-    return Measured(gain.value, math.hypot(gain.std, ratio - gain.value))
+    return Measured(gain.value, math.hypot(gain.std, error))
 
 
 def _responsivity(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list[str]) -> Figures:
@@ -316,16 +338,16 @@ def _dark_noise(at: EmvaLevels, gain: Measured, remarks: list[str]) -> tuple[Fig
     else:
         shortest = int(np.argmin(at.dark_exposure))
         square = Measured(float(at.dark_variance[shortest]), float(at.dark_variance_std[shortest]))
-    if square.value < HIDDEN_DN2:
-        limit_e = HIDDEN_DN / gain.value
+    hidden_dn2 = HIDDEN_DN2 * at.step_dn**2
+    if square.value < hidden_dn2:
+        limit_e = HIDDEN_DN * at.step_dn / gain.value
         remarks.append(
-            f"the dark variance is {max(square.value, 0.0):.2g} DN^2, below 0.24, where rounding hides it: the "
-            "temporal dark noise is "
-            f"below {limit_e:.3g} e"
+            f"the dark variance is {max(square.value, 0.0):.2g} DN^2, below {hidden_dn2:.3g}, where rounding hides "
+            f"it: the temporal dark noise is below {limit_e:.3g} e"
         )
         return {}, limit_e
     noise_dn = math.sqrt(square.value)
-    noise_e = math.sqrt(square.value - QUANTISATION_DN2)
+    noise_e = math.sqrt(square.value - QUANTISATION_DN2 * at.step_dn**2)
     return {
         "temporal_dark_noise_dn": Measured(noise_dn, square.std / (2.0 * noise_dn)),
         "temporal_dark_noise_e": Measured(noise_e, square.std / (2.0 * noise_e)).over(gain),
@@ -397,7 +419,7 @@ def _dark_current(at: EmvaLevels, gain: Measured, remarks: list[str]) -> Figures
         return {}
     found: Figures = {}
     mean, variance = at.mean_line, at.variance_line
-    hidden = float(at.dark_variance.min()) < HIDDEN_DN2
+    hidden = float(at.dark_variance.min()) < HIDDEN_DN2 * at.step_dn**2
     if hidden and mean.rate is not None and abs(mean.rate) < 3.0 * math.sqrt(float(mean.covariance[1, 1])):
         remarks.append("rounding hides the dark current, which the means of the darks don't show")
     elif mean.rate is not None:
@@ -466,6 +488,47 @@ def _spatial(plane: str, stacks: _Stacks, gain: Measured) -> Figures:
     return found
 
 
+def _evenness(plane: str, stacks: _Stacks, found: Figures, remarks: list[str]) -> Figures:
+    """Split the nonuniformity of the bright stack into the smooth surface and what rows and columns share without it,
+    and report light that is more uneven than the standard asks for, and gains of rows and columns."""
+    if stacks.bright is None or stacks.dark is None or "prnu_percent" not in found:
+        return {}
+    bright, dark = stacks.bright.plane[plane], stacks.dark.plane[plane]
+    if bright.pattern is None or dark.pattern is None or bright.every_pixel is None:
+        return {}
+    signal = bright.mean_of_all - dark.mean_of_all
+    span, span_std = bright.shading_span
+    uneven = Measured(100.0 * span / signal, 100.0 * span_std / signal)
+    smooth_dn = Measured(*root(bright.every_pixel.total - bright.pattern.total, bright.every_pixel.total_std))
+    shading = Measured(100.0 * smooth_dn.value / signal, 100.0 * smooth_dn.std / signal)
+    more = {"light_nonuniformity_percent": uneven, "shading_percent": shading}
+    if uneven.value - SIGNIFICANT_SIGMA * uneven.std > LARGEST_NONUNIFORMITY_PERCENT:
+        rest = _without_dark(bright.pattern.total, dark.pattern.total)
+        remarks.append(
+            f"the light is uneven by {measured(uneven.value, uneven.std, '%')} (highest less lowest over the mean), "
+            f"above the standard's limit of {LARGEST_NONUNIFORMITY_PERCENT:g} %: PRNU1288 of "
+            f"{found['prnu_percent'].value:.3g} % is {shading.value:.3g} % of shading and {100.0 * rest / signal:.4g} "
+            "% without it; light the sensor evenly, without a lens"
+        )
+    for line in ("row", "column"):
+        own, below = getattr(bright.pattern, f"{line}s"), getattr(dark.pattern, f"{line}s")
+        std = math.hypot(getattr(bright.pattern, f"{line}s_std"), getattr(dark.pattern, f"{line}s_std"))
+        gains = Measured(*(100.0 * part / signal for part in root(own - below, std)))
+        more[f"{line}_gain_percent"] = gains
+        if own - below > LINE_SIGMA * std:
+            remarks.append(
+                f"the gains of {line}s differ by {measured(gains.value, gains.std, '%')} (standard deviation, shading "
+                f"removed), {(own - below) / std:.0f} standard deviations above what independent pixels give: "
+                f"amplifiers or converters of the {line}s; correct each {line} by its own flat field"
+            )
+    return more
+
+
+def _without_dark(bright_dn2: float, dark_dn2: float) -> float:
+    """Return the standard deviation, DN, of a pattern less that of the dark."""
+    return math.sqrt(max(bright_dn2 - dark_dn2, 0.0))
+
+
 def _parts(split: SpatialVariance) -> dict[str, Measured]:
     return {
         "": Measured(split.total, split.total_std),
@@ -489,9 +552,13 @@ def _plotted(at: EmvaLevels, given: EmvaInput, deviation: FloatArray, stacks: _S
         dark_mean_dn=values_of(at.below_mean),
         dark_variance_dn2=values_of(at.below_variance),
         linearity_deviation_percent=tuple(None if np.isnan(value) else float(value) for value in deviation),
+        signal_dn_std=values_of(at.signal_std),
+        excess_variance_dn2_std=values_of(np.hypot(at.variance_std, at.below(at.dark_variance_std, None))),
         dark_exposure_s=values_of(at.dark_exposure),
         dark_exposure_mean_dn=values_of(at.dark_mean),
+        dark_exposure_mean_dn_std=values_of(at.dark_mean_std),
         dark_exposure_variance_dn2=values_of(at.dark_variance),
+        dark_exposure_variance_dn2_std=values_of(at.dark_variance_std),
         stack_dark_exposure_s=dark.exposure_s if dark is not None else None,
         stack_dark_images=dark.repeats if dark is not None else None,
         stack_light=bright.light if bright is not None else None,

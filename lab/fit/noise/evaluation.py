@@ -26,7 +26,6 @@ from lab.measure.level_lines import (
     saturation_of,
 )
 from lab.measure.levels import LEAST_REACH, MeasuredLevel, RecordedLevels, Remarks
-from lab.measure.rounding import QUANTISATION_DN2
 from lab.measure.weighted_lines import least_squares
 from sim.spectrum import FloatArray
 
@@ -357,10 +356,11 @@ def _laws(
 
 def _dark_scatter_dn(recorded: RecordedLevels, dark: DarkSignal, name: str) -> float:
     """Standard deviation of dark means about their line, DN: each flat has its own dark subtracted."""
-    if len(recorded.darks) < 4:
+    steady = [level for level in recorded.darks if level.drift is None]
+    if len(steady) < 4:
         return 0.0
     line = dark.lines[name]
-    rest = [level.plane[name].mean - line.at(level.exposure_s) for level in recorded.darks]
+    rest = [level.plane[name].mean - line.at(level.exposure_s) for level in steady]
     return float(np.sqrt(np.sum(np.square(rest)) / (len(rest) - 2)))
 
 
@@ -448,7 +448,7 @@ def lamp_drift(recorded: RecordedLevels, dark: DarkSignal, saturation: Saturatio
         frames = np.average([plane.frame_means for plane in planes], axis=0, weights=pixels)
         variance = float(np.average([plane.temporal_variance for plane in planes], weights=pixels))
         rounding = max(plane.mean_rounding_std for plane in planes)
-        noise = max(variance, QUANTISATION_DN2) / pixels.sum() + rounding**2
+        noise = max(variance, recorded.quantisation_dn2) / pixels.sum() + rounding**2
         signal = float(
             np.average([p.mean - dark.lines[n].black for p, n in zip(planes, own, strict=True)], weights=pixels)
         )
@@ -549,7 +549,9 @@ def evaluate(
     refuse_light_darks(recorded, dark)
     saturation = saturation_of(recorded, dark)
     consistency = level_consistency(recorded, dark, saturation, remarks)
-    transfer, points = transfer_of(recorded, dark, saturation, recorded.darks, consistency.series)
+    # the mean of repeats that drift isn't that of the charge behind their variance
+    steady = tuple(level for level in recorded.darks if level.drift is None)
+    transfer, points = transfer_of(recorded, dark, saturation, steady or recorded.darks, consistency.series)
     evaluation = Evaluation(recorded, dark, saturation, consistency, transfer, points, remarks)
     _remark_on_transfer(evaluation)
     return evaluation

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy import special
@@ -23,6 +23,7 @@ from lab.fit.noise.dark_current import (
     dark_signal_hidden,
     dark_temperature_c,
     read_noise,
+    remark_on_temperatures,
 )
 from lab.fit.noise.emva1288 import EmvaInput, emva1288_figures
 from lab.fit.noise.evaluation import Evaluation, evaluate, in_electrons
@@ -37,11 +38,22 @@ from lab.fit.noise.response import (
 )
 from lab.formats.cgats import TableRow, table_rows
 from lab.formats.recording_set import DataSheet, RecordingSet
-from lab.formats.results import CameraFit, ChannelNoise, Emva1288, FitResult, NoiseFit, PhotonTransfer, Skipped
+from lab.formats.results import (
+    CameraFit,
+    ChannelNoise,
+    Emva1288,
+    FitResult,
+    NoiseFit,
+    PhotonTransfer,
+    RepeatDrift,
+    Skipped,
+)
+from lab.formats.results.plausible import implausible_figures
+from lab.measure.code_step import find_code_step, under_highest_code
 from lab.measure.dark_pixels import DarkPixels, read_noise_distribution, stack_of
 from lab.measure.levels import DEFECT_SIGMA, MeasuredLevel, PlaneStatistics, defective_pixels, rounded_c
 from lab.measure.mishaps import alike_planes, copied_frames, exchanged_frames
-from lab.measure.rounding import HIDDEN_DN2, QUANTISATION_DN2
+from lab.measure.repeats import find_drifts
 from lab.measure.stated_light import StatedLight, lamps_of, light_of, most_frequent_gain_db, why_not
 from lab.measure.weighted_lines import chi2_factor, root
 from sim.camera import Side
@@ -59,8 +71,8 @@ def dsnu(e: Evaluation) -> tuple[float | None, float | None]:
     if pattern is None or dark_signal_hidden(e):
         return None, None
     level, square, std = pattern
-    if min(level.plane[name].temporal_variance for name in e.levels.names) < HIDDEN_DN2:
-        std = float(np.hypot(std, QUANTISATION_DN2))  # the mean of each pixel is rounded
+    if min(level.plane[name].temporal_variance for name in e.levels.names) < e.levels.hidden_dn2:
+        std = float(np.hypot(std, e.levels.quantisation_dn2))  # the mean of each pixel is rounded
     return in_electrons(e, *root(square, std))
 
 
@@ -173,12 +185,13 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
     remark_on_scatter(e)
     remark_on_levels(e)
     remark_on_shading(e)
+    remark_on_temperatures(e)
     principal = principal_figures(e)
+    figures: dict[str, Any] = principal | quantum_efficiency(e)
     from_variance, from_variance_std = dark_current_from_variance(e)
     dark = pixels is not None and e.levels.darks
     return NoiseFit(
-        **principal,
-        **quantum_efficiency(e),
+        **figures,
         conversion_gain_at_zero_dn_per_e=t.curve_gain * scale,
         conversion_gain_at_zero_dn_per_e_std=t.curve_gain_std * scale,
         variance_model_error_percent=100.0 * t.model_error,
@@ -252,6 +265,7 @@ def emva1288_by_plane(e: Evaluation) -> dict[str, Emva1288]:
             variance_error=e.transfer.model_error,
             lamp_error=e.light_scatter,
             spatial=tuple(level for level in e.levels.flats if level.lamp == lamp and level.light > 0),
+            gain_dn_per_e=e.transfer.gain,
         )
         own = emva1288_figures(given)
         if isinstance(own, str):
@@ -346,12 +360,12 @@ MIN_SIZE_PX = 16
 C = TypeVar("C", bound=Capture)
 
 
-def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
+def fit_noise(recordings: RecordingSet, side: Side, drifts: Sequence[RepeatDrift] | None = None) -> NoiseFit:
     """Photon transfer of one camera from its darks and flats (two repeats or more per level).
 
-    Flats and darks of the most frequent `gain_db` are used; the conversion gain is given for 0 dB. Every frame is read
-    once, and no more than one level is held in memory. Raises `NotDetermined` where the flats don't determine the
-    conversion gain. The method: `lab.fit.noise`.
+    Flats and darks of the most frequent `gain_db` are used; the conversion gain is given for 0 dB. `drifts`: of the
+    side's repeats over time, None: they are looked for. No more than one level is held in memory. Raises
+    `NotDetermined` where the flats don't determine the conversion gain. The method: `lab.fit.noise`.
     """
     camera = recordings.camera(side)
     flats = recordings.captures(FlatCapture, side)
@@ -368,12 +382,19 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
         recordings = recordings.without(copies.ids)
     exchanged = exchanged_frames(recordings, side)
     if exchanged is not None:
-        recordings = exchanged.corrected
+        recordings = recordings.without(set(exchanged.captures))
     flats = recordings.captures(FlatCapture, side)
     gain_db = most_frequent_gain_db(flats)
+    darks = recordings.captures(DarkCapture, side)
+    other_gains = _at_other_gains([*flats, *darks], gain_db)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
-    darks = [dark for dark in recordings.captures(DarkCapture, side) if (dark.gain_db or 0.0) == gain_db]
-    dark_levels, pixels = _dark_levels(recordings, darks, camera)
+    darks = [dark for dark in darks if (dark.gain_db or 0.0) == gain_db]
+    if drifts is None:
+        drifts = find_drifts(recordings, side, ("dark",))
+    code = find_code_step(recordings, side)
+    recordings = under_highest_code(recordings, side, code)
+    camera = recordings.camera(side)
+    dark_levels, pixels = _dark_levels(recordings, darks, camera, code.step_dn, drifts)
     light = light_of(flats, camera)
     lamps = _lamps_of(recordings, flats, light)
     flat_levels = [
@@ -381,7 +402,7 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
             group[0].exposure_s,
             light[group[0].id].amount,
             lamps[group[0].id],
-            stack_of(recordings, group, pixels.bad).statistics(),
+            stack_of(recordings, group, pixels.bad, code.step_dn).statistics(),
             group[0].temperature_c,
             tuple(flat.id for flat in group),
             light[group[0].id].std,
@@ -390,14 +411,29 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
         for group in _grouped(flats, lambda flat: (flat.exposure_s, light[flat.id].amount, lamps[flat.id]))
     ]
     alike = alike_planes(recordings, side)
-    mishaps = (*copies.told, *(one.told(side) for one in (exchanged, alike) if one is not None))
+    mishaps = (*other_gains, *copies.told, *(one.told(side) for one in (exchanged, alike) if one is not None))
     try:
         fitted = noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
     except NotDetermined as refused:
         raise NotDetermined("noise", "; ".join((*mishaps, refused.reason))) from refused
     reason = why_not(flats, camera)
-    remarks = (*mishaps, *fitted.remarks, *(() if reason is None else (reason,)))
-    return fitted.model_copy(update={"remarks": remarks})
+    remarks = (*mishaps, *code.lines, *fitted.remarks, *(() if reason is None else (reason,)))
+    return fitted.model_copy(update={"remarks": remarks, "gain_db": gain_db})
+
+
+def _at_other_gains(captures: Sequence[Capture], gain_db: float) -> list[str]:
+    """Return a remark on the darks and flats that aren't fitted, as they aren't of the gain of most flats."""
+    others = [capture for capture in captures if (capture.gain_db or 0.0) != gain_db]
+    if not others:
+        return []
+    listed = []
+    for group in _grouped(others, lambda capture: (capture.kind, capture.gain_db)):
+        kind, gain = group[0].kind, group[0].gain_db
+        stated = "without gain_db (taken as 0 dB)" if gain is None else f"at {gain:g} dB"
+        ids = group[0].id if len(group) == 1 else f"{group[0].id} .. {group[-1].id}"
+        listed.append(f"{len(group)} {kind}{'s' if len(group) > 1 else ''} {stated} ({ids})")
+    what = ", ".join(listed)
+    return [f"fitted at {gain_db:g} dB, the gain of most flats: {what} left out; fit them in a set of their own"]
 
 
 def _mean_c(captures: Sequence[Capture]) -> float | None:
@@ -427,19 +463,24 @@ def _lamps_of(
 
 
 def _dark_levels(
-    recordings: RecordingSet, darks: Sequence[DarkCapture], camera: DataSheet
+    recordings: RecordingSet,
+    darks: Sequence[DarkCapture],
+    camera: DataSheet,
+    step_dn: float,
+    drifts: Sequence[RepeatDrift],
 ) -> tuple[list[MeasuredLevel], DarkPixels]:
     """Statistics of the darks, longest exposure first: it shows the hot pixels, which are left out from there on."""
-    pixels = DarkPixels(camera.cfa)
+    pixels = DarkPixels(camera.cfa, step_dn)
     levels = []
+    drift_of = {name: drift for drift in drifts for name in drift.changing}
     groups = _grouped(darks, lambda dark: (dark.exposure_s, rounded_c(dark.temperature_c)))
     for group in sorted(groups, key=lambda group: -group[0].exposure_s):
-        stack = stack_of(recordings, group, pixels.bad)
+        stack = stack_of(recordings, group, pixels.bad, step_dn)
         if pixels.longest is None and stack.mean is not None:
-            bad = defective_pixels(stack.mean, camera.cfa)
+            bad = defective_pixels(stack.mean, camera.cfa, step_dn)
             if bad.any():
                 pixels.bad = bad
-                stack = stack_of(recordings, group, bad)
+                stack = stack_of(recordings, group, bad, step_dn)
         pixels.take(stack, group[0].exposure_s)
         levels.append(
             MeasuredLevel(
@@ -448,7 +489,9 @@ def _dark_levels(
                 "dark",
                 stack.statistics(),
                 rounded_c(group[0].temperature_c),
+                tuple(dark.id for dark in group),
                 sensor_c=_mean_c(group),
+                drift=next((drift_of[dark.id] for dark in group if dark.id in drift_of), None),
             )
         )
     return levels, pixels
@@ -509,7 +552,8 @@ def fit_level_table(file: Path, camera: DataSheet) -> FitResult:
     fitted = _without_patterns(noise_fit(darks, flats, camera))
     reason = "a table of means and variances holds no frames"
     skipped = tuple(Skipped(step=step, reason=reason, side="left") for step in ("spectral", "mtf", "psf", "geometry"))
-    return FitResult(source=str(file), cameras={"left": CameraFit(noise=fitted)}, skipped=skipped)
+    fit = FitResult(source=str(file), cameras={"left": CameraFit(noise=fitted)}, skipped=skipped)
+    return fit.model_copy(update={"warnings": implausible_figures(fit, {"left": camera})})
 
 
 def _level(row: TableRow, camera: DataSheet) -> tuple[Setting, PlaneStatistics]:

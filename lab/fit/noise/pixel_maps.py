@@ -12,8 +12,9 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
+from lab.measure.code_step import find_code_step
 from lab.measure.dark_pixels import stack_of
-from lab.measure.levels import BoolArray, Stack, defective_pixels, shading
+from lab.measure.levels import BoolArray, Stack, darks_near, defective_pixels, shading
 from lab.measure.rounding import QUANTISATION_DN2
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import planes
@@ -43,18 +44,22 @@ class PixelMaps:
 def pixel_maps(recordings: RecordingSet, side: Side) -> PixelMaps:
     """Maps of offset, dark current and relative gain of the pixels of `side`.
 
-    Offset and dark current: a weighted line through the dark means of each pixel against exposure. Gain: the weighted
+    Offset and dark current: a weighted line through the dark means of each pixel against exposure, of the darks of the
+    temperature at which most flats, or else most darks, were taken. Gain: the weighted
     mean over the flats between 10 and 90 % of saturation. Raises `NotDetermined` without darks.
     """
     camera = recordings.camera(side)
-    darks = sorted(_levels(recordings.captures(DarkCapture, side)), key=lambda group: -group[0].exposure_s)
+    flats = recordings.captures(FlatCapture, side)
+    own = darks_near(recordings.captures(DarkCapture, side), flats)
+    darks = sorted(_levels(own), key=lambda group: -group[0].exposure_s)
     if not darks:
         raise NotDetermined("noise", "no darks: capture two or more at each of two exposures for maps of single pixels")
-    offset, dark, defective = _dark_maps(recordings, darks, camera.cfa)
+    step_dn = find_code_step(recordings, side).step_dn
+    offset, dark, defective = _dark_maps(recordings, darks, camera.cfa, step_dn)
     white = camera.saturation_dn - float(np.median(offset[0]))
     total, square, weight = np.zeros(offset[0].shape), 0.0, 0.0
-    for group in _levels(recordings.captures(FlatCapture, side)):
-        stack = stack_of(recordings, group, defective)
+    for group in _levels(flats):
+        stack = stack_of(recordings, group, defective, step_dn)
         image = stack.image()
         signal = image - offset[0] - (dark[0] * group[0].exposure_s if dark is not None else 0.0)
         share = float(np.median(signal)) / white
@@ -93,21 +98,24 @@ def _levels(captures: list[C]) -> list[list[C]]:
 
 def _pixel_std(stack: Stack) -> float:
     """Standard deviation of the mean of a pixel over the repeats of a stack, DN; that of rounding with one image."""
+    quantisation_dn2 = QUANTISATION_DN2 * stack.step_dn**2
     if stack.squares is None:
-        return float(np.sqrt(QUANTISATION_DN2))
+        return float(np.sqrt(quantisation_dn2))
     variance = float(np.mean(stack.squares)) / (stack.count - 1)
-    return float(np.sqrt(max(variance, QUANTISATION_DN2) / stack.count))
+    return float(np.sqrt(max(variance, quantisation_dn2) / stack.count))
 
 
-def _dark_maps(recordings: RecordingSet, darks: list[list[DarkCapture]], cfa: Cfa) -> tuple[Map, Map | None, BoolArray]:
+def _dark_maps(
+    recordings: RecordingSet, darks: list[list[DarkCapture]], cfa: Cfa, step_dn: float
+) -> tuple[Map, Map | None, BoolArray]:
     """Offset, dark current (with two exposures) and the mask of pixels that stand out of the longest dark."""
     exposure, weight, means = [], [], []
     for group in darks:
-        stack = stack_of(recordings, group)
+        stack = stack_of(recordings, group, step_dn=step_dn)
         exposure.append(group[0].exposure_s)
         weight.append(_pixel_std(stack) ** -2)
         means.append(stack.image())
-    defective = defective_pixels(means[0], cfa)
+    defective = defective_pixels(means[0], cfa, step_dn)
     t, w = np.array(exposure), np.array(weight)
     middle = float(np.sum(w * t) / w.sum())
     mean = sum(one * share for one, share in zip(means, w / w.sum(), strict=True))

@@ -8,7 +8,6 @@ import numpy as np
 
 from lab.fit.noise.evaluation import CURVE_LIMIT, LINE_LIMIT, Evaluation, in_electrons
 from lab.measure.levels import MeasuredLevel
-from lab.measure.rounding import QUANTISATION_DN2
 from lab.measure.weighted_lines import Linearity, chi2_factor, least_squares, linearity
 from sim.spectrum import FloatArray
 
@@ -80,7 +79,7 @@ def response_to_light(
     """
     signal = np.array([level.plane[name].mean - e.dark.mean_dn(name, level.exposure_s) for level in levels])
     noise = np.array([level.plane[name].mean_std for level in levels])
-    shot = e.transfer.gain * np.maximum(signal, 0.0) + QUANTISATION_DN2
+    shot = e.transfer.gain * np.maximum(signal, 0.0) + e.levels.quantisation_dn2
     noise = np.where(np.isfinite(noise), noise, np.sqrt(shot / levels[0].plane[name].pixels))
     beyond = np.maximum(e.light_scatter, [level.light_std for level in levels])
     return np.array([level.light for level in levels]), signal, np.hypot(noise, beyond * signal)
@@ -106,13 +105,13 @@ def full_well(e: Evaluation) -> tuple[float | None, float | None]:
         return None, None
     value, name = max(seen)
     limit = e.levels.white_dn - e.dark.lines[name].black
-    if value >= limit - 0.5:
+    if value >= limit - 0.5 * e.levels.step_dn:
         e.remarks.add(
             f"saturation is the converter's limit ({e.levels.white_dn:g} DN): full_well_e is the signal there, and "
             "the pixel may hold more"
         )
-    # The saturated value is rounded to whole DN
-    return in_electrons(e, value, np.sqrt(QUANTISATION_DN2))
+    # The saturated value is rounded to the step of the codes
+    return in_electrons(e, value, np.sqrt(e.levels.quantisation_dn2))
 
 
 def quantum_efficiency(e: Evaluation) -> dict[str, float | None]:

@@ -52,6 +52,7 @@ from lab.formats.recording_set import DataSheet
 from lab.formats.recording_set.checks import OFF_NAME_NM
 from lab.formats.recording_set.files import locate
 from lab.formats.results import CameraFit, FitResult, Skipped, SpectralFit
+from lab.formats.results.plausible import implausible_figures
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.spectrum import FloatArray, Spectrum
 
@@ -198,7 +199,8 @@ def fit_mean_table(file: Path, camera: DataSheet) -> FitResult:
     spectral = _fit_curves(lights, camera.channels, remarks)
     reason = "a table of channel means holds no frames"
     skipped = tuple(Skipped(step=step, reason=reason, side="left") for step in ("noise", "mtf", "psf", "geometry"))
-    return FitResult(source=str(file), cameras={"left": CameraFit(spectral=spectral)}, skipped=skipped)
+    fit = FitResult(source=str(file), cameras={"left": CameraFit(spectral=spectral)}, skipped=skipped)
+    return fit.model_copy(update={"warnings": implausible_figures(fit, {"left": camera})})
 
 
 def _channel(row: TableRow, camera: DataSheet) -> str:

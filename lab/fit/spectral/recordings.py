@@ -30,7 +30,9 @@ from lab.fit.spectral.sensitivity import (
     trapezoid_weights,
 )
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
+from lab.formats.results import MakerDeparture, NoiseFit, RepeatDrift, SpectralFit
+from lab.measure.code_step import find_code_step
+from lab.measure.levels import darks_near
 from lab.measure.plane_means import PlaneMean, plane_means
 from lab.measure.weighted_lines import DarkLine, dark_line
 from lab.one_blas_thread import one_blas_thread
@@ -60,8 +62,13 @@ class SpectralCaptures:
     channel; `photons`: photons per second at a pixel on axis per radiance.
     """
 
-    def __init__(self, recordings: RecordingSet, side: Side, noise: NoiseFit | None) -> None:
+    def __init__(
+        self, recordings: RecordingSet, side: Side, noise: NoiseFit | None, drifts: Sequence[RepeatDrift] = ()
+    ) -> None:
         self.recordings, self.side, self.noise = recordings, side, noise
+        #: Standard deviation of the mean of each repeat by a drift, DN: in the mean over the n repeats, where these
+        #: count as independent, the drift's uncertainty is left whole.
+        self.drift_dn = {name: one.level_dn_std * len(one.mean_dn) ** 0.5 for one in drifts for name in one.captures}
         self.camera = recordings.camera(side)
         self.remarks: list[str] = []
         self.narrowband: list[NarrowbandCapture | FlatCapture] = [
@@ -79,6 +86,7 @@ class SpectralCaptures:
                 )
         self.gain, self.gain_std = self._conversion_gain()
         self.region = self._central_region()
+        self._step_dn = find_code_step(self.recordings, self.side).step_dn
         self.pixels = {channel: self._pixel_count(channel) for channel in phases(self.camera.cfa)}
         self.photons = self._photons_per_radiance()
         self.darks: dict[tuple[float, str], DarkLine] = {}
@@ -149,7 +157,8 @@ class SpectralCaptures:
 
     def _means(self, capture: Capture) -> dict[str, PlaneMean]:
         """Return the mean of each channel in the region, which starts on whole periods of the mosaic."""
-        return plane_means(self.recordings.frame(capture)[self.region], self.camera.cfa, self.camera.saturation_dn)
+        frame = self.recordings.frame(capture)[self.region]
+        return plane_means(frame, self.camera.cfa, self.camera.saturation_dn, self._step_dn)
 
     def _pixel_count(self, channel: str) -> int:
         """Count the pixels of a channel in the region."""
@@ -174,12 +183,14 @@ class SpectralCaptures:
         return black + rate * exposure_s * self._dn_per_e(gain_db), 0.0
 
     def _read_darks(self) -> None:
-        """Fit the dark means of the region against exposure, by gain and channel."""
+        """Fit the dark means of the region against exposure, by gain and channel, of the temperature at which most
+        narrowband captures were taken."""
         found: dict[tuple[float, str], list[tuple[float, float, float]]] = {}
-        for dark in self.recordings.captures(DarkCapture, self.side):
+        for dark in darks_near(self.recordings.captures(DarkCapture, self.side), self.narrowband):
             for channel, one in self._means(dark).items():
                 own = found.setdefault((dark.gain_db or 0.0, channel), [])
-                own.append((dark.exposure_s, one.mean_dn, one.mean_std_dn))
+                std = float(np.hypot(one.mean_std_dn, self.drift_dn.get(dark.id, 0.0)))
+                own.append((dark.exposure_s, one.mean_dn, std))
         for key, rows in found.items():
             self.darks[key] = dark_line(*np.array(rows).T)
 
@@ -202,7 +213,7 @@ class SpectralCaptures:
         clipped = found.clipped_share > CLIPPED_LIMIT or signal > SATURATED_SHARE * limit
         scale = 1.0 / (gain * capture.exposure_s)
         # The pixels differ by shot noise, read noise and PRNU
-        std = float(np.hypot(found.mean_std_dn, dark_std))
+        std = float(np.sqrt(found.mean_std_dn**2 + dark_std**2 + self.drift_dn.get(capture.id, 0.0) ** 2))
         return signal * scale, std * scale, clipped, signal / limit
 
     def _lights(self) -> tuple[FloatArray, dict[str, FloatArray]]:
@@ -346,7 +357,9 @@ class SpectralCaptures:
 
 
 @one_blas_thread
-def fit_spectral(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None) -> SpectralFit:
+def fit_spectral(
+    recordings: RecordingSet, side: Side, noise: NoiseFit | None = None, drifts: Sequence[RepeatDrift] = ()
+) -> SpectralFit:
     """Fit the absolute quantum efficiency of every channel to the narrowband captures, electrons per photon at the
     pixel.
 
@@ -354,10 +367,10 @@ def fit_spectral(recordings: RecordingSet, side: Side, noise: NoiseFit | None = 
     out, and the mean cos^4 of the region. Signals are means over the central quarter of rows and columns. Saturated
     captures are left out. Where a channel has no other light, the curves of the maker (times a smooth factor common to
     the channels, and a smooth factor of a few per cent of each) and the flats with a stated radiance stand in; without
-    these, smoothness alone. Raises `NotDetermined` where the scale or the light is missing. The method:
-    `lab.fit.spectral`.
+    these, smoothness alone. `drifts`: of the side's repeats over time. Raises `NotDetermined` where the scale or the
+    light is missing. The method: `lab.fit.spectral`.
     """
-    captures = SpectralCaptures(recordings, side, noise)
+    captures = SpectralCaptures(recordings, side, noise, drifts)
     signals = captures.signals()
     gaps = {c: s.limit.size for c, s in signals.items() if s.has_gaps}
     maker = captures.maker_curves() if gaps else None

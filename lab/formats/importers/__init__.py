@@ -11,15 +11,17 @@ from pathlib import Path
 
 from lab.errors import InputError
 from lab.formats.importers.emva1288 import read_emva1288
+from lab.formats.importers.fits_folder import read_fits_folder
+from lab.formats.importers.frame_settings import HeaderChoice, parse_choice
 from lab.formats.importers.raw_folder import (
     read_boards,
     read_checkerboard_pairs,
     read_dot_grids,
-    read_fits_folder,
     read_raw_folder,
 )
 from lab.formats.importers.single_picture import ImportOptions, read_colour_chart, read_slanted_edge
-from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.recording_set import Manifest, RecordingSet, text_problems
+from lab.plain_text import escaped
 
 __all__ = [
     "KINDS",
@@ -46,9 +48,13 @@ class Importer:
     of_a_folder: bool = False
 
 
+def _choice(options: ImportOptions) -> HeaderChoice:
+    return parse_choice(options.only or "", options.ignore or "")
+
+
 def _raw_folder(path: Path, options: ImportOptions) -> RecordingSet:
     if options.checkerboard is None:
-        return read_raw_folder(path, options.tap or "")
+        return read_raw_folder(path, options.tap or "", _choice(options))
     if not options.square_mm:
         raise InputError("--checkerboard: state --square-mm, the side of its squares")
     return read_checkerboard_pairs(path, options.checkerboard, options.square_mm)
@@ -71,13 +77,16 @@ def _checkerboards(path: Path, options: ImportOptions) -> RecordingSet:
     return read_boards(path, "none", options.checkerboard, options.square_mm)
 
 
+_HEADERS = frozenset({"--only", "--ignore"})
 _PICTURE = frozenset({"--camera", "--exposure-s", "--transfer"})
 #: `--from KIND` -> its importer.
 KINDS: dict[str, Importer] = {
     "emva1288": Importer(lambda path, _: read_emva1288(path)),
-    "raw-folder": Importer(_raw_folder, frozenset({"--checkerboard", "--square-mm", "--tap"}), of_a_folder=True),
+    "raw-folder": Importer(_raw_folder, _HEADERS | {"--checkerboard", "--square-mm", "--tap"}, of_a_folder=True),
     "fits": Importer(
-        lambda path, options: read_fits_folder(path, options.tap or ""), frozenset({"--tap"}), of_a_folder=True
+        lambda path, options: read_fits_folder(path, options.tap or "", _choice(options)),
+        _HEADERS | {"--tap"},
+        of_a_folder=True,
     ),
     "slanted-edge": Importer(read_slanted_edge, _PICTURE | {"--channel"}, of_a_file=True),
     "colorchecker": Importer(read_colour_chart, _PICTURE | {"--corners", "--light", "--white-patch"}, of_a_file=True),
@@ -106,7 +115,10 @@ def read_foreign(kind: str, path: Path, options: ImportOptions | None = None) ->
     if path.is_dir() and not any(path.iterdir()):
         raise InputError(f"{path}: is empty; give the folder of the recordings")
     recordings = importer.read(path, options)
-    return recordings.under(_with_notes(recordings, path))
+    manifest = _with_notes(recordings, path)
+    if problems := list(text_problems(manifest.model_dump(exclude_unset=True))):
+        raise InputError("\n".join(f"{path}: {line}" for line in problems))
+    return recordings.under(manifest)
 
 
 def _with_notes(recordings: RecordingSet, path: Path) -> Manifest:
@@ -116,4 +128,5 @@ def _with_notes(recordings: RecordingSet, path: Path) -> Manifest:
     lines = [line.removeprefix(f"{folder}: ") for line in recordings.warnings]
     if folder != Path():
         lines = [line.replace(f"{folder}/", "") for line in lines]
-    return recordings.manifest.model_copy(update={"notes": "\n".join([recordings.manifest.notes, *lines])})
+    notes = escaped("\n".join([recordings.manifest.notes, *lines]), several_lines=True)
+    return recordings.manifest.model_copy(update={"notes": notes})

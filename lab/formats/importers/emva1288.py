@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,12 @@ import numpy as np
 
 from lab.errors import InputError
 from lab.formats.cgats import read_foreign_text
-from lab.formats.importers.images import IMAGES, ImageFiles, read_camera_file, read_image
+from lab.formats.importers.images import ImageFiles, described_sides, read_camera_file, read_image
+from lab.formats.importers.own_statements import compare_with_files
 from lab.formats.importers.stated_settings import held_against_frames
+from lab.formats.pictures import IMAGES, TIFFS, picture_facts
 from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.recording_set.manifest import without_common_photons
 
 NS = 1e-9
 LARGEST_DESCRIPTOR_BYTES = 8 << 20
@@ -170,7 +174,11 @@ def read_emva1288(path: Path) -> RecordingSet:
             f"{file}: {len(missing)} of {len(listed)} listed images are missing and left out ({missing[0]} .. "
             f"{missing[-1]}); copy them for the full set"
         )
-    shape, shift = _shape_and_shift(there[0][2], descriptor, file, warnings)
+    captures, frames, pages, remarks = _captures(there)
+    warnings += [f"{file}: {remark}" for remark in remarks]
+    brightest = max(captures, key=lambda one: (one.get("photons_per_pixel") or 0.0, one["exposure_s"]))["frame"]
+    first = [(frames[path], pages.get(path)) for path in dict.fromkeys((captures[0]["frame"], brightest))]
+    shape, shift = _shape_and_shift(first, descriptor, file, warnings)
     cameras = read_camera_file(
         file.parent / "camera.toml",
         {"left": {"rows": shape[0], "cols": shape[1], "cfa": "MONO", "bit_depth": descriptor.bits or 16}},
@@ -190,7 +198,9 @@ def read_emva1288(path: Path) -> RecordingSet:
             f"{file}: says nothing of {', '.join(unknown)}; they stay unknown (the quantum efficiency is that at the "
             "light's own wavelength): write them to camera.toml beside it where you know them"
         )
-    captures, frames = _captures(there, wavelength_nm)
+    for capture in captures:
+        if capture["kind"] == "flat":
+            capture["wavelength_nm"] = wavelength_nm
     manifest = Manifest.model_validate(
         {
             "format": "calibench-recording",
@@ -201,62 +211,85 @@ def read_emva1288(path: Path) -> RecordingSet:
             "captures": captures,
         }
     )
+    manifest, warnings = without_common_photons(manifest, str(file), warnings)
     manifest, said = held_against_frames(manifest, frames, str(file))
     warnings += said
-    files = ImageFiles(file.parent, frames, shift)
+    stated = {**described_sides(file.parent / "camera.toml")["left"]}
+    if descriptor.bits is not None:
+        stated["bit_depth"] = descriptor.bits
+    warnings += compare_with_files(camera, stated, frames.values())
+    files = ImageFiles(file.parent, frames, shift, pages)
     return RecordingSet(manifest, source=str(path), warnings=tuple(warnings), files=files)
 
 
 def _shape_and_shift(
-    first: Path, descriptor: ImageDescriptor, file: Path, warnings: list[str]
+    images: Sequence[tuple[Path, int | None]], descriptor: ImageDescriptor, file: Path, warnings: list[str]
 ) -> tuple[tuple[int, int], int]:
-    """Rows and columns of the images, and by how many bits the values are shifted up in their 16-bit container."""
-    try:
-        frame = read_image(first)
-    except InputError as error:
-        raise InputError(f"{first}: {error}") from error
-    rows, cols = frame.shape
-    if (descriptor.height, descriptor.width) not in ((rows, cols), (None, None)):
+    """Rows and columns of the images, and by how many bits the values are shifted up in their 16-bit container: by the
+    first image and one of the brightest level (file, page)."""
+    shape, shift = (0, 0), 0
+    for image, page in images:
+        try:
+            frame = read_image(image, page)
+        except InputError as error:
+            raise InputError(f"{image}: {error}") from error
+        shape = shape if any(shape) else (frame.shape[0], frame.shape[1])
+        if descriptor.bits is not None and int(frame.max()) >= 2**descriptor.bits:
+            shift = 16 - descriptor.bits
+            if np.any(frame & ((1 << shift) - 1)):
+                raise InputError(
+                    f"{image}: {int(frame.max())} DN is above the {descriptor.bits} bits of line 'n' in {file.name}; "
+                    "correct it"
+                )
+    rows, cols = shape
+    if (descriptor.height, descriptor.width) not in (shape, (None, None)):
         warnings.append(
             f"{file}: line 'n' says {descriptor.height} x {descriptor.width}, the images are {rows} x {cols} (rows x "
             "cols): "
             "the images are believed; correct the line"
         )
-    shift = 0
-    if descriptor.bits is not None and int(frame.max()) >= 2**descriptor.bits:
-        padding = 16 - descriptor.bits
-        if np.any(frame & ((1 << padding) - 1)):
-            raise InputError(
-                f"{first}: {int(frame.max())} DN is above the {descriptor.bits} bits of line 'n' in {file.name}; "
-                "correct it"
-            )
-        shift = padding
+    if shift:
         warnings.append(
             f"{file}: the images hold {descriptor.bits} bits shifted up by {shift}; they are shifted down: check that"
         )
-    return (rows, cols), shift
+    return shape, shift
 
 
 def _captures(
-    there: list[tuple[DescribedLevel, str, Path]], wavelength_nm: float | None
-) -> tuple[list[dict[str, Any]], dict[str, Path]]:
+    there: list[tuple[DescribedLevel, str, Path]],
+) -> tuple[list[dict[str, Any]], dict[str, Path], dict[str, int], list[str]]:
+    """The captures, one an image or a page of one; the file of each frame, and its page where that has several; and
+    which files have."""
     captures: list[dict[str, Any]] = []
     frames: dict[str, Path] = {}
+    pages: dict[str, int] = {}
+    stacks: list[str] = []
     used: Counter[str] = Counter()
     for level, _, found in there:
-        stem = re.sub(r"[^\w.-]+", "_", found.stem)
-        used[stem] += 1
-        id = stem if used[stem] == 1 else f"{stem}-{used[stem]}"
-        path = f"frames/{id}.npy"
-        capture: dict[str, Any] = {
-            "id": id,
-            "kind": "flat" if level.bright else "dark",
-            "side": "left",
-            "frame": path,
-            "exposure_s": level.exposure_s,
-        }
-        if level.bright:
-            capture |= {"photons_per_pixel": level.photons_per_pixel, "wavelength_nm": wavelength_nm}
-        captures.append(capture)
-        frames[path] = found
-    return captures, frames
+        try:
+            many = picture_facts(found).pages if found.suffix.lower() in TIFFS else 1
+        except InputError as error:
+            raise InputError(f"{found}: {error}") from error
+        if many > 1:
+            stacks.append(f"{found.name} ({many})")
+        for page in range(many):
+            stem = re.sub(r"[^\w.-]+", "_", found.stem) + ("" if many == 1 else f"-p{page + 1}")
+            used[stem] += 1
+            id = stem if used[stem] == 1 else f"{stem}-{used[stem]}"
+            path = f"frames/{id}.npy"
+            capture: dict[str, Any] = {
+                "id": id,
+                "kind": "flat" if level.bright else "dark",
+                "side": "left",
+                "frame": path,
+                "exposure_s": level.exposure_s,
+            }
+            if level.bright:
+                capture["photons_per_pixel"] = level.photons_per_pixel
+            captures.append(capture)
+            frames[path] = found
+            if many > 1:
+                pages[path] = page
+    more = f" and {len(stacks) - 3} more" if len(stacks) > 3 else ""
+    remarks = [f"each page of {', '.join(stacks[:3])}{more} is an image of its level"] if stacks else []
+    return captures, frames, pages, remarks

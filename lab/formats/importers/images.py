@@ -1,27 +1,21 @@
-"""Pictures as frames: FITS, TIFF, PNG and raw files, and how a sensor was read out."""
+"""Pictures as frames: TIFF, PNG and raw files, FITS by `fits_file`, and how a sensor was read out."""
 
 from __future__ import annotations
 
-import gzip
-import io
-import struct
 import tomllib
-import warnings
-import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from lab.errors import InputError, one_line
+from lab.errors import InputError
 from lab.formats.cgats import read_foreign_csv, read_foreign_text
+from lab.formats.importers.fits_file import FITS, is_fits, load_fits, unpacked_name
+from lab.formats.pictures import IMAGES, read_picture
 from lab.formats.recording_set import RAWS, DataSheet, FolderFiles, Frame, load_frame
 from lab.formats.recording_set.files import locate
 from lab.formats.spectrum_csv import parse_spectrum
@@ -29,168 +23,25 @@ from sim.camera import Side
 from sim.parameters import Frozen
 from sim.spectrum import Spectrum
 
-#: Endings of FITS files, and of what gzip makes of them; bytes that one may hold, at most: 32768 x 32768 pixels of 16
-#: bit.
-FITS = (".fits", ".fit", ".fts")
-GZIP = ".gz"
-LARGEST_BYTES = 2 << 30
-#: Words of IMAGETYP, in small letters, and the kind of capture.
-IMAGE_TYPES = {"dark": "dark", "bias": "dark", "zero": "dark", "flat": "flat"}
-
-
-@dataclass(frozen=True)
-class FitsHeader:
-    """What a header states; None where it has no such keyword.
-
-    `kind` of IMAGETYP or OBSTYPE; `exposure_s` of EXPTIME or EXPOSURE; `temperature_c` of CCD-TEMP; `time` of DATE-OBS
-    (UTC)."""
-
-    image_type: str | None
-    kind: str | None
-    exposure_s: float | None
-    temperature_c: float | None
-    time: datetime | None
-
-
-def is_fits(file: Path) -> bool:
-    """Return whether a file is a FITS file by its ending, `.fits.gz` included."""
-    return file.name.lower().removesuffix(GZIP).endswith(FITS)
-
-
-def load_fits(file: Path) -> Frame:
-    """Return the only image of a FITS file, uint16 (rows, cols) with BZERO and BSCALE applied. InputError without
-    the path."""
-    found, _ = _opened(file)
-    if found.ndim != 2:
-        raise InputError(f"has the shape {found.shape}, not (rows, cols); save one file a frame")
-    if found.dtype.kind not in "iu" and not np.array_equal(found, np.rint(found)):
-        raise InputError(f"its values are {found.dtype} with fractions; save raw DN as integers")
-    if found.size and (found.min() < 0 or found.max() > np.iinfo(np.uint16).max):
-        raise InputError(
-            f"its values are {found.min():g} .. {found.max():g}; raw DN are 0 .. 65535: save them unscaled"
-        )
-    return np.ascontiguousarray(found, dtype=np.uint16)
-
-
-def fits_header(file: Path, *, with_image: bool = True) -> FitsHeader:
-    """Return what the header says; InputError without the path. Without `with_image`, the image isn't read, and damage
-    in it stays unseen."""
-    header = _opened(file)[1] if with_image else _header(file)
-    stated = header.get("IMAGETYP", header.get("OBSTYPE"))
-    words = str(stated).lower() if stated is not None else ""
-    kind = next((kind for word, kind in IMAGE_TYPES.items() if word in words), None)
-    return FitsHeader(
-        str(stated).strip() if stated is not None else None,
-        kind,
-        _number(header, "EXPTIME", "EXPOSURE"),
-        _number(header, "CCD-TEMP"),
-        _time(header.get("DATE-OBS")),
-    )
-
-
-@contextmanager
-def _stream(file: Path) -> Iterator[IO[bytes]]:
-    """The file's bytes, uncompressed. Raises InputError where there are too many of them."""
-    if not file.name.lower().endswith(GZIP):
-        with file.open("rb") as stream:
-            yield stream
-        return
-    held = io.BytesIO()
-    with gzip.open(file) as packed:
-        while part := packed.read(1 << 20):
-            held.write(part)
-            if held.tell() > LARGEST_BYTES:
-                raise InputError(f"holds more than the limit of {LARGEST_BYTES} bytes; save one frame a file")
-    held.seek(0)
-    yield held
-
-
-def _header(file: Path) -> Any:
-    """Return the header of the first image that isn't empty, with that of the file's beginning."""
-    from astropy.io import fits
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            with _stream(file) as stream, fits.open(stream, memmap=False, lazy_load_hdus=True) as opened:
-                first = opened[0]
-                image = next((hdu for hdu in opened if getattr(hdu, "is_image", False) and hdu.header["NAXIS"]), first)
-                return first.header if image is first else first.header + image.header
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(f"damaged FITS ({one_line(error)}); copy it again or recapture") from error
-
-
-def _opened(file: Path) -> tuple[Any, Any]:
-    """Return the image's values and header. A file whose data or checksum is damaged is refused."""
-    from astropy.io import fits
-    from astropy.io.fits.verify import VerifyWarning
-    from astropy.utils.exceptions import AstropyUserWarning
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", AstropyUserWarning)  # truncated, or a wrong checksum
-        warnings.simplefilter("ignore", VerifyWarning)  # a header that is only untidy
-        try:
-            with _stream(file) as stream, fits.open(stream, memmap=False, checksum=True) as opened:
-                images = [hdu for hdu in opened if getattr(hdu, "is_image", False) and hdu.data is not None]
-                first = opened[0]
-                found = [
-                    (np.asarray(hdu.data), hdu.header if hdu is first else first.header + hdu.header) for hdu in images
-                ]
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(f"damaged FITS ({one_line(error)}); copy it again or recapture") from error
-    if len(found) != 1:
-        raise InputError(f"holds {len(found)} images, not 1; save one file a frame")
-    return found[0]
-
-
-def _number(header: Any, *names: str) -> float | None:
-    for name in names:
-        value = header.get(name)
-        if value is None:
-            continue
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            number = np.nan
-        if not np.isfinite(number):
-            raise InputError(f"{name} = {value!r} isn't a number; correct the header")
-        return number
-    return None
-
-
-def _time(stated: Any) -> datetime | None:
-    try:
-        time = datetime.fromisoformat(str(stated))
-    except ValueError:
-        return None
-    return time if time.tzinfo is not None else time.replace(tzinfo=UTC)
-
-
 # ----------------------------------------------------------------------------------------------------------------------
-# Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, FITS, camera raws, .npy. They are decoded on
+# Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 1 to 16 bit, FITS, camera raws, .npy. They are decoded on
 # access.
 #
 # A channel of transparency (RGBA) is dropped, and `has_alpha` says so. Spectra beside them may have semicolons and
 # decimal commas.
 
 
-IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
-
-
-def read_image(file: Path) -> Frame:
-    """Grey values of an image file as uint16 (rows, cols), as stored. InputError without the path."""
+def read_image(file: Path, page: int | None = None) -> Frame:
+    """Grey values of an image file as uint16 (rows, cols), as stored; `page`: of a TIFF with several, or the
+    plane of a FITS cube. InputError without the path."""
     suffix = file.suffix.lower()
     if suffix == ".npy" or suffix in RAWS:
         return load_frame(file)
     if is_fits(file):
-        return load_fits(file)
+        return load_fits(file, page)
     if suffix not in IMAGES:
         raise InputError(f"can't be read; give one of {' '.join((*IMAGES, *FITS, *RAWS, '.npy'))}")
-    return grey(decoded(file))
+    return grey(read_picture(file, page))
 
 
 def is_frame(file: Path) -> bool:
@@ -199,9 +50,8 @@ def is_frame(file: Path) -> bool:
 
 
 def frame_name(path: str) -> str:
-    """Return the name of a frame's file without its ending, `.fits.gz` included."""
-    name = path.rpartition("/")[2]
-    return Path(name[: -len(GZIP)] if is_fits(Path(name)) and name.lower().endswith(GZIP) else name).stem
+    """Return the name of a frame's file without its ending, `.fits.gz` and `.fits.fz` included."""
+    return Path(unpacked_name(path.rpartition("/")[2])).stem
 
 
 def has_alpha(image: NDArray[Any]) -> bool:
@@ -210,62 +60,39 @@ def has_alpha(image: NDArray[Any]) -> bool:
     return image.shape[2:] in ((2,), (4,))
 
 
-def decoded(file: Path) -> NDArray[Any]:
-    """Return an image file's samples as they're stored, channels in OpenCV's order. InputError without the path."""
-    data = file.read_bytes()
-    if why := _damage(data):
-        raise InputError(f"damaged image ({why}); copy it again or recapture")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise InputError(f"damaged image ({str(error).split('error:')[-1].strip()}); copy it again") from error
-    if image is None:
-        raise InputError("damaged image (it can't be decoded); copy it again or recapture")
-    return np.asarray(image)
-
-
-def _damage(data: bytes) -> str | None:
-    """Why PNG or JPEG data are incomplete. The decoder would silently fill the missing part with zeros."""
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
-        at = 8
-        while at + 12 <= len(data):
-            (length,) = struct.unpack(">I", data[at : at + 4])
-            body, sum_ = data[at + 4 : at + 8 + length], data[at + 8 + length : at + 12 + length]
-            if len(sum_) < 4:
-                break
-            if zlib.crc32(body) != struct.unpack(">I", sum_)[0]:
-                return f"the checksum of chunk {body[:4]!r} is wrong"
-            if body[:4] == b"IEND":
-                return None
-            at += 12 + length
-        return "it ends too early"
-    if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-1024:]:
-        return "it ends too early"
-    return None
-
-
 def grey(image: NDArray[Any]) -> Frame:
     """Return the grey values (rows, cols) of a decoded image; a channel of transparency is dropped. InputError for
-    colours and other numbers."""
-    if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"its values are {image.dtype}; save grey values of 8 or 16 bit")
+    colours, and for numbers that aren't codes of 0 to 65535."""
     if image.ndim == 3:
         colours = image[..., :3]
         if image.shape[2] >= 3 and not np.array_equal(colours.min(axis=2), colours.max(axis=2)):
             raise InputError("is a colour picture; give the raw mosaic, or grey values")
         image = image[..., 0]
+    return codes_of(image)
+
+
+def codes_of(image: NDArray[Any]) -> Frame:
+    """Return numbers as codes, uint16. InputError for fractions and for numbers beyond 0 to 65535."""
+    if image.dtype not in (np.uint8, np.uint16):
+        if image.dtype.kind not in "iuf" or not np.array_equal(image, np.rint(image)):
+            raise InputError(f"its values are {image.dtype} with fractions; save raw DN as integers of 8 or 16 bit")
+        if image.size and (image.min() < 0 or image.max() > np.iinfo(np.uint16).max):
+            raise InputError(f"its values are {image.min():g} .. {image.max():g}; save raw DN, 0 .. 65535, unscaled")
     return np.ascontiguousarray(image, dtype=np.uint16)
 
 
 class ImageFiles(FolderFiles):
-    """A folder whose frames are images. `images`: the file of each frame by its path in the recording set.
+    """A folder whose frames are images. `images`: the file of each frame by its path in the recording set; `pages`: its
+    page in there, where that has several.
 
     Values are shifted down by `shift` bits. The files are decoded on access and, as spectra, aren't copied byte by
     byte."""
 
-    def __init__(self, root: Path, images: Mapping[str, Path], shift: int = 0) -> None:
+    def __init__(
+        self, root: Path, images: Mapping[str, Path], shift: int = 0, pages: Mapping[str, int] | None = None
+    ) -> None:
         super().__init__(root)
-        self.images, self.shift = dict(images), shift
+        self.images, self.shift, self.pages = dict(images), shift, dict(pages or {})
 
     def file(self, path: str) -> Path | None:
         return None if path in self.images or path.lower().endswith(".csv") else super().file(path)
@@ -274,7 +101,13 @@ class ImageFiles(FolderFiles):
         return parse_spectrum(read_foreign_csv(locate(self.root, path)).text)
 
     def frame(self, path: str, camera: DataSheet) -> Frame:
-        return np.right_shift(read_image(self.images[path]), self.shift, dtype=np.uint16)
+        frame = read_image(self.images[path], self.pages.get(path))
+        if np.any(frame & ((1 << self.shift) - 1)):
+            raise InputError(
+                f"its codes aren't multiples of {1 << self.shift}, as those of other images of the set are; give "
+                "images of one bit depth"
+            )
+        return np.right_shift(frame, self.shift, dtype=np.uint16)
 
     def where(self, path: str) -> str:
         return str(self.images[path]) if path in self.images else super().where(path)
@@ -379,9 +212,15 @@ class Readout:
 class TapFiles(ImageFiles):
     """Images whose frames are cropped, joined and levelled as a `Readout` says."""
 
-    def __init__(self, root: Path, images: Mapping[str, Path], readouts: Mapping[str, Readout]) -> None:
+    def __init__(
+        self,
+        root: Path,
+        images: Mapping[str, Path],
+        readouts: Mapping[str, Readout],
+        pages: Mapping[str, int] | None = None,
+    ) -> None:
         """`readouts`: by the frame's path in the recording set."""
-        super().__init__(root, images)
+        super().__init__(root, images, pages=pages)
         self.readouts = dict(readouts)
 
     def frame(self, path: str, camera: DataSheet) -> Frame:
@@ -501,7 +340,7 @@ def _overscan_means(taps: Sequence[Tap], files: Sequence[Path]) -> dict[str, lis
     if all(tap.overscan is None for tap in taps):
         return means
     for file in chosen:
-        frame = read_image(file)
+        frame = read_image(file, 0)
         for tap in taps:
             if tap.overscan is not None:
                 means.setdefault(tap.name, []).append(float(frame[_box(tap.overscan)].mean()))

@@ -18,8 +18,9 @@ import csv
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -28,29 +29,27 @@ import numpy as np
 from lab.capture_kinds.base import CAPTURES, Capture, Names, Open, names_in
 from lab.errors import InputError, one_line
 from lab.formats.cgats import in_its_unit, nearest_name, read_foreign_csv, read_foreign_text, remarks_on
+from lab.formats.importers.fits_file import fits_header, has_keyword, is_fits
+from lab.formats.importers.frame_settings import ALL_FRAMES, HeaderChoice, is_chosen, states, text_of
 from lab.formats.importers.images import (
-    FITS,
-    GZIP,
-    IMAGES,
-    FitsHeader,
     Readout,
     Tap,
     TapFiles,
-    decoded,
     described_sides,
-    fits_header,
     frame_name,
     grey,
     has_alpha,
-    is_fits,
     is_frame,
     parse_taps,
     read_camera_file,
     read_image,
     readout,
 )
-from lab.formats.importers.stated_settings import held_against_frames
-from lab.formats.recording_set import DataSheet, FolderFiles, Manifest, RecordingError, RecordingSet, parse_manifest
+from lab.formats.importers.own_statements import compare_with_files, known_from_file, taken_from_file
+from lab.formats.importers.stated_settings import frame_header, held_against_frames
+from lab.formats.pictures import IMAGES, TIFFS, picture_facts, read_picture
+from lab.formats.recording_set import DataSheet, Manifest, RecordingError, RecordingSet, parse_manifest
+from lab.formats.recording_set.files import locate_as_written
 from sim.camera import Side
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -131,8 +130,8 @@ def _columns() -> list[str]:
     """Return the keys of all kinds of capture, those of objects in them with a dot."""
     names: dict[str, None] = {}
     for kind in CAPTURES.models.values():
-        for key, field in kind.model_fields.items():
-            parts = [part for part in (field.annotation, *get_args(field.annotation)) if isinstance(part, type)]
+        for key, declared in kind.model_fields.items():
+            parts = [part for part in (declared.annotation, *get_args(declared.annotation)) if isinstance(part, type)]
             inner = next((part for part in parts if issubclass(part, Open)), None)
             names |= dict.fromkeys([key] if inner is None else [f"{key}.{name}" for name in inner.model_fields])
     return list(names)
@@ -162,8 +161,8 @@ def capture_of_row(row: dict[str, str]) -> dict[str, Any]:
 def _list_sizes(kind: type[Capture]) -> dict[str, int]:
     """Keys of a kind that hold several numbers, and how many make a group (0: a flat list)."""
     sizes = {}
-    for key, field in kind.model_fields.items():
-        parts = [part for part in (field.annotation, *get_args(field.annotation)) if get_origin(part) is tuple]
+    for key, declared in kind.model_fields.items():
+        parts = [part for part in (declared.annotation, *get_args(declared.annotation)) if get_origin(part) is tuple]
         if parts:
             sizes[key] = len(get_args(get_args(parts[0])[0]))
     return sizes
@@ -181,16 +180,18 @@ def _list(key: str, cell: str, size: int) -> list[Any]:
 INDEX, CAMERA = "index.csv", "camera.toml"
 
 
-def read_raw_folder(path: Path, tap: str = "") -> RecordingSet:
+def read_raw_folder(path: Path, tap: str = "", choice: HeaderChoice = ALL_FRAMES) -> RecordingSet:
     """Return the captures that `index.csv` in the folder `path` lists, as a recording set. `tap`: that tap of the
-    sensor alone.
+    sensor alone; `choice`: what is used of the frames' headers.
 
     Raises RecordingError with one line for every row that can't be used.
     """
-    return recordings_of_index(path, read_index(path / INDEX), str(path / INDEX), tap)
+    return recordings_of_index(path, read_index(path / INDEX), str(path / INDEX), tap, choice)
 
 
-def recordings_of_index(path: Path, index: Index, where: str, tap: str = "") -> RecordingSet:
+def recordings_of_index(
+    path: Path, index: Index, where: str, tap: str = "", choice: HeaderChoice = ALL_FRAMES
+) -> RecordingSet:
     """Return the captures of the rows of `index`, with the `camera.toml` of the folder `path`. `where`: what lists
     them, for messages."""
     cameras = path / CAMERA
@@ -204,8 +205,45 @@ def recordings_of_index(path: Path, index: Index, where: str, tap: str = "") -> 
             names = ", ".join(one.name for one in listed) or "none"
             raise InputError(f"--tap {tap}: {cameras} describes no such tap of the {side} camera; it has {names}")
     remarks = tuple(f"{cameras}: {remark}" for remark in read_foreign_text(cameras).remarks)
-    index = replace(index, remarks=index.remarks + remarks)
-    return _recording_set(path, index, where, lambda measured: read_camera_file(cameras, measured), taps)
+    index = _of_choice(path, replace(index, remarks=index.remarks + remarks), where, choice)
+    return _recording_set(path, index, where, lambda measured: read_camera_file(cameras, measured), taps, choice)
+
+
+def _of_choice(path: Path, index: Index, where: str, choice: HeaderChoice) -> Index:
+    """Return the rows whose frames have the settings that are asked for, with a remark on the others. Raises InputError
+    where none has, or no header states a keyword that is to be ignored."""
+    if choice == ALL_FRAMES:
+        return index
+    files = [path / row.get("frame", "") for _, row in index.rows]
+    stated = {file: frame_header(file) for file in files if file.is_file()}
+    settings = {file: header.settings for file, header in stated.items() if header is not None}
+    if choice.ignored:
+        unknown = [name for name in choice.ignored if not any(_has(file, name, settings) for file in files)]
+        if unknown:
+            raise InputError(f"--ignore {','.join(unknown)}: no frame's header states it; correct the keyword")
+    kept = [
+        (number, row)
+        for (number, row), file in zip(index.rows, files, strict=True)
+        if file not in stated or is_chosen(choice, row.get("kind", ""), settings.get(file, {}))
+    ]
+    for keyword, wanted in choice.only:
+        there = {text_of(own[keyword]) for own in settings.values() if keyword in own}
+        if not any(states(own, keyword, wanted) for own in settings.values()):
+            found = f"they state {', '.join(sorted(there))}" if there else "none states it"
+            raise InputError(f"--only {keyword}={wanted}: no frame's header states that, {found}; correct it")
+    option = ",".join("=".join(pair) for pair in choice.only)
+    if not kept:
+        raise InputError(f"{where}: no frame's header states all of {option} (--only); give one of them")
+    remarks = [f"{where}: {', '.join(choice.ignored)} of the headers ignored (--ignore)"] if choice.ignored else []
+    if dropped := [row["frame"] for number, row in index.rows if (number, row) not in kept]:
+        some = f"{dropped[0]}{f' and {len(dropped) - 1} more' if len(dropped) > 1 else ''}"
+        remarks.append(f"{where}: --only {option}: {len(dropped)} of {len(index.rows)} frames left out: {some}")
+    return replace(index, rows=kept, remarks=(*index.remarks, *remarks))
+
+
+def _has(file: Path, keyword: str, settings: Mapping[Path, Mapping[str, object]]) -> bool:
+    """Return whether the header of a file has a keyword."""
+    return keyword in settings.get(file, {}) or (is_fits(file) and has_keyword(file, keyword))
 
 
 def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: float) -> RecordingSet:
@@ -283,36 +321,30 @@ def _recording_set(
     where: str,
     cameras: Callable[[dict[Side, dict[str, Any]]], dict[Side, DataSheet]],
     taps: Mapping[Side, tuple[Tap, ...]] = {},
+    choice: HeaderChoice = ALL_FRAMES,
 ) -> RecordingSet:
-    folder = FolderFiles(path)
-    images: dict[str, Path] = {}
-    captures: list[dict[str, Any]] = []
-    numbers: list[int] = []
-    problems: list[str] = []
-    used: Counter[str] = Counter()
-    for number, row in index.rows:
-        try:
-            capture = capture_of_row(row)
-            found = folder.file(capture["frame"])
-        except InputError as error:
-            problems.append(f"{where}: row {number}: {row.get('frame', '')}: {error}")
-            continue
-        stem = re.sub(r"[^\w.-]+", "_", str(capture.get("id") or frame_name(capture["frame"])))
-        used[stem] += 1
-        frame = f"frames/{stem if used[stem] == 1 else f'{stem}-{used[stem]}'}.npy"
-        captures.append({"id": stem, "side": "left", "exposure_s": None} | capture | {"frame": frame})
-        images[frame] = found or path / capture["frame"]
-        numbers.append(number)
-    if problems:
-        raise RecordingError(problems)
-    measured, remarks = _measured(captures, images)
+    listed = _listed_frames(path, index, where)
+    captures, images, numbers = listed.captures, listed.images, listed.numbers
+    measured, known, remarks = _measured(listed, choice.ignored)
+    if listed.stacks:
+        more = f" and {len(listed.stacks) - 3} more" if len(listed.stacks) > 3 else ""
+        remarks.append(
+            f"{where}: each page of {', '.join(listed.stacks[:3])}{more} is a frame of its own, in the order of the "
+            "pages (a time in the index isn't used for them)"
+        )
     readouts: dict[Side, Readout] = {}
-    for side, listed in taps.items():
-        if listed and side in measured:
+    for side, own_taps in taps.items():
+        if own_taps and side in measured:
             own = [images[capture["frame"]] for capture in captures if capture["side"] == side]
-            cut = readout(listed, own, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
+            cut = readout(own_taps, own, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
             measured[side] |= {"rows": cut.shape[0], "cols": cut.shape[1], "black_level_dn": cut.black_level_dn}
+            for key in ("cfa", "black_level_dn"):  # of the whole sensor
+                if known[side].pop(key, None) is not None and key == "cfa":
+                    del measured[side]["cfa"]
             readouts[side] = cut
+    if listed.renamed:
+        more = f" (and {len(listed.renamed) - 1} more)" if len(listed.renamed) > 1 else ""
+        remarks.append(f"{where}: {listed.renamed[0]}{more}; write the names as the files have them")
     described = cameras(measured)
     text = json.dumps(
         {
@@ -331,15 +363,95 @@ def _recording_set(
     warnings = _by_row(warnings, numbers)
     remarks += [remark for one in readouts.values() for remark in one.remarks]
     remarks += remarks_on(path, _spectra(manifest))
-    manifest, said = held_against_frames(manifest, images, where)
+    manifest, said = held_against_frames(manifest, images, where, choice)
     remarks += said
+    statements = described_sides(path / CAMERA)
+    for side, camera in described.items():
+        files = {images[capture["frame"]]: capture["kind"] for capture in captures if capture["side"] == side}
+        stated = statements.get(side, {})
+        if files:
+            boards = [file for file, kind in files.items() if kind == "charuco"]
+            remarks += taken_from_file(stated, known[side], next(iter(files)))
+            remarks += compare_with_files(camera, stated, files, boards, choice.ignored, is_whole=side not in readouts)
     by_frame = {capture["frame"]: readouts[capture["side"]] for capture in captures if capture["side"] in readouts}
     return RecordingSet(
         manifest,
         source=str(path),
         warnings=tuple(dict.fromkeys((*index.remarks, *warnings, *remarks))),
-        files=TapFiles(path, images, by_frame),
+        files=TapFiles(path, images, by_frame, listed.pages),
     )
+
+
+@dataclass
+class _ListedFrames:
+    """What the rows of an index list, a capture for each frame. `images`: file of each frame by its path in the
+    recording set; `pages`: its page, where the file has several; `numbers`: row of each capture; `stacks`: files of
+    several pages, with their number; `renamed`: remarks on names that the files have otherwise."""
+
+    captures: list[dict[str, Any]] = field(default_factory=list)
+    images: dict[str, Path] = field(default_factory=dict)
+    pages: dict[str, int] = field(default_factory=dict)
+    numbers: list[int] = field(default_factory=list)
+    stacks: list[str] = field(default_factory=list)
+    renamed: list[str] = field(default_factory=list)
+
+
+def _listed_frames(path: Path, index: Index, where: str) -> _ListedFrames:
+    """Return the captures of an index with ids that are unique where the rows state none. Raises RecordingError with
+    one line for each row whose frame can't be used."""
+    listed = _ListedFrames()
+    problems: list[str] = []
+    used: set[str] = set()
+    stems = Counter(_stem(frame_name(row.get("frame", ""))) for _, row in index.rows if "id" not in row)
+    for number, row in index.rows:
+        try:
+            capture = capture_of_row(row)
+            file, renamed = locate_as_written(path, capture["frame"])
+            many = _pages(file)
+        except InputError as error:
+            problems.append(f"{where}: row {number}: {row.get('frame', '')}: {error}")
+            continue
+        listed.renamed += [renamed] if renamed else []
+        stem = _stem(str(capture.get("id") or frame_name(capture["frame"])))
+        if "id" not in capture and stems[stem] > 1:  # of several folders
+            stem = _stem(capture["frame"].rpartition("/")[0].replace("/", "-") + "-" + stem).lstrip("-")
+        if many > 1:
+            listed.stacks.append(f"{capture['frame']} ({many})")
+        for page in range(many):
+            name = _unused(stem if many == 1 else f"{stem}-p{page + 1}", used)
+            frame = f"frames/{name}.npy"
+            own = {"id": name, "side": "left", "exposure_s": None} | capture | {"frame": frame}
+            if many > 1:
+                listed.pages[frame] = page
+                own |= {"id": name} | ({"pose": f"{capture['pose']}-p{page + 1}"} if "pose" in capture else {})
+                own.pop("time", None)  # of one page, and which isn't known
+            listed.captures.append(own)
+            listed.images[frame] = file
+            listed.numbers.append(number)
+    if problems:
+        raise RecordingError(problems)
+    return listed
+
+
+def _stem(name: str) -> str:
+    """Return a name with the letters that ids and files have."""
+    return re.sub(r"[^\w.-]+", "_", name)
+
+
+def _unused(name: str, used: set[str]) -> str:
+    """Return the name, with the first number behind it that makes it a new one where it is used; it is used from now
+    on."""
+    numbered = (name if number == 1 else f"{name}-{number}" for number in count(1))
+    free = next(one for one in numbered if one not in used)
+    used.add(free)
+    return free
+
+
+def _pages(file: Path) -> int:
+    """Return the pages of a TIFF, or the frames of a FITS file; 1 of other files."""
+    if is_fits(file):
+        return fits_header(file, with_image=False).frames
+    return picture_facts(file).pages if file.suffix.lower() in TIFFS else 1
 
 
 def _by_row(lines: Sequence[str], numbers: Sequence[int]) -> list[str]:
@@ -364,101 +476,30 @@ def _spectra(manifest: Manifest) -> list[str]:
     return list(dict.fromkeys(named))
 
 
-def _measured(captures: list[dict[str, Any]], images: dict[str, Path]) -> tuple[dict[Side, dict[str, Any]], list[str]]:
-    """Rows and columns of each side's first image, and the bit depth of files of 8 bit: what `camera.toml` may leave
-    out. And what is dropped of the images, in sentences."""
+def _measured(
+    listed: _ListedFrames, ignored: Collection[str]
+) -> tuple[dict[Side, dict[str, Any]], dict[Side, dict[str, Any]], list[str]]:
+    """What each side's first image tells and `camera.toml` may leave out: rows and columns, and the bit depth of files
+    of 8 bit; of these, what its file states (mosaic, black level, bits a sample). And what is dropped of the images, in
+    sentences."""
     measured: dict[Side, dict[str, Any]] = {}
+    known: dict[Side, dict[str, Any]] = {}
     remarks = []
     for side in get_args(Side):
-        first = next((images[capture["frame"]] for capture in captures if capture["side"] == side), None)
-        if first is None:
+        name = next((capture["frame"] for capture in listed.captures if capture["side"] == side), None)
+        if name is None:
             continue
+        first = listed.images[name]
         try:
-            image = decoded(first) if first.suffix.lower() in IMAGES else None
-            frame = read_image(first) if image is None else grey(image)
+            image = read_picture(first, listed.pages.get(name)) if first.suffix.lower() in IMAGES else None
+            frame = read_image(first, listed.pages.get(name)) if image is None else grey(image)
+            known[side] = known_from_file(first, (frame.shape[0], frame.shape[1]), ignored)
         except InputError as error:
             raise InputError(f"{first}: {error}") from error
         measured[side] = {"rows": frame.shape[0], "cols": frame.shape[1]}
         if image is not None and image.dtype == np.uint8:
             measured[side]["bit_depth"] = 8
+        measured[side] |= known[side]
         if image is not None and has_alpha(image):
             remarks.append(f"{first}: has a channel of transparency, which is dropped, as in the others of this side")
-    return measured, remarks
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# A folder of FITS frames. The header of each says what it shows, or an `index.csv` beside them, as in a folder of
-# raws.
-#
-# Used of the header: IMAGETYP or OBSTYPE (dark, bias, zero, flat), EXPTIME or EXPOSURE (s), CCD-TEMP, DATE-OBS. An
-# index has one row a frame; its empty cells of exposure, temperature and time are taken from the header. GAIN and
-# BAYERPAT have no common meaning: state these values in `camera.toml`, which has the camera's keys, `cfa` and
-# `bit_depth` at least.
-
-
-def read_fits_folder(path: Path, tap: str = "") -> RecordingSet:
-    """Return the FITS frames in the folder `path` as a recording set. `tap`: that tap of the sensor alone.
-
-    Raises RecordingError with one line for every frame that can't be used: damaged, without an exposure. Frames whose
-    image type is neither dark nor flat need an `index.csv`; without one they are left out with a warning.
-    """
-    if (path / INDEX).is_file():
-        return recordings_of_index(path, _with_headers(path), str(path / INDEX), tap)
-    files = sorted(file for file in path.iterdir() if is_fits(file))
-    if not files:
-        raise InputError(f"{path}: no FITS frames ({', '.join(FITS)}, also with {GZIP}); give their folder")
-    rows: list[tuple[int, dict[str, str]]] = []
-    problems: list[str] = []
-    left_out: dict[str, list[str]] = {}
-    for number, file in enumerate(files, start=1):
-        try:
-            header = fits_header(file)
-        except InputError as error:
-            problems.append(f"{file}: {error}")
-            continue
-        if header.kind is None:
-            left_out.setdefault(header.image_type or "none", []).append(file.name)
-        elif header.exposure_s is None:
-            problems.append(f"{file}: its header has no EXPTIME; write exposure_s into {INDEX}")
-        else:
-            rows.append((number, {"frame": file.name, "kind": header.kind} | _cells(header)))
-    if problems:
-        raise RecordingError(problems)
-    types = "; ".join(f"IMAGETYP {kind}: {names[0]} and {len(names) - 1} more" for kind, names in left_out.items())
-    if not rows:
-        raise InputError(
-            f"{path}: no frame says that it is dark or flat ({types}); write {INDEX}: frame,kind,exposure_s,..."
-        )
-    recordings = recordings_of_index(path, Index(rows), str(path), tap)
-    if left_out:
-        recordings.warnings += (f"{path}: neither dark nor flat and left out: {types}; write {INDEX} to use them",)
-    return recordings
-
-
-def _cells(header: FitsHeader) -> dict[str, str]:
-    """Return what a header states, as cells of an index."""
-    stated = {
-        "exposure_s": None if header.exposure_s is None else f"{header.exposure_s:.12g}",
-        "temperature_c": None if header.temperature_c is None else f"{header.temperature_c:.6g}",
-        "time": None if header.time is None else header.time.isoformat(),
-    }
-    return {key: cell for key, cell in stated.items() if cell is not None}
-
-
-def _with_headers(path: Path) -> Index:
-    """Return the index, with what the headers state in empty cells."""
-    rows: list[tuple[int, dict[str, str]]] = []
-    problems: list[str] = []
-    index = read_index(path / INDEX)
-    for number, row in index.rows:
-        file = path / row.get("frame", "")
-        if is_fits(file) and file.is_file():
-            try:
-                rows.append((number, _cells(fits_header(file)) | row))
-            except InputError as error:
-                problems.append(f"{path / INDEX}: row {number}: {row['frame']}: {error}")
-        else:
-            rows.append((number, row))
-    if problems:
-        raise RecordingError(problems)
-    return replace(index, rows=rows)
+    return measured, known, remarks

@@ -8,7 +8,8 @@ picture."""
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -20,9 +21,16 @@ from pydantic import ValidationError
 
 from lab.errors import InputError
 from lab.formats.cgats import read_foreign_csv
-from lab.formats.importers.images import IMAGES, decoded, described_sides, has_alpha, read_image
+from lab.formats.importers.images import codes_of, described_sides, has_alpha, read_image
+from lab.formats.importers.own_statements import (
+    compare_with_files,
+    known_from_file,
+    subsampling_remark,
+    taken_from_file,
+)
 from lab.formats.importers.stated_settings import held_against_frames
-from lab.formats.recording_set import DataSheet, Frame, Manifest, RecordingSet
+from lab.formats.pictures import IMAGES, picture_facts, read_picture
+from lab.formats.recording_set import DataSheet, Frame, Manifest, RecordingSet, frame_problem
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic
@@ -39,7 +47,8 @@ class ImportOptions:
     place of the `camera.toml` beside the picture. `channel`: of a colour picture, R, G or B. `transfer`: what the
     picture's codes are, proportional to the light or sRGB. `corners`: of a chart's 24 patches, [row, col] of dark skin,
     bluish green, black, white. `light`, `white_patch`: CSV of the radiance of a perfect diffuser, or of the chart's
-    white patch, in the chart's place. `tap`: one tap of the sensor alone."""
+    white patch, in the chart's place. `tap`: one tap of the sensor alone. `only`: frames whose headers state these
+    settings, KEY=VALUE,...; `ignore`: keywords of headers that aren't used, KEY,..."""
 
     checkerboard: tuple[int, int] | None = None
     dots: tuple[int, int] | None = None
@@ -52,6 +61,8 @@ class ImportOptions:
     light: Path | None = None
     white_patch: Path | None = None
     tap: str | None = None
+    only: str | None = None
+    ignore: str | None = None
 
     def stated(self) -> tuple[str, ...]:
         """Names of the options that are stated, as on the command line."""
@@ -210,44 +221,86 @@ def _picture(
         raise InputError(f"{path}: no such file; give one picture")
     file, keys = _stated_camera(path, options)
     is_image = path.suffix.lower() in IMAGES
-    try:
-        image = decoded(path) if is_image else read_image(path)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    colours = image.ndim == 3 and image.shape[2] >= 3 and bool(np.ptp(image[..., :3], axis=2).any())
-    lacking = [] if colours or "cfa" in keys else ["cfa"]
+    with _about(path):
+        image = read_picture(path) if is_image else read_image(path)
+        known = known_from_file(path, (image.shape[0], image.shape[1]))
+        colours = image.ndim == 3 and image.shape[2] >= 3 and bool(np.ptp(image[..., :3], axis=2).any())
+        notes = _refuse_mixed_channels(path, options) if is_image and colours else ()
+    stated = frozenset(keys)
+    keys = known | keys
     if image.dtype == np.uint8:
         keys.setdefault("bit_depth", 8)
-    lacking += [key for key in ("bit_depth", "black_level_dn") if key not in keys]
-    told = ([f"{', '.join(lacking)} ({file})"] if lacking else []) + list(missing)
-    if options.exposure_s is None:
-        told.append("--exposure-s")
-    if is_image and options.transfer is None:
-        told.append("--transfer linear, or srgb where the picture is made for a screen")
-    if told:
-        raise InputError(f"{path}: isn't stated: {'; '.join(told)}; state them")
-    notes: tuple[str, ...] = ()
+    _refuse_unstated(path, file, keys, options, missing, needs_cfa=not colours)
     if has_alpha(image):
         notes += (f"{path}: has a channel of transparency, which is dropped",)
-    if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path}: its values are {image.dtype}; save 8 or 16 bit")
     if colours:
-        values, keys["cfa"] = plane_of(image[..., 2::-1])
+        image, keys["cfa"] = plane_of(image[..., :3])
         notes += (f"{path}: a colour picture: its pixels are no mosaic's, and neighbours share their noise",)
     else:
-        values = image[..., 0] if image.ndim == 3 else image
-    frame = np.ascontiguousarray(values, dtype=np.uint16)
+        notes += tuple(taken_from_file(stated, known, path))
+    with _about(path):
+        frame = codes_of(image[..., 0] if image.ndim == 3 else image)
+    camera = _camera_of(file, keys, frame)
+    if problem := frame_problem(frame, camera):
+        raise InputError(f"{path}: {problem}")
+    notes += tuple(compare_with_files(camera, frozenset() if colours else stated, [path]))
     if options.transfer == "srgb":
         frame, keys = _linear(frame, keys)
+        camera = _camera_of(file, keys, frame)
         notes += (
             f"{path}: decoded from sRGB to linear codes of {LINEAR_BITS} bit; a screen's tone curve isn't undone",
         )
+    return frame, camera, notes
+
+
+@contextmanager
+def _about(path: Path) -> Iterator[None]:
+    """Put the picture's path before an InputError that doesn't state it."""
     try:
-        camera = DataSheet.model_validate(keys | {"rows": frame.shape[0], "cols": frame.shape[1]})
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _refuse_unstated(
+    path: Path,
+    file: Path,
+    keys: Mapping[str, Any],
+    options: ImportOptions,
+    missing: tuple[str, ...],
+    *,
+    needs_cfa: bool,
+) -> None:
+    """Raise InputError that names everything that isn't stated."""
+    needed = (*(("cfa",) if needs_cfa else ()), "bit_depth", "black_level_dn")
+    lacking = [key for key in needed if key not in keys]
+    told = ([f"{', '.join(lacking)} ({file})"] if lacking else []) + list(missing)
+    if options.exposure_s is None:
+        told.append("--exposure-s")
+    if path.suffix.lower() in IMAGES and options.transfer is None:
+        told.append("--transfer linear, or srgb where the picture is made for a screen")
+    if told:
+        raise InputError(f"{path}: isn't stated: {'; '.join(told)}; state them")
+
+
+def _refuse_mixed_channels(path: Path, options: ImportOptions) -> tuple[str, ...]:
+    """Return the note on a colour picture whose channels share their fine detail; InputError, without the path, where
+    the channel that is asked for has least of its own."""
+    mixed = subsampling_remark(picture_facts(path))
+    if mixed is None:
+        return ()
+    if options.channel in ("R", "B"):
+        raise InputError(f"{mixed}; give --channel G, a picture without subsampling, or the raw")
+    return (f"{path}: {mixed}",)
+
+
+def _camera_of(file: Path, keys: Mapping[str, Any], frame: Frame) -> DataSheet:
+    """Return the camera that a camera file's keys describe, of the frame's size."""
+    try:
+        return DataSheet.model_validate({**keys, "rows": frame.shape[0], "cols": frame.shape[1]})
     except ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"{file}: {'.'.join(map(str, first['loc']))}: {first['msg']}; correct it") from error
-    return frame, camera, notes
 
 
 def _stated_camera(path: Path, options: ImportOptions) -> tuple[Path, dict[str, Any]]:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import log10
 from pathlib import Path
@@ -22,9 +23,17 @@ from pydantic import ValidationError
 
 from lab.capture_kinds.base import Capture
 from lab.errors import InputError
-from lab.formats.importers.images import fits_header, is_fits
+from lab.formats.importers.fits_file import FitsHeader, fits_header, is_fits
+from lab.formats.importers.frame_settings import (
+    ALL_FRAMES,
+    F_NUMBER_FACTOR,
+    HeaderChoice,
+    StatedFrame,
+    compare_settings,
+    text_of,
+)
 from lab.formats.raw_file import TiffDescription
-from lab.formats.recording_set import RAWS, InstrumentSnapshot, Manifest, differences
+from lab.formats.recording_set import RAWS, DataSheet, InstrumentSnapshot, Manifest, RecordingError
 from lab.formats.recording_set.manifest import Value
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -46,7 +55,9 @@ PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 @dataclass(frozen=True)
 class FrameHeader:
     """How a frame was taken, by its own file. None: not stated. `source`: what states it, in a word; `camera`: which
-    camera did, and how it was set."""
+    camera did, and how it was set; `stacked`: that the frame is made of several; `settings`: those of `frame_settings`,
+    by keyword; `problems`: (key of the capture, line) of values that can't be used; `remarks`: values that were
+    converted."""
 
     source: str
     exposure_s: float | None = None
@@ -55,6 +66,11 @@ class FrameHeader:
     gain_db: float | None = None
     temperature_c: float | None = None
     camera: InstrumentSnapshot | None = None
+    pixel_pitch_um: float | None = None
+    stacked: str | None = None
+    settings: Mapping[str, str | float] = field(default_factory=dict)
+    problems: tuple[tuple[str, str], ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def is_marked(self) -> bool:
@@ -62,15 +78,15 @@ class FrameHeader:
         return self.source in ("EXIF", "metadata")
 
 
-def frame_header(file: Path) -> FrameHeader | None:
-    """Return the header of a frame's file; None where it states nothing that is known here."""
+def frame_header(file: Path, ignored: Collection[str] = ()) -> FrameHeader | None:
+    """Return the header of a frame's file without `ignored` keywords; None where it states nothing that is known
+    here."""
     suffix = file.suffix.lower()
     found: FrameHeader | None = None
     try:
         if is_fits(file):
-            header = fits_header(file, with_image=False)
-            found = FrameHeader("FITS header", exposure_s=header.exposure_s, temperature_c=header.temperature_c)
-        elif suffix in RAWS:
+            return _of_fits(fits_header(file, with_image=False, ignored=ignored))
+        if suffix in RAWS:
             found = _of_raw(file)
         elif suffix in (".tif", ".tiff"):
             with file.open("rb") as stream:
@@ -82,7 +98,26 @@ def frame_header(file: Path) -> FrameHeader | None:
             found = _of_tiff(io.BytesIO(block)) if block is not None else None
     except (OSError, InputError, rawpy.LibRawError):
         return None
-    return found
+    if found is None or not ignored:
+        return found
+    return replace(found, settings={key: value for key, value in found.settings.items() if key not in ignored})
+
+
+def _of_fits(header: FitsHeader) -> FrameHeader:
+    settings = dict(header.settings)
+    model, serial = (text_of(settings[key]) if key in settings else "" for key in ("INSTRUME", "SERNO"))
+    camera = InstrumentSnapshot(model=model, serial_number=serial, settings=settings) if model or serial else None
+    return FrameHeader(
+        "FITS header",
+        exposure_s=header.exposure_s,
+        temperature_c=header.temperature_c,
+        camera=camera,
+        pixel_pitch_um=header.pixel_pitch_um,
+        settings=settings,
+        stacked=header.stacked,
+        problems=header.problems,
+        remarks=header.remarks,
+    )
 
 
 def _of_raw(file: Path) -> FrameHeader | None:
@@ -92,12 +127,16 @@ def _of_raw(file: Path) -> FrameHeader | None:
         taken = getattr(raw, "other", None)  # older versions don't tell it
         if taken is None:
             return None
+        f_number, iso = _above_zero(taken.aperture), _above_zero(taken.iso_speed)
+        settings = dict(told.settings) if told is not None else {}
+        of_dials = {"FNumber": f_number, "ISO": iso, "FocalLength": _above_zero(taken.focal_length)}
         return FrameHeader(
             "metadata",
             exposure_s=_above_zero(taken.shutter_speed),
-            f_number=_above_zero(taken.aperture),
-            iso=_above_zero(taken.iso_speed),
+            f_number=f_number,
+            iso=iso,
             camera=told.camera if told is not None else None,
+            settings=settings | {key: value for key, value in of_dials.items() if value is not None},
         )
 
 
@@ -116,12 +155,18 @@ def _of_tiff(stream: Any) -> FrameHeader | None:
         return FrameHeader("description", exposure_s=_above_zero(own.exposure_s), gain_db=own.gain_db)
     except ValidationError:
         pass
+    f_number = _above_zero(tags.get("FNumber"))
+    iso = _above_zero(tags.get("PhotographicSensitivity", tags.get("ISOSpeedRatings")))
+    stated: dict[str, str | float | None] = {"FNumber": f_number, "ISO": iso}
+    stated["FocalLength"] = _above_zero(tags.get("FocalLength"))
+    stated |= {key: _text(tags.get(key)) or None for key in ("Model", "BodySerialNumber")}
     return FrameHeader(
         "EXIF",
         exposure_s=_above_zero(tags.get("ExposureTime")),
-        f_number=_above_zero(tags.get("FNumber")),
-        iso=_above_zero(tags.get("PhotographicSensitivity", tags.get("ISOSpeedRatings"))),
+        f_number=f_number,
+        iso=iso,
         camera=_camera(tags),
+        settings={key: value for key, value in stated.items() if value is not None},
     )
 
 
@@ -190,11 +235,11 @@ LONGEST_S, LONGEST_LIT_S = 3600.0, 60.0
 #: Factor within which a shutter that is marked in thirds of a stop is meant, half of a third: 1/60 s is 1/64 s. Others
 #: are measured: relative.
 MARKED_FACTOR, MEASURED_SHARE = 2.0 ** (1.0 / 6.0), 0.02
-#: Factor within which two f-numbers are one marking: half of a third of a stop, by the square root. f/5.6 is 5.66.
-F_NUMBER_FACTOR = 2.0 ** (1.0 / 12.0)
 #: Difference of two gains that ISO speeds, marked in thirds of a stop (2 dB), leave open, dB; and of temperatures,
 #: degree C.
 GAIN_DB, TEMPERATURE_C = 1.0, 1.0
+#: Relative difference of two pixel pitches that rounding leaves open: data sheets have two to three digits.
+PITCH_SHARE = 0.02
 #: What a time that is written to the second leaves open, s.
 CLOCK_S = 1.0
 #: Factors between units of time.
@@ -203,30 +248,121 @@ UNIT_FACTORS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 FEWEST_ROWS, FEWEST_OFF = 4, 2
 
 
-def held_against_frames(manifest: Manifest, images: Mapping[str, Path], where: str) -> tuple[Manifest, list[str]]:
-    """Return the manifest with the cameras that the frames' own files name; and one line for each quantity of it that
-    these files contradict, and for exposures that are hardly meant in seconds.
+def held_against_frames(
+    manifest: Manifest, images: Mapping[str, Path], where: str, choice: HeaderChoice = ALL_FRAMES
+) -> tuple[Manifest, list[str]]:
+    """Return the manifest with what the frames' own files add to it: cameras, temperatures and gains (dB) that it
+    leaves open; and one line for each quantity that these files contradict or convert, and for exposures that are
+    hardly meant in seconds.
 
-    `images`: the file of each frame by its path. Raises InputError where the exposures can't be right: `where` names
-    what lists them."""
-    headers = {path: frame_header(file) for path, file in images.items()}
+    `images`: the file of each frame by its path. Raises InputError where the exposures can't be right, frames are made
+    of several, or settings differ between frames that are fitted together: `where` names what lists
+    them."""
+    by_file = {file: frame_header(file, choice.ignored) for file in dict.fromkeys(images.values())}
     seen = [
         _HeaderSeen(capture, images[capture.frame], header)
         for capture in manifest.captures
-        if (header := headers[capture.frame]) is not None
+        if (header := by_file[images[capture.frame]]) is not None
     ]
-    lines = _contradictions(manifest, seen, images, where)
-    there: dict[str, InstrumentSnapshot] = {}
-    for side in manifest.cameras:
-        name = f"camera {side}"
-        named = [(one, one.header.camera) for one in seen if one.capture.side == side and one.header.camera is not None]
-        for one, camera in named:
-            first = there.setdefault(name, camera)
-            who = {name: camera.model_copy(update={"settings": {}})}  # lens and white balance may differ
-            if changed := differences({name: first}, who):
-                lines.append(f"{one.file}: {changed[0]}, as in {named[0][0].file.name}: give each camera its own side")
-                break
-    return manifest.model_copy(update={"instruments": there}) if there else manifest, lines
+    whole, lines = _completed(manifest, seen)
+    places = {id(capture): place for place, capture in enumerate(manifest.captures)}
+    seen = [replace(one, capture=whole.captures[places[id(one.capture)]]) for one in seen]
+    manifest = whole
+    lines += _contradictions(manifest, seen, images, where)
+    problems, uneven = compare_settings(
+        [StatedFrame(one.capture, one.file, one.header.settings) for one in seen], where
+    )
+    for side, camera in manifest.cameras.items():
+        own = [one for one in seen if one.capture.side == side]
+        problems += _stacked(own)
+        lines += _other_pitch(own, camera)
+    if problems:
+        raise RecordingError(problems)
+    cameras = {
+        f"camera {side}": _named_camera([one for one in seen if one.capture.side == side]) for side in manifest.cameras
+    }
+    there = {name: camera for name, camera in cameras.items() if camera is not None}
+    return manifest.model_copy(update={"instruments": there}) if there else manifest, lines + uneven + _remarks(seen)
+
+
+def _completed(manifest: Manifest, seen: Sequence[_HeaderSeen]) -> tuple[Manifest, list[str]]:
+    """Return the manifest with temperatures and gains that it leaves open and the frames' own files state, and a line
+    for each quantity."""
+    captures = {id(capture): capture for capture in manifest.captures}
+    lines = []
+    for key, unit in (("temperature_c", "degree C"), ("gain_db", "dB")):
+        added = [one for one in seen if getattr(one.capture, key) is None and getattr(one.header, key) is not None]
+        for one in added:
+            known = {key: getattr(one.header, key)}
+            captures[id(one.capture)] = captures[id(one.capture)].model_copy(update=known)
+        if added:
+            values = [getattr(one.header, key) for one in added]
+            span = f"{min(values):g}" + (f" .. {max(values):g}" if max(values) > min(values) else "")
+            lines.append(f"{added[0].file}: {key} = {span} {unit} by its {added[0].header.source}{_and(added)}")
+    if not lines:
+        return manifest, []
+    return manifest.model_copy(update={"captures": tuple(captures.values())}), lines
+
+
+def _named_camera(own: Sequence[_HeaderSeen]) -> InstrumentSnapshot | None:
+    """Return the camera that the frames of one side name, with the settings that all of them share."""
+    named = [one.header.camera for one in own if one.header.camera is not None]
+    if not named:
+        return None
+    shared = {
+        key: value
+        for key, value in named[0].settings.items()
+        if all(camera.settings.get(key) == value for camera in named)
+    }
+    return named[0].model_copy(update={"settings": shared})
+
+
+def _stacked(own: Sequence[_HeaderSeen]) -> list[str]:
+    """Return the line for frames that are means or sums of several."""
+    off = [one for one in own if one.header.stacked is not None and one.capture.codes_are_fitted]
+    if not off:
+        return []
+    line = (
+        f"{off[0].file}: {off[0].header.stacked}{_and(off)}: made of several frames, whose noise isn't one frame's; "
+        "give the single frames, or where the header is wrong, --ignore its keyword"
+    )
+    return [line]
+
+
+def _other_pitch(own: Sequence[_HeaderSeen], camera: DataSheet) -> list[str]:
+    """Return the line for frames whose headers state another pixel pitch than the camera's."""
+    pitch_um = camera.pixel_pitch_um
+    line = _said(
+        "pixel_pitch_um",
+        "um",
+        [
+            (one, pitch_um, one.header.pixel_pitch_um)
+            for one in own
+            if _differ(pitch_um, one.header.pixel_pitch_um, PITCH_SHARE * (pitch_um or 0.0))
+        ],
+    )
+    return [line] if line else []
+
+
+def _remarks(seen: Sequence[_HeaderSeen]) -> list[str]:
+    """Return the headers' remarks, and problems with what the captures don't state either, one line for all frames
+    that have the same but for numbers."""
+    texts: list[tuple[Path | str, str]] = []
+    for one in {one.file: one for one in seen}.values():
+        open_ones = [line for key, line in one.header.problems if getattr(one.capture, key) is None]
+        texts += [(one.file, text) for text in (*open_ones, *one.header.remarks)]
+    return join_alike(texts)
+
+
+def join_alike(texts: Sequence[tuple[Path | str, str]]) -> list[str]:
+    """Return one line for all files with the same text but for numbers: the first file, its text, and how many more."""
+    found: dict[str, list[tuple[Path | str, str]]] = {}
+    for file, text in texts:
+        found.setdefault(re.sub(r"[\d.+-]+", "#", text), []).append((file, text))
+    return [
+        f"{alike[0][0]}{f' and {len(alike) - 1} more' if len(alike) > 1 else ''}: {alike[0][1]}"
+        for alike in found.values()
+    ]
 
 
 def _contradictions(
@@ -258,6 +394,7 @@ def _contradictions(
     lines.append(_said("temperature_c", "degree C", [one for one in warm if _differ(*one[1:], TEMPERATURE_C)]))
     gains = [(one, one.capture.gain_db, one.header.gain_db) for one in seen]
     lines.append(_said("gain_db", "dB", [one for one in gains if _differ(*one[1:], GAIN_DB)]))
+    lines += [_gain_of_some([c for c in manifest.captures if c.side == side], images) for side in manifest.cameras]
     for side, camera in manifest.cameras.items():
         own = [one for one in seen if one.capture.side == side]
         f_number, key = camera.f_number, "f_number"
@@ -345,7 +482,8 @@ def _said(key: str, unit: str, off: Sequence[tuple[_HeaderSeen, float | None, fl
 
 
 def _uneven_gain(own: Sequence[_HeaderSeen]) -> str:
-    """Return the line for frames of one side whose ISO speeds differ otherwise than their gains."""
+    """Return the line for frames of one side whose ISO speeds differ otherwise than their gains. Other ISO speeds at
+    one gain are a difference of settings."""
     known = [one for one in own if one.header.iso is not None]
     if not known:
         return ""
@@ -354,7 +492,8 @@ def _uneven_gain(own: Sequence[_HeaderSeen]) -> str:
     off = [
         one
         for one in known
-        if abs((one.capture.gain_db or 0.0) - gain_db - 20.0 * log10((one.header.iso or iso) / iso)) > GAIN_DB
+        if (one.capture.gain_db or 0.0) != gain_db
+        and abs((one.capture.gain_db or 0.0) - gain_db - 20.0 * log10((one.header.iso or iso) / iso)) > GAIN_DB
     ]
     if not off:
         return ""
@@ -364,6 +503,18 @@ def _uneven_gain(own: Sequence[_HeaderSeen]) -> str:
         f"{one.file}: its {one.header.source} says ISO {one.header.iso:g} and that of {first.file.name} ISO {iso:g}, "
         f"{20.0 * log10((one.header.iso or iso) / iso):+.1f} dB, but gain_db is {stated}{_and(off)}; write the gain "
         "of each into the column gain_db"
+    )
+
+
+def _gain_of_some(own: Sequence[Capture], images: Mapping[str, Path]) -> str:
+    """Return the line for frames of one side that state no gain where others do; empty where there is none."""
+    without = [capture for capture in own if capture.gain_db is None]
+    gains = sorted({capture.gain_db for capture in own if capture.gain_db is not None})
+    if not without or not any(gains):
+        return ""
+    return (
+        f"{images[without[0].frame]}: no gain_db{_and(without)}, where others state "
+        f"{', '.join(f'{gain:g}' for gain in gains)} dB: taken as 0 dB; write the gain of each into the column gain_db"
     )
 
 

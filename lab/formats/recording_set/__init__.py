@@ -15,8 +15,9 @@ from lab.formats.recording_set.manifest import (
     differences,
     manifest_json,
     parse_manifest,
+    text_problems,
 )
-from lab.formats.recording_set.recordings import RecordingSet
+from lab.formats.recording_set.recordings import RecordingSet, frame_problem
 
 __all__ = [
     "RAWS",
@@ -34,11 +35,13 @@ __all__ = [
     "archive",
     "clipped_share",
     "differences",
+    "frame_problem",
     "inspect",
     "load_frame",
     "manifest_json",
     "packed",
     "parse_manifest",
     "read",
+    "text_problems",
     "write",
 ]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.base import Capture, Names, Open, names_in
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
@@ -18,7 +19,8 @@ from lab.errors import InputError
 from lab.formats.recording_set.files import Frame
 from lab.formats.recording_set.manifest import DataSheet, Findings
 from lab.formats.recording_set.recordings import RecordingSet
-from sim.camera import Side
+from sim.camera import CameraModel, Lens, Side
+from sim.parameters import read_quantities
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Darks and flats that contradict their own names or places: more light without light than with it, and frames moved
@@ -422,6 +424,14 @@ def _camera_problems(camera: DataSheet) -> Iterator[str]:
             f"black_level_dn = {camera.black_level_dn:g} isn't below the white level {camera.saturation_dn:g}; "
             "correct one"
         )
+    for key, quantity in (read_quantities(CameraModel) | read_quantities(Lens)).items():
+        value, unit = getattr(camera, key, None), "" if quantity.unit == "1" else f" {quantity.unit}"
+        for limit, beyond in ((quantity.lower, "below"), (quantity.upper, "above")):
+            if value is not None and limit is not None and (value < limit if beyond == "below" else value > limit):
+                yield (
+                    f"{key} = {value:g}{unit} is {beyond} the limit of {limit:g}{unit} ({quantity.meaning}); correct "
+                    "its value or its unit, or leave it out"
+                )
     for channel in camera.quantum_efficiency or {}:
         if channel not in camera.channels:
             yield (
@@ -500,6 +510,16 @@ def _check_cameras(recordings: RecordingSet, found: Findings) -> None:
                 found.problems.append(f"{recordings.where(camera.lens_file)} (lens_file of camera {side}): {error}")
 
 
+def _improbable_squares(capture: Capture) -> Iterator[str]:
+    """Say that the squares of a board are improbably small or large: as a rule, a length in another unit."""
+    from lab.formats.results.plausible import STATED  # here: its figures are those of recording sets' data sheets
+
+    if isinstance(capture, CharucoCapture):
+        line = STATED["square_mm"].sentence("square_mm", capture.square_mm, None, "mm")
+        if line is not None:
+            yield line
+
+
 def _check_captures(recordings: RecordingSet, found: Findings) -> None:
     manifest, source = recordings.manifest, recordings.source
     for id, count in Counter(capture.id for capture in manifest.captures).items():
@@ -512,7 +532,7 @@ def _check_captures(recordings: RecordingSet, found: Findings) -> None:
         found.warnings += _unknown_keys(where, capture)
         camera = manifest.cameras[capture.side]
         found.problems += [f"{where}: {text}" for text in capture.problems(camera.rows, camera.cols)]
-        for text in capture.remarks():
+        for text in (*capture.remarks(), *_improbable_squares(capture)):
             remarked.setdefault(text, []).append(capture.id)
         first = framed.setdefault(capture.frame, capture)
         if first is not capture and not capture.shares_frame:

@@ -10,10 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 import rawpy
-import tifffile
 from numpy.typing import NDArray
 
 from lab.errors import InputError, one_line
+from lab.formats.pictures import picture_facts, read_picture
 from lab.formats.recording_set.manifest import DataSheet
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.spectrum import Spectrum
@@ -42,7 +42,9 @@ def locate(root: Path, path: str) -> Path:
     if not inside:
         raise InputError("leads out of the folder; copy the file into the folder and name it by its relative path")
     if not exists:
-        raise InputError("no such file; add it, or take what needs it out of the manifest")
+        others = _in_other_case(root, pure)
+        near = f" (there is {', '.join(others)}: capitals count; rename it)" if others else ""
+        raise InputError(f"no such file{near}; add it, or take what needs it out of the manifest")
     if not is_file:
         raise InputError("not a file; name the file itself")
     if not os.access(found, os.R_OK):
@@ -50,6 +52,33 @@ def locate(root: Path, path: str) -> Path:
             "can't be read (Permission denied); run it as the user to whom it belongs, or have its permissions changed"
         )
     return found
+
+
+def _in_other_case(root: Path, path: PurePosixPath) -> list[str]:
+    """Return the paths below `root` that differ from `path` by capitals alone."""
+    found = [root]
+    for part in path.parts:
+        if part == "..":
+            return []
+        found = [
+            entry
+            for folder in found
+            if folder.is_dir()
+            for entry in folder.iterdir()
+            if entry.name.casefold() == part.casefold()
+        ]
+    return [entry.relative_to(root).as_posix() for entry in found]
+
+
+def locate_as_written(root: Path, path: str) -> tuple[Path, str | None]:
+    """Return the file at a path of an index that a person or another system wrote, and a remark where its name isn't
+    exactly that: separators as Windows has them, or other capitals, where just one file is meant. Raises InputError as
+    `locate`."""
+    named = path.replace("\\", "/") if "/" not in path else path
+    others = [] if (root / named).exists() else _in_other_case(root, PurePosixPath(named))
+    taken = others[0] if len(others) == 1 else named
+    file = locate(root, taken)
+    return file, None if taken == path else f"{path} is taken to be {taken}"
 
 
 def _load_npy(file: Path, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
@@ -72,27 +101,20 @@ def _load_npy(file: Path, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
 def _load_tif(file: Path, wanted: tuple[int, int] | None = None) -> NDArray[Any]:
     """Return a TIFF of one page, 16 bit, one sample a pixel. One of another shape than `wanted` isn't decoded: it may
     be far larger than its file."""
-    frame = None
-    try:
-        with tifffile.TiffFile(file) as tif:
-            pages, page = len(tif.pages), tif.pages[0]
-            shape, dtype = tuple(page.shape), np.dtype(page.dtype)
-            if pages == 1 and dtype == np.uint16 and len(shape) == 2 and wanted in (None, shape):
-                frame = np.ascontiguousarray(page.asarray())
-    except Exception as error:
-        raise InputError(f"damaged TIFF ({one_line(error)}); write it again or recapture") from error
-    if pages != 1:
-        raise InputError(f"has {pages} pages, not 1; save one file a frame")
-    if dtype != np.uint16:
-        raise InputError(f"its samples are {dtype}, not uint16; save raw DN as 16 bit")
-    if frame is None and len(shape) == 2 and wanted is not None:
+    facts = picture_facts(file)
+    shape = facts.shape or ()
+    if facts.pages != 1:
+        raise InputError(f"has {facts.pages} pages, not 1; save one file a frame")
+    if facts.dtype != np.uint16:
+        raise InputError(f"its samples are {facts.dtype}, not uint16; save raw DN as 16 bit")
+    if len(shape) != 2:
+        raise InputError(f"has the shape {shape}, not (rows, cols); save the mosaic, not colours")
+    if wanted is not None and wanted != shape:
         raise InputError(
             f"{shape[0]} x {shape[1]} pixels (rows x cols), but the manifest says {wanted[0]} x {wanted[1]}; "
             "recapture, or correct rows and cols"
         )
-    if frame is None:
-        raise InputError(f"has the shape {shape}, not (rows, cols); save the mosaic, not colours")
-    return frame
+    return read_picture(file)
 
 
 def _load_raw(file: Path, shape: tuple[int, int] | None = None) -> NDArray[Any]:

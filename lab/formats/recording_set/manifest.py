@@ -14,7 +14,9 @@ from typing import Any, Literal, get_args
 from pydantic import Field, ValidationError, field_validator
 
 from lab.capture_kinds.base import CAPTURES, AnyCapture, Capture, Open
+from lab.capture_kinds.flat import FlatCapture
 from lab.errors import InputError, one_line
+from lab.plain_text import complaints_of, escaped
 from sim.camera import Cfa, Shutter, Side
 
 # --- What each instrument was when recordings were taken: its identity, all its settings, and what couldn't be set ----
@@ -196,7 +198,10 @@ def _usable_captures(listed: list[Any], where: str, sides: Container[str], found
         if not isinstance(item, dict):
             found.problems.append(f"{at}: isn't an object; write the capture's keys")
             continue
-        at += f" ({item['id']})" if item.get("id") is not None else ""
+        at += f" ({escaped(str(item['id']))})" if item.get("id") is not None else ""
+        if lines := list(complaints_of(item)):
+            found.problems += [f"{at}: {line}" for line in lines]
+            continue
         kind = item.get("kind")
         if not isinstance(kind, str):
             found.problems.append(f"{at}: the kind is {kind!r}; write one of {', '.join(CAPTURES.names)}")
@@ -219,6 +224,13 @@ def _usable_captures(listed: list[Any], where: str, sides: Container[str], found
     return captures
 
 
+def text_problems(document: Mapping[str, Any], *unasked: str) -> Iterator[str]:
+    """Yield a line for each text of a manifest that has control characters, except in the keys `unasked`. Reports of
+    instruments are never asked for: nobody can correct them, and they are escaped where they are shown."""
+    asked = {key: value for key, value in document.items() if key not in ("instruments", "changes", *unasked)}
+    return complaints_of(asked, several_lines=("notes",))
+
+
 def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
     """Return the manifest in JSON `text`, and warnings for what was skipped. Raises RecordingError, one line for each
     problem."""
@@ -232,6 +244,7 @@ def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
         given = f"format {raw.get('format')!r} version {raw.get('version')!r}"
         raise RecordingError([f"{where}: {given}, not 'calibench-recording' 1; give a recording set of that version"])
     found = Findings()
+    found.problems += [f"{where}: {line}" for line in text_problems(raw, "captures")]
     listed, cameras = raw.get("captures"), raw.get("cameras")
     captures: list[Capture] = []
     if isinstance(listed, list):
@@ -250,4 +263,29 @@ def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
         found.problems.append(f"{where}: cameras is empty; describe the left camera at least")
     if found.problems or manifest is None:
         raise RecordingError(found.problems)
-    return manifest.model_copy(update={"captures": tuple(captures)}), found.warnings
+    return without_common_photons(manifest.model_copy(update={"captures": tuple(captures)}), where, found.warnings)
+
+
+#: Exposures from which on one number of photons for all flats is taken for that of a setting, not of an exposure: a
+#: responsivity needs three different lights, so that nothing is lost.
+EXPOSURES_OF_ONE_NUMBER = 3
+
+
+def without_common_photons(manifest: Manifest, where: str, warnings: list[str]) -> tuple[Manifest, list[str]]:
+    """Return the manifest with the numbers of photons taken out of the flats of a side that all state the same one at
+    three exposures or more, and `warnings` with a line for each such side."""
+    changed: dict[str, Capture] = {}
+    for side in manifest.cameras:
+        flats = [c for c in manifest.captures if isinstance(c, FlatCapture) and c.side == side and c.photons_per_pixel]
+        exposures = {flat.exposure_s for flat in flats}
+        if len({flat.photons_per_pixel for flat in flats}) != 1 or len(exposures) < EXPOSURES_OF_ONE_NUMBER:
+            continue
+        warnings.append(
+            f"{where}: all {len(flats)} flats of the {side} camera ({flats[0].id} .. {flats[-1].id}) state "
+            f"{flats[0].photons_per_pixel:g} photons a pixel at exposures of {min(exposures):g} to {max(exposures):g} "
+            "s; these are numbers of one exposure, so they are taken as unknown: K is fitted, the quantum efficiency "
+            "isn't; state the photons of each exposure"
+        )
+        changed |= {flat.id: flat.model_copy(update={"photons_per_pixel": None}) for flat in flats}
+    captures = tuple(changed.get(capture.id, capture) for capture in manifest.captures)
+    return manifest.model_copy(update={"captures": captures}) if changed else manifest, warnings

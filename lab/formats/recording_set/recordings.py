@@ -8,6 +8,7 @@ from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args, overload
 
+import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.base import Capture, in_folder
@@ -142,7 +143,7 @@ class RecordingSet:
         camera = self.camera(capture.side)
         try:
             frame = self._files.frame(capture.frame, camera)
-            if problem := _frame_problem(frame, camera):
+            if problem := frame_problem(frame, camera):
                 raise InputError(problem)  # noqa: TRY301
         except InputError as error:
             raise InputError(f"{self.where(capture.frame)} (capture {capture.id}): {error}") from error
@@ -184,7 +185,7 @@ class RecordingSet:
         return self._files.where(path)
 
 
-def _frame_problem(frame: Frame, camera: DataSheet) -> str | None:
+def frame_problem(frame: Frame, camera: DataSheet) -> str | None:
     """Why `frame` can't be a frame of `camera`, with the remedy; None where it can."""
     if frame.shape != (camera.rows, camera.cols):
         return (
@@ -193,13 +194,24 @@ def _frame_problem(frame: Frame, camera: DataSheet) -> str | None:
         )
     highest, limit = int(frame.max()), 2**camera.bit_depth - 1
     if highest > limit:
-        return (
-            f"{highest} DN is above what {camera.bit_depth} bits hold ({limit} DN); correct bit_depth, or save raw DN "
-            "unscaled"
-        )
+        return f"{highest} DN is above what {camera.bit_depth} bits hold ({limit} DN); {_remedy(frame, camera)}"
     if highest > camera.saturation_dn:
         return (
             f"{highest} DN is above white_level_dn = {camera.saturation_dn:g} DN; correct white_level_dn, or save raw "
             "DN unscaled"
         )
     return None
+
+
+def _remedy(frame: Frame, camera: DataSheet) -> str:
+    """Return what to do about codes above the bit depth: codes that are all multiples of 2^n are of fewer bits."""
+    shift = 0
+    while shift < 15 and not np.any(frame & ((2 << shift) - 1)):
+        shift += 1
+    if shift and int(frame.max()) >> shift < 2**camera.bit_depth:
+        return (
+            f"its codes are multiples of {1 << shift}, as codes of {camera.bit_depth} bits shifted up by {shift} are "
+            f"(left-aligned): state bit_depth = {camera.bit_depth + shift} and levels in stored codes, or save raw DN "
+            "unshifted"
+        )
+    return "correct bit_depth, or save raw DN unscaled"

@@ -406,5 +406,6 @@ class DiagnosisResult(DiagnosisLists):
     threshold: float | None = None
     false_alarm_rate: float | None = None
     summary: tuple[str, ...] = ()  # the diagnosis in sentences
+    warnings: tuple[str, ...] = ()  # of the fit: figures outside the range of working cameras
     policy: tuple[PolicyRule, ...] = ()  # the rules of decision
     baseline: str | None = None  # names of the camera files that it began with, where not with the fitted cameras

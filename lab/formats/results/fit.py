@@ -84,6 +84,8 @@ class NoiseFit(ChannelNoise):
     channels: dict[str, ChannelNoise] = {}
     #: By plane of the mosaic (`R`, `G1`, `G2`, `B`, or `Y`), by the letter of the standard.
     emva1288: dict[str, Emva1288] = {}
+    #: Amplification at which flats and darks were recorded; `conversion_gain_dn_per_e` is given for 0 dB.
+    gain_db: float | None = None
     photon_transfer: PhotonTransfer | None = None
     #: What the recordings show of the bench, in sentences ("the lamp drifted by ...").
     remarks: tuple[str, ...] = ()
@@ -218,6 +220,17 @@ class Emva1288(Frozen):
     prnu_column_percent_std: float | None = None
     prnu_pixel_percent: float | None = None
     prnu_pixel_percent_std: float | None = None
+    #: Of the same stacks, with the smooth surface (degree 6 in rows and columns) apart: highest less lowest light over
+    #: the mean (the standard asks for 3 % at most), standard deviation of the surface, and what rows and columns share
+    #: without it.
+    light_nonuniformity_percent: float | None = None
+    light_nonuniformity_percent_std: float | None = None
+    shading_percent: float | None = None
+    shading_percent_std: float | None = None
+    row_gain_percent: float | None = None
+    row_gain_percent_std: float | None = None
+    column_gain_percent: float | None = None
+    column_gain_percent_std: float | None = None
     dark_current_from_mean_e_per_s: float | None = None
     dark_current_from_mean_e_per_s_std: float | None = None
     dark_current_from_variance_e_per_s: float | None = None
@@ -228,9 +241,11 @@ class Emva1288(Frozen):
 
 
 class Emva1288Points(Frozen):
-    """The measured points, one entry per level; dark values are at the level's exposure.
+    """The measured points, one entry per level; dark values are at the level's exposure. Empty standard uncertainties:
+    of a result of an earlier version.
 
-    `light` is in `light_unit`: photons per pixel, or the exposure where the flats don't state photons.
+    `signal_dn_std`, `excess_variance_dn2_std`: of mean and variance less dark. `light` is in `light_unit`: photons per
+    pixel, or the exposure where the flats don't state photons.
     """
 
     light_unit: Literal["photons", "s"]
@@ -241,9 +256,13 @@ class Emva1288Points(Frozen):
     dark_mean_dn: tuple[float, ...]
     dark_variance_dn2: tuple[float, ...]
     linearity_deviation_percent: tuple[float | None, ...]
+    signal_dn_std: tuple[float, ...] = ()
+    excess_variance_dn2_std: tuple[float, ...] = ()
     dark_exposure_s: tuple[float, ...] = ()
     dark_exposure_mean_dn: tuple[float, ...] = ()
+    dark_exposure_mean_dn_std: tuple[float, ...] = ()
     dark_exposure_variance_dn2: tuple[float, ...] = ()
+    dark_exposure_variance_dn2_std: tuple[float, ...] = ()
     #: The pair of stacks that the spatial figures come from, and how many images each has.
     stack_dark_exposure_s: float | None = None
     stack_dark_images: int | None = None
@@ -577,6 +596,53 @@ class PsfSymmetry(Frozen):
 # --- The result of `calibench fit` ------------------------------------------------------------------------------------
 
 
+# --- Repeats of one setting over time ---------------------------------------------------------------------------------
+
+
+DriftShape = Literal["trend", "decay", "warm_up", "step"]
+
+
+class RepeatDrift(Frozen):
+    """What the means of repeated frames show over time beyond white scatter; how it is found: `lab.measure.repeats`.
+
+    `kind`: of the captures; `captures`: all repeats of the setting in order, `changing`: those in which the curve
+    changes. `amplitude_dn`: change of the curve from the first of these to the last. `time_constant_s`, or `_frames`
+    where captures state no time: of a decay or warm-up; `steady_dn`: the value that it approaches. `p_value`:
+    probability by chance, for the number of settings of this kind. `scatter_dn`: standard deviation about the curve;
+    `noise_dn`: that by the noise of pixels. `level_dn_std`: standard uncertainty of the setting's mean by the drift.
+    `elapsed_s`, `mean_dn`, `curve_dn`, `curve_dn_std`: of each of `captures`; of a trend that several settings have in
+    common, departures from each setting's mean by number of the repeat.
+    """
+
+    shape: DriftShape
+    kind: str
+    setting: str
+    captures: tuple[str, ...]
+    changing: tuple[str, ...]
+    amplitude_dn: float
+    amplitude_dn_std: float
+    time_constant_s: float | None = None
+    time_constant_s_std: float | None = None
+    time_constant_frames: float | None = None
+    time_constant_frames_std: float | None = None
+    steady_dn: float | None = None
+    steady_dn_std: float | None = None
+    p_value: float
+    scatter_dn: float
+    noise_dn: float
+    level_dn_std: float
+    elapsed_s: tuple[float, ...] | None = None
+    mean_dn: tuple[float, ...]
+    curve_dn: tuple[float, ...]
+    curve_dn_std: tuple[float, ...]
+    statement: str = ""
+
+    @property
+    def is_of_one_setting(self) -> bool:
+        """Whether the numbers are of the repeats of one setting, not departures that several have in common."""
+        return len(self.mean_dn) == len(self.captures)
+
+
 class CameraFit(Frozen):
     """All that was fitted of one camera; None and empty: see `FitResult.skipped`."""
 
@@ -588,6 +654,14 @@ class CameraFit(Frozen):
     psf_field: tuple[PsfKernel, ...] = ()
     psf_symmetry: PsfSymmetry | None = None
     geometry: GeometryFit | None = None
+    #: Repeats that change over time, of every capture kind.
+    repeat_drifts: tuple[RepeatDrift, ...] = ()
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the recordings show beside the figures: repeats that drift first, then what the fits report."""
+        parts = (part.remarks for part in (self.noise, self.spectral, self.geometry) if part is not None)
+        return (*(drift.statement for drift in self.repeat_drifts), *(remark for own in parts for remark in own))
 
 
 class FitResult(Frozen):
@@ -599,3 +673,5 @@ class FitResult(Frozen):
     cameras: dict[Side, CameraFit]
     stereo: StereoFit | None = None
     skipped: tuple[Skipped, ...] = ()
+    #: Figures and stated lengths outside the range of working cameras, a line each: quantity, value, limit, remedy.
+    warnings: tuple[str, ...] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 from pathlib import Path
 from typing import Any
@@ -174,3 +175,61 @@ def test_a_run_that_only_packs_is_halted_and_its_station_asked(
         assert not running.bench.opened and running.bench.log.count("stop monochromator") <= 4
         go_on.set()
         until_state(client, session, "interrupted")
+
+
+def test_a_page_halts_after_a_restart_of_the_service_and_does_nothing_else(tmp_path: Path) -> None:
+    with serving(tmp_path) as running, running.client(None) as page, running.client(None) as reader:
+        assert page.get("/halt").json() == {"may_halt": False} and page.post("/api/v1/halt").status_code == 401
+        login = page.post("/login", json={"key": running.keys["operate"]})
+        stated = next(one for one in login.headers.get_list("set-cookie") if one.startswith("calibench_halt="))
+        assert "httponly" in stated.lower() and "samesite=strict" in stated.lower()
+        assert reader.post("/login", json={"key": running.keys["read"]}).status_code == 200
+        assert "calibench_halt" not in reader.cookies and not reader.get("/halt").json()["may_halt"]
+        token, keys = page.cookies["calibench_halt"], running.keys
+        rows = (tmp_path / "registry.sqlite").read_bytes() + (tmp_path / "registry.sqlite-wal").read_bytes()
+        assert token.encode() not in rows  # only its hash is kept
+    with serving(tmp_path, keys=keys) as running, running.client(None) as page:
+        page.cookies.set("calibench_halt", token)
+        running.bench.opened = True
+        assert page.get("/halt").json() == {"may_halt": True}
+        assert halt(page)["shutter"] == "closed" and not running.bench.opened
+        assert page.get("/api/v1/stations").status_code == 401
+        assert page.post("/api/v1/sessions", json=DARKS).status_code == 401
+        assert page.post("/api/v1/halt", headers={"Origin": "https://elsewhere.example"}).status_code == 403
+        running.store.remove_key("operate")  # it takes its tokens with it
+        assert page.post("/api/v1/halt").status_code == 401
+        page.cookies.clear()
+        assert page.post("/login", json={"key": keys["admin"]}).status_code == 200
+        other = page.cookies["calibench_halt"]
+        assert page.post("/logout").status_code == 204
+        page.cookies.clear()
+        page.cookies.set("calibench_halt", other)
+        assert page.post("/api/v1/halt").status_code == 401
+
+
+def test_a_halt_names_every_station_also_one_whose_file_is_gone_or_broken(running: Running) -> None:
+    stations = running.store.root / "stations"
+    with running.client("operate") as client:
+        running.bench.delay_s = 0.05
+        session = client.post("/api/v1/sessions", json=DARKS).json()["id"]
+        until_state(client, session, "running")
+        (stations / "fakes.toml").rename(stations / "fakes.bak")
+        (stations / "broken.toml").write_text("not a station")
+        found = {one["name"]: one["safety"] for one in client.post("/api/v1/halt").json()["stations"]}
+        assert found[f"session {session}"]["shutter"] == "closed"
+        assert found["broken"]["state"] == "not confirmed" and "can't be used" in found["broken"]["words"]
+
+
+def test_a_halt_is_confirmed_while_the_registry_is_locked(running: Running) -> None:
+    """By another process that writes: what waits is held as soon as it lets go."""
+    with running.client("operate") as client:
+        waits = client.post(
+            "/api/v1/sessions", json=DARKS | {"queue": True, "not_before": "2999-01-01T00:00:00Z"}
+        ).json()["id"]
+        running.bench.opened = True
+        with sqlite3.connect(running.store.root / "registry.sqlite") as other:
+            other.execute("BEGIN IMMEDIATE")
+            assert halt(client)["shutter"] == "closed" and not running.bench.opened
+            assert client.get(f"/api/v1/sessions/{waits}").json()["error"] is None
+        other.close()
+        until(client, f"/api/v1/sessions/{waits}", lambda now: now["error"] == "held: halted by operate")

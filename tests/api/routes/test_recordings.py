@@ -298,7 +298,7 @@ def test_a_full_disk_is_said_and_captures_keep_their_room(
     with running.client("calibrate") as client:
         monkeypatch.setattr("api.upload.shutil.disk_usage", lambda _: usage._replace(free=RESERVE_BYTES + 100))
         response = send(client, packed(folder))
-        assert response.status_code == 503 and "make room" in response.json()["detail"]
+        assert response.status_code == 507 and "make room" in response.json()["detail"]
         monkeypatch.undo()
 
         def full(*_: object) -> None:
@@ -306,7 +306,7 @@ def test_a_full_disk_is_said_and_captures_keep_their_room(
 
         monkeypatch.setattr("api.upload.recording.read", full)
         response = send(client, packed(folder))
-        assert response.status_code == 503 and "full" in response.json()["detail"]
+        assert response.status_code == 507 and "full" in response.json()["detail"]
         monkeypatch.undo()
         assert kept(running) == []
         left = running.store.root / "recordings" / ".incoming-left"

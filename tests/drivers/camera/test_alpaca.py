@@ -18,6 +18,8 @@ from drivers.found_settings import FoundSettings
 from mocks.peers import AlpacaSimulator
 from tests.peers import missing
 
+pytestmark = pytest.mark.extra  # a simulator of another maker's
+
 #: As `mocks.peers.ALPACA_DEVICES` has them.
 FOUND = {"binx": 2, "biny": 2, "startx": 8, "starty": 4, "numx": 200, "numy": 100, "connected": False}
 

@@ -17,6 +17,8 @@ from drivers.errors import Disconnected, InstrumentError, InUse, NoAnswer
 from mocks.peers import AravisFakeCamera, EmulatedBasler
 from tests.peers import missing
 
+pytestmark = pytest.mark.extra  # the library's stand-in of a GigE camera
+
 LEFT, RIGHT = "0815-0000", "0815-0001"
 
 

@@ -15,6 +15,8 @@ from mocks.peers import VirtualCamera
 from mocks.tethered import write_dng
 from tests.peers import missing
 
+pytestmark = pytest.mark.extra  # the library's own camera
+
 
 @pytest.fixture
 def peer(tmp_path: Path) -> Iterator[VirtualCamera]:

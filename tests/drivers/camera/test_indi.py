@@ -21,6 +21,8 @@ from drivers.indi import IndiDevice
 from mocks.peers import IndiSimulator
 from tests.peers import missing
 
+pytestmark = pytest.mark.extra  # a simulator of another maker's
+
 FOUND = {
     "CCD_BINNING": "HOR_BIN=2;VER_BIN=2",
     "CCD_FRAME": "X=16;Y=8;WIDTH=256;HEIGHT=128",

@@ -14,6 +14,8 @@ from drivers.found_settings import FoundSettings
 from mocks.peers import DemoCamera
 from tests.peers import missing
 
+pytestmark = pytest.mark.extra  # the library's own cameras
+
 
 @pytest.fixture
 def peer(tmp_path: Path) -> Iterator[DemoCamera]:

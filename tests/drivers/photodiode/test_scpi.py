@@ -65,6 +65,58 @@ def test_golden_transcript(scripted: Callable[[str], Any], tmp_path: Path) -> No
     assert peer.strange == []
 
 
+def test_golden_transcript_of_an_electrometer(scripted: Callable[[str], Any], tmp_path: Path) -> None:
+    file = tmp_path / "diode.csv"
+    file.write_text("wavelength_nm,responsivity_a_per_w\n500,0.2\n600,0.2\n")
+    peer = scripted("scpi-electrometer-driver.txt")
+    with diode_at(peer.address, str(file), readings=2, area_mm2=100.0, calibration_sd_percent=1.0) as diode:
+        assert diode.measure(550.0).current_a == pytest.approx(2e-6, rel=1e-12)
+        with pytest.raises(Garbled, match=r"answered 'READ\?' with .*ZADC.*: zero check is on"):
+            diode.measure(550.0)
+    assert peer.strange == []
+
+
+class Answering(MockScpiMeter):
+    """A meter whose readings are this text."""
+
+    def __init__(self, reading: str) -> None:
+        super().__init__(Line(550.0, 1.0))
+        self.reading = reading
+
+    def receive(self, data: bytes) -> list[bytes]:
+        return [Reply(self.reading.encode() + b"\n")] if b"READ?" in data else super().receive(data)
+
+
+@pytest.mark.parametrize(
+    ("reading", "current_a"), [("12.5uA", 12.5e-6), ("1.25 mA", 1.25e-3), ("830 pA", 830e-12), (".5E-06", 5e-7)]
+)
+def test_readings_have_the_unit_that_the_meter_states(
+    served: Callable[..., str], calibration: str, reading: str, current_a: float
+) -> None:
+    with diode_at(served(Answering(reading), Tcp("127.0.0.1", 0)), calibration, readings=2) as diode:
+        assert diode.measure(550.0).current_a == pytest.approx(current_a, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("reading", "error", "reason"),
+    [
+        ("+1.2E-03NVDC", Garbled, "its unit is 'VDC', not A; .* `setup` has it measure a direct current"),
+        ("1.25E-06 W", Garbled, "its unit is 'W', not A"),
+        ("1,25E-06", Garbled, "it may have a decimal comma"),
+        ("-9.910000E+37", Refused, "beyond its range; dim the light"),
+        ("9.9E37,+1,+0", Refused, "beyond its range; dim the light"),
+        ("NAN", Refused, "beyond its range; dim the light"),
+    ],
+)
+def test_what_isnt_a_current_is_refused_in_one_line(
+    served: Callable[..., str], calibration: str, reading: str, error: type[Exception], reason: str
+) -> None:
+    with diode_at(served(Answering(reading), Tcp("127.0.0.1", 0)), calibration, readings=2) as diode:
+        with pytest.raises(error, match=reason) as refused:
+            diode.measure(550.0)
+        assert "\n" not in str(refused.value)
+
+
 def test_irradiance_is_radiance_times_solid_angle(served: Callable[..., str], calibration: str) -> None:
     light = Line(550.0, 2.0)
     with diode_at(served(MockScpiMeter(light), Tcp("127.0.0.1", 0)), calibration) as diode:

@@ -401,8 +401,8 @@ def test_limits_are_drafted_from_what_is_usual(store: Store) -> None:
     for value in (2.0, 2.1, 2.2, 2.3):
         calibrated(store, value)
     newest = calibrated(store, 5.0)
-    found, number = life.drafted_limits(store, newest)
-    assert number == 4  # not from itself
+    found, whence = life.drafted_limits(store, newest)
+    assert len(whence) == 4 and newest not in whence
     limit = next(one for one in found if one.figure == "noise read_noise_e" and one.side == "left")
     half = float(stats.t.ppf(0.995, 3)) * float(np.std([2.0, 2.1, 2.2, 2.3], ddof=1)) * math.sqrt(1.25) + 2.0 * STD
     low, high = limit.good
@@ -410,5 +410,13 @@ def test_limits_are_drafted_from_what_is_usual(store: Store) -> None:
     assert limit.judge(Figure(name="noise read_noise_e", value=5.0, std=STD)) == "bad"
     sharp = next(one for one in found if "mtf50" in one.figure)
     assert sharp.figure == "mtf * mtf50_cy_per_px" and sharp.good[1] is None
-    alone, number = life.drafted_limits(store, calibrated(store, 2.0, {"left": "X1", "right": "X2"}))
-    assert number == 1 and alone
+    single = calibrated(store, 2.0, {"left": "X1", "right": "X2"})
+    alone, whence = life.drafted_limits(store, single)
+    assert whence == (single,) and alone
+    # Whoever sends them, the certificate keeps that they aren't independent; not of limits that a laboratory set.
+    own = life.certify(store, single, "Ada", CalibrationLimits(limit=alone))
+    assert own.limits is not None and "this calibration alone" in (own.limits.dependence_on(single) or "")
+    usual = life.certify(
+        store, newest, "Ada", CalibrationLimits(limit=(limit.model_copy(update={"good": (0.0, 9.0)}),))
+    )
+    assert usual.limits is not None and usual.limits.dependence_on(newest) is None

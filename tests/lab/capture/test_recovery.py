@@ -15,6 +15,7 @@ from lab.capture.plan import CapturePlan
 from lab.capture.records import RunRecord, now
 from lab.capture.recovery import Recovery, make_station_safe
 from lab.capture.store import Store
+from lab.capture.tables import SessionRow
 from lab.capture_kinds.dark import DarkSequence
 from tests.lab.fake_bench import Bench, station
 
@@ -86,7 +87,8 @@ def test_a_session_whose_process_lives_is_left_alone(store: Store) -> None:
     Recovery(store, bench.drivers).look()
     lock.release()
     assert bench.opened and bench.log == []
-    assert store.session(session_id).error is None
+    with store.reading() as db:
+        assert db.get_one(SessionRow, session_id).error is None  # nothing was recorded
 
 
 def test_the_shutter_answers_before_the_others_are_reached(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,8 +15,11 @@ from alembic.runtime.migration import MigrationContext
 import lab.jobs
 from lab.calibration.life import drift_board
 from lab.calibration.overview import overviews
+from lab.capture.backup import back_up
 from lab.capture.plan import CapturePlan
+from lab.capture.restore import restore
 from lab.capture.session import CaptureSession
+from lab.capture.settings import Settings
 from lab.capture.store import Store
 from lab.capture.tables import Base
 from lab.capture_kinds.dark import DarkSequence
@@ -26,6 +29,8 @@ from lab.pipeline import PipelineRequest, Tell
 from tests.lab import fake_bench
 from tests.lab.calibration.test_life import calibrated
 from tests.postgresql import database, postgresql
+
+pytestmark = pytest.mark.extra  # starts a PostgreSQL server
 
 DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
 
@@ -128,3 +133,38 @@ def test_sessions_are_searched_and_looked_over(url: str, tmp_path: Path) -> None
     assert found.mtf50_cy_per_px == {"left": 0.25} and found.read_noise_e == {"left": 2.0, "right": 2.0}
     assert len(drift_board(store, "m c L1").columns) == 1
     store.close()
+
+
+def test_a_backup_has_the_rows_and_a_restore_brings_them_back(url: str, server: str, tmp_path: Path) -> None:
+    """Into another empty database, and with --replace into the one that changed since; the next rows follow on."""
+    store = Store(tmp_path / "data", url)
+    calibration = calibrated(store, 2.0)
+    session = store.result(calibration).source
+    store.add_key("ada", "read", "a" * 64)
+    times = store.session(session)
+    backup = tmp_path / "backup"
+    made = back_up(store, backup)
+    assert made.sessions == 1 and not back_up(store, backup).is_new
+    with Store(made.generation.folder).reading():  # a data folder with a registry of its own
+        assert Store(made.generation.folder).session(session) == times
+
+    with database(server, "elsewhere") as other:
+        restore(backup, Settings(data=tmp_path / "again", database_url=other))
+        assert not (tmp_path / "again" / "registry.sqlite").exists()
+        again = Store(tmp_path / "again", other)
+        assert again.session(session) == times and again.keys() == store.keys()
+        assert again.result(calibration) == store.result(calibration)
+        CaptureSession.start(again, fake_bench.station(), DARKS)  # its rows' numbers are new
+        again.close()
+        with pytest.raises(InputError, match="has 2 sessions; give --replace"):
+            restore(backup, Settings(data=tmp_path / "third", database_url=other))
+
+    store.delete_session(session)
+    store.add_key("eve", "admin", "e" * 64)
+    store.close()
+    done = restore(backup, store.settings, replace=True)
+    restored = Store(store.root, url)
+    keys = restored.keys()
+    assert restored.has_session(session) and [name for name, *_ in keys] == ["ada"]
+    assert done.before is not None
+    restored.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import json
 import os
@@ -575,9 +576,10 @@ def test_a_camera_of_another_size_is_refused(store: Store) -> None:
         session.run()
 
 
-def test_a_full_disk_is_said_and_the_session_resumes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = Bench()
+def test_on_a_full_disk_the_session_pauses_and_goes_on(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, shown = Bench(), []
     session = begin(store, bench, DARKS)
+    session._on_progress = shown.append
     with monkeypatch.context() as broken:
 
         def full(*_: object) -> None:
@@ -585,9 +587,35 @@ def test_a_full_disk_is_said_and_the_session_resumes(store: Store, monkeypatch: 
                 raise OSError(28, "No space left on device")
 
         broken.setattr("os.fsync", full)
-        with pytest.raises(InputError, match="No space left on device"):
+        assert session.run().state == "finished"
+    assert_safe(bench)
+    assert_whole(store, session.id)
+    (paused,) = [now for now in shown if now.state == "paused"]
+    assert "No space left on device" in (paused.remark or "")
+    # What the page shows of the shutter: closed, while it is paused and while it is packed.
+    for now in shown:
+        if now.state in ("paused", "packing"):
+            assert now.bench is not None and now.bench.shutter_open is False
+
+
+def test_a_quota_that_takes_no_frame_ends_the_run_with_its_reason(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk has room, and yet no file is taken: the step is tried three times."""
+    bench, tries = Bench(), []
+    session = begin(store, bench, DARKS)
+
+    def full(*_: object) -> None:
+        tries.append(bench.shots)
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("os.fsync", full)
+        broken.setattr("lab.capture.session.ROOM_S", 0.0)
+        with pytest.raises(InputError, match="Disk quota exceeded"):
             session.run()
     assert_safe(bench)
+    assert "Disk quota exceeded" in (store.session(session.id).error or "")
     assert CaptureSession(store, session.id, connect=bench.drivers).run().state == "finished"
     assert_whole(store, session.id)
 

@@ -18,6 +18,8 @@ from lab.formats.recording_set import inspect
 from mocks.peers import AravisFakeCamera, EmulatedBasler, operator_stage
 from tests.peers import missing
 
+pytestmark = pytest.mark.extra  # makers' emulated cameras
+
 SHEET = {"rows": 1040, "cols": 1024, "cfa": "RGGB", "bit_depth": 12}
 
 

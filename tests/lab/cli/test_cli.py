@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import sqlite3
 import subprocess
@@ -18,7 +19,6 @@ import numpy as np
 import psutil
 import pytest
 import sqlalchemy as sa
-import typer
 
 import lab.diagnose
 import lab.fit
@@ -29,6 +29,7 @@ from lab.capture.session import CaptureSession
 from lab.capture_kinds.dark import DarkSequence
 from lab.cli import bench_process, capturing, diagnosis, entry, fitting
 from lab.cli.console import EXIT_INPUT
+from lab.cli.help import help_and_example
 from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
 from lab.diagnose.visibility import EffectList, effect_list
@@ -761,17 +762,71 @@ def _commands(command: Any, *path: str) -> Iterator[tuple[str, Any]]:
 
 def test_every_help_is_of_one_style() -> None:
     """A command's is a sentence; an option's or argument's a phrase without a capital or a full stop."""
-    entry.attach_service_and_mocks()
-    found = dict(_commands(typer.main.get_command(entry.app), "calibench"))
+    found = dict(_commands(entry.command_tree(), "calibench"))
     assert len(found) > 40
     for path, command in found.items():
-        assert (command.help or "").rstrip().endswith("."), path
+        sentences, example = help_and_example(command)
+        assert sentences.endswith("."), path
+        assert hasattr(command, "commands") or example.startswith(path), path
         for parameter in command.params:
             told = getattr(parameter, "help", None)
             assert told, (path, parameter.name)
             word = told.split()[0]
             assert not told.endswith(".") or told.endswith("..."), (path, parameter.name)
             assert word[0].islower() or not word[1:].islower() or word.startswith("Dask"), (path, parameter.name)
+
+
+def test_no_help_shows_a_type_of_python_or_cuts_a_summary(capsys: pytest.CaptureFixture[str]) -> None:
+    for path, command in _commands(entry.command_tree(), "calibench"):
+        assert cli.main([*path.split()[1:], "--help"]) == 0
+        text = capsys.readouterr().out
+        assert re.search(r"<\w+[^>]*>", text) is None, path
+        for name, below in getattr(command, "commands", {}).items():
+            assert below.short_help in " ".join(text.split()), name
+            assert below.short_help.endswith("."), name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["fit", "--jsn", "fit.json"], "No such option: --jsn (Possible options: --json). See `calibench fit --help`."),
+        (["fit"], "Missing argument 'SOURCE'. See `calibench fit --help`."),
+        (
+            ["calibrations", "shw", "1"],
+            "No such command 'shw'. Did you mean 'show'? See `calibench calibrations --help`.",
+        ),
+        (["fitt", "set"], "No such command 'fitt'. Did you mean 'fit'? See `calibench --help`."),
+    ],
+)
+def test_an_error_of_usage_refers_to_the_help_of_its_command(
+    arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(arguments) == 2
+    assert capsys.readouterr().err == f"calibench: {text}\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["put-back", "7f3a"],
+        ["confirm", "7f3a"],
+        ["confirm", "7f3a", "board"],
+        ["export", "7f3a", "--to", "SET"],
+        ["fit", "7f3a"],
+        ["calibrations", "show", "7f3a"],
+        ["calibrations", "history", "7f3a"],
+        ["capture", "--resume", "7f3a"],
+    ],
+)
+def test_an_unknown_id_is_refused_by_its_name(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    open_store(tmp_path / "data")
+    arguments = [str(tmp_path / "set") if word == "SET" else word for word in arguments]
+    assert cli.main([*arguments, "--data", str(tmp_path / "data")]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert "7f3a" in lines[0]
 
 
 def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:

@@ -110,7 +110,7 @@ def test_codes_that_were_shifted_are_no_faulty_converter() -> None:
         )
 
     model, skipped = measurement_model(_changed(shifted, 4), "left", None)
-    assert any("every code is a multiple of 16, as of a converter of 4 bits less" in s.reason for s in skipped)
+    assert any("codes lie 16 DN apart, as those of fewer bits that were shifted or scaled" in s.reason for s in skipped)
     assert model is not None
     assert not decide(model, np.random.default_rng(1), DecisionPolicy()).before
 

@@ -215,11 +215,3 @@ def test_pictures_one_pose_off_are_named(late, name):
     off = [StereoPair(pair.left, pairs[(k - late) % len(pairs)].right) for k, pair in enumerate(pairs)]
     with pytest.raises(NotDetermined, match=f"fits the right one of the {name} pose"):
         fit_pairs(off, left, right, (SHAPE, SHAPE))
-
-
-@pytest.mark.parametrize("square_mm", [0.025, 0.0254, 25400.0])
-def test_squares_in_another_unit_are_reported(square_mm):
-    capture = seen(np.random.default_rng(0), poses(1))[0].capture
-    remarks = list(capture.model_copy(update={"square_mm": square_mm}).remarks())
-    assert len(remarks) == 1 and f"square_mm is {square_mm:g}" in remarks[0] and "write millimetres" in remarks[0]
-    assert not list(capture.model_copy(update={"square_mm": 0.5}).remarks())

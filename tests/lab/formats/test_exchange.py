@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import shutil
 import struct
 import subprocess
@@ -176,7 +177,7 @@ def test_a_lens_comes_back(k1: float, k2: float, slope: float, curve: float, los
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "lens.xml"
         assert write_lensfun(file, content) == ()
-        back, remarks = with_lens(content, read_lensfun(file, 8.0, 4.0))
+        back, remarks = with_lens(content, read_lensfun(file, content.camera))
     assert remarks == () and back.camera.geometry is not None and content.camera.geometry is not None
     np.testing.assert_allclose(back.camera.geometry.distortion[:2], (k1, k2), atol=1e-6)
     np.testing.assert_allclose(back.camera.geometry.camera_matrix, content.camera.geometry.camera_matrix)
@@ -220,9 +221,10 @@ def test_lensfun_itself_applies_the_lens_as_we_mean_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(corrected[::96, ::128, 1] * dark, 1.0, atol=0.003)
     by_colour = modifier.apply_subpixel_distortion()[5, 5] - matrix[:2, 2]
     radius = np.linalg.norm(by_colour, axis=-1)
-    kept = read_lensfun(tmp_path / "lens.xml", 8.0, 4.0).tca
+    kept = read_lensfun(tmp_path / "lens.xml", camera).tca
     assert kept is not None
-    assert (radius[0] / radius[1], radius[2] / radius[1]) == pytest.approx(kept, abs=1e-6)
+    over_green = [float(one[0]) for one in kept(np.array([1.0]))]
+    assert (radius[0] / radius[1], radius[2] / radius[1]) == pytest.approx(over_green, abs=1e-6)
 
 
 def test_what_lensfun_has_no_law_for_is_told(tmp_path: Path) -> None:
@@ -245,23 +247,27 @@ LENSES = """<lensdatabase version="1">
 def test_lensfuns_other_laws_are_read(tmp_path: Path) -> None:
     file = tmp_path / "db.xml"
     file.write_text(LENSES)
-    poly3 = read_lensfun(file, 8.5, 4.0, "B")
-    assert (poly3.focal_length_mm, poly3.tca) == (8.0, (1.0004, 0.9998)) and poly3.distortion is not None
-    np.testing.assert_allclose(poly3.distortion(np.array([0.0, 1.0])), [1.02, 1.0])
+    poly3 = read_lensfun(file, CAMERA.camera, "B")
+    assert poly3.distortion is not None and poly3.tca is not None
+    half_short_mm = 0.5 * math.hypot(36.0, 24.0) / 7.8 / math.hypot(1.5, 1.0)
+    radius_mm = np.array([0.0, half_short_mm])
+    np.testing.assert_allclose(poly3.distortion(radius_mm), [1.02, 1.0])
+    np.testing.assert_allclose(poly3.tca(radius_mm), [[1.0004, 1.0004], [0.9998, 0.9998]])
     made, _ = with_lens(CAMERA, poly3)
     assert made.camera.geometry is not None
     f = CAMERA.camera.lens.focal_length_mm * 1e3 / CAMERA.camera.pixel_pitch_um
     assert made.camera.geometry.camera_matrix[0][0] == pytest.approx(1.02 * f)
     assert made.camera.geometry.distortion[0] < 0
-    ptlens = read_lensfun(file, 8.0, 4.0, "A")
+    ptlens = read_lensfun(file, CAMERA.camera, "A")
     assert ptlens.distortion is not None
-    np.testing.assert_allclose(ptlens.distortion(np.array([0.0, 1.0])), [1.0 - 0.01 + 0.03 - 0.005, 1.0])
+    half_short_mm = 0.5 * math.hypot(36.0, 24.0) / 1.5 / math.hypot(1.5, 1.0)
+    np.testing.assert_allclose(ptlens.distortion(np.array([0.0, half_short_mm])), [1.0 - 0.01 + 0.03 - 0.005, 1.0])
 
 
 @pytest.mark.parametrize(
     ("text", "model", "said"),
     [
-        (LENSES, "", "holds 2 lenses, name one by --lens: A, B"),
+        (LENSES, "", "holds 2 lenses; choose one by --lens: 'A', 'B'"),
         (LENSES, "C", "holds no lens 'C'"),
         ("<lensdatabase/>", "", "holds no lens with a calibration"),
         ("<a", "", "isn't lensfun's XML"),
@@ -274,7 +280,7 @@ def test_bad_lensfun_is_refused_in_one_line(tmp_path: Path, text: str, model: st
     file = tmp_path / "db.xml"
     file.write_text(text)
     with pytest.raises(InputError, match=said) as told:
-        read_lensfun(file, 8.0, 4.0, model)
+        read_lensfun(file, CAMERA.camera, model)
     assert str(told.value).startswith(str(file)) and "\n" not in str(told.value)
 
 

@@ -50,10 +50,18 @@ def test_a_copy_of_a_folder_keeps_the_files_bytes_and_the_unknown_keys(folder: P
     assert manifest["captures"][0]["operator"] == "Ada"
 
 
+#: No control characters, which `lab.plain_text` refuses.
+PLAIN = st.characters(
+    codec="utf-8",
+    exclude_categories=("Cc", "Zl", "Zp"),
+    exclude_characters="\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069",
+)
+
+
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     frame=hnp.arrays(np.uint16, st.tuples(st.integers(1, 9), st.integers(1, 9))),
-    name=st.text(st.characters(codec="utf-8"), max_size=20),
+    name=st.text(PLAIN, max_size=20),
     exposure_s=st.floats(0, 1e6),
     suffix=st.sampled_from(["npy", "tif"]),
     wavelengths=st.lists(st.floats(1, 1e4), min_size=1, max_size=8, unique=True).map(sorted),
@@ -372,3 +380,14 @@ def test_joined_sets_keep_apart_what_they_name_alike(small_set: Callable[..., Re
                 assert both.spectrum(getattr(new, key)) == first.spectrum(told[key])
         if "screen" in told:
             assert new.screen.pose == f"resolve/{old.screen.pose}"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "limit"),
+    [("f_number", 0.3, "0.5"), ("pixel_pitch_um", 0.00345, "0.1 um"), ("focal_length_mm", 0.008, "0.1 mm")],
+)
+def test_a_stated_value_that_no_camera_has_is_refused(folder: Path, key: str, value: float, limit: str) -> None:
+    """Before it meets a model's own limits: an f-number of a lens faster than f/0.5, a pitch in mm, a length in m."""
+    edit(folder, lambda manifest: manifest["cameras"]["left"].update({key: value}))
+    found = problems(folder)
+    assert any(f"{key} = {value:g}" in line and f"is below the limit of {limit}" in line for line in found)

@@ -300,3 +300,19 @@ def test_the_geometrys_distortion_bends_what_a_pinhole_placed() -> None:
     )
     assert np.abs(plain - bent)[40:56, 56:72].max() < 0.1 * np.ptp(plain)
     assert np.abs(plain - bent).max() > 0.3 * np.ptp(plain)
+
+
+def test_a_camera_whose_focal_length_nobody_stated_asks_for_it(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No length that was taken for it ("5000 mm") is shown; with the length in the file, the scene is drawn."""
+    content = read_camera(small)
+    lens = content.camera.lens.model_copy(update={"focal_length_mm": None})
+    write_camera(small, replace(content, camera=content.camera.model_copy(update={"lens": lens})))
+    out = tmp_path / "u.npy"
+    assert _run("uniform", "--camera", small, "--out", out) == 2
+    told = capsys.readouterr().err
+    assert "focal_length_mm of the camera's lens is not set" in told and "below [lens]" in told and "5000" not in told
+    assert not out.exists()
+    small.write_text(small.read_text().replace("[lens]", "[lens]\nfocal_length_mm = 8.0", 1))
+    assert _run("uniform", "--camera", small, "--out", out) == 0

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from lab.calibration.limits import CalibrationLimits
-from lab.errors import InputError
+from lab.errors import NoRoom
 from lab.formats.recording_set import DataSheet, InstrumentSnapshot, RecordingSet
 from lab.formats.results import (
     CameraFit,
@@ -379,7 +379,7 @@ def test_writing_is_whole_or_not_at_all(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(InputError, match="No space left"):
+    with pytest.raises(NoRoom, match="No space left"):
         write_report(tmp_path / "deep" / "other.html", recordings, *results)
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["report.html"]
 

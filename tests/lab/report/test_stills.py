@@ -180,6 +180,7 @@ WIDTHS = """() => [...document.querySelectorAll(".chart")].filter(box => box.que
     .map(box => [box.clientWidth, box.querySelector(".main-svg").clientWidth])"""
 
 
+@pytest.mark.extra
 def test_charts_are_drawn_anew_for_paper(
     small_set: Callable[..., RecordingSet], made_up: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -213,6 +214,7 @@ def test_charts_are_drawn_anew_for_paper(
     assert all(drawn <= box and box > 420 for box, drawn in paper)  # paper has the desk's columns
 
 
+@pytest.mark.extra
 def test_axe_finds_nothing_and_a_phone_needs_no_scroll_sideways(
     small_set: Callable[..., RecordingSet], made_up: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -74,7 +74,13 @@ def _diagnosed(law: Law | None, cfa: str = "MONO", seed: int = 930) -> Diagnosis
     return diagnose(recordings_of(camera, plan), at_once=False)
 
 
-@pytest.mark.parametrize("law", STRONG, ids=lambda law: f"{law.name}-{law.variant}")
+@pytest.mark.parametrize(
+    "law",
+    [  # of several variants of a law one is enough for every day
+        pytest.param(law, id=f"{law.name}-{law.variant}", marks=pytest.mark.slow if law.variant else ())
+        for law in STRONG
+    ],
+)
 def test_a_strong_one_is_named_and_sized(law: Law) -> None:
     (named,) = _diagnosed(law, "RGGB" if law.effect in OF_COLOURS else "MONO").effects
     assert named.name == law.effect

@@ -111,3 +111,11 @@ def test_bad_flats_are_refused() -> None:
         MeasuredIllumination.from_flat(np.ones((6, 6)))
     with pytest.raises(ValueError, match="subtract the dark frame"):
         MeasuredIllumination.from_flat(-np.ones((96, 96)))
+
+
+def test_without_a_focal_length_the_light_does_not_fall_off(colour_camera: CameraModel) -> None:
+    lens = colour_camera.lens.model_copy(update={"focal_length_mm": None})
+    camera = colour_camera.model_copy(update={"lens": lens})
+    row, col = np.array([0.0, 3.0])[:, None], np.array([0.0, 5.0, 9.0])
+    np.testing.assert_array_equal(relative_illumination(camera, row, col), np.ones((2, 3)))
+    np.testing.assert_array_equal(sin_theta(camera, row, col), np.zeros((2, 3)))

@@ -19,7 +19,7 @@ from lab.diagnose.measurements.block import Block, measurements
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import TAIL_EDGES, DarkCondition
 from lab.diagnose.measurements.dark_level import dark_level_block
-from lab.diagnose.measurements.dark_readout import fixed_line_block
+from lab.diagnose.measurements.dark_readout import correlation_block, fixed_line_block
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
@@ -115,6 +115,24 @@ def test_odd_and_even_rows_share_what_is_fixed(noise_e: float, offset_e: float) 
         assert [block.labels[k].held_out for k in at] == [False, True]
         found.append(chi2((block.value - block.predict([noisy]).mean)[at], block.covariance[np.ix_(at, at)]))
     assert abs(np.mean(found) - 2.0) < 4.0 * np.sqrt(4.0 / DRAWN)
+
+
+@pytest.mark.parametrize(
+    ("shape", "is_measured"), [((48, 48), False), ((49, 49), False), ((50, 50), True), ((32, 64), True)]
+)
+def test_the_size_that_correlation_needs_is_the_one_that_is_named(shape: tuple[int, int], is_measured: bool) -> None:
+    rng = np.random.default_rng(3)
+    frames = {f"d{k}": np.rint(100.0 + 4.0 * rng.standard_normal(shape)).astype(np.uint16) for k in range(6)}
+    captures = [{"id": name, "kind": "dark", "side": "left", "frame": name, "exposure_s": 0.01} for name in frames]
+    sheet = {"rows": shape[0], "cols": shape[1], "cfa": "MONO", "bit_depth": 12}
+    manifest = Manifest.model_validate({"cameras": {"left": sheet}, "captures": captures})
+    recordings = RecordingSet(manifest, frames, {}, {})
+    study = Study(recordings, "left", camera_model(recordings, "left"))
+    if is_measured:
+        assert correlation_block(study).labels
+        return
+    with pytest.raises(NotDetermined, match="measured from 50 px along rows or columns on"):
+        correlation_block(study)
 
 
 # --- statistics against drawn numbers ---------------------------------------------------------------------------------

@@ -249,7 +249,7 @@ def test_edges_at_another_f_number_are_predicted_at_it() -> None:
 
 def test_edges_at_another_f_number_are_no_slanted_edges_of_the_data_sheets_lens() -> None:
     study = _stopped(f_number=4.0, stated=2.8)
-    with pytest.raises(NotDetermined, match="no slanted-edge captures"):
+    with pytest.raises(NotDetermined, match=r"^slanted_edge: no slanted_edge captures"):
         edge_block(study)
-    with pytest.raises(NotDetermined, match="no slanted-edge captures"):
+    with pytest.raises(NotDetermined, match=r"^stopped_edge: no stopped_edge captures"):
         stopped_edge_block(_recorded(cfa="MONO", f_number=4.0))

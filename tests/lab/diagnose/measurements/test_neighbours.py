@@ -157,7 +157,7 @@ def test_tones_of_the_read_out_are_told_and_leave_no_correlation() -> None:
     assert np.mean(np.square(pulls)) < 1.0 + 3.0 * np.sqrt(2.0 / len(pulls))
 
 
-@pytest.mark.parametrize("cfa", ["MONO", "GRBG"])
+@pytest.mark.parametrize("cfa", ["MONO", pytest.param("GRBG", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "one",
     [

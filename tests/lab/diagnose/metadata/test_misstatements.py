@@ -79,7 +79,9 @@ def test_exchanged_narrowband_lights_are_told(cfa: str, first_nm: float, second_
         first_nm,
         second_nm,
     }
-    assert corrected.manifest == recordings.manifest
+    assert "if they were exchanged, exchange the two lights" in found.check
+    assert found.told("left").correction == "the captures are left out"
+    assert corrected.manifest == recordings.without(set(found.captures)).manifest
 
 
 @pytest.mark.parametrize("off_dn", [8.0, -8.0])
@@ -275,13 +277,14 @@ def test_exchanged_frames_of_two_levels_are_told_and_nothing_else() -> None:
     wrong = swapped(recordings, [one], [other])
     corrected, (found,) = misstatements(wrong, "left")
     assert set(found.captures) == {one, other}
-    assert corrected.manifest == recordings.manifest
+    assert corrected.manifest == recordings.without({one, other}).manifest
     result = diagnose(wrong)
     assert (result.verdict, result.effects, result.mismatches) == ("unexplained", (), ())
     (item,) = result.unexplained
     assert one in item.check
     assert other in item.check
     assert "exchange these frames" in item.check
+    assert item.correction == "the captures are left out"
 
 
 def test_a_dark_and_a_flat_exchanged_are_told() -> None:

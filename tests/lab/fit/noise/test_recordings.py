@@ -26,6 +26,21 @@ def test_fit_noise_reads_a_recording_set() -> None:
     assert any("25 deg C" in remark for remark in fit.remarks)
 
 
+@pytest.mark.parametrize(("flat_c", "is_reported"), [(25.0, False), (25.4, False), (10.0, True), (40.0, True)])
+def test_darks_at_another_temperature_than_the_flats_are_reported(flat_c: float, is_reported: bool) -> None:
+    """They are subtracted from the flats nevertheless: the share of the signal by which that may be wrong is given."""
+    recordings = recording_set(Sensor(), [(0.001, 4), (1.0, 4)], LADDER, temperature_c=25.0)
+    captures = tuple(
+        capture.model_copy(update={"temperature_c": flat_c}) if capture.kind == "flat" else capture
+        for capture in recordings.captures()
+    )
+    fit = fit_noise(recordings.under(recordings.manifest.model_copy(update={"captures": captures})), "left")
+    remarks = [remark for remark in fit.remarks if "subtracted" in remark]
+    assert len(remarks) == is_reported
+    if is_reported:
+        assert f"flats at {flat_c:.1f} °C have darks at 25.0 °C subtracted: their own dark signal differs" in remarks[0]
+
+
 def test_gain_is_given_for_0_db() -> None:
     fit = fit_noise(recording_set(Sensor(), [(0.001, 2)], LADDER, gain_db=6.0), "left")
     assert fit.conversion_gain_dn_per_e == pytest.approx(0.5 / 10**0.3, rel=0.03)

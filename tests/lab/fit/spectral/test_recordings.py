@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
 from lab.fit.noise.noise_fit import fit_noise
 from lab.fit.spectral.maker_curves import compare_curves
 from lab.fit.spectral.recordings import MIN_LIGHTS, fit_spectral
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet, read
-from lab.formats.results import NoiseFit, SpectralFit
+from lab.formats.results import NoiseFit, RepeatDrift, SpectralFit
 from sim.frame import Exposure, sample
 from sim.scene import Darkness, UniformField
 from sim.spectrum import PHOTON_ENERGY_J_NM, Spectrum
@@ -73,6 +74,42 @@ def test_absolute_quantum_efficiency_of_the_forward_model() -> None:
         truth = model().quantum_efficiency[channel].at(fit.wavelength_nm)
         score = (np.array(fit.quantum_efficiency[channel]) - truth) / np.array(fit.quantum_efficiency_std[channel])
         assert np.sqrt(np.mean(score**2)) < 2.0
+
+
+def test_repeats_that_drift_widen_the_quantum_efficiency_of_their_light() -> None:
+    """A drift of 20 DN of the 550 nm: the standard deviation there is at least as large, less what neighbours hold."""
+    drawn_set = recordings()
+    (light,) = [c for c in drawn_set.captures("narrowband") if getattr(c, "wavelength_nm", None) == 550.0]
+    mean = float(drawn_set.frame(light).mean())
+    drift = RepeatDrift(
+        shape="trend", kind="narrowband", setting="narrowband, 550 nm", captures=(light.id,), changing=(light.id,),
+        amplitude_dn=70.0, amplitude_dn_std=1.0, p_value=1e-6, scatter_dn=1.0, noise_dn=1.0, level_dn_std=20.0,
+        mean_dn=(mean,), curve_dn=(mean,), curve_dn_std=(1.0,),
+    )  # fmt: skip
+    plain, widened = (fit_spectral(drawn_set, "left", NOISE, drifts) for drifts in ((), (drift,)))
+    at = plain.wavelength_nm.index(550.0)
+    share = 20.0 / (mean - 64.0)
+    assert widened.quantum_efficiency_std["G"][at] > 1.5 * plain.quantum_efficiency_std["G"][at]
+    assert widened.quantum_efficiency_std["G"][at] < 3.0 * share * widened.quantum_efficiency["G"][at]
+    far = plain.wavelength_nm.index(450.0)
+    assert widened.quantum_efficiency_std["G"][far] == pytest.approx(plain.quantum_efficiency_std["G"][far], rel=0.1)
+
+
+def test_the_darks_of_another_temperature_are_not_those_of_the_lights() -> None:
+    """Darks at 60 C with 200 DN more at the lights' exposure, beside those at the lights' 20 C."""
+    base = recordings(step_nm=20.0)
+    content = base.manifest.model_dump(mode="json")
+    frames = {c.frame: base.frame(c) for c in base.captures()}
+    for capture in content["captures"]:
+        capture["temperature_c"] = 20.0
+    for capture in [c for c in content["captures"] if c["kind"] == "dark"]:
+        hot = capture | {"id": f"hot-{capture['id']}", "frame": f"hot-{capture['frame']}", "temperature_c": 60.0}
+        content["captures"].append(hot)
+        added = np.uint16(200 * (capture["exposure_s"] > 0.01))
+        frames[hot["frame"]] = frames[capture["frame"]] + added
+    spectra = {c.radiance: base.spectrum(c.radiance) for c in base.captures(NarrowbandCapture)}
+    hot_set = RecordingSet(Manifest.model_validate(content), frames, spectra)
+    assert fit_spectral(hot_set, "left", NOISE) == fit_spectral(base, "left", NOISE)
 
 
 def test_saturated_light_is_a_lower_limit_without_the_makers_curves() -> None:

@@ -112,5 +112,5 @@ def test_dots_that_are_not_there_are_told(tmp_path: Path) -> None:
     (tmp_path / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 12\n')
     with pytest.raises(InputError, match="state --dots ROWSxCOLS and --square-mm"):
         read_foreign("dot-grid", tmp_path, ImportOptions(dots=(ROWS, COLS)))
-    with pytest.raises(InputError, match=r"--from fits doesn't take --dots; it takes --tap"):
+    with pytest.raises(InputError, match=r"--from fits doesn't take --dots; it takes --ignore, --only, --tap"):
         read_foreign("fits", tmp_path, ImportOptions(dots=(ROWS, COLS)))

@@ -249,3 +249,46 @@ def test_a_wrong_photon_number_at_one_level_does_not_refuse_the_set(tmp_path: Pa
     # A saturated level may have any light above that of saturation
     assert len(named) == (0 if (level, photons) == (7, 12000.0) else 1)
     assert all(f"b_{level}_0" in line for line in named)
+
+
+@pytest.mark.parametrize(
+    ("bits", "gain", "exposures_us", "said"),
+    [(12, 0.25, range(20, 260, 20), 2000.0), (14, 1.1, (5, 10, 40, 90, 160), 1e5), (10, 0.05, (1e3, 3e3, 7e3), 7.0)],
+)
+def test_one_number_of_photons_for_all_exposures_is_taken_as_unknown(
+    tmp_path: Path, bits: int, gain: float, exposures_us: Any, said: float
+) -> None:
+    """Two thirds of the range at the longest exposure. K within 4 of its standard deviations; no quantum efficiency,
+    and one line that names value, exposures and captures."""
+    rng, shape = np.random.default_rng(4), (60, 80)
+    lines = [f"n {bits} {shape[1]} {shape[0]}"]
+    for number, us in enumerate(exposures_us):
+        for key, level in (("b", us / max(exposures_us)), ("d", 0.0)):
+            lines.append(f"{key} {1e3 * us:g}" + (f" {said:g}" if key == "b" else ""))
+            for snap in range(2):
+                charge = rng.poisson(level * 0.65 * 2**bits / gain, shape) + 9.0 * rng.standard_normal(shape)
+                code = np.clip(np.rint(40.0 + gain * charge), 0, 2**bits - 1).astype(np.uint16)
+                name = f"{key}{number}_{snap}.png"
+                assert cv2.imwrite(str(tmp_path / name), code)
+                lines.append(f"i {name}")
+    (tmp_path / "data.txt").write_text("\n".join(lines))
+    recordings = read_emva1288(tmp_path)
+    (line,) = (one for one in recordings.warnings if "state " in one and "photons a pixel" in one)
+    assert f"({recordings.captures('flat')[0].id} .. " in line and f"state {said:g} photons a pixel" in line
+    assert "state the photons of each exposure" in line
+    assert {flat.photons_per_pixel for flat in recordings.captures("flat")} == {None}
+    noise = fit_noise(recordings, "left")
+    assert noise.quantum_efficiency is None and noise.conversion_gain_dn_per_e_std is not None
+    assert abs((noise.conversion_gain_dn_per_e or 0.0) - gain) < 4.0 * noise.conversion_gain_dn_per_e_std
+
+
+def test_one_number_of_photons_at_one_or_two_exposures_stays(tmp_path: Path) -> None:
+    """Levels of a lamp that is dimmed, or a repeated level, may have one exposure or two."""
+    folder = make(tmp_path)
+    text = (folder / "data.txt").read_text(encoding="latin-1")
+    for level in (3, 4):
+        text = text.replace(f"b {1000.0 * level} {500.0 * level}", "b 2000.0 1000.0")
+    text = text.replace("b 1000.0 500.0", "b 1000.0 1000.0")
+    (folder / "data.txt").write_text(text, encoding="latin-1")
+    recordings = read_emva1288(folder)
+    assert {flat.photons_per_pixel for flat in recordings.captures("flat")} == {1000.0}

@@ -167,7 +167,7 @@ def test_rows_of_which_the_same_is_said_share_a_line(folder: Path) -> None:
         file.write("dark.png,dark,left,-1\nnb.png,dark,left,-1\n")
     with pytest.raises(InputError) as caught:
         read_raw_folder(folder)
-    said = "row 8 (dark) and 1 more: exposure_s: input should be greater than or equal to 0 (it is '-1'); correct it"
+    said = "row 8 (dark-2) and 1 more: exposure_s: input should be greater than or equal to 0 (it is '-1'); correct it"
     assert str(caught.value) == f"{folder}/index.csv: {said}"
 
 

@@ -15,8 +15,10 @@ from astropy.io import fits
 from lab.errors import InputError
 from lab.formats import recording_set as recording
 from lab.formats.importers import read_foreign, read_raw_folder
+from lab.formats.importers.frame_settings import parse_choice
 from lab.formats.importers.single_picture import ImportOptions
 from lab.formats.importers.stated_settings import frame_header
+from lab.formats.recording_set import RecordingError
 
 EXPOSURE, F_NUMBER, ISO, EXIF_IFD = 33434, 33437, 34855, 34665
 
@@ -137,15 +139,33 @@ def test_apertures_and_gains_are_held_against_exif(tmp_path: Path) -> None:
     )
     for name, f_number, iso in (("a", (28, 10), 100), ("b", (28, 10), 400), ("c", (4, 1), 400)):
         _jpeg(folder / f"{name}.jpg", _exif((1, 10), f_number, iso))
-    aperture, gain = [line for line in read_raw_folder(folder).warnings if "EXIF" in line]
-    assert aperture == f"{folder}/c.jpg: f_number = 2.83, its EXIF says 4; the former is used: correct what is wrong"
+    with pytest.raises(RecordingError) as caught:
+        read_raw_folder(folder)
+    gain, aperture = caught.value.problems
     assert gain == (
-        f"{folder}/c.jpg: its EXIF says ISO 400 and that of a.jpg ISO 100, +12.0 dB, but gain_db is unknown; write "
-        "the gain of each into the "
-        "column gain_db"
+        f"{folder}/index.csv: ISO (ISO speed) differs between frames that are fitted together: 100 in 1 frame (a.jpg), "
+        "400 in 1 frame (c.jpg); import one group, --only ISO=100, or give each group its own gain_db (dB) in "
+        "index.csv; where the header is wrong, --ignore ISO"
     )
-    (folder / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 8\n')
-    assert any("c.jpg: f_number (of a.jpg) = 2.8, its EXIF says 4" in line for line in read_raw_folder(folder).warnings)
+    assert "FNumber (f-number) differs between frames that are fitted together: 2.8 in 2 frames" in aperture
+    alone = read_raw_folder(folder, choice=parse_choice("FNumber=2.8", ""))  # b is 12 dB above a, as its ISO speed
+    assert [capture.id for capture in alone.captures()] == ["a", "b"]
+    (told,) = [
+        line
+        for line in read_raw_folder(folder, choice=parse_choice("ISO=400,FNumber=4", "")).warnings
+        if "EXIF" in line
+    ]
+    assert told == f"{folder}/c.jpg: f_number = 2.83, its EXIF says 4; the former is used: correct what is wrong"
+    rows = ["a.jpg,flat,0.1,0", "b.jpg,flat,0.1,6"]
+    (told,) = [
+        line
+        for line in read_raw_folder(_folder(tmp_path, rows, "", "frame,kind,exposure_s,gain_db")).warnings
+        if "ISO" in line
+    ]
+    assert told == (
+        f"{folder}/b.jpg: its EXIF says ISO 400 and that of a.jpg ISO 100, +12.0 dB, but gain_db is 6 dB; write the "
+        "gain of each into the column gain_db"
+    )
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds")])
@@ -246,5 +266,10 @@ def test_the_cameras_that_the_frames_name_go_into_the_set(tmp_path: Path) -> Non
     assert camera.settings == {"WhiteBalance": "manual"}
     assert recording.read(recording.write(recordings, tmp_path / "set")).manifest.instruments == {"camera left": camera}
     _named(folder / "b.tif", "6009999")
-    (line,) = [line for line in read_foreign("raw-folder", folder).warnings if "serial" in line]
-    assert "b.tif: camera left: serial number was 6001234, is 6009999, as in a.tif: give each camera" in line
+    with pytest.raises(RecordingError) as caught:
+        read_foreign("raw-folder", folder)
+    (line,) = caught.value.problems
+    assert (
+        "BodySerialNumber (camera) differs between frames that are fitted together: 6001234 in 1 frame (a.tif)" in line
+    )
+    assert "give each camera its own side in index.csv" in line
