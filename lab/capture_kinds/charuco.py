@@ -85,10 +85,6 @@ class StereoSequence(Sequence):
         return tuple(made)
 
 
-#: A camera's board has squares from a fifth of a millimetre, below which printers and macro lenses don't get, to a metre.
-USUAL_SQUARES_MM = 0.2, 1000.0
-
-
 class CharucoCapture(Capture):
     """A ChArUco board. The same `pose` in captures of both sides makes a stereo pair."""
 
@@ -136,23 +132,6 @@ class CharucoCapture(Capture):
             yield f"markers of {self.marker_mm:g} mm don't fit squares of {self.square_mm:g} mm; correct one"
         if min(self.squares) < 2:
             yield f"squares {list(self.squares)} make no board; give [rows, cols] of squares, 2 at least"
-
-    def remarks(self) -> Iterator[str]:
-        yield from super().remarks()
-        if (doubt := square_doubt(self.square_mm)) is not None:
-            yield doubt
-
-
-def square_doubt(square_mm: float) -> str | None:
-    """Say why the side of a board's squares is improbable and what to do; None for a usual one."""
-    low, high = USUAL_SQUARES_MM
-    if low <= square_mm <= high:
-        return None
-    metres = "" if square_mm > high else f": {square_mm:g} m are {1e3 * square_mm:g} mm"
-    return (
-        f"square_mm is {square_mm:g}, and squares of boards have {low:g}..{high:g} mm; write millimetres{metres}. "
-        "Distances and a pair's baseline grow in proportion"
-    )
 
 
 KIND = CharucoCapture

@@ -8,8 +8,9 @@
   Jacobian and residuals give the full covariance. Errors that neighbouring corners share are an error of the model,
   and part of it;
 - `lab.measure.board_calibration`: outlying corners and views are left out, with the reason. Projection and
-  distortion are chosen by views that their fits haven't used: a richer model is refused where it predicts them worse. Two halves of the
-  views are calibrated separately; what they differ by beyond their uncertainties widens the covariance.
+  distortion are chosen by views that their fits haven't used: a richer model is refused where it predicts them worse.
+  Two halves of the views are calibrated separately; what they differ by beyond their uncertainties widens the
+  covariance.
 
 Lateral colour: the camera of each colour of a mosaic follows from where its corners lie beside those of the luminance
 (`channel_geometry`).
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.capture_kinds.charuco import CharucoCapture, square_doubt
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
@@ -36,6 +37,7 @@ from lab.formats.results import (
     Skipped,
     ViewResiduals,
 )
+from lab.formats.results.words import PROJECTION_NAMES
 from lab.measure.board_calibration import (
     DIFFERENCE_SIGMA,
     MIN_VIEWS,
@@ -51,18 +53,13 @@ from lab.measure.board_detection import MIN_CORNERS, BoardView, CornerFits, chan
 from lab.measure.bundle_adjustment import Solution, warp_prior_mm
 from lab.measure.projection import Camera, grid, grid_points
 from lab.one_blas_thread import one_blas_thread
-from sim.camera import ProjectionKind, Side
+from sim.camera import Side
 from sim.scene.projection import COUNT
 
 Array = NDArray[np.floating[Any]]
 HUBER_STD = 1.5  # standard deviations of a coordinate from which residuals lose weight
 MOST_ITERATIONS = 50
 
-PROJECTION_NAMES: dict[ProjectionKind, str] = {
-    "pinhole": "a pinhole with Brown's distortion",
-    "equidistant": "an equidistant fisheye (OpenCV's fisheye)",
-    "splined_stereographic": "a splined stereographic fisheye (radial spline)",
-}
 LARGEST_WARP_STD = 0.5  # of the standard deviation of the prior; above it, the views don't determine a warp
 
 
@@ -70,8 +67,8 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
     """Fit the camera of each colour to its corners, one entry of `corners` for each view.
 
     Poses and boards are the same for all colours, so that only differences count: scale, principal point and the
-    first two radial coefficients of each colour by least squares, dq = J dtheta. The radial shift of a colour is its own less that of green, against
-    the distance from the principal point, positive outwards.
+    first two radial coefficients of each colour by least squares, dq = J dtheta. The radial shift of a colour is its
+    own less that of green, against the distance from the principal point, positive outwards.
     """
     if not corners or "G" not in corners[0]:
         return ()
@@ -306,9 +303,7 @@ def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
 
 
 def _projection_remarks(calibration: Calibration) -> list[str]:
-    """Say that another projection than a pinhole was chosen and why, and what a lens departs from its projection by;
-    and where the stated squares are improbable.
-    """
+    """Say that another projection than a pinhole was chosen and why, and what a lens departs from its projection by."""
     kind = calibration.camera.projection.kind
     name = PROJECTION_NAMES[kind]
     remarks = []
@@ -325,8 +320,7 @@ def _projection_remarks(calibration: Calibration) -> list[str]:
             f"The lens departs from {name} by about {calibration.solution.lens_px:.3f} px (standard deviation, along "
             "the radius at the farthest corner). The standard uncertainties include it."
         )
-    sizes = dict.fromkeys(view.capture.square_mm for view in calibration.views)
-    return [*remarks, *(doubt for size in sizes if (doubt := square_doubt(size)) is not None)]
+    return remarks
 
 
 def _remarks(solution: Solution, validation: CrossValidation | None, of_pictures: float | None) -> list[str]:

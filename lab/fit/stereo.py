@@ -309,10 +309,11 @@ def _side_remarks(state: RigParameters, x_std_mm: float) -> list[str]:
     x, y, z = -state.rotation.T @ state.translation_mm  # the right camera in the frame of the left one
     if not (x < -SIDES_SIGMA * x_std_mm and abs(x) > max(abs(y), abs(z))):
         return []
-    return [
+    exchanged = (
         f"The right camera stands {abs(x):.4g} mm left of the left one: are the pictures of the sides exchanged, or is "
         "the rig upside down? Where they are exchanged, state the other side; nothing was changed."
-    ]
+    )
+    return [exchanged]
 
 
 # --- depth -----------------------------------------------------------------------------------------------------------

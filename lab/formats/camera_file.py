@@ -43,6 +43,7 @@ from sim.effects.library import effect, effects
 from sim.optics.imaging import DiffractionLimited, MeasuredOtf, MeasuredPsf, TracedLens
 from sim.optics.table import LensTable
 from sim.parameters import Quantity, read_quantities
+from sim.scene.projection import Projection
 from sim.spectrum import Spectrum
 
 FORMAT, VERSION = "calibench-camera", 1
@@ -358,7 +359,8 @@ def _lines(file: Path, content: CameraFile) -> Iterator[str]:
     yield from _parameters(camera.lens.illumination)
     if camera.geometry is not None:
         yield ""
-        yield "[geometry]  # pinhole (px) and distortion k1 k2 p1 p2 k3, as OpenCV defines them"
+        coefficients = " ".join(Projection.of(camera.geometry).coefficients[: len(camera.geometry.distortion) or None])
+        yield f"[geometry]  # {camera.geometry.projection} projection: camera matrix (px) and distortion {coefficients}"
         yield from _parameters(camera.geometry)
     if camera.std:
         yield ""

@@ -44,9 +44,11 @@ CENTROID_PASSES = 4
 
 MIN_CORNERS = 8  # of a view: a pose has six parameters
 WINDOW_PX = 9.0  # largest radius of the window of a corner
-
-
-OUTLYING_GUESS = 5.0  # median distances from the bent homography, from which a corner has no say in it
+LEAST_BEND_PX = 1e-3  # displacement of a corner by the curvature of its edges, below which they are taken as straight
+EDGE_SQUARES = 2  # on both sides of a corner, over which the curvature of an edge is measured
+#: Distance from the bent homography, from which a corner isn't used for it: of the median distance, and of the spacing
+#: of the corners, by which those at the rim of a wide board may be off.
+OUTLYING_GUESS, OUTLYING_SQUARES = 5.0, 0.05
 
 
 class CornerFits(NamedTuple):
@@ -73,10 +75,10 @@ def fit_corners(
         I = level + gradient . r + contrast E(d1) E(d2)
 
     E: a blurred edge, an error function of -1..1; d1, d2: distances from two lines through the corner, straight ones or
-    parabolas with the curvatures `bend_per_px` (2, n, 2), vectors (x, y) of the lines along `across` and `down`. `points` (n,
-    2), (x, y): the first guess, good to about 2 px. `across`, `down` (n, 2): directions of the axes of the board
-    there. `half_px` (n,): radius of the window. `clear(points) -> bool` says which pixels may be used. Trusted are
-    fits that converged near the guess, are sharp enough, and explain the picture.
+    parabolas with the curvatures `bend_per_px` (2, n, 2), vectors (x, y) of the lines along `across` and `down`.
+    `points` (n, 2), (x, y): the first guess, good to about 2 px. `across`, `down` (n, 2): directions of the axes of the
+    board there. `half_px` (n,): radius of the window. `clear(points) -> bool` says which pixels may be used. Trusted
+    are fits that converged near the guess, are sharp enough, and explain the picture.
     """
     points = np.array(points, dtype=float)
     count = len(points)
@@ -551,7 +553,10 @@ def refine_corners(
         return np.asarray(inside & ~(near & light))
 
     light_squares = _light_squares(picture, to_image, square_mm, marker_mm, rows, cols)
-    bend = edge_curvatures(board, to_image, square_mm)
+    straight = fit_corners(picture, points, along[0], along[1], half, clear)
+    bend = edge_curvatures(board, np.where(straight.trusted[:, None], straight.points, np.nan), square_mm)
+    if np.max(np.linalg.norm(bend, axis=2) * half**2) / 6.0 < LEAST_BEND_PX:
+        return straight
     return fit_corners(picture, points, along[0], along[1], half, clear, bend)
 
 
@@ -570,31 +575,45 @@ def _bent_homography(homography: Array, source: Array, target: Array) -> Callabl
         x, y = ((at - middle) / scale).T
         return np.column_stack([x**i * y ** (k - i) for k in range(degree + 1) for i in range(k + 1)])
 
-    design, displaced = terms(source), target - plane(source)
+    design, square = terms(source), float(np.ptp(target, axis=0).max() / np.sqrt(len(target)))
     near = np.ones(len(source), dtype=bool)
     for _ in range(2):  # a corner that was found at a wrong place would bend the map about its neighbours
+        displaced = target - plane(source)
         coefficients = np.linalg.lstsq(design[near], displaced[near], rcond=1e-9)[0]
         distance = np.linalg.norm(displaced - design @ coefficients, axis=1)
-        near = distance <= max(OUTLYING_GUESS * float(np.median(distance)), 1e-9)
+        near = distance <= max(OUTLYING_GUESS * float(np.median(distance)), OUTLYING_SQUARES * square)
+        # The given homography may follow a part of a wide board; the nearer it is to all, the less is left to bend
+        whole, _ = cv2.findHomography(source[near].astype(np.float64), target[near].astype(np.float64), 0)
+        homography = homography if whole is None else whole
+    displaced = target - plane(source)
+    coefficients = np.linalg.lstsq(design[near], displaced[near], rcond=1e-9)[0]
     return lambda at: np.asarray(plane(at) + terms(at) @ coefficients)
 
 
-def edge_curvatures(board: Array, to_image: Callable[[Array], Array], square_mm: float) -> Array:
-    """Return the curvatures (2, n, 2), 1/px, of the images of the edges along x and along y of the board, as vectors
-    (x, y) at its corners (n, 2), mm. `to_image` maps mm to px.
+def edge_curvatures(board: Array, points: Array, square_mm: float) -> Array:
+    """Estimate the curvatures (2, n, 2), 1/px, of the images of the edges along x and along y of the board, as vectors
+    (x, y) at its corners: `board` (n, 2), mm, seen at `points` (n, 2), px, NaN where one isn't known.
 
     A fit of straight edges to curved ones is off by about curvature times window^2 / 6: 0.02 px at half the frame of a
-    fisheye.
+    fisheye. A polynomial goes through the corners of the same edge up to two squares away, or the nearest four. Its
+    part along the edge is perspective's. 0 where fewer than four corners are known.
     """
-    step, found = 0.25 * square_mm, []
-    for direction in (np.array([step, 0.0]), np.array([0.0, step])):
-        after, before = to_image(board + direction), to_image(board - direction)
-        chord, sag = 0.5 * (after - before), 0.5 * (after + before) - to_image(board)
-        length = np.maximum(np.linalg.norm(chord, axis=1, keepdims=True), 1e-9)
-        unit = chord / length
-        sag -= np.sum(sag * unit, axis=1, keepdims=True) * unit  # perspective moves the middle along the edge
-        found.append(2.0 * sag / length**2)
-    return np.array(found)
+    found = np.zeros((2, len(board), 2))
+    known = np.isfinite(points).all(axis=1)
+    steps = board / square_mm
+    for along in (0, 1):
+        for k, place in enumerate(steps):
+            away = steps - place
+            on_edge = np.flatnonzero(known & (np.abs(away[:, 1 - along]) < 0.5))
+            if len(on_edge) < 4:
+                continue
+            distance = np.abs(away[on_edge, along])
+            nearest = on_edge[np.argsort(distance)][: max(4, int(np.sum(distance < EDGE_SQUARES + 0.5)))]
+            design = np.vander(away[nearest, along], increasing=True)
+            _, slope, half = np.linalg.solve(design, points[nearest])[:3]
+            twice, square = 2.0 * half, float(slope @ slope)
+            found[along, k] = (twice - (twice @ slope) / square * slope) / square
+    return found
 
 
 def _light_squares(

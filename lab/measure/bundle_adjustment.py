@@ -25,8 +25,8 @@ A lens that doesn't project as its model displaces the corners at one place of t
 views nor halves of them show that by their scatter; what shows it is that residuals have a mean over the frame. This
 discrepancy is taken as radial, d(r) = (r / R) h(r / R), R the distance of the farthest corner from the principal point,
 with h a Gaussian process of variance b^2 and correlation length R / 4 (Kennedy and O'Hagan 2001). b is the most likely
-one, given what poses and parameters leave of d in the residuals (`fit_lens_error`). The part of d that the parameters have absorbed, a focal length that is off, is in their
-covariance: A^-1 (sum J^T d) (sum J^T d)^T A^-1 over all poses.
+one, given what poses and parameters leave of d in the residuals (`fit_lens_error`). The part of d that the parameters
+have absorbed, a focal length that is off, is in their covariance: A^-1 (sum J^T d) (sum J^T d)^T A^-1 over all poses.
 
 The estimates of the solve stay. Their covariance becomes the sandwich A^-1 B A^-1 of Huber (1967) and White (1980),
 with A = sum J^T J the normal matrix of the solve, J the Jacobian without the poses, and B the covariance of the scores
@@ -67,8 +67,8 @@ MOST_POSES = 40  # that V is fitted to; more change little and take long
 LENS_NODES = 8
 LENS_LENGTH = 0.25
 LEAST_SHOWN = 1e-4  # of the largest part of the discrepancy, below which parameters have taken up a part of it
-#: Twice the log of the ratio of likelihoods, above which a lens is taken as departing from its projection: half a chi2 of
-#: one parameter, whose bound is 0, exceeds it once in 1000.
+#: Twice the log of the ratio of likelihoods, above which a lens is taken as departing from its projection: half a chi2
+#: of one parameter, whose bound is 0, exceeds it once in 1000.
 LEAST_LENS_RATIO = 9.55
 LENS_RANGE = 12.0  # of the log of b, below the largest part that is seen: 6e-6 of it
 
@@ -394,8 +394,9 @@ class Observation:
 class RigParameters:
     """All parameters.
 
-    `projections`, `intrinsics` (cameras, 12): see `sim.scene.projection`. `rotation` (3, 3), `translation_mm` (3,): camera 0 to camera 1. `warps_mm` (boards, 3).
-    `rotations` (poses, 3, 3), `translations_mm` (poses, 3): board to camera 0.
+    `projections`, `intrinsics` (cameras, 12): see `sim.scene.projection`. `rotation` (3, 3), `translation_mm` (3,):
+    camera 0 to camera 1. `warps_mm` (boards, 3). `rotations` (poses, 3, 3), `translations_mm` (poses, 3): board to
+    camera 0.
     """
 
     projections: tuple[Projection, ...]

@@ -28,12 +28,13 @@ from lab.formats.raw_file import (
 from lab.formats.result_file import installed_versions
 from lab.formats.scene_file import light, scene
 from sim import frame as sim_frame
-from sim.camera import CameraModel, Lens
+from sim.camera import CameraModel, Geometry, Lens
 from sim.effects.distortion import Distortion
 from sim.frame import Exposure
 from sim.optics.imaging import TracedLens
 from sim.parameters import Frozen, Quantity
 from sim.scene.catalogue import View
+from sim.scene.warp import rays
 from sim.sensor import electrons as sensor
 from sim.sensor.electrons import FixedPattern
 from sim.spectrum import FloatArray, Spectrum
@@ -44,6 +45,9 @@ Progress = Callable[[str, float], None]
 BRIGHTEST_PERCENT, AUTO_SHARE = 1.0, 0.7
 #: Limits of the automatic exposure (s).
 SHORTEST_S, LONGEST_S = 1e-6, 3600.0
+#: Angle from the axis up to which scenes are placed by a pinhole. There a scene is drawn 1.4 focal lengths wide on each
+#: side; the search of the place that light comes from takes up to 40 steps of sin^2 of the angle each, to 1e-4 px.
+WIDEST_SCENE_DEG = 55.0
 
 
 class SimulateOptions(Frozen):
@@ -203,7 +207,26 @@ def _distorting(content: CameraFile) -> CameraFile:
     straight = camera.geometry is None or camera.geometry.is_ideal
     if straight or isinstance(camera.lens.imaging, TracedLens):
         return content
+    assert camera.geometry is not None
+    _check_field(camera, camera.geometry)
     return replace(content, effects=(*content.effects, Distortion(geometry=camera.geometry)))
+
+
+def _check_field(camera: CameraModel, geometry: Geometry) -> None:
+    """Raise InputError where a corner of the frame of a fisheye sees farther from the axis than a pinhole can place
+    scenes.
+    """
+    if geometry.projection == "pinhole":
+        return
+    row, col = np.array([0.0, 0.0, 1.0, 1.0]) * (camera.rows - 1), np.array([0.0, 1.0, 0.0, 1.0]) * (camera.cols - 1)
+    seen = rays(col, row, geometry)
+    angle_deg = np.rad2deg(np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]))
+    if not np.all(angle_deg <= WIDEST_SCENE_DEG):
+        raise InputError(
+            f"the corner of the frame sees {np.nanmax(angle_deg):.0f} deg off the axis ({geometry.projection} "
+            f"projection), and scenes are placed by a pinhole, up to {WIDEST_SCENE_DEG:g} deg: give a camera file with "
+            "fewer rows and columns"
+        )
 
 
 def automatic_exposure_s(electrons_per_s: FloatArray, camera: CameraModel, gain_db: float = 0.0) -> float:

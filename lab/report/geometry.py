@@ -15,7 +15,7 @@ from lab.errors import InputError, NotDetermined
 from lab.fit.stereo import rectification_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
-from lab.formats.results.words import measured
+from lab.formats.results.words import PROJECTION_NAMES, measured
 from lab.measure.board_detection import luminance
 from lab.report.charts import CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.pictures import photograph_data_uri
@@ -257,7 +257,7 @@ def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
             rows.append((f"lateral colour, {channel.channel} − G", f"{shift} {at}"))
     rows += [
         (
-            f"distortion {' '.join(model.coefficients)}",
+            f"{model.lens_projection.replace('_', ' ')} projection, {' '.join(model.coefficients)}",
             f"held-out views {model.held_out_rms_px:.4f} px rms: {model.reason}",
         )
         for model in geometry.distortion_models
@@ -301,6 +301,7 @@ def context(geometry: GeometryFit | None) -> dict[str, Any]:
     if geometry is None:
         return {}
     return {
+        "projection": PROJECTION_NAMES[geometry.lens_projection],
         "facts": facts(geometry),
         "rejected": (*geometry.rejected, *geometry.rejected_corners),
         "remarks": geometry.remarks,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.base import Capture, Names, Open, names_in
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
@@ -509,6 +510,16 @@ def _check_cameras(recordings: RecordingSet, found: Findings) -> None:
                 found.problems.append(f"{recordings.where(camera.lens_file)} (lens_file of camera {side}): {error}")
 
 
+def _improbable_squares(capture: Capture) -> Iterator[str]:
+    """Say that the squares of a board are improbably small or large: as a rule, a length in another unit."""
+    from lab.formats.results.plausible import STATED  # here: its figures are those of recording sets' data sheets
+
+    if isinstance(capture, CharucoCapture):
+        line = STATED["square_mm"].sentence("square_mm", capture.square_mm, None, "mm")
+        if line is not None:
+            yield line
+
+
 def _check_captures(recordings: RecordingSet, found: Findings) -> None:
     manifest, source = recordings.manifest, recordings.source
     for id, count in Counter(capture.id for capture in manifest.captures).items():
@@ -521,7 +532,7 @@ def _check_captures(recordings: RecordingSet, found: Findings) -> None:
         found.warnings += _unknown_keys(where, capture)
         camera = manifest.cameras[capture.side]
         found.problems += [f"{where}: {text}" for text in capture.problems(camera.rows, camera.cols)]
-        for text in capture.remarks():
+        for text in (*capture.remarks(), *_improbable_squares(capture)):
             remarked.setdefault(text, []).append(capture.id)
         first = framed.setdefault(capture.frame, capture)
         if first is not capture and not capture.shares_frame:

@@ -403,7 +403,8 @@ class GeometryFit(Frozen):
     """Camera matrix, px, and distortion of a projection (`sim.scene.projection`).
 
     `distortion` of a pinhole: OpenCV's `k1 k2 p1 p2 k3`; of an equidistant projection: `k1 k2 k3 k4` of OpenCV's
-    fisheye; of a splined stereographic one: `s1 s2 p1 p2 s3 s4 s5 s6`, its spline up to `spline_angle_deg` off the axis.
+    fisheye; of a splined stereographic one: `s1 s2 p1 p2 s3 s4 s5 s6`, its spline up to `spline_angle_deg` off the
+    axis.
     """
 
     lens_projection: ProjectionKind = "pinhole"

@@ -152,8 +152,8 @@ STATED: dict[str, Plausible] = {
     # the cone of f/0.5 fills half of space; pinholes: f/100 and more
     "f_number": Plausible(0.5, 1e3, "no lens in air is faster; correct it", "correct it"),
     "focal_length_mm": Plausible(0.1, 2e4, _LENGTH, _LENGTH),
-    # targets of microscopes: 0.05 mm; boards as large as walls: 1 m
-    "square_mm": Plausible(0.04, 2e3, _LENGTH, _LENGTH),
+    # boards of 25 to 150 mm a square in metres: 0.025 to 0.15; finer ones are targets of microscopes; walls: 1 m
+    "square_mm": Plausible(0.2, 1e3, _LENGTH, _LENGTH),
     # share of the codes of bit_depth: converters reach most of their codes
     "white_level_dn over the highest code": Plausible(
         0.4, 1.0, "bit_depth may be that of the file, not of the converter; correct it", "correct bit_depth"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from sim.camera import ProjectionKind
+
 #: Field -> plain name.
 NAMES = {
     "conversion_gain_dn_per_e": "system gain K",
@@ -54,6 +56,11 @@ PLACES = {
     ("distortion", "k3"): "radial distortion k3",
     ("distortion", "k4"): "radial distortion k4",
     **{("distortion", f"s{k}"): f"radial distortion s{k}" for k in range(1, 7)},
+}
+PROJECTION_NAMES: dict[ProjectionKind, str] = {
+    "pinhole": "a pinhole with Brown's distortion",
+    "equidistant": "an equidistant fisheye (OpenCV's fisheye)",
+    "splined_stereographic": "a splined stereographic fisheye (radial spline)",
 }
 #: End of a field's name -> unit.
 _UNITS = {

@@ -180,3 +180,38 @@ def test_public_stereo_pairs():
         assert np.all(gap <= 2 * np.array(alone.camera_matrix_std))
     # OpenCV's own focal length of these pairs, 534.8 px, was found with one focal length for both cameras
     assert left.camera_matrix[0][0] == pytest.approx(534.8, rel=0.01)
+
+
+def test_an_exchanged_pair_is_reported_and_nothing_is_changed():
+    """The right camera of `projected` stands 80 mm right of the left one."""
+    pairs, left, right = drawn_pairs()
+    assert fit_pairs(pairs, left, right, (SHAPE, SHAPE)).remarks == ()
+    exchanged = [StereoPair(pair.right, pair.left) for pair in pairs]
+    fit = fit_pairs(exchanged, right, left, (SHAPE, SHAPE))
+    assert fit.translation_mm[0] == pytest.approx(80.0, abs=3 * fit.translation_mm_std[0] + 5.0)
+    assert len(fit.remarks) == 1
+    assert "mm left of the left one" in fit.remarks[0] and "exchanged" in fit.remarks[0]
+
+
+def test_cameras_above_each_other_have_no_wrong_side():
+    """Turned by 90 deg about the axis, each picture of the same rig has the second camera above or below the first."""
+
+    def turned(view):
+        x, y = view.image_px.T
+        return replace(view, image_px=np.column_stack([SHAPE[0] - 1.0 - y, x]))
+
+    pairs, _, _ = drawn_pairs()
+    sides = [[turned(getattr(pair, side)) for pair in pairs] for side in ("left", "right")]
+    shape = SHAPE[::-1]
+    fits = [geometry_result(calibrate_robustly(views, shape)) for views in sides]
+    both = [StereoPair(one, two) for one, two in zip(*sides, strict=True)]
+    assert fit_pairs(both, *fits, (shape, shape)).remarks == ()
+    assert fit_pairs([StereoPair(p.right, p.left) for p in both], *fits[::-1], (shape, shape)).remarks == ()
+
+
+@pytest.mark.parametrize(("late", "name"), [(1, "next"), (-1, "previous")])
+def test_pictures_one_pose_off_are_named(late, name):
+    pairs, left, right = drawn_pairs()
+    off = [StereoPair(pair.left, pairs[(k - late) % len(pairs)].right) for k, pair in enumerate(pairs)]
+    with pytest.raises(NotDetermined, match=f"fits the right one of the {name} pose"):
+        fit_pairs(off, left, right, (SHAPE, SHAPE))

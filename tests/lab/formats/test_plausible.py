@@ -148,7 +148,7 @@ def test_lengths_in_other_units_are_asked_about() -> None:
     assert "pixel_pitch_um 0.00345 µm is below" in warnings_of(SHEET.model_copy(update={"pixel_pitch_um": 0.00345}))[0]
     fit = FitResult(source="x", cameras={})
     assert implausible_figures(fit, {}, (0.03, 0.03)) == (
-        "boards: square_mm 0.03 mm is below the limit of 0.04 mm: a length in another unit, as metres? give it in mm",
+        "boards: square_mm 0.03 mm is below the limit of 0.2 mm: a length in another unit, as metres? give it in mm",
     )
     pair = StereoFit(
         rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), translation_mm=(-0.1, 0.0, 0.0),

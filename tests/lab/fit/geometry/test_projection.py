@@ -73,8 +73,8 @@ def test_the_equidistant_projection_is_opencvs_fisheye(points):
     ids=["equidistant", "splined"],
 )
 def test_slopes_and_rays_of_a_fisheye_up_to_100_degrees(projection, distortion):
-    """Slopes against differences of step h = 1e-6, whose error is 420 px h^2 and rounding / h: below 1e-5 px a unit. The
-    second sixth of the rays is on the axis, where the formulas divide 0 by 0.
+    """Slopes against differences of step h = 1e-6, whose error is 420 px h^2 and rounding / h: below 1e-5 px a unit.
+    The second sixth of the rays is on the axis, where the formulas divide 0 by 0.
     """
     rng = np.random.default_rng(3)
     angle, about = rng.uniform(0.0, np.deg2rad(100.0), 60), rng.uniform(0.0, 2 * np.pi, 60)
