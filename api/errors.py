@@ -136,6 +136,10 @@ def _of_field(expected: Expected, one: Mapping[str, Any]) -> str:
         return f"{len(str(given))} characters, {one['ctx']['max_length']} at most; shorten it"
     if kind == "string_pattern_mismatch":  # ids alone have patterns
         return f"{str(given)[:60]!r} is no id: take one that the lists have, of letters, digits and hyphens"
+    if kind == "timezone_aware":
+        return f"{shown} has no time zone{give}"
+    if kind == "too_short":
+        return f"{one['ctx']['actual_length']} given, {one['ctx']['min_length']} at least{give}"
     if kind == "missing":
         return f"is missing{give}"
     if field and kind.endswith(("_type", "_parsing", "literal_error", "enum")):

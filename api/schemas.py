@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    AwareDatetime,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    field_validator,
+    model_validator,
+)
 
 from api.keys import Permission
 from api.safety import StationSafety
@@ -184,6 +195,9 @@ class CaptureStart(PlanAsked):
     )
 
 
+_WEB_ADDRESS = r"^https?://[^\s/@]+(/\S*)?$"
+
+
 class Then(Asked):
     """What follows a session's end, when it has finished."""
 
@@ -198,10 +212,17 @@ class Then(Asked):
     webhook: str | None = Field(
         default=None,
         max_length=400,
-        pattern=r"^https?://[^\s/@]+(/\S*)?$",
+        pattern=_WEB_ADDRESS,
         description="is told by a POST how it ended, also where the session ended early; on a host that the service "
         "was started with (`--webhook-host`)",
     )
+
+    @field_validator("webhook", mode="before")
+    @classmethod
+    def _web_address(cls, value: Any) -> Any:
+        if isinstance(value, str) and not re.match(_WEB_ADDRESS, value):
+            raise ValueError(f"{value[:60]!r} isn't the URL of a web server; give one, such as https://lab.example/hook")
+        return value
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Self:

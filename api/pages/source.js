@@ -125,7 +125,7 @@ let figuresOf = "";
 
 const drawFigures = searchIn("figures-search", () => figures, (found) => {
   show("figures", found, figureRow);
-  $("no-figures").textContent = found.length ? "" : figures.length ? "None is like that." : "Not fitted yet: start a fit above.";
+  $("no-figures").textContent = found.length ? "" : figures.length ? "No matching figures." : "Not fitted yet: start a fit above.";
 });
 
 /** @param {Source} source @param {string | undefined} fit */

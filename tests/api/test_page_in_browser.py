@@ -381,7 +381,7 @@ def test_two_stations_a_queue_and_a_halt(browser: Any, lab: Running) -> None:
     page.wait_for_selector("#session-facts .state.interrupted")
     lab.bench.delay_s = 0.0
     assert not lab.bench.opened
-    watched.go("/", "#queue .reason:has-text('halted by admin')")
+    watched.go("/", "#queue .reason:has-text('halted by the key')")
     (lab.store.root / "stations" / "other.toml").unlink()
     watched.close()
 
@@ -431,7 +431,7 @@ def test_sessions_are_searched_named_and_two_compared(browser: Any, lab: Running
     assert "explained" in row and "0.25" in row and "2.15" in row and "a bench of fakes" in row
     page.fill("#sessions-search input[name=search]", "no such thing")
     page.press("#sessions-search input[name=search]", "Enter")
-    page.wait_for_selector("#no-sessions:has-text('None is like that')")
+    page.wait_for_selector("#no-sessions:has-text('No matching sessions')")
     with lab.client() as client:  # another one that is fitted
         asked = {"station": "fakes", "quick": True, "sequences": ["dark"], "name": "to compare"}
         other = client.post("/api/v1/sessions", json=asked).json()["id"]
@@ -605,6 +605,38 @@ def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:
     page.fill("#start-form input[name=name]", "as planned")
     page.click("#start")
     watched.go("/sessions", "#sessions tr:has-text('as planned') td:has-text('/10')")
+    watched.close()
+
+
+def test_an_error_of_the_start_form_names_the_field(browser: Any, lab: Running) -> None:
+    """A text in place of a number, two numbers in place of one, and what the service refuses: in plain words, with the
+    field named as the form names it, and nothing is started."""
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    page.wait_for_selector("#plan-words:has-text('3 sequences')")
+    page.press("#plan-words", "Enter")
+    page.click("#plan-rows li:first-child summary")
+    field = "#plan-rows li:first-child label:has-text('frames at each exposure') input"
+    for text in ("five", "2, 3", "1e999"):
+        page.fill(field, text)
+        page.press(field, "Tab")
+        page.wait_for_selector(f"#plan-problem:has-text('dark, frames at each exposure: \u201c{text}\u201d isn')")
+        assert page.get_attribute(field, "aria-invalid") == "true"
+        page.click("#start")
+        page.wait_for_selector(f"#start-problem:has-text('dark, frames at each exposure: \u201c{text}\u201d isn')")
+        assert page.inner_text("#plan-problem") == ""
+    assert watched.faults() == []
+    page.fill(field, "2")
+    page.press(field, "Tab")
+    page.wait_for_selector("#plan-problem:empty", state="attached")
+    page.press("#then-words", "Enter")
+    page.fill("#start-form input[name=webhook]", "https://lab.example/hook")
+    page.click("#start")
+    page.wait_for_selector("#start-problem:has-text('Webhook URL: ')")
+    assert "'lab.example' isn't a host that the service tells" in page.inner_text("#start-problem")
+    assert page.query_selector(".station.busy") is None
+    watched.complaints = [line for line in watched.complaints if "422" not in line]  # the refused one
     watched.close()
 
 
