@@ -38,6 +38,7 @@ from lab.challenge.truth import SIZES
 from lab.formats.importers import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from lab.formats.results.diagnosis import DiagnosisVerdict
+from lab.pipeline import Step
 from lab.plain_text import complaints_of
 from sim.camera import Cfa, Side
 
@@ -221,7 +222,9 @@ class Then(Asked):
     @classmethod
     def _web_address(cls, value: Any) -> Any:
         if isinstance(value, str) and not re.match(_WEB_ADDRESS, value):
-            raise ValueError(f"{value[:60]!r} isn't the URL of a web server; give one, such as https://lab.example/hook")
+            raise ValueError(
+                f"{value[:60]!r} isn't the URL of a web server; give one, such as https://lab.example/hook"
+            )
         return value
 
     @model_validator(mode="after")
@@ -241,10 +244,20 @@ class Then(Asked):
         return ", ".join(word for word in words if word)
 
 
+class WorkStep(Schema):
+    """A step of an analysis, and how far it is."""
+
+    name: Step
+    state: Literal["waiting", "running", "done", "failed", "cancelled"]
+
+
 class ThenState(Schema):
     """How far that is which follows a session's end. `words`: what was asked for, and what came of it."""
 
     state: Literal["waiting", "running", "done", "failed"]
+    steps: tuple[WorkStep, ...] = Field(
+        default=(), description="what is computed, in order, until there is a job, which then has them"
+    )
     words: str
     job_id: str | None = Field(default=None, description="of the job that computes it")
     comparison: str | None = Field(default=None, description="path of the page that compares with the certified one")
@@ -647,6 +660,7 @@ class Job(Schema):
     recordings_id: str | None
     challenge_id: str | None = None
     state: JobState
+    steps: tuple[WorkStep, ...] = Field(default=(), description="of work on a session or on recordings, in order")
     progress: float = Field(ge=0, le=1)
     message: str
     error: str | None

@@ -11,10 +11,10 @@ import re
 import shutil
 import threading
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -24,6 +24,7 @@ from lab.capture.queue import put_into_queue
 from lab.capture.station import Drivers, Station, read_station
 from lab.formats.camera_file import CameraFile, default_camera, write_camera
 from lab.formats.recording_set import packed
+from lab.pipeline import PipelineProgress, PipelineRequest, Step
 from tests.api.conftest import STATION, Running, serving, until_state
 from tests.api.routes.test_confirm import PERSON, begun, confirm
 from tests.api.routes.test_findings import diagnosis
@@ -605,6 +606,55 @@ def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:
     page.fill("#start-form input[name=name]", "as planned")
     page.click("#start")
     watched.go("/sessions", "#sessions tr:has-text('as planned') td:has-text('/10')")
+    watched.close()
+
+
+def test_the_steps_of_an_analysis_are_followed_to_its_report(
+    browser: Any, lab: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the capture to the report in one view, whose part that stands there stays. The pipeline itself is a stand-in
+    that ends a step when it is told to."""
+    steps = {name: threading.Event() for name in ("fit", "validate", "diagnose", "report")}
+
+    def pipeline(request: PipelineRequest, tell: Callable[[PipelineProgress], None], **_: Any) -> None:
+        for number, (name, go_on) in enumerate(steps.items()):
+            tell(PipelineProgress(cast(Step, name), "the left camera", number / len(steps)))
+            assert go_on.wait(60.0)
+        page = lab.store.root / "reports" / f"{request.job_id}.html"
+        page.parent.mkdir(exist_ok=True)
+        page.write_text("<title>a report</title><h1>What was found</h1>")
+        lab.store.add_result("report", request.source, {"path": f"reports/{page.name}"}, request.job_id)
+
+    monkeypatch.setattr("lab.jobs.run_pipeline", pipeline)
+    monkeypatch.setattr("lab.jobs._WRITE_EVERY_S", 0.0)
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    page.fill("#start-form input[name=name]", "followed")
+    page.evaluate("""() => { document.querySelector("#start-form select[name=then]").value = "pipeline" }""")
+    lab.bench.delay_s = 0.05
+    page.click("#start")
+    page.wait_for_selector(".station.busy a:has-text('followed')")
+    watched.go("/sessions", "#sessions a:text-is('followed')")
+    page.click("#sessions a:text-is('followed')")  # an address that names no part
+    page.wait_for_selector("#session-steps .running:has-text('capture')")
+    assert page.locator("#session-steps li").all_inner_texts()[1:] == [f"{name} waiting" for name in steps]
+    lab.bench.delay_s = 0.0
+    for name, go_on in steps.items():
+        page.wait_for_selector(f"#session-steps .running:has-text('{name}')")
+        page.wait_for_selector("#session-message:has-text('the left camera')")
+        assert page.is_visible("#panel-live") and page.is_hidden("#panel-frames")
+        assert watched.faults() == []
+        go_on.set()
+    page.wait_for_selector("#session-steps .done:has-text('report')")
+    assert page.is_visible("#panel-live") and page.is_hidden("#session-bar")
+    with page.expect_popup() as opened:
+        page.click("#session-facts a:has-text('Report')")
+    opened.value.wait_for_selector("h1:has-text('What was found')")
+    opened.value.close()
+    watched.tab_to("Findings")
+    watched.press("Enter", "#panel-findings:not([hidden])")
+    assert watched.faults() == []
     watched.close()
 
 
