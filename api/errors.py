@@ -130,18 +130,25 @@ def _of_field(expected: Expected, one: Mapping[str, Any]) -> str:
     give = f"; give {field}" if field else ""
     # A key that was sent is never repeated.
     shown = "what was sent" if place[-1] == "key" else json.dumps(given, ensure_ascii=False, default=str)[:60]
-    if kind == "extra_forbidden":
-        return f"there is no such field; those that there are: {', '.join(expected.names(place[:-1])) or 'none'}"
-    if kind == "string_too_long":
-        return f"{len(str(given))} characters, {one['ctx']['max_length']} at most; shorten it"
-    if kind == "string_pattern_mismatch":  # ids alone have patterns
-        return f"{str(given)[:60]!r} is no id: take one that the lists have, of letters, digits and hyphens"
-    if kind == "missing":
-        return f"is missing{give}"
-    if field and kind.endswith(("_type", "_parsing", "literal_error", "enum")):
-        return f"{shown} isn't taken{give}"
-    text = re.sub(r"^[A-Z]\w+ (should|must)", r"\1", str(one["msg"]))
-    return f"{shown} {text}{give}"
+    match kind:
+        case "extra_forbidden":
+            text = f"there is no such field; those that there are: {', '.join(expected.names(place[:-1])) or 'none'}"
+        case "string_too_long":
+            text = f"{len(str(given))} characters, {one['ctx']['max_length']} at most; shorten it"
+        case "string_pattern_mismatch":  # ids alone have patterns
+            text = f"{str(given)[:60]!r} is no id: take one that the lists have, of letters, digits and hyphens"
+        case "timezone_aware":
+            text = f"{shown} has no time zone{give}"
+        case "too_short":
+            text = f"{one['ctx']['actual_length']} given, {one['ctx']['min_length']} at least{give}"
+        case "missing":
+            text = f"is missing{give}"
+        case _ if field and kind.endswith(("_type", "_parsing", "literal_error", "enum")):
+            text = f"{shown} isn't taken{give}"
+        case _:
+            ends = re.sub(r"^[A-Z]\w+ (should|must)", r"\1", str(one["msg"]))
+            text = f"{shown} {ends}{give}"
+    return text
 
 
 def _invalid(request: Request, error: Exception) -> Response:

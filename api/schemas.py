@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    AwareDatetime,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    field_validator,
+    model_validator,
+)
 
 from api.keys import Permission
 from api.safety import StationSafety
@@ -27,6 +38,7 @@ from lab.challenge.truth import SIZES
 from lab.formats.importers import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from lab.formats.results.diagnosis import DiagnosisVerdict
+from lab.pipeline import Step
 from lab.plain_text import complaints_of
 from sim.camera import Cfa, Side
 
@@ -184,6 +196,9 @@ class CaptureStart(PlanAsked):
     )
 
 
+_WEB_ADDRESS = r"^https?://[^\s/@]+(/\S*)?$"
+
+
 class Then(Asked):
     """What follows a session's end, when it has finished."""
 
@@ -198,10 +213,19 @@ class Then(Asked):
     webhook: str | None = Field(
         default=None,
         max_length=400,
-        pattern=r"^https?://[^\s/@]+(/\S*)?$",
+        pattern=_WEB_ADDRESS,
         description="is told by a POST how it ended, also where the session ended early; on a host that the service "
         "was started with (`--webhook-host`)",
     )
+
+    @field_validator("webhook", mode="before")
+    @classmethod
+    def _web_address(cls, value: Any) -> Any:
+        if isinstance(value, str) and not re.match(_WEB_ADDRESS, value):
+            raise ValueError(
+                f"{value[:60]!r} isn't the URL of a web server; give one, such as https://lab.example/hook"
+            )
+        return value
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Self:
@@ -220,10 +244,20 @@ class Then(Asked):
         return ", ".join(word for word in words if word)
 
 
+class WorkStep(Schema):
+    """A step of an analysis, and how far it is."""
+
+    name: Step
+    state: Literal["waiting", "running", "done", "failed", "cancelled"]
+
+
 class ThenState(Schema):
     """How far that is which follows a session's end. `words`: what was asked for, and what came of it."""
 
     state: Literal["waiting", "running", "done", "failed"]
+    steps: tuple[WorkStep, ...] = Field(
+        default=(), description="what is computed, in order, until there is a job, which then has them"
+    )
     words: str
     job_id: str | None = Field(default=None, description="of the job that computes it")
     comparison: str | None = Field(default=None, description="path of the page that compares with the certified one")
@@ -626,6 +660,7 @@ class Job(Schema):
     recordings_id: str | None
     challenge_id: str | None = None
     state: JobState
+    steps: tuple[WorkStep, ...] = Field(default=(), description="of work on a session or on recordings, in order")
     progress: float = Field(ge=0, le=1)
     message: str
     error: str | None

@@ -22,18 +22,21 @@ def _kinds(annotation: Any) -> set[Any]:
 def check_kind(where: str, value: Any, annotation: Any) -> None:
     """Raise ValueError where the value at `where` would only be taken for what the annotation says after a
     conversion."""
-    _check(where, value, _kinds(annotation) - {type(None), Ellipsis})
+    kinds = _kinds(annotation)
+    _check(where, value, kinds - {type(None), Ellipsis}, none_allowed=type(None) in kinds)
 
 
-def _check(where: str, value: Any, wanted: set[Any]) -> None:
+def _check(where: str, value: Any, wanted: set[Any], *, none_allowed: bool) -> None:
     shown = json.dumps(value) if isinstance(value, bool) else repr(value)[:60]
     numbers = bool(wanted & {int, float})
     if isinstance(value, list | tuple):
         for number, one in enumerate(value):
-            _check(f"{where}.{number}", one, wanted)
+            _check(f"{where}.{number}", one, wanted, none_allowed=none_allowed)
     elif isinstance(value, dict):
         for name, one in value.items():
-            _check(f"{where}.{name}", one, wanted)
+            _check(f"{where}.{name}", one, wanted, none_allowed=none_allowed)
+    elif value is None and numbers and not none_allowed:
+        raise ValueError(f"{where}: null isn't a number; write one")
     elif isinstance(value, bool) and numbers and bool not in wanted:
         raise ValueError(f"{where}: {shown} isn't a number; write one")
     elif isinstance(value, str) and numbers and wanted <= {int, float}:

@@ -28,6 +28,7 @@ from lab.errors import CannotWrite, InputError
 from lab.fit.compare import compare
 from lab.formats.results import FitResult
 from lab.jobs import JobRunner
+from lab.pipeline import STEPS
 from lab.resolve import ResolveLimits
 
 log = logging.getLogger(__name__)
@@ -64,11 +65,20 @@ def then_of(store: Store, session_id: str) -> ThenState | None:
         state, kept, asked = row.then_state, row.then or {}, row.request
     if state is None or asked is None:
         return None
-    words = Then.model_validate(asked["then"]).in_words
+    then = Then.model_validate(asked["then"])
+    words = then.in_words
     if state != "waiting":
         words = f"{words}: {kept.get('words') or state}"
+    names = () if then.kind is None else STEPS[then.kind]
+    steps = [
+        {"name": name, "state": "waiting"}
+        for name in names
+        if name != "capture" and (name != "resolve" or then.resolve)
+    ]
     more = {name: kept.get(name) for name in ("job_id", "comparison", "told")}
-    return ThenState.model_validate({"state": state, "words": words, **more})
+    return ThenState.model_validate(
+        {"state": state, "steps": steps if state == "waiting" else (), "words": words, **more}
+    )
 
 
 def check_webhook(url: str | None, hosts: Collection[str]) -> None:

@@ -7,7 +7,7 @@ import "./inspector.js";
 import "./models.js";
 import "./recordings.js";
 import "./source.js";
-import { $, addView, address, ask, element, forgetHalt, goTo, halt, may, mayHalt, post, put, query, reach, said, scopeIs, show, showView, told } from "./page.js";
+import { $, Problem, addView, address, ask, element, forgetHalt, goTo, halt, may, mayHalt, post, put, query, reach, said, scopeIs, show, showView, told } from "./page.js";
 import { asked as planned, showEstimate, showPlan, take } from "./plan.js";
 import { queueIs, showQueue } from "./queue.js";
 import { leaveStations, placeCards, showStations, stationsAre } from "./stations.js";
@@ -147,21 +147,37 @@ function showStartButton(station) {
   fields.compare.disabled = fields.then.value === "";
   if (fields.resolve.disabled) fields.resolve.checked = false;
   if (fields.compare.disabled) fields.compare.checked = false;
-  const parts = [fields.then.value ? fields.then.selectedOptions[0].textContent : "nothing", fields.resolve.checked ? "resolve" : "", fields.compare.checked ? "compare" : "", fields.webhook.value ? "tell" : ""];
+  const parts = [fields.then.value ? fields.then.selectedOptions[0].textContent : "nothing", fields.resolve.checked ? "resolve" : "", fields.compare.checked ? "compare" : "", fields.webhook.value ? "webhook" : ""];
   $("then-words").textContent = `Then: ${parts.filter(Boolean).join(", ")}`;
 }
 
+/** An error of the start form, with the field named as the form does.
+ * @param {unknown} error */
+function withLabel(error) {
+  const [all, name] = /^(?:then\.)?(\w+): /.exec(said(error)) ?? [];
+  const field = name ? form.querySelector(`[name="${name}"]`) : null;
+  const label = field?.closest("label")?.innerText.trim().split("\n")[0];
+  return new Problem(label ? `${label}: ${said(error).slice(all?.length)}` : said(error));
+}
+
 form.addEventListener("change", () => showStart());
+// A field that the browser refuses may stand in a folded part.
+form.addEventListener("invalid", ({ target }) => target instanceof Element && target.closest("details")?.setAttribute("open", ""), true);
 form.addEventListener("submit", told("start-problem", async () => {
   const fields = form.elements;
+  $("plan-problem").textContent = "";
   const at = fields.not_before.value ? new Date(fields.not_before.value).toISOString() : null;
   const station = stations.find((s) => s.name === fields.station.value);
   const wanted = { station: fields.station.value, name: fields.name.value, notes: fields.notes.value, quick: fields.quick.checked, demands_certified: fields.certified.checked, ...planned() };
   const then = may("admin") ? thenOf(fields) : null;
   const queued = Boolean(at || editing || station?.busy_with);
   const whole = { ...wanted, queue: queued, not_before: at, ...(then ? { then } : {}) };
-  if (editing) await put(`/sessions/${editing}/request`, whole);
-  else await post("/sessions", whole);
+  try {
+    if (editing) await put(`/sessions/${editing}/request`, whole);
+    else await post("/sessions", whole);
+  } catch (error) {
+    throw withLabel(error);
+  }
   fields.name.value = fields.notes.value = fields.not_before.value = "";
   if (editing) leaveEdit();
   await refresh();

@@ -1,6 +1,6 @@
 // What a session will take: the sequences of a station with their parameters, and the service's estimate of captures and time.
 
-import { $, ask, duration, element, post, said } from "./page.js";
+import { $, Problem, ask, duration, element, post, said } from "./page.js";
 
 /** @typedef {Model<"SequenceParameter">} Parameter */
 /** A sequence's parts: the box that takes it, what it takes, its fields, and the row that they stand in.
@@ -17,7 +17,7 @@ const rows = new Map();
 
 /** @typedef {NonNullable<Asked["sequences"]>[number]} Sequence */
 /** @param {number} seconds @param {boolean} learned */
-const about = (seconds, learned) => `${learned ? "about" : "perhaps"} ${duration(seconds)}`;
+const about = (seconds, learned) => `about ${duration(seconds)}${learned ? "" : " (estimated)"}`;
 /** @param {number | number[] | null | undefined} value */
 const text = (value) => (value == null ? "not set" : [value].flat().map((one) => Number(one.toPrecision(6))).join(", "));
 
@@ -41,16 +41,31 @@ function row(sequence, changed) {
   return { taken, takes, fields, whole };
 }
 
+/** The numbers that a parameter's field has. Throws a Problem where its text isn't one number, or several where it takes several.
+ * @param {Sequence} of
+ * @param {Part["fields"][number]} one */
+function numbersIn(of, { field, parameter }) {
+  const texts = parameter.several ? field.value.split(",").map((part) => part.trim()) : [field.value.trim()];
+  const wrong = texts.find((part) => part === "" || !Number.isFinite(Number(part)));
+  field.setAttribute("aria-invalid", String(wrong !== undefined));
+  if (wrong !== undefined) {
+    const how = parameter.several ? "give numbers with commas between them" : "give one number, with a point for its decimals";
+    throw new Problem(`${of}, ${parameter.meaning}: “${wrong}” isn't a number; ${how}`);
+  }
+  return texts.map(Number);
+}
+
 // What `POST /sessions` takes of the plan.
 export function asked() {
   const chosen = [...rows].filter(([, part]) => part.taken.checked);
   /** @type {Record<string, Record<string, number | number[]>>} */
   const parameters = {};
   for (const [name, part] of chosen) {
-    for (const { field, parameter } of part.fields) {
-      if (!field.value.trim()) continue;
-      const numbers = field.value.split(",").map(Number);
-      (parameters[name] ??= {})[parameter.name] = parameter.several ? numbers : numbers[0];
+    for (const one of part.fields) {
+      one.field.removeAttribute("aria-invalid");
+      if (!one.field.value.trim()) continue;
+      const numbers = numbersIn(name, one);
+      (parameters[name] ??= {})[one.parameter.name] = one.parameter.several ? numbers : numbers[0];
     }
   }
   return { sequences: rows.size && chosen.length < rows.size ? chosen.map(([name]) => name) : null, parameters };
@@ -68,14 +83,14 @@ export function take({ sequences, parameters }) {
 /** @param {string} station @param {boolean} quick */
 export async function showEstimate(station, quick) {
   const number = ++latest;
-  const wanted = asked();
-  if (wanted.sequences?.length === 0) {
-    $("plan-words").textContent = "No sequence is chosen";
-    for (const part of rows.values()) part.takes.textContent = "";
-    return;
-  }
   let found;
   try {
+    const wanted = asked();
+    if (wanted.sequences?.length === 0) {
+      $("plan-words").textContent = "No sequence is chosen";
+      for (const part of rows.values()) part.takes.textContent = "";
+      return;
+    }
     found = await post(`/stations/${encodeURIComponent(station)}/estimate`, { quick, ...wanted });
   } catch (error) {
     if (number !== latest) return;
@@ -87,11 +102,11 @@ export async function showEstimate(station, quick) {
   $("plan-problem").textContent = "";
   const learned = found.sequences.every((one) => one.learned);
   $("plan-words").textContent = `${found.sequences.length} sequence${found.sequences.length === 1 ? "" : "s"}, ${found.captures} captures, ${about(found.estimated_s, learned)}`;
-  $("plan-learned").textContent = learned ? "" : "“Perhaps”: this station hasn't shown yet how long its steps take.";
+  $("plan-learned").textContent = learned ? "" : "Estimated: no session of this station has measured yet how long its steps take.";
   const planned = new Map(found.sequences.map((one) => [one.name, one]));
   for (const [name, part] of rows) {
     const one = planned.get(name);
-    part.takes.textContent = one ? `${one.captures} captures, ${about(one.estimated_s, one.learned)}` : "left out";
+    part.takes.textContent = one ? `${one.captures} captures, ${about(one.estimated_s, one.learned)}` : "not taken";
     for (const { field, parameter } of part.fields) if (one && !field.value) field.placeholder = text(one.parameters[parameter.name]);
   }
 }

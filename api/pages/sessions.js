@@ -114,7 +114,7 @@ addView({
     const asked = query();
     if (first) for (const key of KEYS) form.elements[key].value = asked.get(key) ?? "";
     await list.refresh(asked.toString());
-    $("no-sessions").textContent = asked.size ? "None is like that." : "None yet: start one at the desk.";
+    $("no-sessions").textContent = asked.size ? "No matching sessions." : "None yet: start one at the desk.";
     showChosen();
   },
 });

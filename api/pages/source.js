@@ -5,9 +5,11 @@ import { showFrames, leaveFrames } from "./frames.js";
 import { showFindings } from "./findings.js";
 import { figureRow, searchIn } from "./figures.js";
 import { showOwnJobs } from "./jobs.js";
-import { $, LIVE, addView, api, ask, change, element, goTo, may, named, post, remove, show, showView, time, told } from "./page.js";
+import { $, LIVE, addView, address, api, ask, change, element, goTo, may, named, post, remove, show, showView, time, told } from "./page.js";
 import { actionsOf, verdictWords } from "./sessions.js";
 import { showWatched, watch } from "./watch.js";
+
+const FOLLOWED = 20; // newest jobs among which the one that wrote the newest report is looked for
 
 /** @typedef {"live" | "findings" | "figures" | "frames" | "jobs"} Tab */
 /** @typedef {Model<"SessionDetail"> | Model<"RecordingsDetail">} Detail */
@@ -19,6 +21,9 @@ const EVERY = /** @type {Tab[]} */ (Object.keys(TABS));
 const tabsOf = (kind) => EVERY.filter((tab) => kind === "sessions" || tab !== "live");
 
 let shown = ""; // the source that stands there
+/** The part of it that stands there: the end of a capture or of an analysis changes it no more than a refresh.
+ * @type {Tab} */
+let part = "live";
 let noted = ""; // its name and notes as the form has them
 
 const asks = asksBanner(() => $("session-title"), () => showView());
@@ -34,8 +39,8 @@ const steps = element("span");
 /** @param {string} label @param {string | Node | null | undefined} value */
 const fact = (label, value) => (value ? [element("div", {}, element("dt", { textContent: label }), element("dd", {}, value))] : []);
 
-/** @param {Detail} one */
-function showHead(one) {
+/** @param {Detail} one @param {Model<"Job">[]} jobs */
+function showHead(one, jobs) {
   const session = "state" in one ? one : null;
   const name = one.name || one.id;
   $("session-title").textContent = name;
@@ -51,6 +56,7 @@ function showHead(one) {
     ...fact("Steps done", session && steps),
     ...fact("Captures", String("counts" in one ? one.captures : one.captures.reduce((sum, each) => sum + each.captures, 0))),
     ...fact("Verdict", verdictWords(one.verdict)),
+    ...fact("Report", reportOf(one, jobs)),
     ...fact("Calibration", one.results?.fit ? element("a", { href: `#/calibrations/${one.results.fit}`, textContent: one.results.fit }) : ""),
   ];
   $("session-facts").replaceChildren(...facts);
@@ -65,6 +71,30 @@ function showHead(one) {
     form.elements.name.value = one.name;
     form.elements.notes.value = one.notes;
   }
+}
+
+/** The steps of the newest job on a source, or of what follows its capture, each with its state.
+ * @param {Detail} one @param {Model<"Job"> | undefined} job */
+function showWork(one, job) {
+  const session = "state" in one ? one : null;
+  const capture = /** @type {const} */ ({ name: "capture", state: session && LIVE.includes(session.state) ? "running" : session?.state === "finished" ? "done" : "waiting" });
+  const follows = session?.then?.state === "waiting" ? [capture, ...session.then.steps] : [];
+  const steps = follows.length > 1 ? follows : (job?.steps ?? []);
+  const runs = !follows.length && job?.state === "running" ? job : null;
+  $("session-work").hidden = steps.length === 0;
+  show("session-steps", steps.map((step) => ({ id: step.name, ...step })), (step) =>
+    element("li", { className: step.state }, step.name, " ", element("span", { className: "hint", textContent: step.state })));
+  $("session-bar").hidden = !runs;
+  $("session-bar").value = runs?.progress ?? 0;
+  $("session-message").textContent = runs?.message ?? "";
+  $("session-failure").textContent = (!follows.length && job?.error) || "";
+}
+
+/** The newest report of a source, as a link.
+ * @param {Detail} one @param {Model<"Job">[]} jobs */
+function reportOf(one, jobs) {
+  const job = jobs.find((made) => made.state === "done" && ["report", "pipeline"].includes(made.kind));
+  return job ? named("a", "Report", `of ${one.name || one.id}`, { href: `${api}/jobs/${job.id}/report`, target: "_blank", rel: "noopener" }) : null;
 }
 
 /** @type {Record<Source["kind"], Model<"JobStart">["kind"][]>} */
@@ -125,7 +155,7 @@ let figuresOf = "";
 
 const drawFigures = searchIn("figures-search", () => figures, (found) => {
   show("figures", found, figureRow);
-  $("no-figures").textContent = found.length ? "" : figures.length ? "None is like that." : "Not fitted yet: start a fit above.";
+  $("no-figures").textContent = found.length ? "" : figures.length ? "No matching figures." : "Not fitted yet: start a fit above.";
 });
 
 /** @param {Source} source @param {string | undefined} fit */
@@ -144,12 +174,16 @@ async function showFigures(source, fit) {
 async function showSource(first, kind, id, tab) {
   const source = { kind, id };
   if (shown !== `${kind}/${id}`) $("session-title").textContent = id;
-  const one = await ask(`/${kind}/${id}`);
+  const [one, jobs] = await Promise.all([ask(`/${kind}/${id}`), ask(`/jobs?limit=${FOLLOWED}&${kind === "sessions" ? "session_id" : "recordings_id"}=${id}`)]);
+  if (address().replace(/\?.*$/, "") !== `/${kind}/${id}${tab ? `/${tab}` : ""}`) return; // somebody went on meanwhile
   const tabs = tabsOf(kind);
   const session = "state" in one ? one : null;
-  const usual = !session || one.results.diagnose ? "findings" : "frames";
-  const at = tabs.includes(tab) ? tab : session && LIVE.includes(session.state) ? "live" : usual;
-  if (first || shown !== `${kind}/${id}`) {
+  const goesOn = session && (LIVE.includes(session.state) || ["waiting", "running"].includes(session.then?.state ?? ""));
+  const usual = goesOn ? "live" : !session || one.results.diagnose ? "findings" : "frames";
+  const again = !first && shown === `${kind}/${id}`;
+  const at = tabs.includes(tab) ? tab : again ? part : usual;
+  part = at;
+  if (!again) {
     if (shown !== `${kind}/${id}`) leaveFrames();
     shown = `${kind}/${id}`;
     $("session-problem").textContent = "";
@@ -161,11 +195,15 @@ async function showSource(first, kind, id, tab) {
     for (const name of EVERY) $(`panel-${name}`).hidden = name !== at;
     watch(at === "live" ? session : null);
   }
-  showHead(one);
+  showHead(one, jobs);
+  showWork(one, jobs.at(0));
   document.title = `${one.name || one.id} · ${TABS[at]} · calibench`;
   showActions(source, one);
   if (at === "live") await showWatched();
-  else if (at === "findings") await showFindings(source, one.results.diagnose);
+  else if (at === "findings") {
+    await showFindings(source, one.results.diagnose);
+    $("findings-report").replaceChildren(reportOf(one, jobs) ?? "No report yet: start one above.");
+  }
   else if (at === "figures") await showFigures(source, one.results.fit);
   else if (at === "frames") await showFrames(source, one);
   else await showOwnJobs(source, one.name || one.id);

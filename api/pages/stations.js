@@ -119,7 +119,7 @@ function showStrip(parts) {
   strip.state.className = parts.state.className;
   const [shutter, light] = [parts.shutter.textContent ?? "", parts.light.textContent];
   const screen = session?.state === "packing" ? "not in use" : session ? "in use" : safety?.state === "safe" ? "dark" : "not known";
-  const words = [`shutter ${shutter === "–" ? "not known" : shutter.startsWith("closed") ? "closed" : shutter}`, light === "–" ? "" : `light ${light}`, `screen ${screen}`];
+  const words = [`shutter ${["–", "unknown"].includes(shutter) ? "state unknown" : shutter.startsWith("closed") ? "closed" : shutter}`, light === "–" ? "" : `light ${light}`, `screen ${screen}`];
   strip.facts.textContent = words.filter(Boolean).join(" · ");
   strip.facts.className = parts.shutter.className;
   showAge(parts);
@@ -147,7 +147,7 @@ function forget(parts) {
 function showBench(parts, bench, safety) {
   const open = bench?.shutter_open;
   parts.shutter.textContent = open == null ? "–" : open ? "open" : "closed";
-  if (!bench) parts.shutter.textContent = !safety ? "not asked yet" : safety.shutter === "closed" ? `closed ${clock(safety.at)}` : { none: "none", unknown: "unknown" }[safety.shutter];
+  if (!bench) parts.shutter.textContent = !safety ? "unknown" : safety.shutter === "closed" ? `closed ${clock(safety.at)}` : { none: "none", unknown: "unknown" }[safety.shutter];
   parts.shutter.className = open || (!bench && safety?.shutter === "unknown") ? "open" : "";
   const nm = bench?.wavelength_nm;
   parts.light.textContent = nm == null ? "–" : nm === 0 ? "white" : `${Number(nm.toFixed(1))} nm`;

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
+from typing import Annotated, cast
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import HTMLResponse
@@ -13,16 +13,31 @@ from api.errors import Conflict, answers, known
 from api.events import described, stream, watched
 from api.keys import Permission
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
-from api.schemas import Job, JobStart, PipelineResults, PipelineStart
+from api.schemas import Job, JobStart, PipelineResults, PipelineStart, WorkStep
 from api.security import REPORT_POLICY, Demand
 from api.service import ADMIN, CALIBRATE, HEX_ID, READ, SESSION_ID, Here, HexId, Service, SessionId, camera_model
 from lab.challenge.kept import WORK
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
-from lab.pipeline import source_recordings
+from lab.pipeline import STEPS, Goal, Step, source_recordings
 from lab.resolve import resolve_limits, station_of
 
 router = APIRouter()
+
+
+def steps_of(info: JobInfo, *, captures: bool) -> tuple[WorkStep, ...]:
+    """The steps of a job; its newest message begins with the one under way. `captures`: whether a pipeline captures."""
+    names = tuple(name for name in STEPS.get(cast(Goal, info.kind), ()) if captures or name != "capture")
+    now = info.message.partition(":")[0]
+    # `resolve` is a step of those pipelines that were asked for it, which the job's row doesn't have.
+    names = tuple(name for name in names if name != "resolve" or name == now)
+    at = names.index(cast(Step, now)) if now in names else 0
+    if info.state in ("queued", "done"):
+        return tuple(WorkStep(name=name, state="done" if info.state == "done" else "waiting") for name in names)
+    return tuple(
+        WorkStep(name=name, state="done" if n < at else info.state if n == at else "waiting")
+        for n, name in enumerate(names)
+    )
 
 
 def _job(service: Service, info: JobInfo) -> Job:
@@ -30,6 +45,7 @@ def _job(service: Service, info: JobInfo) -> Job:
     challenge_id = service.challenges.id_of(info.source)
     return Job(
         **info.model_dump(exclude={"source", "message", "error", "cancel_requested"}),
+        steps=steps_of(info, captures=recordings_id is None),
         message=service.public(info.message),
         error=service.public.or_none(info.error),
         session_id=info.source if recordings_id is None and challenge_id is None else None,

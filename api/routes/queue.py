@@ -155,7 +155,8 @@ def halt(
     `stations` has every station by its name: whose shutter is closed, by its own answer, and whose isn't confirmed by
     then."""
     station = service.station(asked.station) if asked is not None and asked.station is not None else None
-    until_s, live, why = time.monotonic() + ANSWER_S, service.live, f"halted by {key.name}"
+    until_s, live = time.monotonic() + ANSWER_S, service.live
+    why = f"halted by the key {key.name!r} at {now():%H:%M:%S} UTC"
     ended = live.halt(station, why)  # first: nothing that the registry does delays it
     held = service.waiting.hold(why, station)
     unusable: dict[str, str] = {}

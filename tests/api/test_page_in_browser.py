@@ -11,10 +11,10 @@ import re
 import shutil
 import threading
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -24,6 +24,7 @@ from lab.capture.queue import put_into_queue
 from lab.capture.station import Drivers, Station, read_station
 from lab.formats.camera_file import CameraFile, default_camera, write_camera
 from lab.formats.recording_set import packed
+from lab.pipeline import PipelineProgress, PipelineRequest, Step
 from tests.api.conftest import STATION, Running, serving, until_state
 from tests.api.routes.test_confirm import PERSON, begun, confirm
 from tests.api.routes.test_findings import diagnosis
@@ -381,7 +382,7 @@ def test_two_stations_a_queue_and_a_halt(browser: Any, lab: Running) -> None:
     page.wait_for_selector("#session-facts .state.interrupted")
     lab.bench.delay_s = 0.0
     assert not lab.bench.opened
-    watched.go("/", "#queue .reason:has-text('halted by admin')")
+    watched.go("/", "#queue .reason:has-text('halted by the key')")
     (lab.store.root / "stations" / "other.toml").unlink()
     watched.close()
 
@@ -431,7 +432,7 @@ def test_sessions_are_searched_named_and_two_compared(browser: Any, lab: Running
     assert "explained" in row and "0.25" in row and "2.15" in row and "a bench of fakes" in row
     page.fill("#sessions-search input[name=search]", "no such thing")
     page.press("#sessions-search input[name=search]", "Enter")
-    page.wait_for_selector("#no-sessions:has-text('None is like that')")
+    page.wait_for_selector("#no-sessions:has-text('No matching sessions')")
     with lab.client() as client:  # another one that is fitted
         asked = {"station": "fakes", "quick": True, "sequences": ["dark"], "name": "to compare"}
         other = client.post("/api/v1/sessions", json=asked).json()["id"]
@@ -605,6 +606,87 @@ def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:
     page.fill("#start-form input[name=name]", "as planned")
     page.click("#start")
     watched.go("/sessions", "#sessions tr:has-text('as planned') td:has-text('/10')")
+    watched.close()
+
+
+def test_the_steps_of_an_analysis_are_followed_to_its_report(
+    browser: Any, lab: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the capture to the report in one view, whose part that stands there stays. The pipeline itself is a stand-in
+    that ends a step when it is told to."""
+    steps = {name: threading.Event() for name in ("fit", "validate", "diagnose", "report")}
+
+    def pipeline(request: PipelineRequest, tell: Callable[[PipelineProgress], None], **_: Any) -> None:
+        for number, (name, go_on) in enumerate(steps.items()):
+            tell(PipelineProgress(cast(Step, name), "the left camera", number / len(steps)))
+            assert go_on.wait(60.0)
+        page = lab.store.root / "reports" / f"{request.job_id}.html"
+        page.parent.mkdir(exist_ok=True)
+        page.write_text("<title>a report</title><h1>What was found</h1>")
+        lab.store.add_result("report", request.source, {"path": f"reports/{page.name}"}, request.job_id)
+
+    monkeypatch.setattr("lab.jobs.run_pipeline", pipeline)
+    monkeypatch.setattr("lab.jobs._WRITE_EVERY_S", 0.0)
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    page.fill("#start-form input[name=name]", "followed")
+    page.evaluate("""() => { document.querySelector("#start-form select[name=then]").value = "pipeline" }""")
+    lab.bench.delay_s = 0.05
+    page.click("#start")
+    page.wait_for_selector(".station.busy a:has-text('followed')")
+    watched.go("/sessions", "#sessions a:text-is('followed')")
+    page.click("#sessions a:text-is('followed')")  # an address that names no part
+    page.wait_for_selector("#session-steps .running:has-text('capture')")
+    assert page.locator("#session-steps li").all_inner_texts()[1:] == [f"{name} waiting" for name in steps]
+    lab.bench.delay_s = 0.0
+    for name, go_on in steps.items():
+        page.wait_for_selector(f"#session-steps .running:has-text('{name}')")
+        page.wait_for_selector("#session-message:has-text('the left camera')")
+        assert page.is_visible("#panel-live") and page.is_hidden("#panel-frames")
+        assert watched.faults() == []
+        go_on.set()
+    page.wait_for_selector("#session-steps .done:has-text('report')")
+    assert page.is_visible("#panel-live") and page.is_hidden("#session-bar")
+    with page.expect_popup() as opened:
+        page.click("#session-facts a:has-text('Report')")
+    opened.value.wait_for_selector("h1:has-text('What was found')")
+    opened.value.close()
+    watched.tab_to("Findings")
+    watched.press("Enter", "#panel-findings:not([hidden])")
+    assert watched.faults() == []
+    watched.close()
+
+
+def test_an_error_of_the_start_form_names_the_field(browser: Any, lab: Running) -> None:
+    """A text in place of a number, two numbers in place of one, and what the service refuses: in plain words, with the
+    field named as the form names it, and nothing is started."""
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    page.wait_for_selector("#plan-words:has-text('3 sequences')")
+    page.press("#plan-words", "Enter")
+    page.click("#plan-rows li:first-child summary")
+    field = "#plan-rows li:first-child label:has-text('frames at each exposure') input"
+    for text in ("five", "2, 3", "1e999"):
+        page.fill(field, text)
+        page.press(field, "Tab")
+        page.wait_for_selector(f"#plan-problem:has-text('dark, frames at each exposure: \u201c{text}\u201d isn')")
+        assert page.get_attribute(field, "aria-invalid") == "true"
+        page.click("#start")
+        page.wait_for_selector(f"#start-problem:has-text('dark, frames at each exposure: \u201c{text}\u201d isn')")
+        assert page.inner_text("#plan-problem") == ""
+    assert watched.faults() == []
+    page.fill(field, "2")
+    page.press(field, "Tab")
+    page.wait_for_selector("#plan-problem:empty", state="attached")
+    page.press("#then-words", "Enter")
+    page.fill("#start-form input[name=webhook]", "https://lab.example/hook")
+    page.click("#start")
+    page.wait_for_selector("#start-problem:has-text('Webhook URL: ')")
+    assert "'lab.example' isn't a host that the service tells" in page.inner_text("#start-problem")
+    assert page.query_selector(".station.busy") is None
+    watched.complaints = [line for line in watched.complaints if "422" not in line]  # the refused one
     watched.close()
 
 

@@ -155,6 +155,22 @@ def test_notes_may_have_several_lines(shared: Running) -> None:
             '"soon" isn\'t taken; give a time with its zone, such as {"not_before": "2030-01-01T12:00:00Z"}',
         ),
         (
+            "sessions",
+            {"json": {"station": "a", "parameters": {"dark": {"frames": None}}}},
+            "parameters.dark.frames: null isn't a number; write one",
+        ),
+        (
+            "sessions",
+            {"json": {"station": "a", "not_before": "2999-01-01T00:00", "queue": True}},
+            '"2999-01-01T00:00" has no time zone; give a time with its zone, such as {"not_before":',
+        ),
+        ("sessions", {"json": {"station": "a", "sequences": []}}, "sequences: 0 given, 1 at least; give a list, such"),
+        (
+            "sessions",
+            {"json": {"station": "a", "then": {"webhook": "lab"}}},
+            "then.webhook: 'lab' isn't the URL of a web server; give one, such as https://",
+        ),
+        (
             "challenges",
             {"json": {"cases": 0}},
             "cases: 0 should be greater than or equal to 1; give a whole number, such as",

@@ -153,7 +153,7 @@ def test_a_halt_while_it_waits_is_confirmed_and_the_session_asks_again(desk: Run
         asked(client, id)
         (station,) = client.post("/api/v1/halt").json()["stations"]
         assert station["safety"]["shutter"] == "closed"
-        assert until_state(client, id, "interrupted")["error"] == "halted by operate"
+        assert until_state(client, id, "interrupted")["error"].startswith("halted by the key 'operate' at ")
         assert client.get(f"/api/v1/sessions/{id}").json()["asks"] is None
         assert "asks for nothing now" in refused(confirm(client, id, "cap"))
         assert client.post(f"/api/v1/sessions/{id}/resume").status_code == 202

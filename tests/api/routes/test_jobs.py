@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,14 @@ import lab.jobs
 import lab.predict.validate
 import lab.report
 from api.client import ServiceClient
+from api.routes.jobs import steps_of
 from api.security import REPORT_POLICY
 from lab.capture.store import Store
 from lab.diagnose import Diagnosis
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, DiagnosisResult, FitResult, NoiseFit, ReportFile, ValidationResult
+from lab.jobs import JobInfo
 from lab.pipeline import PipelineProgress, PipelineRequest, Tell
 from tests.api.conftest import Running, events, serving, until, until_state
 from tests.lab.doubts import doubt, offered
@@ -93,6 +96,31 @@ def test_progress_is_told_and_a_cancelled_job_has_no_result(shared: Running, wit
         told = events(client, f"{path}/events")
         assert told[-1][1]["state"] == "cancelled" and told[0][0] == "progress"
         assert "cancelled" in client.get(f"{path}/result").json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("state", "message", "captures", "expected"),
+    [
+        ("queued", "", True, "capture waiting, fit waiting, validate waiting, diagnose waiting, report waiting"),
+        ("running", "", False, "fit running, validate waiting, diagnose waiting, report waiting"),
+        (
+            "running",
+            "resolve: a dark series: 3 of 40",
+            True,
+            "capture done, fit done, validate done, diagnose done, resolve running, report waiting",
+        ),
+        ("failed", "diagnose: draws", False, "fit done, validate done, diagnose failed, report waiting"),
+        ("cancelled", "validate: left", False, "fit done, validate cancelled, diagnose waiting, report waiting"),
+        ("done", "", True, "capture done, fit done, validate done, diagnose done, report done"),
+    ],
+)
+def test_the_steps_of_a_job_follow_from_its_message(state: str, message: str, captures: bool, expected: str) -> None:
+    at = datetime(2030, 1, 1, tzinfo=UTC)
+    info = JobInfo.model_validate(
+        {"id": "a", "kind": "pipeline", "source": "s", "state": state, "progress": 0.5, "message": message}
+        | {"error": None, "cancel_requested": False, "created": at, "started": at, "finished": None}
+    )
+    assert ", ".join(f"{step.name} {step.state}" for step in steps_of(info, captures=captures)) == expected
 
 
 def test_a_job_that_fails_says_why(shared: Running, with_task: Callable[..., None]) -> None:

@@ -83,12 +83,12 @@ def test_a_halt_holds_queued_sessions_until_they_are_released(running: Running, 
     with pytest.raises(ServiceProblem, match="404: no station"):
         client.halt("elsewhere")
     assert client.halt("fakes") == (runs,)
-    with pytest.raises(ServiceProblem, match="is interrupted: halted by admin"):
+    with pytest.raises(ServiceProblem, match="is interrupted: halted by the key 'admin' at "):
         client.wait_session(runs)
     running.bench.delay_s = 0.0
     assert not running.bench.opened
     (held,) = client.queue()
-    assert held.held is not None and f"session {runs} is interrupted: halted by admin" in held.held
+    assert held.held is not None and f"session {runs} is interrupted: halted by the key 'admin' at " in held.held
     running.app.state.service.waiting.look()
     assert client.session(waits).state == "queued"
     client.resume(runs)  # it finishes after all
