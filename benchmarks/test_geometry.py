@@ -19,7 +19,7 @@ from lab.fit.stereo import fit_stereo
 from lab.formats.importers import read_checkerboard_pairs
 from lab.measure.board_calibration import calibrate, calibrate_robustly
 from lab.measure.board_detection import find_board, luminance
-from lab.measure.projection import Camera, difference, grid, grid_points, points_at
+from lab.measure.projection import CameraGeometry, difference, grid, grid_points, points_at
 from tests.lab.fit import conftest as drawn
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
@@ -40,13 +40,13 @@ def opencv(views) -> tuple[np.ndarray, float]:
     points = [view.image_px.astype(np.float32) for view in views]
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-10)
     rms, matrix, distortion, *_ = cv2.calibrateCamera(boards, points, SHAPE[::-1], None, None, criteria=criteria)
-    return Camera.of(matrix, distortion.ravel()[:5]), rms
+    return CameraGeometry.of(matrix, distortion.ravel()[:5]), rms
 
 
 @pytest.mark.parametrize(("board", "warp_mm"), [("flat", (0.0, 0.0, 0.0)), ("bent by 0.4 mm", (0.4, -0.3, 0.2))])
 def test_calibration_of_known_cameras(board: str, warp_mm: tuple[float, float, float]) -> None:
     truth = replace(TRUTH, warp_mm=warp_mm)
-    camera = Camera.of(truth.left, truth.distortion_left)
+    camera = CameraGeometry.of(truth.left, truth.distortion_left)
     image = grid_points(*grid(SHAPE))
     at = poses(VIEWS)
     off: dict[str, list[float]] = {"ours": [], "theirs": []}

@@ -42,11 +42,12 @@ from lab.formats.results import (
     NoiseFit,
     PhotonTransfer,
     ProjectionChange,
+    RepeatDrift,
     Skipped,
     StereoFit,
 )
 from lab.formats.results.words import plain_name, unit_of
-from lab.measure.projection import Camera, difference, grid, grid_points, implied_motion, seen_points
+from lab.measure.projection import CameraGeometry, difference, grid, grid_points, implied_motion, seen_points
 from sim.camera import ProjectionKind, Side
 from sim.parameters import Frozen
 from sim.scene.projection import COUNT, Projection
@@ -56,9 +57,10 @@ FALSE_ALARM_RATE = 0.01
 MIN_SEEN = 20  # fewest corners that determine an implied motion
 ROUNDING = 1e-9  # relative standard deviation below which a value counts as exact
 FEW = 9  # most numbers under one name with a row each; more are a curve
-#: Models that aren't compared: points of plots, and the bands in which a curve departs from the maker's. Those are
-#: chosen where the departure is largest, so that each session has others; the curves that they rest on are compared.
-NOT_COMPARED = (PhotonTransfer, Emva1288Points, MakerDeparture)
+#: Models that aren't compared: points of plots, drifts of one session's repeats, and the bands in which a curve departs
+#: from the maker's. Those are chosen where the departure is largest, so that each session has others; the curves that
+#: they rest on are compared.
+NOT_COMPARED = (PhotonTransfer, Emva1288Points, MakerDeparture, RepeatDrift)
 #: Fields that aren't compared: properties of the set-up, and dark currents at the temperatures that a session happened
 #: to have.
 NOT_COMPARED_FIELDS = {(MtfCurve, "angle_deg")} | {
@@ -359,7 +361,7 @@ def _covariance(fit: GeometryFit) -> Array | None:
     if fit.covariance is None:
         return None
     found = np.zeros((COUNT, COUNT))
-    names = Camera.of_fit(fit).projection.names
+    names = CameraGeometry.of_fit(fit).projection.names
     at = [names.index(name) for name in fit.parameters if name in names]
     found[np.ix_(at, at)] = np.array(fit.covariance)[: len(at), : len(at)]
     return found
@@ -368,7 +370,7 @@ def _covariance(fit: GeometryFit) -> Array | None:
 def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange | Skipped:
     """Compare the projections of two fits over the corners of both, without the motion that they imply."""
     of_a, of_b = _covariance(a), _covariance(b)
-    first, second = Camera.of_fit(a), Camera.of_fit(b)
+    first, second = CameraGeometry.of_fit(a), CameraGeometry.of_fit(b)
     if of_a is None or of_b is None:
         which = "A" if of_a is None else "B"
         return Skipped(

@@ -51,7 +51,7 @@ from lab.measure.board_calibration import (
 )
 from lab.measure.board_detection import MIN_CORNERS, BoardView, CornerFits, channel_corners, find_boards
 from lab.measure.bundle_adjustment import Solution, warp_prior_mm
-from lab.measure.projection import Camera, grid, grid_points
+from lab.measure.projection import CameraGeometry, grid, grid_points
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 from sim.scene.projection import COUNT
@@ -88,7 +88,7 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
         beside = _fit_shift(at - green, jacobian, trusted) if channel != "G" else None
         if own is None or (channel != "G" and beside is None):
             continue
-        theta = Camera(camera.projection, intrinsics + parameters @ own[0])
+        theta = CameraGeometry(camera.projection, intrinsics + parameters @ own[0])
         result = ChannelGeometry(
             channel=channel,
             camera_matrix=theta.matrix.tolist(),

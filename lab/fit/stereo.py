@@ -39,7 +39,7 @@ from lab.measure.bundle_adjustment import (
     board_pose,
     rms_px,
 )
-from lab.measure.projection import Camera, cross_matrices, grid, grid_points
+from lab.measure.projection import CameraGeometry, cross_matrices, grid, grid_points
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 from sim.scene.projection import Projection
@@ -176,8 +176,8 @@ def _views_by_pose(recordings: RecordingSet, side: Side, fit: GeometryFit) -> di
 def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
     """Return the mask (12,) of the intrinsics that a fit has fitted."""
     if fit.parameters:
-        return np.array([name in fit.parameters for name in Camera.of_fit(fit).projection.names])
-    return np.append(np.ones(8, dtype=bool), Camera.of_fit(fit).intrinsics[8:] != 0.0)
+        return np.array([name in fit.parameters for name in CameraGeometry.of_fit(fit).projection.names])
+    return np.append(np.ones(8, dtype=bool), CameraGeometry.of_fit(fit).intrinsics[8:] != 0.0)
 
 
 def _split_by_numbering(
@@ -193,7 +193,7 @@ def _split_by_numbering(
     half_turn = Rotation.from_rotvec([0.0, 0.0, np.pi])
     for pair in pairs:
         of_left, of_right = (
-            Rotation.from_matrix(board_pose(view, Camera.of_fit(fit))[0])
+            Rotation.from_matrix(board_pose(view, CameraGeometry.of_fit(fit))[0])
             for view, fit in ((pair.left, left), (pair.right, right))
         )
         turns.append(of_right * of_left.inv())
@@ -233,7 +233,7 @@ def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit
     It starts from the fits of the single cameras. Its covariance takes corners as independent. Observations are pair by
     pair, left then right. `shape`: (rows, cols).
     """
-    cameras = Camera.of_fit(left), Camera.of_fit(right)
+    cameras = CameraGeometry.of_fit(left), CameraGeometry.of_fit(right)
     observations = rig_observations(pairs)
     poses, turns, translations = [], [], []
     for pair in pairs:
@@ -423,7 +423,7 @@ def rectification(state: RigParameters, pairs: Sequence[StereoPair], shape: tupl
     )
 
 
-def _rectified_rows(image: Array, camera: Camera, turn: Array, new: Array) -> Array:
+def _rectified_rows(image: Array, camera: CameraGeometry, turn: Array, new: Array) -> Array:
     """Return the rows (n,), px, of the rectified frame in which corners at `image` (n, 2) lie; NaN behind it.
 
     `turn` (3, 3): rotation of the camera to the rectified one; `new` (3, 4): projection of that.
@@ -447,7 +447,7 @@ def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, 
     left, right = _cameras_of(stereo)
     x, y = np.meshgrid(np.arange(shape[1], dtype=float), np.arange(shape[0], dtype=float))
     found: dict[Side, tuple[Array, Array]] = {}
-    sides: tuple[tuple[Side, Camera, Any, Any], ...] = (
+    sides: tuple[tuple[Side, CameraGeometry, Any, Any], ...] = (
         ("left", left, own.rotation_left, own.projection_left),
         ("right", right, own.rotation_right, own.projection_right),
     )
@@ -460,10 +460,10 @@ def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, 
     return found
 
 
-def _cameras_of(stereo: StereoFit) -> tuple[Camera, Camera]:
+def _cameras_of(stereo: StereoFit) -> tuple[CameraGeometry, CameraGeometry]:
     """Return the cameras of a stereo fit, as fitted together."""
     left, right = (
-        Camera.of(matrix, distortion or (), Projection(kind, angle))
+        CameraGeometry.of(matrix, distortion or (), Projection(kind, angle))
         for matrix, distortion, kind, angle in (
             (
                 stereo.camera_matrix_left, stereo.distortion_left,

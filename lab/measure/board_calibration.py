@@ -31,7 +31,7 @@ from lab.measure.bundle_adjustment import (
     splined,
     with_boards,
 )
-from lab.measure.projection import Camera, Difference, difference, points_at, projection_std
+from lab.measure.projection import CameraGeometry, Difference, difference, points_at, projection_std
 from sim.camera import ProjectionKind, Side
 from sim.scene.projection import CAMERA, COUNT, EQUIDISTANT, PINHOLE, Projection
 
@@ -225,7 +225,7 @@ class Calibration:
         return np.asarray(self.solution.state.intrinsics[0])
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> CameraGeometry:
         """Return the camera."""
         return self.solution.state.camera()
 

@@ -47,7 +47,7 @@ from scipy.spatial.transform import Rotation
 
 from lab.errors import NotDetermined
 from lab.measure.board_detection import BoardView
-from lab.measure.projection import Camera, cross_matrices
+from lab.measure.projection import CameraGeometry, cross_matrices
 from sim.camera import ProjectionKind
 from sim.scene.projection import COUNT, PINHOLE, WIDEST_DEG, Projection
 
@@ -407,9 +407,9 @@ class RigParameters:
     rotations: Array
     translations_mm: Array
 
-    def camera(self, number: int = 0) -> Camera:
+    def camera(self, number: int = 0) -> CameraGeometry:
         """Return one of the cameras."""
-        return Camera(self.projections[number], self.intrinsics[number])
+        return CameraGeometry(self.projections[number], self.intrinsics[number])
 
 
 @dataclass(frozen=True)
@@ -818,7 +818,7 @@ def _rotation(rotation_vector: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(rotation_vector).as_matrix())
 
 
-def board_pose(view: BoardView, camera: Camera) -> tuple[Array, Array]:
+def board_pose(view: BoardView, camera: CameraGeometry) -> tuple[Array, Array]:
     """Find the rotation (3, 3) and translation (3,), mm, from the flat board to a camera, from one view. Raises
     `NotDetermined` where none fits.
 
@@ -858,7 +858,9 @@ def _towards_axis(direction: Array) -> Array:
     return _rotation(axis * (angle / length) if length > 0.0 else np.zeros(3))
 
 
-def first_camera(views: Sequence[BoardView], shape: tuple[int, int], projection: Projection = PINHOLE) -> Camera:
+def first_camera(
+    views: Sequence[BoardView], shape: tuple[int, int], projection: Projection = PINHOLE
+) -> CameraGeometry:
     """Return a camera without distortion to begin with. `shape`: (rows, cols) of the frames.
 
     The focal length of a pinhole is that of Zhang, or the width of the frame where the views determine none. That of
@@ -866,8 +868,8 @@ def first_camera(views: Sequence[BoardView], shape: tuple[int, int], projection:
     """
     middle = (shape[1] - 1) / 2.0, (shape[0] - 1) / 2.0
 
-    def camera(focal: float) -> Camera:
-        return Camera.of([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]], (), projection)
+    def camera(focal: float) -> CameraGeometry:
+        return CameraGeometry.of([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]], (), projection)
 
     boards = [view.board_mm.astype(np.float32) for view in views]
     points = [view.image_px.astype(np.float32) for view in views]
@@ -884,7 +886,7 @@ def first_camera(views: Sequence[BoardView], shape: tuple[int, int], projection:
     return min(trials, key=lambda one: sum(_pose_square(view, one) for view in few))
 
 
-def _pose_square(view: BoardView, camera: Camera) -> float:
+def _pose_square(view: BoardView, camera: CameraGeometry) -> float:
     """Return the sum of squared residuals, px^2, of a view at its pose by `board_pose`; infinite without one."""
     try:
         rotation, translation = board_pose(view, camera)
@@ -893,7 +895,7 @@ def _pose_square(view: BoardView, camera: Camera) -> float:
     return float(np.sum((camera.project(view.board_mm @ rotation.T + translation) - view.image_px) ** 2))
 
 
-def splined(camera: Camera, shape: tuple[int, int]) -> Camera:
+def splined(camera: CameraGeometry, shape: tuple[int, int]) -> CameraGeometry:
     """Return a camera with a splined stereographic projection that projects as `camera` does, an equidistant one. The
     spline ends at the corner of the frame that is farthest from the axis. `shape`: (rows, cols) of the frame.
     """
@@ -911,10 +913,10 @@ def splined(camera: Camera, shape: tuple[int, int]) -> Camera:
     by_camera = projection.project_with_jacobian(points, start)[2][:, 0]
     radial = [projection.names.index(name) for name in projection.coefficients if name.startswith("s")]
     start[radial] = np.linalg.lstsq(by_camera[:, radial], wanted, rcond=1e-9)[0]
-    return Camera(projection, start)
+    return CameraGeometry(projection, start)
 
 
-def first_state(views: Sequence[BoardView], camera: Camera) -> RigParameters:
+def first_state(views: Sequence[BoardView], camera: CameraGeometry) -> RigParameters:
     """Return the parameters of one camera to begin with, each view with a pose of its own."""
     poses = [board_pose(view, camera) for view in views]
     return RigParameters(

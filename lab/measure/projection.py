@@ -34,19 +34,21 @@ FLOOR_PX = 1e-3  # differences below this are rounding
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraGeometry:
     """A projection with its `intrinsics` (12,), in the order of `projection.names`."""
 
     projection: Projection
     intrinsics: Array
 
     @classmethod
-    def of(cls, camera_matrix: ArrayLike, distortion: Sequence[float] = (), projection: Projection = PINHOLE) -> Camera:
+    def of(
+        cls, camera_matrix: ArrayLike, distortion: Sequence[float] = (), projection: Projection = PINHOLE
+    ) -> CameraGeometry:
         """Return a camera from its matrix (3, 3), px, and its distortion coefficients."""
         return cls(projection, projection.intrinsics(camera_matrix, distortion))
 
     @classmethod
-    def of_fit(cls, fit: GeometryFit) -> Camera:
+    def of_fit(cls, fit: GeometryFit) -> CameraGeometry:
         """Return a fitted camera."""
         return cls.of(fit.camera_matrix, fit.distortion, Projection(fit.lens_projection, fit.spline_angle_deg))
 
@@ -152,12 +154,12 @@ def seen_points(fit: GeometryFit) -> Array:
     depth = np.array([z for view in fit.residuals for z in view.depth_mm])
     if not len(image):
         return np.zeros((0, 3))
-    points = Camera.of_fit(fit).at_depth(image, depth)
+    points = CameraGeometry.of_fit(fit).at_depth(image, depth)
     points = points[np.isfinite(points).all(axis=1)]
     return points[:: max(1, len(points) // GAUGE_CORNERS)]
 
 
-def points_at(image: Array, camera: Camera, distance_mm: float | None) -> Array:
+def points_at(image: Array, camera: CameraGeometry, distance_mm: float | None) -> Array:
     """Return the points (n, 3), mm, that project to `image` (n, 2) at a distance from the camera; None: far away. NaN
     where there are none.
     """
@@ -171,7 +173,7 @@ def _motion_jacobian(points: Array, by_point: Array, unit_mm: float) -> Array:
     return np.concatenate([-by_point @ cross_matrices(points), by_point * unit_mm], axis=2)
 
 
-def error_operator(camera: Camera, gauge: Array, points: Array) -> Array:
+def error_operator(camera: CameraGeometry, gauge: Array, points: Array) -> Array:
     """Return E (n, 2, 12), the Jacobian of the projections of `points` by the intrinsics, without the motion implied on
     `gauge` (m, 3).
     """
@@ -183,7 +185,7 @@ def error_operator(camera: Camera, gauge: Array, points: Array) -> Array:
     return by_camera - _motion_jacobian(points, by_point, unit_mm) @ implied
 
 
-def projection_std(camera: Camera, covariance: Array, gauge: Array, points: Array) -> Array:
+def projection_std(camera: CameraGeometry, covariance: Array, gauge: Array, points: Array) -> Array:
     """Return the standard deviation (n,) of the projections of `points` in the worst direction, px; NaN where a point
     is NaN.
 
@@ -197,7 +199,7 @@ def projection_std(camera: Camera, covariance: Array, gauge: Array, points: Arra
     return found
 
 
-def implied_motion(first: Camera, second: Camera, gauge: Array) -> tuple[Array, Array]:
+def implied_motion(first: CameraGeometry, second: CameraGeometry, gauge: Array) -> tuple[Array, Array]:
     """Find the rotation and translation from the frame of the first camera to that of the second.
 
     With it `second` projects `gauge` (m, 3), points in the frame of the first, to where `first` does; by Gauss-Newton.
@@ -217,7 +219,7 @@ def implied_motion(first: Camera, second: Camera, gauge: Array) -> tuple[Array, 
 
 
 def difference(
-    first: Camera, second: Camera, covariances: tuple[Array, Array], gauge: Array, points: Array
+    first: CameraGeometry, second: CameraGeometry, covariances: tuple[Array, Array], gauge: Array, points: Array
 ) -> Difference:
     """Compare how `second` projects `points` (n, 3), in the frame of the first camera, with `first`.
 
@@ -237,7 +239,7 @@ def difference(
     return Difference(vectors, np.concatenate(factors, axis=1))
 
 
-def _error_factor(camera: Camera, covariance: Array, gauge: Array, points: Array) -> Array:
+def _error_factor(camera: CameraGeometry, covariance: Array, gauge: Array, points: Array) -> Array:
     """Return a factor (2n, 12) of the covariance of the projections of `points` (n, 3), without an implied motion."""
     operator = error_operator(camera, gauge, points).reshape(-1, COUNT)
     unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))  # the scales differ by orders of magnitude

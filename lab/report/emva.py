@@ -692,8 +692,10 @@ def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[EmvaSheet]
 BOTH_ESTIMATES = {
     "system_gain_dn_per_e": (
         "conversion_gain_dn_per_e",
-        "with nonlinearity or a brighter-fatter effect, the standard's line to 70 % of saturation has another slope than "
-        "the curve has at zero signal",
+        (
+            "with nonlinearity or a brighter-fatter effect, the standard's line to 70 % of saturation has another "
+            "slope than the curve has at zero signal"
+        ),
     ),
     "quantum_efficiency": ("quantum_efficiency", "each is the responsivity over its own K"),
     "temporal_dark_noise_e": ("read_noise_e", "each has its own K; the joint fit has the defective pixels left out"),

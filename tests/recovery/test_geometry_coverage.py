@@ -14,7 +14,7 @@ from lab.fit.stereo import StereoPair, depth_std, solve_rig
 from lab.formats.results import CameraFit, FitResult
 from lab.measure.board_calibration import calibrate_robustly, cross_validation
 from lab.measure.board_detection import CornerFits
-from lab.measure.projection import Camera, difference, grid, grid_points, points_at
+from lab.measure.projection import CameraGeometry, difference, grid, grid_points, points_at
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 DRAWS, VARIANCE_DRAWS = 400, 800
@@ -55,7 +55,7 @@ def test_geometry_covers() -> None:
     at = poses(VIEWS)
     x, y = grid(SHAPE)
     image = grid_points(x, y)
-    truth = Camera.of(TRUTH.left, TRUTH.distortion_left)
+    truth = CameraGeometry.of(TRUTH.left, TRUTH.distortion_left)
     names = [*("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"), "bend x", "bend y", "twist"]
     scores: dict[str, list[float]] = {}
     errors, variances, halves, fits = [], [], [], []
@@ -161,7 +161,7 @@ def test_projection_variance_is_that_of_many_solves() -> None:
     dominates."""
     x, y = grid(SHAPE)
     image = grid_points(x, y)
-    truth = Camera.of(TRUTH.left, TRUTH.distortion_left)
+    truth = CameraGeometry.of(TRUTH.left, TRUTH.distortion_left)
     at = poses(VIEWS)
     squares, stated = np.zeros(len(image)), np.zeros(len(image))
     for draw in range(VARIANCE_DRAWS):

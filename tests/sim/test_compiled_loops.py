@@ -7,6 +7,8 @@ import pwd
 import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -55,24 +57,22 @@ def run_as_nobody(installed: Path, *arguments: str, **environment: str) -> subpr
 
 
 @pytest.fixture
-def installed(tmp_path: Path) -> Path:
-    """An installation where only root may write."""
-    for above in tmp_path.parents:
-        if above.stat().st_uid == os.geteuid() and above != Path("/") and not above.stat().st_mode & 0o005:
-            above.chmod(0o755)
-    tmp_path.chmod(0o755)
-    made = tmp_path / "installed"
-    (made / "optics").mkdir(parents=True)
-    shutil.copy(compiled_loops.__file__, made)
-    (made / "optics" / "loop.py").write_text(LOOP)
-    return made
+def installed() -> Iterator[Path]:
+    """An installation where only root may write, in a folder that others may enter: pytest's own is closed to them."""
+    with tempfile.TemporaryDirectory(prefix="calibench-installed-") as folder:
+        Path(folder).chmod(0o755)
+        made = Path(folder) / "installed"
+        (made / "optics").mkdir(parents=True)
+        shutil.copy(compiled_loops.__file__, made)
+        (made / "optics" / "loop.py").write_text(LOOP)
+        yield made
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="acts as a user without a home")
-def test_a_user_without_a_home_compiles(installed: Path, tmp_path: Path) -> None:
+def test_a_user_without_a_home_compiles(installed: Path) -> None:
     """In the data folder where there is one of that user, else among the temporary ones, never in another user's."""
     user = pwd.getpwnam("nobody")
-    data, temporary = tmp_path / "data", tmp_path / "tmp"
+    data, temporary = installed.parent / "data", installed.parent / "tmp"
     data.mkdir(mode=0o750)
     os.chown(data, user.pw_uid, user.pw_gid)
     temporary.mkdir()

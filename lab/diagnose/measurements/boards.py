@@ -17,7 +17,7 @@ from lab.formats.results import Skipped
 from lab.measure.board_calibration import PROJECTIONS, Calibration, calibrate_robustly, free_intrinsics, observations_of
 from lab.measure.board_detection import BoardView, channel_corners, find_boards
 from lab.measure.bundle_adjustment import BundleAdjustment, Solution
-from lab.measure.projection import Camera
+from lab.measure.projection import CameraGeometry
 from lab.measure.reads import SHIFT
 from lab.measure.study import Study
 from sim.camera import Side
@@ -105,7 +105,7 @@ def board_block(study: Study) -> Block:
     else:
         free = free_intrinsics(())
         # focal length and principal point as of these boards, distortion as of the earlier calibration
-        fixed = Camera.of(known.camera_matrix, known.distortion, Projection.of(known))
+        fixed = CameraGeometry.of(known.camera_matrix, known.distortion, Projection.of(known))
         start = np.array([np.concatenate([state.intrinsics[0, :4], fixed.intrinsics[4:]])])
         state = replace(state, projections=(fixed.projection,), intrinsics=start)
     bundle = BundleAdjustment(observations_of(views), free[None, :], shape)

@@ -19,7 +19,7 @@ from lab.errors import InputError
 Value = str | float
 
 
-class Changes(Enum):
+class SharedBy(Enum):
     """What a setting changes, and so which frames have to share it."""
 
     CODES = "codes"  # gain and offset between charge and code: frames whose codes are fitted together, darks included
@@ -37,7 +37,7 @@ class FrameSetting:
     differ in the unit. `factor`: ratio of two numbers, 1 or more, up to which they are one setting, as written."""
 
     name: str
-    changes: Changes
+    changes: SharedBy
     keywords: tuple[str, ...]
     factor: float = 1.001  # headers round measured settings to three digits or more
 
@@ -49,29 +49,29 @@ ISO_FACTOR, F_NUMBER_FACTOR, FOCAL_LENGTH_FACTOR = 2.0 ** (1.0 / 6.0), 2.0 ** (1
 #: All settings that are compared. The keywords are those of Andor Solis, ASCOM and MaxIm DL, INDI and KStars, N.I.N.A.,
 #: SharpCap, ZWO, observatories (NOAO's CCDSUM), and of EXIF.
 SETTINGS = (
-    FrameSetting("gain", Changes.CODES, ("GAIN", "CAMGAIN", "EGAIN", "PREAMP", "EMGAIN", "EMREALGN", "GAMMA")),
-    FrameSetting("ISO speed", Changes.CODES, ("ISO", "ISOSPEED"), ISO_FACTOR),
-    FrameSetting("offset", Changes.CODES, ("OFFSET", "BLKLEVEL", "BLACKLVL", "CAMOFFS", "PEDESTAL")),
+    FrameSetting("gain", SharedBy.CODES, ("GAIN", "CAMGAIN", "EGAIN", "PREAMP", "EMGAIN", "EMREALGN", "GAMMA")),
+    FrameSetting("ISO speed", SharedBy.CODES, ("ISO", "ISOSPEED"), ISO_FACTOR),
+    FrameSetting("offset", SharedBy.CODES, ("OFFSET", "BLKLEVEL", "BLACKLVL", "CAMOFFS", "PEDESTAL")),
     FrameSetting(
         "read-out mode",
-        Changes.CODES,
+        SharedBy.CODES,
         ("READOUTM", "READMODE", "READOUT", "OUTPTAMP", "READTIME", "VSHIFT", "CONVGAIN", "BITPIX"),
     ),
-    FrameSetting("camera", Changes.CAMERA, ("INSTRUME", "SERNO", "Model", "BodySerialNumber")),
+    FrameSetting("camera", SharedBy.CAMERA, ("INSTRUME", "SERNO", "Model", "BodySerialNumber")),
     FrameSetting(
         "binning",
-        Changes.PIXELS,
+        SharedBy.PIXELS,
         (
             *("XBINNING", "YBINNING", "BINNING", "CCDSUM", "CCDBINX", "CCDBINY", "CCDXBIN", "CCDYBIN"),
             *("BINX", "BINY", "HBIN", "VBIN"),
         ),
     ),
-    FrameSetting("window", Changes.PIXELS, ("XORGSUBF", "YORGSUBF", "IMGRECT", "SUBRECT")),
-    FrameSetting("orientation", Changes.PIXELS, ("ROWORDER", "FLIPX", "FLIPY", "FLIPSTAT")),
-    FrameSetting("mosaic", Changes.PIXELS, ("BAYERPAT", "XBAYROFF", "YBAYROFF")),
-    FrameSetting("filter", Changes.LIGHT, ("FILTER", "FILTER1", "FILTER2", "INSFLNAM")),
-    FrameSetting("f-number", Changes.LIGHT, ("FNumber",), F_NUMBER_FACTOR),
-    FrameSetting("focal length", Changes.VIEW, ("FocalLength", "FOCALLEN"), FOCAL_LENGTH_FACTOR),
+    FrameSetting("window", SharedBy.PIXELS, ("XORGSUBF", "YORGSUBF", "IMGRECT", "SUBRECT")),
+    FrameSetting("orientation", SharedBy.PIXELS, ("ROWORDER", "FLIPX", "FLIPY", "FLIPSTAT")),
+    FrameSetting("mosaic", SharedBy.PIXELS, ("BAYERPAT", "XBAYROFF", "YBAYROFF")),
+    FrameSetting("filter", SharedBy.LIGHT, ("FILTER", "FILTER1", "FILTER2", "INSFLNAM")),
+    FrameSetting("f-number", SharedBy.LIGHT, ("FNumber",), F_NUMBER_FACTOR),
+    FrameSetting("focal length", SharedBy.VIEW, ("FocalLength", "FOCALLEN"), FOCAL_LENGTH_FACTOR),
 )
 KEYWORDS = {keyword: setting for setting in SETTINGS for keyword in setting.keywords}
 
@@ -133,19 +133,19 @@ def _first_difference(setting: FrameSetting, own: Sequence[StatedFrame], where: 
 
 def _is_bound(setting: FrameSetting, frame: StatedFrame) -> bool:
     """Return whether a difference of the setting makes the frame's fit wrong."""
-    return setting.changes not in (Changes.CODES, Changes.LIGHT) or frame.capture.codes_are_fitted
+    return setting.changes not in (SharedBy.CODES, SharedBy.LIGHT) or frame.capture.codes_are_fitted
 
 
 def _groups(setting: FrameSetting, own: Sequence[StatedFrame]) -> list[list[StatedFrame]]:
     """Return the frames of one side that have to share a setting, in groups."""
-    keys: dict[Changes, Callable[[Capture], object]] = {
-        Changes.CODES: lambda capture: round(capture.gain_db or 0.0, 6),
-        Changes.LIGHT: _light,
+    keys: dict[SharedBy, Callable[[Capture], object]] = {
+        SharedBy.CODES: lambda capture: round(capture.gain_db or 0.0, 6),
+        SharedBy.LIGHT: _light,
     }
     groups: dict[object, list[StatedFrame]] = {}
     for frame in own:
         is_dark = isinstance(frame.capture, DarkCapture)
-        if is_dark and setting.changes in (Changes.LIGHT, Changes.VIEW):
+        if is_dark and setting.changes in (SharedBy.LIGHT, SharedBy.VIEW):
             continue
         key = keys.get(setting.changes)
         groups.setdefault(key(frame.capture) if key is not None else None, []).append(frame)
@@ -182,9 +182,9 @@ def _difference(
             f"are compared as of one setting: import one group, --only {keyword}={text_of(next(iter(values)))}"
         )
     apart = {
-        Changes.CODES: ", or give each group its own gain_db (dB) in index.csv",
-        Changes.CAMERA: ", or give each camera its own side in index.csv",
-        Changes.LIGHT: ", or state the light of each frame (photons_per_pixel and wavelength_nm) in index.csv",
+        SharedBy.CODES: ", or give each group its own gain_db (dB) in index.csv",
+        SharedBy.CAMERA: ", or give each camera its own side in index.csv",
+        SharedBy.LIGHT: ", or state the light of each frame (photons_per_pixel and wavelength_nm) in index.csv",
     }.get(setting.changes, "")
     return (
         f"{where}: {keyword} ({setting.name}) differs between frames that are fitted together: {listed}; import one "
@@ -244,7 +244,7 @@ def parse_choice(only: str, ignored: str) -> HeaderChoice:
 def is_chosen(choice: HeaderChoice, kind: str, settings: Mapping[str, Value]) -> bool:
     """Return whether a frame of a kind is one of those that `only` asks for. A dark needs no setting of the light."""
     for keyword, wanted in choice.only:
-        if kind == "dark" and KEYWORDS[keyword].changes in (Changes.LIGHT, Changes.VIEW):
+        if kind == "dark" and KEYWORDS[keyword].changes in (SharedBy.LIGHT, SharedBy.VIEW):
             continue
         if not states(settings, keyword, wanted):
             return False

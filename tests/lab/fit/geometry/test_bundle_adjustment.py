@@ -27,7 +27,7 @@ from lab.measure.bundle_adjustment import (
     first_camera,
     first_state,
 )
-from lab.measure.projection import Camera
+from lab.measure.projection import CameraGeometry
 from sim.scene.projection import PINHOLE
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
@@ -153,7 +153,7 @@ def pulls(draw: int, *, with_ripple: bool) -> tuple[np.ndarray, np.ndarray]:
     views = rippled(rng) if with_ripple else seen(rng, AT_EIGHT, noise_px=NOISE_PX)
     alone = calibrate(views, SHAPE)
     whole = with_model_error(views, SHAPE, alone)
-    error = (alone.state.intrinsics[0] - Camera.of(TRUTH.left, TRUTH.distortion_left).intrinsics)[:4]
+    error = (alone.state.intrinsics[0] - CameraGeometry.of(TRUTH.left, TRUTH.distortion_left).intrinsics)[:4]
     return error / whole.std()[:4], error / alone.std()[:4]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from lab.measure.board_calibration import calibrate_robustly
 from lab.measure.projection import (
-    Camera,
+    CameraGeometry,
     cross_matrices,
     difference,
     error_operator,
@@ -27,7 +27,7 @@ MATRIX = np.array([[420.0, 0, 203.0], [0, 421.0, 147.0], [0, 0, 1]])
 BROWN = np.array([-0.12, 0.06, 5e-4, -3e-4, 0.02])
 RATIONAL = np.array([-0.12, 0.06, 5e-4, -3e-4, 0.02, 0.03, -0.01, 0.004])
 
-CAMERA = Camera.of(TRUTH.left, TRUTH.distortion_left)
+CAMERA = CameraGeometry.of(TRUTH.left, TRUTH.distortion_left)
 FISHEYE = np.array([0.03, -0.012, 0.004, -0.001])
 SPLINE = np.array([0.01, -0.01, 1e-3, -5e-4, -0.03, -0.05, -0.07, -0.09])
 
@@ -40,7 +40,7 @@ def points() -> np.ndarray:
 
 @pytest.mark.parametrize("distortion", [np.zeros(5), BROWN, RATIONAL])
 def test_projection_and_slopes_are_opencvs(points, distortion):
-    camera = Camera.of(MATRIX, distortion)
+    camera = CameraGeometry.of(MATRIX, distortion)
     seen, by_point, by_camera = camera.project_with_jacobian(points)
     all_eight = np.pad(distortion, (0, 8 - len(distortion)))
     theirs, slopes = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, all_eight)
@@ -51,14 +51,14 @@ def test_projection_and_slopes_are_opencvs(points, distortion):
 
 
 def test_rays_are_the_inverse(points):
-    camera = Camera.of(MATRIX, RATIONAL)
+    camera = CameraGeometry.of(MATRIX, RATIONAL)
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
     np.testing.assert_allclose(camera.unproject(camera.project(points)), rays, atol=1e-12)
     np.testing.assert_allclose(camera.at_depth(camera.project(points), points[:, 2]), points, atol=1e-12)
 
 
 def test_the_equidistant_projection_is_opencvs_fisheye(points):
-    camera = Camera.of(MATRIX, FISHEYE, EQUIDISTANT)
+    camera = CameraGeometry.of(MATRIX, FISHEYE, EQUIDISTANT)
     theirs, slopes = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), MATRIX, FISHEYE)
     seen, by_point, by_camera = camera.project_with_jacobian(points)
     np.testing.assert_allclose(seen, theirs[:, 0], atol=1e-9)
@@ -81,7 +81,7 @@ def test_slopes_and_rays_of_a_fisheye_up_to_100_degrees(projection, distortion):
     angle[10:20] = 0.0
     across = np.sin(angle)
     points = 3.0 * np.column_stack([across * np.cos(about), across * np.sin(about), np.cos(angle)])
-    camera = Camera.of(MATRIX, distortion, projection)
+    camera = CameraGeometry.of(MATRIX, distortion, projection)
     seen, by_point, by_camera = camera.project_with_jacobian(points)
     np.testing.assert_allclose(camera.unproject(seen), points / 3.0, atol=1e-9)
     step = 1e-6
@@ -90,7 +90,7 @@ def test_slopes_and_rays_of_a_fisheye_up_to_100_degrees(projection, distortion):
         np.testing.assert_allclose(by_point[:, :, k], slope, atol=1e-5)
     for k, unit in enumerate(np.eye(COUNT) * step):
         if projection.names[k]:
-            one, other = (Camera(projection, camera.intrinsics + sign * unit) for sign in (1, -1))
+            one, other = (CameraGeometry(projection, camera.intrinsics + sign * unit) for sign in (1, -1))
             slope = (one.project(points) - other.project(points)) / (2 * step)
             np.testing.assert_allclose(by_camera[:, :, k], slope, atol=1e-5)
 
@@ -99,23 +99,23 @@ def test_a_projection_that_contradicts_itself_is_refused():
     with pytest.raises(ValueError, match="spline_angle_deg is None of a splined_stereographic projection"):
         Projection("splined_stereographic")
     with pytest.raises(ValueError, match="k1 k2 k3 k4"):
-        Camera.of(MATRIX, BROWN, EQUIDISTANT)
+        CameraGeometry.of(MATRIX, BROWN, EQUIDISTANT)
 
 
 def test_where_a_distortion_folds_there_is_no_ray():
     """x (1 - 0.5 x^2) is largest, 0.544, at x = 0.816: nothing is seen beyond."""
-    camera = Camera.of(MATRIX, [-0.5, 0, 0, 0, 0])
+    camera = CameraGeometry.of(MATRIX, [-0.5, 0, 0, 0, 0])
     rays = camera.unproject(np.array([[203.0 + 420 * 0.5, 147.0], [203.0 + 420 * 0.6, 147.0]]))
     assert np.isfinite(rays[0]).all()
     assert np.isnan(rays[1, 0])
 
 
 def test_matrix_and_coefficients_come_back():
-    camera = Camera.of(MATRIX, BROWN)
+    camera = CameraGeometry.of(MATRIX, BROWN)
     np.testing.assert_array_equal(camera.matrix, MATRIX)
     np.testing.assert_array_equal(camera.distortion, BROWN)
-    np.testing.assert_array_equal(Camera.of(MATRIX, RATIONAL).distortion, RATIONAL)
-    np.testing.assert_array_equal(Camera.of(MATRIX, FISHEYE, EQUIDISTANT).distortion, FISHEYE)
+    np.testing.assert_array_equal(CameraGeometry.of(MATRIX, RATIONAL).distortion, RATIONAL)
+    np.testing.assert_array_equal(CameraGeometry.of(MATRIX, FISHEYE, EQUIDISTANT).distortion, FISHEYE)
 
 
 def test_cross_matrices_are_cross_products(points):
@@ -139,7 +139,7 @@ def test_a_displaced_principal_point_is_mostly_a_turn():
     """5 px of the centre are a turn by 5 / f: what is left is second order in the field, and far below 5 px."""
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-200, 200, (80, 2)), rng.uniform(500, 900, 80)])
-    other = Camera(PINHOLE, CAMERA.intrinsics + 5.0 * np.eye(COUNT)[2])
+    other = CameraGeometry(PINHOLE, CAMERA.intrinsics + 5.0 * np.eye(COUNT)[2])
     found = difference(CAMERA, other, (np.eye(COUNT) * 1e-12,) * 2, points, points)
     assert np.linalg.norm(other.project(points) - CAMERA.project(points), axis=1).mean() == pytest.approx(5.0)
     assert found.rms_px < 0.5

@@ -11,7 +11,7 @@ from lab.errors import InputError
 from lab.fit.noise.noise_fit import fit_noise
 from lab.formats import recording_set as recording
 from lab.formats.importers import read_fits_folder, read_foreign, read_raw_folder
-from lab.formats.importers.frame_settings import ALL_FRAMES, KEYWORDS, SETTINGS, Changes, is_same, parse_choice
+from lab.formats.importers.frame_settings import ALL_FRAMES, KEYWORDS, SETTINGS, SharedBy, is_same, parse_choice
 from lab.formats.importers.single_picture import ImportOptions
 from lab.formats.recording_set import RecordingError
 
@@ -202,7 +202,7 @@ def test_boards_at_other_gains_are_a_warning_and_at_other_binnings_refused(tmp_p
 def test_the_list_is_declared_once() -> None:
     assert len(KEYWORDS) == sum(len(setting.keywords) for setting in SETTINGS)
     assert all(setting.factor >= 1.0 for setting in SETTINGS)
-    assert {setting.changes for setting in SETTINGS} == set(Changes)
+    assert {setting.changes for setting in SETTINGS} == set(SharedBy)
     assert is_same("ISO", 100.0, 110.0)  # within half of a third of a stop
     assert not is_same("ISO", 100.0, 125.0)
     assert is_same("FILTER", "ha", "Ha")
