@@ -482,7 +482,7 @@ def _unmoved_px(
     they are.
     """
     from_row, from_col = row, col
-    for _ in range(40):
+    for _ in range(200):  # the steps of a fisheye shrink by sin^2 of the angle from the axis each
         down, right = _shift_px(camera, from_row, from_col, wavelength_nm, effects)
         step = max(np.max(np.abs(row - down - from_row)), np.max(np.abs(col - right - from_col)))
         from_row, from_col = row - down, col - right

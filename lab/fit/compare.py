@@ -4,7 +4,7 @@ Every number that a fit states with a standard deviation is compared, found by i
 of a curve or a kernel share one row: that of the point with the largest difference, corrected for the number of points
 (Sidak). Dark currents are compared at the sensor temperature of A (`lab.fit.noise.dark_current`). The geometry of
 cameras is also compared by its effect: both calibrations project the same points, after the rigid motion that they
-imply between each other is removed (`lab.measure.pinhole`). Parameters that differ much may project alike, and the
+imply between each other is removed (`lab.measure.projection`). Parameters that differ much may project alike, and the
 reverse.
 
 Rules by which changes fail a check (`calibench compare --fail-on`) name a figure and a tolerance: `FIGURE`, or

@@ -361,7 +361,7 @@ def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tupl
     x, y = grid(shapes[0])
     state = solution.state
     points = state.camera(0).at_depth(grid_points(x, y), depth_mm)
-    there = np.isfinite(points).all(axis=1)
+    there = np.all(np.isfinite(points), axis=1)
     seen = np.full((len(points), 2), np.nan)
     on_right = points[there] @ state.rotation.T + state.translation_mm
     front = state.camera(1).projection.sees(on_right)

@@ -141,7 +141,7 @@ def _edge_distances(p: Array, dx: Array, dy: Array, bend: Array) -> list[tuple[A
     curvature towards its normal (n, 1), 1/px. See `_corner_model`.
     """
     x, y = dx - p[:, :1], dy - p[:, 1:2]
-    found = []
+    found: list[tuple[Array, Array, Array]] = []
     for angle, curvature in zip((p[:, 2:3], p[:, 3:4]), bend, strict=True):
         along = np.cos(angle) * y - np.sin(angle) * x
         towards = np.cos(angle) * curvature[:, :1] + np.sin(angle) * curvature[:, 1:]

@@ -203,19 +203,21 @@ def fit_lens_error(
     the farthest corner, and what it adds to the covariance (k, k) of the shared parameters.
 
     With F the columns of d for b = 1, without what poses and parameters take up, F^T r = F^T (F c + e) has the
-    covariance b^2 G^2 + W, with G = F^T F and W = F^T V F of `errors` (None: `noise_px`^2 G). b is the most likely
+    covariance b^2 G^2 + W, with G = F^T F and W = F^T V F of `errors` (None: `noise_px`^2 G). Priors count as
+    observations of the parameters: at the end of a solve their gradient is that of the corners. b is the most likely
     one; 0 where it is no better than none, by `LEAST_LENS_RATIO`. `prior`: see `fit_correlated_errors`.
     """
     size, count = len(prior), 2 * LENS_NODES
     normal, mixed = np.diag(prior).astype(float), np.zeros((size, count))
-    gram, middle, score = np.zeros((count, count)), np.zeros((size + count, size + count)), np.zeros(size + count)
+    gram, middle, score = np.zeros((count, count)), np.zeros((size + count, size + count)), np.zeros(count)
+    middle[:size, :size] = noise_px**2 * np.diag(prior)
     for pose in poses:
         free = _free_of_pose(pose, np.concatenate([pose.shared, _lens_columns(pose)], axis=2))
         shared, lens = free[:, :size], free[:, size:]
         normal += shared.T @ shared
         mixed += shared.T @ lens
         gram += lens.T @ lens
-        score += free.T @ pose.residuals.ravel()
+        score += lens.T @ pose.residuals.ravel()
         if errors is None:
             middle += noise_px**2 * (free.T @ free)
         else:
@@ -224,7 +226,7 @@ def fit_lens_error(
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     absorbed = np.linalg.solve(normal / np.outer(scale, scale), mixed / scale[:, None]) / scale[:, None]  # A^-1 J^T F
     take = np.concatenate([-absorbed, np.eye(count)])
-    gram, middle, score = gram - mixed.T @ absorbed, take.T @ middle @ take, take.T @ score
+    gram, middle = gram - mixed.T @ absorbed, take.T @ middle @ take
     size_px, axes = np.linalg.eigh(gram)
     shown = size_px > LEAST_SHOWN * float(size_px.max(initial=0.0))
     axes, size_px = axes[:, shown], size_px[shown]
@@ -761,7 +763,10 @@ class BundleAdjustment:
             [one.view.board_mm[:, :2] / one.view.capture.square_mm for one in self.observations]
         ).astype(float)
         residuals = np.concatenate(solution.residuals)
-        away = self.seen - solution.state.intrinsics[self.of_camera, 2:4]
+        # where the corners are predicted: measured places would bring the noise of the residuals into what they are
+        # compared with
+        predicted = self.seen - residuals
+        away = predicted - solution.state.intrinsics[self.of_camera, 2:4]
         for camera in range(self.cameras):
             its = self.of_camera == camera
             away[its] /= np.linalg.norm(away[its], axis=1).max(initial=1e-9)

@@ -45,9 +45,9 @@ Progress = Callable[[str, float], None]
 BRIGHTEST_PERCENT, AUTO_SHARE = 1.0, 0.7
 #: Limits of the automatic exposure (s).
 SHORTEST_S, LONGEST_S = 1e-6, 3600.0
-#: Angle from the axis up to which scenes are placed by a pinhole. There a scene is drawn 1.4 focal lengths wide on each
-#: side; the search of the place that light comes from takes up to 40 steps of sin^2 of the angle each, to 1e-4 px.
-WIDEST_SCENE_DEG = 55.0
+#: Angle from the axis up to which scenes are placed by a pinhole. A frame to 40 deg is drawn with a margin to about 70,
+#: where the search of the place that light comes from still ends (`sim.plain_image`); from 42 deg on it doesn't.
+WIDEST_SCENE_DEG = 40.0
 
 
 class SimulateOptions(Frozen):

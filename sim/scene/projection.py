@@ -27,10 +27,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sim.camera import Geometry, ProjectionKind
 from sim.spectrum import FloatArray
@@ -38,6 +38,7 @@ from sim.spectrum import FloatArray
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
 
+Array = NDArray[np.floating[Any]]
 COUNT = 12  # intrinsics of any projection; a projection that has fewer leaves the others at 0
 CAMERA = ("fx", "fy", "cx", "cy")
 #: Coefficients by their places 4.. in the vector of intrinsics; an empty name: not used.
@@ -101,9 +102,9 @@ class Projection:
         found[self._places[: len(distortion)]] = distortion
         return found
 
-    def distortion(self, intrinsics: FloatArray) -> FloatArray:
+    def distortion(self, intrinsics: Array) -> FloatArray:
         """Return the distortion coefficients; of a pinhole five, or eight where the denominator of g is used."""
-        found = np.asarray(intrinsics)[self._places]
+        found = np.asarray(intrinsics, float)[self._places]
         return found[:5] if self.kind == "pinhole" and not np.any(found[5:]) else found
 
     @cached_property
@@ -120,7 +121,7 @@ class Projection:
         assert self.spline_angle_deg is not None
         return float(2.0 * np.tan(np.deg2rad(self.spline_angle_deg) / 2.0)) ** 2
 
-    def sees(self, points: FloatArray) -> FloatArray:
+    def sees(self, points: Array) -> NDArray[np.bool_]:
         """Tell which points (n, 3) the projection is defined for: before a pinhole; up to 170 deg off a fisheye's
         axis.
         """
@@ -128,7 +129,7 @@ class Projection:
             return np.asarray(points[:, 2] > 0.0)
         return np.asarray(points[:, 2] > np.cos(np.deg2rad(WIDEST_DEG)) * np.linalg.norm(points, axis=1))
 
-    def plane(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def plane(self, points: Array) -> tuple[FloatArray, FloatArray]:
         """Return where points (n, 3) are in the ideal plane: x and y (n,)."""
         x, y, z = points[:, 0], points[:, 1], points[:, 2]
         if self.kind == "pinhole":
@@ -139,7 +140,7 @@ class Projection:
         scale = 2.0 / (np.linalg.norm(points, axis=1) + z)
         return x * scale, y * scale
 
-    def _plane_jacobian(self, points: FloatArray) -> FloatArray:
+    def _plane_jacobian(self, points: Array) -> FloatArray:
         """Return the Jacobian (n, 2, 3) of `plane`."""
         x, y, z = points[:, 0], points[:, 1], points[:, 2]
         rho2 = x * x + y * y
@@ -163,7 +164,7 @@ class Projection:
         found[:, 0, 2], found[:, 1, 2] = x * by_z, y * by_z
         return found
 
-    def rays(self, x: FloatArray, y: FloatArray) -> FloatArray:
+    def rays(self, x: Array, y: Array) -> FloatArray:
         """Return the rays (n, 3) of length 1 to places (n,) in the ideal plane; NaN beyond the sphere."""
         r2 = x * x + y * y
         if self.kind == "pinhole":
@@ -175,7 +176,7 @@ class Projection:
         below = 1.0 + 0.25 * r2
         return np.stack([x / below, y / below, (2.0 - below) / below], axis=-1)
 
-    def _radial(self, r2: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _radial(self, r2: Array, k: Array) -> tuple[FloatArray, FloatArray]:
         """Return g and dg/dr2 at r2. `k` (8,): coefficients, places 4.. of the intrinsics."""
         if self.kind == "pinhole":
             above = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
@@ -190,7 +191,7 @@ class Projection:
         at = np.minimum(r2 / self._square_end, 1.0)
         return 1.0 + self._radial_terms(r2, k) @ weights, self._spline(at, 1) @ weights / self._square_end
 
-    def _radial_terms(self, r2: FloatArray, k: FloatArray) -> FloatArray:
+    def _radial_terms(self, r2: Array, k: Array) -> FloatArray:
         """Return dg by each of the six radial coefficients (n, 6), 0 where one isn't used."""
         found = np.zeros((*r2.shape, 6))
         if self.kind == "pinhole":
@@ -208,13 +209,14 @@ class Projection:
             found[...] = self._spline(end) + self._spline(end, 1) * (at - end)[..., None]
         return found
 
-    def distort(self, x: FloatArray, y: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def distort(self, x: Array, y: Array, k: Array) -> tuple[FloatArray, FloatArray]:
         """Return where the distortion moves places (n,) of the ideal plane to. `k` (8,): places 4.. of the
         intrinsics.
         """
-        return self._distort(x, y, k)[:2]
+        xd, yd, *_ = self._distort(x, y, k)
+        return xd, yd
 
-    def _distort(self, x: FloatArray, y: FloatArray, k: FloatArray) -> tuple[FloatArray, ...]:
+    def _distort(self, x: Array, y: Array, k: Array) -> tuple[FloatArray, ...]:
         """Return xd, yd, and dxd/dx, dxd/dy (= dyd/dx), dyd/dy."""
         r2 = x * x + y * y
         g, slope = self._radial(r2, k)
@@ -227,11 +229,11 @@ class Projection:
             g + 2.0 * (y * y * slope + 3.0 * p1 * y + p2 * x),
         )
 
-    def undistort(self, xd: FloatArray, yd: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def undistort(self, xd: Array, yd: Array, k: Array) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """Return the inverse of `distort` by Newton's method, and where it is one: a distortion that folds maps two
         rays to one pixel, and the valid one has a positive Jacobian.
         """
-        x, y = xd.copy(), yd.copy()
+        x, y = np.array(xd, float), np.array(yd, float)
         with np.errstate(all="ignore"):
             for _ in range(NEWTON_STEPS):
                 at_x, at_y, xx, cross, yy = self._distort(x, y, k)
@@ -245,14 +247,12 @@ class Projection:
             valid = (np.hypot(at_x - xd, at_y - yd) < NEWTON_TOLERANCE) & (xx * yy - cross * cross > 0) & (xx > 0)
         return x, y, valid
 
-    def project(self, points: FloatArray, intrinsics: FloatArray) -> FloatArray:
+    def project(self, points: Array, intrinsics: Array) -> FloatArray:
         """Project points (n, 3) in the frame of the camera to px (n, 2)."""
         xd, yd = self.distort(*self.plane(points), intrinsics[4:])
         return np.column_stack([intrinsics[0] * xd + intrinsics[2], intrinsics[1] * yd + intrinsics[3]])
 
-    def project_with_jacobian(
-        self, points: FloatArray, intrinsics: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def project_with_jacobian(self, points: Array, intrinsics: Array) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Project points (n, 3) to px (n, 2). Returns these and their Jacobians by the point (n, 2, 3) and by the
         intrinsics (n, 2, 12).
         """
@@ -274,7 +274,7 @@ class Projection:
             by_camera[:, 1, 6], by_camera[:, 1, 7] = focal[1] * (r2 + 2.0 * y * y), focal[1] * 2.0 * x * y
         return np.column_stack([focal[0] * xd + intrinsics[2], focal[1] * yd + intrinsics[3]]), by_point, by_camera
 
-    def unproject(self, image: FloatArray, intrinsics: FloatArray) -> FloatArray:
+    def unproject(self, image: Array, intrinsics: Array) -> FloatArray:
         """Find the rays (n, 3) of length 1 of px (n, 2); NaN where the projection has no inverse."""
         x, y, valid = self.undistort(
             (image[:, 0] - intrinsics[2]) / intrinsics[0], (image[:, 1] - intrinsics[3]) / intrinsics[1], intrinsics[4:]
@@ -285,7 +285,7 @@ class Projection:
 PINHOLE, EQUIDISTANT = Projection("pinhole"), Projection("equidistant")
 
 
-def _angle_over_rho(rho: FloatArray, z: FloatArray) -> FloatArray:
+def _angle_over_rho(rho: Array, z: Array) -> FloatArray:
     """Return theta / rho, with theta = atan2(rho, z); on the axis 1 / z."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where(rho < 1e-6 * np.abs(z), 1.0 / z, np.arctan2(rho, z) / rho))

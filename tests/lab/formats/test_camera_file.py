@@ -53,7 +53,19 @@ def _files() -> list[CameraFile]:
             "dark_current_doubling_c": None,
         }
     )  # fmt: skip
+    matrix = ((260.0, 0.0, 320.0), (0.0, 260.0, 240.0), (0.0, 0.0, 1.0))
+    fisheyes = [
+        Geometry(camera_matrix=matrix, distortion=(0.01, -0.02, 0.003, 0.0), projection="equidistant"),
+        Geometry(
+            camera_matrix=matrix, distortion=(0.01, -0.02, 0.0, 1e-4, -0.1, -0.1, -0.2, -0.2),
+            projection="splined_stereographic", spline_angle_deg=88.5,
+        ),
+    ]  # fmt: skip
     return [
+        *(
+            CameraFile(one.projection, default_camera().camera.model_copy(update={"geometry": one}))
+            for one in fisheyes
+        ),
         default_camera(),
         CameraFile('quotes " and \\ and µ', full, (effect("veiling_glare")(share_percent=1.7),
         effect("defocus")(defocus_um=3.3))),

@@ -294,6 +294,21 @@ def test_one_remark_on_several_captures_is_one_warning(folder: Path) -> None:
     assert f": {len(flats)} captures ({flats[0]}, " in warning
 
 
+@pytest.mark.parametrize(("square_mm", "place"), [(0.025, "below"), (0.1016, "below"), (25400.0, "above")])
+def test_squares_in_another_unit_are_asked_about_where_they_are_read(
+    folder: Path, square_mm: float, place: str
+) -> None:
+    def board(manifest: dict[str, Any]) -> None:
+        capture = manifest["captures"][0]
+        same = {key: capture[key] for key in ("side", "frame", "exposure_s")}
+        more = {"id": "board", "kind": "charuco", "dictionary": "none", "squares": [7, 10], "pose": "a"}
+        manifest["captures"].append(same | more | {"square_mm": square_mm})
+
+    edit(folder, board)
+    (warning,) = (line for line in read(folder).warnings if "square_mm" in line)
+    assert f"{place} the limit" in warning and "give it in mm" in warning
+
+
 def test_levels_that_contradict_each_other(folder: Path) -> None:
     edit(
         folder, lambda m: m["cameras"]["left"].update(black_level_dn=4095) or m["cameras"]["right"].update(bit_depth=11)

@@ -13,6 +13,7 @@ import pytest
 import rawpy
 
 from lab import cli
+from lab.errors import InputError
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.formats.recording_set import load_frame
 from lab.predict.simulate import SimulateOptions, automatic_exposure_s, preview, simulate
@@ -300,6 +301,29 @@ def test_the_geometrys_distortion_bends_what_a_pinhole_placed() -> None:
     )
     assert np.abs(plain - bent)[40:56, 56:72].max() < 0.1 * np.ptp(plain)
     assert np.abs(plain - bent).max() > 0.3 * np.ptp(plain)
+
+
+def test_a_fisheye_moves_what_a_pinhole_placed_and_a_wider_one_is_refused() -> None:
+    """The bright squares of a checkerboard through an equidistant lens of 38 deg at the corner: straight ahead they
+    stay, and the corner of the frame holds more of them, since f tan 38 deg is 1.18 times f 38 deg.
+    """
+    content = default_camera()
+    options = SimulateOptions(scene="checkerboard", expected=True)
+
+    def frame(corner_deg: float | None) -> np.ndarray:
+        camera = content.camera.model_copy(update={"rows": 96, "cols": 128})
+        if corner_deg is not None:
+            focal = float(np.hypot(63.5, 47.5) / np.deg2rad(corner_deg))
+            matrix = ((focal, 0.0, 63.5), (0.0, focal, 47.5), (0.0, 0.0, 1.0))
+            geometry = Geometry(camera_matrix=matrix, projection="equidistant")
+            camera = camera.model_copy(update={"geometry": geometry})
+        return simulate(options, replace(content, camera=camera)).frame.astype(float)
+
+    plain, bent = frame(None), frame(38.0)
+    assert np.abs(plain - bent)[44:52, 60:68].max() < 0.1 * np.ptp(plain)
+    assert np.abs(plain - bent).max() > 0.3 * np.ptp(plain)
+    with pytest.raises(InputError, match=r"sees 70 deg off the axis \(equidistant projection\).*up to 40 deg"):
+        frame(70.0)
 
 
 def test_a_camera_whose_focal_length_nobody_stated_asks_for_it(

@@ -83,7 +83,8 @@ def test_facts_tell_the_warp_the_halves_and_the_models(rig):
     rows = dict(facts(left))
     assert "bend x" in rows["warp of the board (9 x 12 squares of 25 mm, none)"]
     assert "px difference" in rows["cross-validation of two halves of the views"]
-    assert sum(name.startswith("distortion") for name in rows) == 3
+    assert sum(name.startswith("pinhole projection, k1") for name in rows) == 3
+    assert sum(name.startswith(("equidistant projection", "splined stereographic projection")) for name in rows) == 2
     assert sum("chosen" in text for text in rows.values()) == 1
 
 

@@ -175,3 +175,43 @@ def test_a_charts_patches_are_distorted(colour_camera: CameraModel, lamp: Spectr
     x, y = distort(straight[1], straight[0], geometry)
     assert middle == pytest.approx([float(y), float(x)], abs=0.05)
     assert abs(float(x) - float(straight[1])) > 0.1
+
+
+# --- fisheyes ---------------------------------------------------------------------------------------------------------
+
+
+FISHEYE = Geometry(
+    camera_matrix=((180.0, 0.0, 160.0), (0.0, 181.0, 118.0), (0.0, 0.0, 1.0)),
+    distortion=(0.02, -0.01, 0.002, 0.0),
+    projection="equidistant",
+)
+
+
+def test_a_board_before_a_fisheye_is_where_opencv_has_it() -> None:
+    rotation = cv2.Rodrigues(np.array([0.3, -0.4, 0.2]))[0]
+    pose = np.column_stack([rotation[:, :2], [-50.0, -40.0, 60.0]])
+    warp = Warp.of(np.array(FISHEYE.camera_matrix) @ pose, FISHEYE)
+    u, v = (part.ravel() for part in np.meshgrid(np.linspace(0, 100, 9), np.linspace(0, 80, 7)))
+    points = np.column_stack([u, v, np.zeros_like(u)])
+    wanted, _ = cv2.fisheye.projectPoints(
+        points[:, None], cv2.Rodrigues(rotation)[0], pose[:, 2], np.array(FISHEYE.camera_matrix),
+        np.array(FISHEYE.distortion),
+    )  # fmt: skip
+    row, col = warp.to_camera(u, v)
+    np.testing.assert_allclose(np.column_stack([col, row]), wanted[:, 0], atol=1e-9)
+    np.testing.assert_allclose(warp.to_pattern(row, col), (u, v), atol=1e-7)
+
+
+def test_the_grid_of_a_fisheye_agrees_with_its_points_and_knows_what_lies_behind() -> None:
+    """Pixels 320 px off the axis see 100 deg and more: their rays don't meet a plane before the camera. Rays are
+    interpolated to 1e-5 px; near the horizon of the plane a pixel is many cells.
+    """
+    warp = Warp.of(np.array(FISHEYE.camera_matrix) @ np.diag([1.0, 1.0, 50.0]), FISHEYE)
+    row, col = np.linspace(0.0, 239.0, 80), np.linspace(-200.0, 500.0, 120)
+    u, v = warp.grid_to_pattern(row, col)
+    u0, v0 = warp.to_pattern(*np.meshgrid(row, col, indexing="ij"))
+    near = np.hypot(u0, v0) < 200.0
+    assert near.sum() > 2000
+    np.testing.assert_allclose(u[near], u0[near], atol=1e-3)
+    np.testing.assert_allclose(v[near], v0[near], atol=1e-3)
+    assert np.all(u[:, 0] > 1e8)
