@@ -197,19 +197,20 @@ def fit_correlated_errors(poses: Sequence[PoseErrors], prior: Array) -> Correlat
 
 
 def fit_lens_error(
-    poses: Sequence[PoseErrors], errors: CorrelatedErrors | None, noise_px: float, prior: Array
+    poses: Sequence[PoseErrors], errors: CorrelatedErrors | None, noise_px: float, prior: Array, values: Array
 ) -> tuple[float, Array]:
     """Fit the discrepancy of the lens to the residuals at the end of a solve. Returns b, px, its standard deviation at
     the farthest corner, and what it adds to the covariance (k, k) of the shared parameters.
 
     With F the columns of d for b = 1, without what poses and parameters take up, F^T r = F^T (F c + e) has the
     covariance b^2 G^2 + W, with G = F^T F and W = F^T V F of `errors` (None: `noise_px`^2 G). Priors count as
-    observations of the parameters: at the end of a solve their gradient is that of the corners. b is the most likely
-    one; 0 where it is no better than none, by `LEAST_LENS_RATIO`. `prior`: see `fit_correlated_errors`.
+    observations of the parameters, whose `values` (k,) are their residuals. What the last step of the solve left of the
+    gradient is taken out of F^T r. b is the most likely one; 0 where it is no better than none, by `LEAST_LENS_RATIO`.
+    `prior`: see `fit_correlated_errors`.
     """
     size, count = len(prior), 2 * LENS_NODES
     normal, mixed = np.diag(prior).astype(float), np.zeros((size, count))
-    gram, middle, score = np.zeros((count, count)), np.zeros((size + count, size + count)), np.zeros(count)
+    gram, middle, score = np.zeros((count, count)), np.zeros((size + count, size + count)), np.zeros(size + count)
     middle[:size, :size] = noise_px**2 * np.diag(prior)
     for pose in poses:
         free = _free_of_pose(pose, np.concatenate([pose.shared, _lens_columns(pose)], axis=2))
@@ -217,7 +218,7 @@ def fit_lens_error(
         normal += shared.T @ shared
         mixed += shared.T @ lens
         gram += lens.T @ lens
-        score += lens.T @ pose.residuals.ravel()
+        score += free.T @ pose.residuals.ravel()
         if errors is None:
             middle += noise_px**2 * (free.T @ free)
         else:
@@ -226,7 +227,8 @@ def fit_lens_error(
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     absorbed = np.linalg.solve(normal / np.outer(scale, scale), mixed / scale[:, None]) / scale[:, None]  # A^-1 J^T F
     take = np.concatenate([-absorbed, np.eye(count)])
-    gram, middle = gram - mixed.T @ absorbed, take.T @ middle @ take
+    score[:size] -= prior * values
+    gram, middle, score = gram - mixed.T @ absorbed, take.T @ middle @ take, take.T @ score
     size_px, axes = np.linalg.eigh(gram)
     shown = size_px > LEAST_SHOWN * float(size_px.max(initial=0.0))
     axes, size_px = axes[:, shown], size_px[shown]
@@ -742,7 +744,9 @@ class BundleAdjustment:
         of_all, lens_px, of_lens = errors is None, 0.0, np.zeros_like(solution.covariance)
         errors = fit_correlated_errors(poses, prior) if errors is None else errors
         if of_all:  # parts of the views share the lens: it isn't among what they may differ by
-            lens_px, of_lens = fit_lens_error(poses, errors, solution.noise_px, prior)
+            lens_px, of_lens = fit_lens_error(
+                poses, errors, solution.noise_px, prior, self._prior_values(solution.state)
+            )
         if errors is None and not lens_px:
             return solution
         share = 1.0 if errors is None else (errors.noise_px / max(solution.noise_px, 1e-9)) ** 2

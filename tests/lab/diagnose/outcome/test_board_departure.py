@@ -3,6 +3,7 @@ isn't."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -52,7 +53,9 @@ def test_a_board_that_bows_anew_in_each_pose_is_told(noise_is_known: bool) -> No
     assert f"depart from the camera's geometry by {fit.corner_px_std:.2f} px" in found.shape
     assert "noise explains 0.09 px; a bent board" in found.shape
     # the most tilted boards show a bow the most
-    assert "of 10 captures: left-2 (0.54 px), " in found.where
+    largest = re.search(r"of 10 captures: left-2 \((0\.\d+) px\), ", found.where)
+    # 0.54 px about a distortion of one term; of five terms, which held-out views don't refuse, the fit takes up 0.06 px
+    assert largest is not None and 0.45 < float(largest[1]) < 0.57
     assert "in the frame at the " in found.where
     assert set(found.captures) < {view.capture for view in fit.residuals}
     assert found.significance_sigma > 50
