@@ -461,6 +461,14 @@ def test_a_figure_of_the_drift_board_has_its_history(browser: Any, lab: Running)
     names = page.locator("#drift-rows th").all_inner_texts()
     assert any("temporal dark noise (read noise)" in name and name.endswith(" e") for name in names)
     assert "\u25c6" in page.inner_text("#drift-rows .cell.drifted")
+    # The many figures of the edges are folded, until they are asked for.
+    shown = page.locator("#drift-rows tr:has-text('MTF50')")
+    assert shown.count() == 0
+    page.click("#drift-rows .fold button:has-text('MTF by edge and channel')")
+    assert shown.count() > 0
+    assert watched.focused()["text"].startswith("MTF by edge")
+    page.keyboard.press("Enter")
+    assert shown.count() == 0
     page.fill("#drift-form input[name=search]", "mtf50")
     page.wait_for_selector("#drift-rows tr:nth-child(2)", state="detached")
     page.fill("#drift-form input[name=search]", "")
@@ -471,7 +479,9 @@ def test_a_figure_of_the_drift_board_has_its_history(browser: Any, lab: Running)
     page.wait_for_selector("#history .point")
     assert len(page.query_selector_all("#history .point")) >= 3 and len(page.query_selector_all("#history .band")) == 2
     assert len(page.query_selector_all("#history path")) == 1  # the drift has a shape of its own
-    assert "1 drifted" in page.inner_text("#history-words")
+    assert "1 drifted" in page.inner_text("#history-words") and " UTC, " in page.inner_text("#history-words")
+    times = page.locator("#history text").all_text_contents()
+    assert "fitted (UTC)" in times and sum(bool(re.fullmatch(r"\d\d-\d\d \d\d:\d\d", one)) for one in times) >= 3
     watched.close()
 
 
@@ -649,7 +659,7 @@ def test_the_steps_of_an_analysis_are_followed_to_its_report(
     page.wait_for_selector("#session-steps .done:has-text('report')")
     assert page.is_visible("#panel-live") and page.is_hidden("#session-bar")
     with page.expect_popup() as opened:
-        page.click("#session-facts a:has-text('Report')")
+        page.click("#session-facts a:has-text('Open report')")
     opened.value.wait_for_selector("h1:has-text('What was found')")
     opened.value.close()
     watched.tab_to("Findings")
