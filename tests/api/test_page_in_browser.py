@@ -25,6 +25,7 @@ from lab.capture.station import Drivers, Station, read_station
 from lab.formats.camera_file import CameraFile, default_camera, write_camera
 from lab.formats.recording_set import packed
 from lab.pipeline import PipelineProgress, PipelineRequest, Step
+from sim.sensor.mosaic import first_pixels
 from tests.api.conftest import STATION, Running, serving, until_state
 from tests.api.routes.test_confirm import PERSON, begun, confirm
 from tests.api.routes.test_findings import diagnosis
@@ -51,6 +52,8 @@ REFRESH = """async () => (await import("/static/page.js")).tellHalts(await (awai
 #: Has nothing follow the sessions that are started: a pipeline by default.
 NOTHING_FOLLOWS = """() => { const then = document.querySelector("#start-form select[name=then]");
     window.followed = then.value; then.value = ""; then.dispatchEvent(new Event("change", {bubbles: true})) }"""
+#: Where the planes of the fakes' frames begin, by channel.
+FIRSTS = first_pixels("RGGB")
 #: The views by their addresses, and what stands in each when it is complete. Words in capitals: ids.
 VIEWS = {
     "/": "#plan-words:has-text('3 sequences')",
@@ -498,23 +501,54 @@ def test_a_frame_is_inspected(browser: Any, lab: Running, ids: dict[str, str]) -
     watched.go(f"/sessions/{ids['SESSION']}/frames/{first}", "#inspect-readout:has-text('DN')")
     rows, cols = frames[0].shape
     row, col = rows // 2, cols // 2
-    assert page.inner_text("#inspect-readout").startswith(f"column {col}, row {row}: {frames[0][row, col]} DN")
+
+    def channel(row: int, col: int) -> str:
+        return next(name for name, at in FIRSTS.items() if at == (row % 2, col % 2))
+
+    at = f"column {col}, row {row}, {channel(row, col)}: {frames[0][row, col]} DN"
+    assert page.inner_text("#inspect-readout").startswith(at)
     page.focus("#inspect-canvas")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowDown")
-    assert f"column {col + 1}, row {row + 1}: {frames[0][row + 1, col + 1]} DN" in page.inner_text("#inspect-readout")
+    at = f"column {col + 1}, row {row + 1}, {channel(row + 1, col + 1)}: {frames[0][row + 1, col + 1]} DN"
+    assert page.inner_text("#inspect-readout").startswith(at)
     along = frames[0][row + 1, (col + 1) % 2 :: 2]  # of one channel
-    assert f"{along.size} pixels, at most {along.max()} DN" in page.inner_text("#inspect-profile")
+    profile = page.inner_text("#inspect-profile")
+    assert f"{along.size} pixels, at most {along.max()} DN, of channel {channel(row + 1, col + 1)}" in profile
+    pictures = set()
+    for name in ("", *FIRSTS):  # the mosaic, and each channel alone
+        page.select_option("#inspect-form select[name=channel]", name)
+        pictures.add(page.evaluate("document.getElementById('inspect-canvas').toDataURL()"))
+        assert (f"picture of channel {name}" in page.inner_text("#inspect-readout")) == bool(name)
+    assert len(pictures) == 5
+    page.select_option("#inspect-form select[name=channel]", "")
     page.keyboard.press("m")
     page.keyboard.press("Shift+ArrowLeft")
     assert "Profile along the line" in page.inner_text("#inspect-profile")
     before = page.evaluate("document.getElementById('inspect-canvas').toDataURL()")
     page.keyboard.press("+")
     assert page.evaluate("document.getElementById('inspect-canvas').toDataURL()") != before
+    others = page.locator("#inspect-form select[name=minus] option")
+    many = others.count()
+    page.fill("#inspect-form input[name=find]", captures[1]["name"].upper())
+    assert 2 <= others.count() < many
     page.select_option("#inspect-form select[name=minus]", str(second))
     difference = (frames[0] - frames[1])[row + 1, col + 1 - 10]
     page.wait_for_selector(f"#inspect-readout:has-text('is {difference} DN')")
     assert watched.faults() == []
+    watched.go(f"/sessions/{ids['SESSION']}/frames", "#captures img")
+    page.fill("#capture-filter input[name=search]", captures[1]["name"].upper())
+    page.press("#capture-filter input[name=search]", "Enter")
+    with lab.client() as client:
+        found = client.get(f"/api/v1/sessions/{ids['SESSION']}/captures", params={"search": captures[1]["name"]})
+        (sent,) = client.get("/api/v1/recordings").json()[-1:]
+        same = client.get(f"/api/v1/recordings/{sent['id']}/captures", params={"search": captures[1]["name"].upper()})
+    number = int(found.headers["X-Total-Count"])
+    assert 1 <= number < many and [one["name"] for one in same.json()] == [one["name"] for one in found.json()]
+    page.wait_for_selector(f"#capture-count:has-text('{number} captures; ')")
+    page.fill("#capture-filter input[name=search]", "no_such%name")
+    page.press("#capture-filter input[name=search]", "Enter")
+    page.wait_for_selector("#capture-count:has-text('No matching frames.')")
     watched.close()
 
 
