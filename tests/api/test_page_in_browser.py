@@ -35,7 +35,7 @@ from tests.peers import missing
 
 pytestmark = pytest.mark.extra  # drives a browser
 
-PHONE, TABLET, DESK, WIDE = ({"width": wide, "height": 860} for wide in (420, 768, 1280, 1440))
+PHONE, TABLET, DESK, WIDE = ({"width": wide, "height": 860} for wide in (390, 768, 1280, 1600))
 READ_NOISE_E = (2.0, 2.01, 2.15)
 LIMITS = 'valid_days = 90\n[[limit]]\nfigure = "noise read_noise_e"\ngood = [1.9, 2.05]\nwarn = [1.8, 2.2]\n'
 PATIENCE_MS = 60_000.0
@@ -252,6 +252,9 @@ def test_every_view_is_accessible_and_fits(
         assert watched.can_halt(), address
         assert watched.page.inner_text("#view-problem") == "", address
     assert found == {}
+    ends = "[...document.querySelectorAll('#nav a')].map((one) => one.getBoundingClientRect().right)"
+    assert max(watched.page.evaluate(ends)) <= viewport["width"]  # no entry of the menu is cut
+    assert watched.focused()["outline"].startswith("none"), "a heading that is gone to is no control"
     watched.go("/drift", "#drift-rows .cell.drifted")
     watched.page.click("#drift-rows tr:has-text('read noise') button")
     watched.page.wait_for_selector("#history .point")
