@@ -24,6 +24,10 @@ NumberCursor = Annotated[
     Query(ge=1, le=2**31 - 1, description="the id of the last item of the page before; without it, the first page"),
 ]
 
+WordsOfName = Annotated[
+    str, Query(max_length=200, description="only those whose name has each of these words, in either case")
+]
+
 #: OpenAPI's description of the headers that `page_headers` sets.
 HEADERS = {
     "X-Total-Count": {"description": "how many items there are on all pages", "schema": {"type": "integer"}},

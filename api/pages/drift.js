@@ -4,17 +4,18 @@ import { number, svg, ticks } from "./charts.js";
 import { isLike, measured, unitText } from "./figures.js";
 import { $, addView, ask, element, options, query, show, time, told } from "./page.js";
 
-const HEIGHT = 240;
+const HEIGHT = 256;
 const LEFT = 76;
 const RIGHT = 14;
 const TOP = 12;
-const BOTTOM = 34;
+const BOTTOM = 50;
 const form = $("drift-form").elements;
 
 /** @type {Model<"DriftBoard">} */
 let board;
 let asked = ""; // camera and reference temperature of the board
 let figure = ""; // key of the row whose history stands there
+let unfolded = false; // whether the many figures of the edges' MTFs stand there
 
 /** @typedef {Model<"BoardRow">} Row */
 /** @typedef {Model<"HistoryPoint">} Point */
@@ -51,13 +52,35 @@ function rowOf(row) {
   return element("tr", {}, name, ...row.cells.map((one, at) => cell(one, board.columns[at], row)));
 }
 
+/** Days, and of those on which there are several, the times.
+ * @param {{created: string}[]} of */
+function shortTimes(of) {
+  const days = of.map((one) => one.created.slice(0, 10));
+  return of.map(({ created }, at) => (days.indexOf(days[at]) === days.lastIndexOf(days[at]) ? days[at] : `${days[at].slice(5)} ${created.slice(11, 16)}`));
+}
+
+/** The line that folds the figures of the edges' MTFs, or shows them.
+ * @param {Row[]} rows */
+function foldOf(rows) {
+  const look = rows.filter(needsLook).length;
+  const text = `MTF by edge and channel: ${rows.length} figures, ${look || "none"} out of limits or drifted`;
+  const button = element("button", { className: "quiet", textContent: text });
+  button.setAttribute("aria-expanded", String(unfolded));
+  button.addEventListener("click", () => {
+    unfolded = !unfolded;
+    draw();
+  });
+  return element("tr", { className: "fold" }, element("th", { scope: "row" }, button), element("td", { colSpan: board.columns.length }));
+}
+
 function draw() {
   const found = board.rows.filter((row) => isLike(row, form.search.value) && (!form.attention.checked || needsLook(row)));
-  const days = board.columns.map((one) => one.created.slice(0, 10));
-  const head = board.columns.map((one) => {
-    const day = one.created.slice(0, 10);
-    const alone = days.indexOf(day) === days.lastIndexOf(day);
-    const link = element("a", { href: `#/calibrations/${one.calibration_id}`, textContent: alone ? day.slice(2) : `${day.slice(5)} ${one.created.slice(11, 16)}`, title: `${one.name}, ${time(one.created)}, ${one.state}` });
+  // Where somebody looks for some figures, all that are found stand there.
+  const folds = !form.search.value.trim() && !form.attention.checked;
+  const many = folds ? found.filter((row) => row.group === "mtf") : [];
+  const times = shortTimes(board.columns);
+  const head = board.columns.map((one, at) => {
+    const link = element("a", { href: `#/calibrations/${one.calibration_id}`, textContent: times[at], title: `${one.name}, ${time(one.created)}, ${one.state}` });
     link.setAttribute("aria-label", `${one.name}, ${time(one.created)}, ${one.state}`);
     const column = element("th", { scope: "col", className: one.state }, link);
     if (one.state === "certified") column.append(" ✓");
@@ -65,10 +88,13 @@ function draw() {
   });
   $("drift-head").replaceChildren(element("tr", {}, element("th", { scope: "col", textContent: "Figure" }), ...head));
   delete $("drift-rows").dataset.shown;
-  show("drift-rows", found, rowOf);
+  /** @type {({id: string, row: Row} | {id: string, fold: boolean})[]} */
+  const rows = found.filter((row) => !many.includes(row)).map((row) => ({ id: keyOf(row), row }));
+  if (many.length) rows.push({ id: "fold", fold: unfolded }, ...(unfolded ? many.map((row) => ({ id: keyOf(row), row })) : []));
+  show("drift-rows", rows, (one) => ("row" in one ? rowOf(one.row) : foldOf(many)));
   const look = board.rows.filter(needsLook).length;
   const law = board.rows.find((row) => row.law);
-  const words = [`${found.length} of ${board.rows.length} figures, ${board.columns.length} calibrations, the oldest first`, `${look || "none"} out of limits or drifted`];
+  const words = [`${found.length} of ${board.rows.length} figures, ${board.columns.length} calibrations, the oldest first, times in UTC`, `${look || "none"} out of limits or drifted`];
   if (law) words.push(`dark currents at ${degrees(law.reference_c)}: ${law.law}`);
   $("drift-told").textContent = words.join("; ");
 }
@@ -122,7 +148,7 @@ function drawHistory(history) {
   const drifted = points.filter((p) => p.drifted).length;
   const title = titleOf(history);
   const valueText = (/** @type {Point} */ p) => `${measured(p.value, p.std)}${unitText(history.unit)}${p.temperature_c == null ? "" : ` at ${degrees(p.temperature_c)}`}`;
-  const summary = `${title} of ${cameraName(history.camera)}: ${points.length} calibrations, the newest ${valueText(newest)}${newest.mark ? `, ${newest.mark}` : ""}, ${drifted || "none"} drifted`;
+  const summary = `${title} of ${cameraName(history.camera)}: ${points.length} calibrations, the newest, of ${time(newest.created).slice(0, 16)} UTC, ${valueText(newest)}${newest.mark ? `, ${newest.mark}` : ""}, ${drifted || "none"} drifted`;
   const picture = svg("svg", { viewBox: `0 0 ${width} ${HEIGHT}`, role: "img", "aria-label": summary });
   if (bands.length) picture.append(band(bands[1], "warn"), band(bands[0], "good"));
   for (const value of ticks(bottom, top)) {
@@ -130,6 +156,8 @@ function drawHistory(history) {
     picture.append(svg("text", { x: LEFT - 8, y: y(value) + 4, "text-anchor": "end" }, number(value)));
   }
   const every = Math.ceil(points.length / Math.max(2, Math.floor((width - LEFT - RIGHT) / 84)));
+  const times = shortTimes(points);
+  picture.append(svg("text", { x: (LEFT + width - RIGHT) / 2, y: HEIGHT - 6, "text-anchor": "middle" }, "fitted (UTC)"));
   points.forEach((p, at) => {
     const mark = svg("g", { class: `point ${p.mark ?? ""} ${p.state}` }, svg("title", {}, `${time(p.created)}: ${valueText(p)}`));
     mark.append(svg("line", { x1: x(at), x2: x(at), y1: y(p.value - 2 * p.std), y2: y(p.value + 2 * p.std) }));
@@ -138,7 +166,7 @@ function drawHistory(history) {
     mark.append(p.drifted ? svg("path", { d: `M${cx - 7} ${cy}L${cx} ${cy - 7}L${cx + 7} ${cy}L${cx} ${cy + 7}Z` }) : svg("circle", { cx, cy, r: 4.5 }));
     if (p.state === "certified") mark.append(svg("circle", { class: "ring", cx, cy, r: 9 }));
     picture.append(mark);
-    if (at % every === 0) picture.append(svg("text", { x: cx, y: HEIGHT - 12, "text-anchor": "middle" }, p.created.slice(0, 10)));
+    if (at % every === 0) picture.append(svg("text", { x: cx, y: HEIGHT - 26, "text-anchor": "middle" }, times[at]));
   });
   $("history-title").textContent = `History of ${title}`;
   $("history").replaceChildren(picture);

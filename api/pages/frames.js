@@ -26,12 +26,14 @@ export function leaveFrames() {
   $("captures").replaceChildren();
   delete $("captures").dataset.shown;
   for (const key of KEYS) $("capture-filter").elements[key].replaceChildren();
+  $("capture-filter").elements.search.value = "";
 }
 
 const filtered = () => {
   const filter = $("capture-filter").elements;
   const asked = new URLSearchParams({ limit: "200" });
   for (const key of KEYS) if (filter[key].value) asked.set(key, filter[key].value);
+  if (filter.search.value.trim()) asked.set("search", filter.search.value.trim());
   return asked;
 };
 
@@ -73,7 +75,7 @@ export async function showFrames(of, one) {
   }
   drawCaptures();
   const there = counts.reduce((sum, each) => sum + each.captures, 0);
-  $("newer").hidden = !("steps_done" in one && one.steps_done > 0 && there > total && !filtered().has("kind") && !filtered().has("side"));
+  $("newer").hidden = !("steps_done" in one && one.steps_done > 0 && there > total && ![...KEYS, "search"].some((key) => filtered().has(key)));
   $("newer").textContent = "Show those taken since";
 }
 
@@ -103,7 +105,7 @@ function drawCaptures() {
   const pictures = [...frames.values()].map((of) => ({ ...of[0], more: of.length - 1 }));
   const shown = pictures.slice(0, atOnce);
   const left = pictures.length - shown.length + (captures.length < total ? 1 : 0);
-  $("capture-count").textContent = total ? `${total} captures; ${shown.length} frames shown, the newest first. A picture opens the inspector.` : "None yet.";
+  $("capture-count").textContent = total ? `${total} captures; ${shown.length} frames shown, the newest first. A picture opens the inspector.` : [...KEYS, "search"].some((key) => filtered().has(key)) ? "No matching frames." : "None yet.";
   $("more").hidden = left === 0;
   const stretch = $("capture-filter").elements.stretch.checked;
   show("captures", shown.map((c) => ({ ...c, picture: `${c.preview.replace(/png$/, "webp")}?width=320${stretch ? "&stretch=true" : ""}` })), (c) =>
@@ -125,6 +127,7 @@ $("more").addEventListener(
     drawCaptures();
   }),
 );
+$("capture-filter").addEventListener("submit", (event) => event.preventDefault()); // Enter is a change
 $("capture-filter").addEventListener("change", told("session-problem", async () => {
   const asked = filtered();
   asked.set("order", "newest");

@@ -44,6 +44,15 @@ let marked = null;
 
 const canvas = $("inspect-canvas");
 const form = $("inspect-form").elements;
+/** The channel of a pixel of the mosaic.
+ * @param {number} row @param {number} col */
+const channelAt = (row, col) => figures.channels.find((one) => (row - one.row) % step() === 0 && (col - one.col) % step() === 0) ?? figures.channels[0];
+/** The channel whose pixels alone are drawn: the one that is chosen; of a reduced mosaic, whose neighbours would be mixed, the first.
+ * @returns {Model<"ChannelFigures"> | null} */
+const drawnChannel = () => {
+  const chosen = figures.channels.find((one) => one.channel === form.channel.value);
+  return chosen ?? (view.scale < 1 && step() > 1 ? channelAt(0, 0) : null);
+};
 // Of a mosaic, a profile takes the pixels of one channel.
 const step = () => (figures.channels.length > 1 ? 2 : 1);
 /** @param {number} row @param {number} col */
@@ -91,13 +100,14 @@ function draw() {
   const brush = brushOf(canvas);
   const picture = brush.createImageData(canvas.width, canvas.height);
   const saturation = Math.ceil(figures.saturation_dn);
-  const coarse = view.scale < 1 ? step() : 1; // reduced, one channel of the mosaic is seen
+  const channel = drawnChannel();
+  /** The pixel of the drawn channel in the mosaic's period of a pixel.
+   * @param {number} at @param {number} first */
+  const nearest = (at, first) => (channel ? Math.floor(at / step()) * step() + first : at);
   for (let y = 0, n = 0; y < canvas.height; y++) {
-    let row = Math.floor(view.top + y / view.scale);
-    row -= row % coarse;
+    const row = nearest(Math.floor(view.top + y / view.scale), channel?.row ?? 0);
     for (let x = 0; x < canvas.width; x++, n += 4) {
-      let col = Math.floor(view.left + x / view.scale);
-      col -= col % coarse;
+      const col = nearest(Math.floor(view.left + x / view.scale), channel?.col ?? 0);
       if (row < 0 || col < 0 || row >= raw.rows || col >= raw.cols) continue;
       const full = !other && raw.codes[row * raw.cols + col] >= saturation;
       const [red, green, blue] = full ? SATURATED : colourOf(at(row, col), low, high);
@@ -126,10 +136,13 @@ function draw() {
 }
 
 function readout() {
-  const where = `column ${cross.col}, row ${cross.row}`;
+  const where = `column ${cross.col}, row ${cross.row}${step() > 1 ? `, ${channelAt(cross.row, cross.col).channel}` : ""}`;
+  const channel = drawnChannel();
+  const picture = [view.scale >= 1 ? "" : `shown at ${number(view.scale, 2)}`, channel && step() > 1 ? `picture of channel ${channel.channel}` : ""];
+  const shownAs = picture.filter(Boolean).map((words) => `, ${words}`).join("");
   const code = raw.codes[cross.row * raw.cols + cross.col];
-  if (other) return `${where}: ${code} DN less ${code - at(cross.row, cross.col)} DN is ${at(cross.row, cross.col)} DN`;
-  return `${where}: ${code} DN${code >= figures.saturation_dn ? ", saturated" : ""}${view.scale >= 1 ? "" : `, shown at ${number(view.scale, 2)}`}`;
+  if (other) return `${where}: ${code} DN less ${code - at(cross.row, cross.col)} DN is ${at(cross.row, cross.col)} DN${shownAs}`;
+  return `${where}: ${code} DN${code >= figures.saturation_dn ? ", saturated" : ""}${shownAs}`;
 }
 
 // The values along the row, the column, or the line from the mark to the cross.
@@ -151,6 +164,9 @@ function profile() {
   return points;
 }
 
+// A line begins at the mark.
+const profiled = () => (form.along.value === "line" ? channelAt(marked?.row ?? 0, marked?.col ?? 0) : channelAt(cross.row, cross.col));
+
 function drawProfile() {
   const along = /** @type {"row" | "column" | "line"} */ (form.along.value);
   const points = profile();
@@ -160,7 +176,7 @@ function drawProfile() {
   const most = points.reduce((so, [, value]) => Math.max(so, value), -Infinity);
   const title = `Profile along ${name}: ${points.length} pixels, at most ${most} DN`;
   const label = { row: "column", column: "row", line: "distance, px" }[along];
-  const caption = element("figcaption", { textContent: `${title}${step() > 1 ? ", of one channel" : ""}${along === "line" && !marked ? "; mark where it begins" : ""}` });
+  const caption = element("figcaption", { textContent: `${title}${step() > 1 ? `, of channel ${profiled().channel}` : ""}${along === "line" && !marked ? "; mark where it begins" : ""}` });
   $("inspect-profile").replaceChildren(chart({ title, series, x: { label }, y: { label: other ? "difference, DN" : "DN" } }), caption);
 }
 
@@ -241,12 +257,24 @@ $("inspect-fit").addEventListener("click", () => fit());
 $("inspect-mark").addEventListener("click", mark);
 $("inspect-auto").addEventListener("click", () => (auto(), draw()));
 $("inspect-form").addEventListener("submit", (event) => event.preventDefault());
-for (const field of [form.low, form.high, form.along]) field.addEventListener("change", () => here && draw());
+for (const field of [form.low, form.high, form.along, form.channel]) field.addEventListener("change", () => here && draw());
 form.minus.addEventListener("change", told("view-problem", async () => {
   await less(form.minus.value);
   auto();
   draw();
 }));
+
+/** Frames that may be taken away from the one that stands there: their names by id.
+ * @type {Map<string, string>} */
+let names = new Map();
+
+// Those frames of which the search knows every word, and the one that is chosen.
+function showOthers() {
+  const words = form.find.value.toLowerCase().split(/\s+/);
+  const found = [...names].filter(([id, name]) => id === form.minus.value || words.every((word) => name.toLowerCase().includes(word)));
+  options(form.minus, ["", ...found.map(([id]) => id)], (value) => names.get(value) ?? "none");
+}
+form.find.addEventListener("input", showOthers);
 
 /** Takes another frame away from this one; "" none.
  * @param {string} id */
@@ -281,9 +309,11 @@ async function showFrame(first, kind, id, number_) {
   raw = found;
   here = true;
   const frames = new Map(others.filter((one) => one.document.frame !== capture.document.frame).map((one) => [one.document.frame, one]));
-  const named = new Map([...frames.values()].map((one) => [String(one.id), `${one.name}${exposure(one.exposure_s)}`]));
-  options(form.minus, ["", ...named.keys()], (value) => named.get(value) ?? "none");
-  form.minus.value = "";
+  names = new Map([...frames.values()].map((one) => [String(one.id), `${one.name}${exposure(one.exposure_s)}`]));
+  form.find.value = form.minus.value = "";
+  showOthers();
+  options(form.channel, ["", ...(step() > 1 ? figures.channels.map((one) => one.channel) : [])], (value) => value || (step() > 1 ? "all" : figures.channels[0].channel));
+  form.channel.value = "";
   await less("");
   drawChannels("inspect-figures", figures);
   canvas.width = Math.max(280, canvas.clientWidth);

@@ -94,7 +94,7 @@ function showWork(one, job) {
  * @param {Detail} one @param {Model<"Job">[]} jobs */
 function reportOf(one, jobs) {
   const job = jobs.find((made) => made.state === "done" && ["report", "pipeline"].includes(made.kind));
-  return job ? named("a", "Report", `of ${one.name || one.id}`, { href: `${api}/jobs/${job.id}/report`, target: "_blank", rel: "noopener" }) : null;
+  return job ? named("a", "Open report", `of ${one.name || one.id}`, { href: `${api}/jobs/${job.id}/report`, target: "_blank", rel: "noopener" }) : null;
 }
 
 /** @type {Record<Source["kind"], Model<"JobStart">["kind"][]>} */

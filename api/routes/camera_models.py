@@ -17,7 +17,7 @@ from api.security import REPORT_POLICY
 from api.sending import BODY, arrived
 from api.service import CALIBRATE, READ, Here, HexId, Service, camera_model
 from api.upload import take_cameras
-from lab.calibration import camera_models
+from lab.calibration import camera_models, life
 from lab.calibration.camera_models import CameraModelRecord
 from lab.errors import InputError
 from lab.fit.compare import FailRule, compare, failures
@@ -151,6 +151,17 @@ def _fit(service: Service, what: str, id: str) -> FitResult:
     return FitResult.model_validate(found.document)
 
 
+def _name_of(service: Service, id: str) -> str:
+    """What the source of a fit is called, where it has a name, with its time and id."""
+    with contextlib.suppress(InputError):
+        found = life.calibration(service.store, id)
+        return f"{found.name}, fitted {found.created:%Y-%m-%d %H:%M} UTC ({id})"
+    with contextlib.suppress(InputError):
+        session = service.store.session(id)
+        return f"{session.name or id}, the newest fit ({id})"
+    return id
+
+
 def _compared(service: Service, a: str, b: str) -> ComparisonResult:
     return compare(_fit(service, "a", a), _fit(service, "b", b)).model_copy(update={"a": a, "b": b})
 
@@ -185,5 +196,6 @@ def compare_calibrations(
 @router.get("/comparisons/page", dependencies=[READ], response_class=HTMLResponse, responses=answers(401, 404, 422))
 def comparison_page(service: Here, a: Source, b: Source) -> HTMLResponse:
     """The comparison with its pictures, one page that needs no network, as `calibench compare --report` writes it."""
-    page = render_comparison(_compared(service, a, b))
+    names = {"a": _name_of(service, a), "b": _name_of(service, b)}
+    page = render_comparison(_compared(service, a, b).model_copy(update=names))
     return HTMLResponse(service.public.within(page), headers={"Content-Security-Policy": REPORT_POLICY})

@@ -14,7 +14,7 @@ from api.archives import ARCHIVE, Form, Packed
 from api.errors import answers
 from api.frames import FOR_EVER, Npy, Picture, Stretch, Width, npy_of, picture_of
 from api.kept_sets import sent_set
-from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers, page_of
+from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, WordsOfName, page_headers, page_of
 from api.preview import Form as PictureForm
 from api.schemas import CaptureCount, CaptureKind, RecordedCapture, Recordings, RecordingsDetail, SentAs
 from api.sending import BODY, arrived
@@ -173,13 +173,19 @@ def list_recorded_captures(
     kind: Annotated[CaptureKind | None, Query(description="only of this kind")] = None,
     side: Annotated[Side | None, Query(description="only of this camera")] = None,
     order: Annotated[Literal["oldest", "newest"], Query(description="the manifest's first, or its last")] = "oldest",
+    search: WordsOfName = "",
     after: NumberCursor = None,
     limit: Limit = PAGE,
 ) -> list[RecordedCapture]:
     """The captures of a recording set, numbered from 1 in the manifest's order, in pages."""
     service.recordings(recordings_id)
     every = enumerate(service.pictures.recordings(recordings_id).captures(), start=1)
-    found = [(n, one) for n, one in every if kind in (None, one.kind) and side in (None, one.side)]
+    words = search.lower().split()
+    found = [
+        (n, one)
+        for n, one in every
+        if kind in (None, one.kind) and side in (None, one.side) and all(word in one.id.lower() for word in words)
+    ]
     if order == "newest":
         found.reverse()
     page = [(n, one) for n, one in found if after is None or (n < after if order == "newest" else n > after)][:limit]

@@ -17,7 +17,7 @@ from api.events import described, event, stream, watched
 from api.frames import FOR_EVER, Npy, Picture, Stretch, Width, npy_of, picture_of
 from api.kept_sets import session_set
 from api.keys import Permission, StoredKey
-from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers
+from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, WordsOfName, page_headers
 from api.preview import Form as PictureForm
 from api.schemas import (
     CaptureCount,
@@ -394,6 +394,7 @@ def list_captures(
     kind: Annotated[CaptureKind | None, Query(description="only of this kind")] = None,
     side: Annotated[Side | None, Query(description="only of this camera")] = None,
     order: Annotated[Literal["oldest", "newest"], Query(description="which come first")] = "oldest",
+    search: WordsOfName = "",
     after: NumberCursor = None,
     limit: Limit = PAGE,
 ) -> list[StoredCapture]:
@@ -401,12 +402,18 @@ def list_captures(
     found = known(
         missing_session(session_id),
         lambda: service.store.captures(
-            session_id, kind=kind, side=side, after=after, newest_first=order == "newest", limit=limit
+            session_id,
+            kind=kind,
+            side=side,
+            search=search,
+            after=after,
+            newest_first=order == "newest",
+            limit=limit,
         ),
     )
     total = sum(
         n
-        for of, n in service.store.count_captures(session_id).items()
+        for of, n in service.store.count_captures(session_id, search).items()
         if kind in (None, of[0]) and side in (None, of[1])
     )
     page_headers(request, response, total, limit, [str(info.id) for info in found])

@@ -34,7 +34,7 @@ from lab.capture.station import Station
 from lab.capture.store import Store
 from lab.capture.tables import CalibrationRow, FigureRow, ResultRow, SessionRow
 from lab.errors import InputError
-from lab.fit.compare import FALSE_ALARM_RATE, Numbers, sidak_part, sigma_of_probability
+from lab.fit.compare import FALSE_ALARM_RATE, MATRIX_PLACES, Numbers, sidak_part, sigma_of_probability
 from lab.fit.noise.dark_current import SensorTemperature
 from lab.formats.recording_set import InstrumentSnapshot, Snapshots, differences
 from lab.formats.results import FitResult
@@ -122,10 +122,15 @@ class BoardCell(Frozen):
     drifted: bool
 
 
+BoardGroup = Literal["key", "mtf", "other"]
+
+
 class BoardRow(Frozen):
     """A figure over the board's calibrations; a cell is None where one doesn't have it. `reference_c`: the temperature
-    to which its values are corrected, by the `law`; None where no law is known."""
+    to which its values are corrected, by the `law`; None where no law is known. `group`: a key figure of the camera,
+    one of the many of its edges' MTFs, or another."""
 
+    group: BoardGroup = "other"
     figure: str
     place: str
     title: str
@@ -137,7 +142,8 @@ class BoardRow(Frozen):
 
 
 class DriftBoard(Frozen):
-    """All figures of a camera by its newest calibrations, the oldest first."""
+    """All figures of a camera by its newest calibrations, the oldest first; key figures are the first rows, those of
+    MTFs the last."""
 
     camera: str
     false_alarm_rate: float
@@ -372,9 +378,13 @@ def _figure(row: Any) -> Figure:
     return Figure(name=row.name, side=row.side, place=row.place, value=row.value, std=row.std, sensor=sensor)
 
 
+#: Earlier versions registered a camera matrix's constants, too.
+_FITTED = sa.or_(FigureRow.name.not_like("%camera_matrix"), FigureRow.place.in_(MATRIX_PLACES))
+
+
 def figures(store: Store, calibration_id: str) -> tuple[Figure, ...]:
     """Return the figures of a calibration."""
-    asked = sa.select(FigureRow).where(FigureRow.calibration_id == calibration_id).order_by(FigureRow.id)
+    asked = sa.select(FigureRow).where(FigureRow.calibration_id == calibration_id, _FITTED).order_by(FigureRow.id)
     with store.reading() as db:
         return tuple(_figure(row) for row in db.scalars(asked))
 
@@ -382,7 +392,7 @@ def figures(store: Store, calibration_id: str) -> tuple[Figure, ...]:
 def figure_names(store: Store) -> list[tuple[str, str, str]]:
     """(camera, figure, place) of every history."""
     register(store)
-    asked = sa.select(FigureRow.camera, FigureRow.name, FigureRow.place).distinct()
+    asked = sa.select(FigureRow.camera, FigureRow.name, FigureRow.place).where(_FITTED).distinct()
     with store.reading() as db:
         return [(camera, name, place) for camera, name, place in sorted(db.execute(asked))]
 
@@ -604,7 +614,7 @@ def drift_board(
     with store.reading() as db:
         asked = sa.select(*FigureRow.__table__.columns, CalibrationRow.session_id, *_LIFE)
         asked = asked.join(CalibrationRow, CalibrationRow.id == FigureRow.calibration_id)
-        asked = asked.where(FigureRow.camera == camera, FigureRow.calibration_id.in_(ids))
+        asked = asked.where(FigureRow.camera == camera, FigureRow.calibration_id.in_(ids), _FITTED)
         rows: dict[tuple[str, str], list[Any]] = {}
         for row in db.execute(asked.order_by(CalibrationRow.created, CalibrationRow.id, FigureRow.id)):
             rows.setdefault((row.name, row.place), []).append(row)
@@ -629,8 +639,23 @@ def drift_board(
             )
             for one, name in columns
         ),
-        rows=tuple(_board_row(of, ids, limits, reference_c, false_alarm_rate) for of in rows.values()),
+        rows=tuple(
+            _board_row(rows[name, place], ids, limits, reference_c, false_alarm_rate)
+            for name, place in sorted(rows, key=lambda of: _board_order(of[0]))
+        ),
     )
+
+
+def _board_group(figure: str) -> BoardGroup:
+    if figure.startswith("mtf "):
+        return "mtf"
+    return "key" if any(fnmatchcase(figure, name) for name in DRAFTED) else "other"
+
+
+def _board_order(figure: str) -> tuple[int, int]:
+    """Return where a figure stands on the board: by its group, and key figures as limits of them are drafted."""
+    at = next((n for n, name in enumerate(DRAFTED) if fnmatchcase(figure, name)), len(DRAFTED))
+    return ("key", "other", "mtf").index(group := _board_group(figure)), at if group == "key" else 0
 
 
 def _board_columns(store: Store, camera: str, newest: int) -> list[tuple[CalibrationRow, str]]:
@@ -663,6 +688,7 @@ def _board_row(
         for row, point in zip(rows, _points(rows, limit, threshold), strict=True)
     }
     return BoardRow(
+        group=_board_group(one.name),
         figure=one.name,
         place=one.place,
         title=plain_name(one.name, one.place),

@@ -525,13 +525,15 @@ class Store:
         *,
         kind: str | None = None,
         side: str | None = None,
+        search: str = "",
         after: int | None = None,
         newest_first: bool = False,
         limit: int | None = None,
     ) -> list[CaptureInfo]:
         """Return the captures of a session in the order in which they were taken, or the newest first: of one kind and
-        side, or all; `limit` at most, those that follow the capture of the id `after` in this order."""
-        asked = _captures_of(sa.select(CaptureRow), session_id, kind, side)
+        side, or all; those whose name has each word of `search`; `limit` at most, those that follow the capture of the
+        id `after` in this order."""
+        asked = _captures_of(sa.select(CaptureRow), session_id, kind, side, search)
         if after is not None:
             asked = asked.where(CaptureRow.id < after if newest_first else CaptureRow.id > after)
         asked = asked.order_by(CaptureRow.id.desc() if newest_first else CaptureRow.id).limit(limit)
@@ -539,11 +541,11 @@ class Store:
             self._row(db, session_id)
             return [CaptureInfo.model_validate(row) for row in db.scalars(asked)]
 
-    def count_captures(self, session_id: str) -> dict[tuple[str, str], int]:
-        """(kind, side) -> how many captures a session has of them."""
+    def count_captures(self, session_id: str, search: str = "") -> dict[tuple[str, str], int]:
+        """(kind, side) -> how many captures a session has of them whose name has each word of `search`."""
         asked = sa.select(CaptureRow.kind, CaptureRow.side, sa.func.count()).group_by(CaptureRow.kind, CaptureRow.side)
         with self.reading() as db:
-            return {(kind, side): n for kind, side, n in db.execute(_captures_of(asked, session_id))}
+            return {(kind, side): n for kind, side, n in db.execute(_captures_of(asked, session_id, search=search))}
 
     def capture(self, capture_id: int) -> CaptureInfo:
         """One capture by its id in the registry."""
@@ -742,8 +744,12 @@ def _searched(asked: Any, search: str, only: Sequence[str] | None) -> Any:
     return asked if only is None else asked.where(SessionRow.id.in_(only))
 
 
-def _captures_of(asked: Any, session_id: str, kind: str | None = None, side: str | None = None) -> Any:
-    """Return a query of captures, confined to a session, a kind and a side."""
+def _captures_of(
+    asked: Any, session_id: str, kind: str | None = None, side: str | None = None, search: str = ""
+) -> Any:
+    """Return a query of captures, confined to a session, a kind, a side and the words of a search."""
+    for word in search.split():
+        asked = asked.where(CaptureRow.name.icontains(word, autoescape=True))
     for column, wanted in ((CaptureRow.session_id, session_id), (CaptureRow.kind, kind), (CaptureRow.side, side)):
         if wanted is not None:
             asked = asked.where(column == wanted)

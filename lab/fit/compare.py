@@ -72,6 +72,8 @@ NOT_COMPARED_FIELDS = {(MtfCurve, "angle_deg")} | {
 #: bend of the response in it.
 LAMP_DRIFT_PERCENT = {"response_bend_percent": 0.1, "linearity_error_percent": 0.1, "brighter_fatter_percent": 0.3}
 INTEGRAL = "integrated_efficiency_nm"
+#: The numbers of a camera matrix that are fitted, and where they stand in it (row, column).
+MATRIX_PLACES = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 AXES = ("wavelength_nm", "frequency_cy_per_px", "radius_px")
 
 #: The name of the difference of two projections, in px, beside the figures of the fits.
@@ -206,6 +208,8 @@ def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
     axis = np.array(getattr(model, axis_name), dtype=float) if axis_name else None
     for field in type(model).model_fields:
         value, std = getattr(model, field), getattr(model, f"{field}_std", None)
+        if field == "camera_matrix" and std is not None:  # its other numbers are constants
+            value, std = ([of[row][col] for row, col in MATRIX_PLACES.values()] for of in (value, std))
         name = f"{prefix}{field}"
         if field == "distortion" and isinstance(model, GeometryFit) and model.lens_projection != "pinhole":
             # Coefficients of another projection mean another thing; so does a spline that ends at another angle
@@ -346,7 +350,7 @@ def place_of(numbers: Numbers, at: int) -> str:
     if numbers.value.size == 1:
         return ""
     if numbers.name.endswith("camera_matrix"):
-        return {0: "fx", 4: "fy", 2: "cx", 5: "cy"}.get(at, str(at))
+        return list(MATRIX_PLACES)[at]
     if numbers.name.endswith("distortion"):
         return _projection_of(numbers.name).coefficients[at]
     if numbers.name.endswith("translation_mm"):

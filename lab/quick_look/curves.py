@@ -18,7 +18,7 @@ from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.measure.edges import measure_edge
 from sim.camera import Side
 from sim.parameters import Frozen
-from sim.sensor.mosaic import planes
+from sim.sensor.mosaic import first_pixels, planes
 
 # --- A frame at a glance: histogram, mean and share of saturated pixels of each channel of the mosaic -----------------
 
@@ -27,10 +27,12 @@ BINS = 64
 
 
 class ChannelFigures(Frozen):
-    """One channel of a frame. `counts`: pixels in each of the equal bins between 0 and the saturation;
-    `saturated_share`: of its pixels, those at or above the data sheet's white level."""
+    """One channel of a frame. `row`, `col`: of its first pixel. `counts`: pixels in each of the equal bins between 0 and
+    the saturation; `saturated_share`: of its pixels, those at or above the data sheet's white level."""
 
     channel: str
+    row: int
+    col: int
     mean_dn: float
     saturated_share: float
     counts: tuple[int, ...]
@@ -50,12 +52,15 @@ def frame_figures(frame: NDArray[np.uint16], camera: DataSheet) -> FrameFigures:
     top = camera.saturation_dn
     bin_dn = (top + 1.0) / BINS
     found = []
+    firsts = first_pixels(camera.cfa)
     for name, plane in planes(frame, camera.cfa).items():
         codes = np.bincount(plane.ravel(), minlength=int(top) + 1)
         at = np.minimum((np.arange(codes.size) / bin_dn).astype(int), BINS - 1)
         found.append(
             ChannelFigures(
                 channel=name,
+                row=firsts[name][0],
+                col=firsts[name][1],
                 mean_dn=float(codes @ np.arange(codes.size) / plane.size),
                 saturated_share=float(codes[int(np.ceil(top)) :].sum() / plane.size),
                 counts=tuple(np.bincount(at, codes, BINS).astype(int).tolist()),

@@ -79,19 +79,21 @@ def render_comparison(comparison: ComparisonResult) -> str:
     """Return the page as HTML text."""
     number = sum(row.changed for row in comparison.changes) + sum(item.changed for item in comparison.projection)
     total = len(comparison.changes) + len(comparison.projection)
+    rows = [
+        {
+            "change": row,
+            "a": measured(row.a, row.a_std),
+            "b": measured(row.b, row.b_std),
+            "difference": measured(row.difference, row.difference_std, row.unit),
+        }
+        for row in sorted(comparison.changes, key=lambda row: -row.significance_sigma)
+    ]
     context: dict[str, Any] = {
         "version": metadata.version("calibench"),
         "comparison": comparison,
         "headline": f"{number} of {total} changed" if number else f"None of {total} changed",
-        "rows": [
-            {
-                "change": row,
-                "a": measured(row.a, row.a_std),
-                "b": measured(row.b, row.b_std),
-                "difference": measured(row.difference, row.difference_std, row.unit),
-            }
-            for row in sorted(comparison.changes, key=lambda row: -row.significance_sigma)
-        ],
+        "changed": [row for row in rows if row["change"].changed],
+        "unchanged": [row for row in rows if not row["change"].changed],
         "significances": significances(comparison),
         "shown": min(SHOWN, len(comparison.changes)),
         "projections": [(item, projection_vectors(item)) for item in comparison.projection],

@@ -39,14 +39,19 @@ def phases(cfa: Cfa) -> dict[str, list[tuple[int, int]]]:
     }
 
 
+def first_pixels(cfa: Cfa) -> dict[str, tuple[int, int]]:
+    """Return where the first pixel (row, column) of each plane of a mosaic is, by the names that `planes` has."""
+    if cfa == "MONO":
+        return {"Y": (0, 0)}
+    at = phases(cfa)
+    return {"R": at["R"][0], "G1": at["G"][0], "G2": at["G"][1], "B": at["B"][0]}
+
+
 def planes(frame: NDArray[Scalar], cfa: Cfa) -> dict[str, NDArray[Scalar]]:
     """Return the mosaic taken apart, as views of `frame` (..., rows, cols): `R`, `G1` (green on red rows), `G2` (green
     on blue rows), `B`; or `Y` of a MONO sensor."""
-    if cfa == "MONO":
-        return {"Y": frame}
-    at = phases(cfa)
-    where = {"R": at["R"][0], "G1": at["G"][0], "G2": at["G"][1], "B": at["B"][0]}
-    return {name: frame[..., row::2, col::2] for name, (row, col) in where.items()}
+    period = step(cfa)
+    return {name: frame[..., row::period, col::period] for name, (row, col) in first_pixels(cfa).items()}
 
 
 def assemble(channels: Mapping[str, NDArray[Scalar]], cfa: Cfa) -> NDArray[Scalar]:

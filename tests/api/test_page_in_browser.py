@@ -25,6 +25,7 @@ from lab.capture.station import Drivers, Station, read_station
 from lab.formats.camera_file import CameraFile, default_camera, write_camera
 from lab.formats.recording_set import packed
 from lab.pipeline import PipelineProgress, PipelineRequest, Step
+from sim.sensor.mosaic import first_pixels
 from tests.api.conftest import STATION, Running, serving, until_state
 from tests.api.routes.test_confirm import PERSON, begun, confirm
 from tests.api.routes.test_findings import diagnosis
@@ -34,7 +35,7 @@ from tests.peers import missing
 
 pytestmark = pytest.mark.extra  # drives a browser
 
-PHONE, TABLET, DESK, WIDE = ({"width": wide, "height": 860} for wide in (420, 768, 1280, 1440))
+PHONE, TABLET, DESK, WIDE = ({"width": wide, "height": 860} for wide in (390, 768, 1280, 1600))
 READ_NOISE_E = (2.0, 2.01, 2.15)
 LIMITS = 'valid_days = 90\n[[limit]]\nfigure = "noise read_noise_e"\ngood = [1.9, 2.05]\nwarn = [1.8, 2.2]\n'
 PATIENCE_MS = 60_000.0
@@ -51,6 +52,8 @@ REFRESH = """async () => (await import("/static/page.js")).tellHalts(await (awai
 #: Has nothing follow the sessions that are started: a pipeline by default.
 NOTHING_FOLLOWS = """() => { const then = document.querySelector("#start-form select[name=then]");
     window.followed = then.value; then.value = ""; then.dispatchEvent(new Event("change", {bubbles: true})) }"""
+#: Where the planes of the fakes' frames begin, by channel.
+FIRSTS = first_pixels("RGGB")
 #: The views by their addresses, and what stands in each when it is complete. Words in capitals: ids.
 VIEWS = {
     "/": "#plan-words:has-text('3 sequences')",
@@ -249,6 +252,9 @@ def test_every_view_is_accessible_and_fits(
         assert watched.can_halt(), address
         assert watched.page.inner_text("#view-problem") == "", address
     assert found == {}
+    ends = "[...document.querySelectorAll('#nav a')].map((one) => one.getBoundingClientRect().right)"
+    assert max(watched.page.evaluate(ends)) <= viewport["width"]  # no entry of the menu is cut
+    assert watched.focused()["outline"].startswith("none"), "a heading that is gone to is no control"
     watched.go("/drift", "#drift-rows .cell.drifted")
     watched.page.click("#drift-rows tr:has-text('read noise') button")
     watched.page.wait_for_selector("#history .point")
@@ -461,6 +467,14 @@ def test_a_figure_of_the_drift_board_has_its_history(browser: Any, lab: Running)
     names = page.locator("#drift-rows th").all_inner_texts()
     assert any("temporal dark noise (read noise)" in name and name.endswith(" e") for name in names)
     assert "\u25c6" in page.inner_text("#drift-rows .cell.drifted")
+    # The many figures of the edges are folded, until they are asked for.
+    shown = page.locator("#drift-rows tr:has-text('MTF50')")
+    assert shown.count() == 0
+    page.click("#drift-rows .fold button:has-text('MTF by edge and channel')")
+    assert shown.count() > 0
+    assert watched.focused()["text"].startswith("MTF by edge")
+    page.keyboard.press("Enter")
+    assert shown.count() == 0
     page.fill("#drift-form input[name=search]", "mtf50")
     page.wait_for_selector("#drift-rows tr:nth-child(2)", state="detached")
     page.fill("#drift-form input[name=search]", "")
@@ -471,7 +485,9 @@ def test_a_figure_of_the_drift_board_has_its_history(browser: Any, lab: Running)
     page.wait_for_selector("#history .point")
     assert len(page.query_selector_all("#history .point")) >= 3 and len(page.query_selector_all("#history .band")) == 2
     assert len(page.query_selector_all("#history path")) == 1  # the drift has a shape of its own
-    assert "1 drifted" in page.inner_text("#history-words")
+    assert "1 drifted" in page.inner_text("#history-words") and " UTC, " in page.inner_text("#history-words")
+    times = page.locator("#history text").all_text_contents()
+    assert "fitted (UTC)" in times and sum(bool(re.fullmatch(r"\d\d-\d\d \d\d:\d\d", one)) for one in times) >= 3
     watched.close()
 
 
@@ -488,23 +504,54 @@ def test_a_frame_is_inspected(browser: Any, lab: Running, ids: dict[str, str]) -
     watched.go(f"/sessions/{ids['SESSION']}/frames/{first}", "#inspect-readout:has-text('DN')")
     rows, cols = frames[0].shape
     row, col = rows // 2, cols // 2
-    assert page.inner_text("#inspect-readout").startswith(f"column {col}, row {row}: {frames[0][row, col]} DN")
+
+    def channel(row: int, col: int) -> str:
+        return next(name for name, at in FIRSTS.items() if at == (row % 2, col % 2))
+
+    at = f"column {col}, row {row}, {channel(row, col)}: {frames[0][row, col]} DN"
+    assert page.inner_text("#inspect-readout").startswith(at)
     page.focus("#inspect-canvas")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowDown")
-    assert f"column {col + 1}, row {row + 1}: {frames[0][row + 1, col + 1]} DN" in page.inner_text("#inspect-readout")
+    at = f"column {col + 1}, row {row + 1}, {channel(row + 1, col + 1)}: {frames[0][row + 1, col + 1]} DN"
+    assert page.inner_text("#inspect-readout").startswith(at)
     along = frames[0][row + 1, (col + 1) % 2 :: 2]  # of one channel
-    assert f"{along.size} pixels, at most {along.max()} DN" in page.inner_text("#inspect-profile")
+    profile = page.inner_text("#inspect-profile")
+    assert f"{along.size} pixels, at most {along.max()} DN, of channel {channel(row + 1, col + 1)}" in profile
+    pictures = set()
+    for name in ("", *FIRSTS):  # the mosaic, and each channel alone
+        page.select_option("#inspect-form select[name=channel]", name)
+        pictures.add(page.evaluate("document.getElementById('inspect-canvas').toDataURL()"))
+        assert (f"picture of channel {name}" in page.inner_text("#inspect-readout")) == bool(name)
+    assert len(pictures) == 5
+    page.select_option("#inspect-form select[name=channel]", "")
     page.keyboard.press("m")
     page.keyboard.press("Shift+ArrowLeft")
     assert "Profile along the line" in page.inner_text("#inspect-profile")
     before = page.evaluate("document.getElementById('inspect-canvas').toDataURL()")
     page.keyboard.press("+")
     assert page.evaluate("document.getElementById('inspect-canvas').toDataURL()") != before
+    others = page.locator("#inspect-form select[name=minus] option")
+    many = others.count()
+    page.fill("#inspect-form input[name=find]", captures[1]["name"].upper())
+    assert 2 <= others.count() < many
     page.select_option("#inspect-form select[name=minus]", str(second))
     difference = (frames[0] - frames[1])[row + 1, col + 1 - 10]
     page.wait_for_selector(f"#inspect-readout:has-text('is {difference} DN')")
     assert watched.faults() == []
+    watched.go(f"/sessions/{ids['SESSION']}/frames", "#captures img")
+    page.fill("#capture-filter input[name=search]", captures[1]["name"].upper())
+    page.press("#capture-filter input[name=search]", "Enter")
+    with lab.client() as client:
+        found = client.get(f"/api/v1/sessions/{ids['SESSION']}/captures", params={"search": captures[1]["name"]})
+        (sent,) = client.get("/api/v1/recordings").json()[-1:]
+        same = client.get(f"/api/v1/recordings/{sent['id']}/captures", params={"search": captures[1]["name"].upper()})
+    number = int(found.headers["X-Total-Count"])
+    assert 1 <= number < many and [one["name"] for one in same.json()] == [one["name"] for one in found.json()]
+    page.wait_for_selector(f"#capture-count:has-text('{number} captures; ')")
+    page.fill("#capture-filter input[name=search]", "no_such%name")
+    page.press("#capture-filter input[name=search]", "Enter")
+    page.wait_for_selector("#capture-count:has-text('No matching frames.')")
     watched.close()
 
 
@@ -649,7 +696,7 @@ def test_the_steps_of_an_analysis_are_followed_to_its_report(
     page.wait_for_selector("#session-steps .done:has-text('report')")
     assert page.is_visible("#panel-live") and page.is_hidden("#session-bar")
     with page.expect_popup() as opened:
-        page.click("#session-facts a:has-text('Report')")
+        page.click("#session-facts a:has-text('Open report')")
     opened.value.wait_for_selector("h1:has-text('What was found')")
     opened.value.close()
     watched.tab_to("Findings")

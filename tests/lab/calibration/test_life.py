@@ -23,12 +23,12 @@ from lab.capture.plan import CapturePlan
 from lab.capture.records import RunRecord, now
 from lab.capture.session import CaptureSession
 from lab.capture.store import Store
-from lab.capture.tables import Base, CalibrationRow, ResultRow
+from lab.capture.tables import Base, CalibrationRow, FigureRow, ResultRow
 from lab.capture_kinds.dark import DarkSequence
 from lab.cli import main
 from lab.errors import InputError
 from lab.fit.compare import FALSE_ALARM_RATE, NOT_COMPARED, NOT_COMPARED_FIELDS
-from lab.formats.results import CameraFit, FitResult, MtfCurve, NoiseFit, StereoFit
+from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
 from lab.formats.results.words import NAMES, plain_name, unit_of
 from sim.parameters import Frozen
 from tests.lab import fake_bench
@@ -37,6 +37,13 @@ DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
 STATION = fake_bench.station()
 SERIALS = {"left": "L1", "right": "R1"}
 STD = 0.01
+GEOMETRY = GeometryFit(
+    camera_matrix=((2003.1, 0, 320.4), (0, 2003.4, 239.1), (0, 0, 1)),
+    camera_matrix_std=((0.4, 0, 0.5), (0, 0.4, 0.5), (0, 0, 0)),
+    distortion=(-0.11, 0.08, 0.0, 0.0, 0.0),
+    distortion_std=(0.001, 0.004, 1e-5, 1e-5, 0.01),
+    rms_px=0.09,
+)
 
 
 def fitted(read_noise_e: float, std: float = STD) -> FitResult:
@@ -345,6 +352,31 @@ def test_a_revoked_certificate_is_no_reference(store: Store) -> None:
     calibrated(store, 2.0)
     points = life.history(store, "m c L1", "noise read_noise_e").points
     assert [point.reference_id for point in points] == [None, first, first] and not points[2].drifted
+
+
+def test_key_figures_are_the_first_rows_of_a_board_and_constants_are_none(store: Store) -> None:
+    """Of a camera matrix, the focal lengths and the principal point; also of calibrations that an earlier version
+    registered with the matrix's constants."""
+    id = calibrated(store, 2.0)
+    with store.transaction() as db:
+        row = db.get_one(ResultRow, id)
+        fit = FitResult.model_validate(row.document)
+        left = fit.cameras["left"].model_copy(update={"geometry": GEOMETRY})
+        row.document = fit.model_copy(update={"cameras": {"left": left}}).model_dump(mode="json")
+    board = life.drift_board(store, "m c L1")
+    matrix = [(row.place, row.title) for row in board.rows if row.figure == "geometry camera_matrix"]
+    assert [place for place, _ in matrix] == ["fx", "fy", "cx", "cy"] and matrix[0][1] == "focal length x"
+    groups = [row.group for row in board.rows]
+    assert groups == sorted(groups, key=("key", "other", "mtf").index) and set(groups) == {"key", "other", "mtf"}
+    assert all((row.group == "mtf") == row.figure.startswith("mtf ") for row in board.rows)
+    assert {"noise read_noise_e", "geometry camera_matrix"} <= {row.figure for row in board.rows if row.group == "key"}
+    with store.transaction() as db:
+        old = db.scalars(sa.select(FigureRow).where(FigureRow.place == "fx")).one()
+        of = {"calibration_id": id, "camera": old.camera, "name": old.name, "side": old.side}
+        db.add(FigureRow(**of, place="8", value=1.0, std=0.0))
+    assert life.drift_board(store, "m c L1") == board
+    assert "8" not in {place for _, _, place in life.figure_names(store)}
+    assert "8" not in {figure.place for figure in life.figures(store, id)}
 
 
 def test_a_board_has_every_figure_of_a_camera(store: Store) -> None:

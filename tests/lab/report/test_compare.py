@@ -56,6 +56,16 @@ def test_the_page_says_what_the_result_says() -> None:
     assert len(page.figures) == 2
 
 
+def test_unchanged_rows_are_folded() -> None:
+    page = render_comparison(RESULT)
+    before, folded = page.split("<details>")
+    assert "Changed: 1 of 2" in before and "noise read_noise_e" in before
+    assert "mtf edge-1 mtf" not in before.partition("<h2>Numbers")[2].partition("<script")[0].replace("charts", "")
+    assert "Unchanged: 1 of 2" in folded and 'title="mtf edge-1 mtf"' in folded
+    same = RESULT.model_copy(update={"changes": RESULT.changes[1:]})
+    assert "<h3>Changed" not in render_comparison(same)
+
+
 def test_bars_are_in_order_and_the_limit_is_where_it_is() -> None:
     figure = significances(RESULT)
     assert figure is not None
