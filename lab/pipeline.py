@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from lab.errors import Cancelled, InputError
+from lab.memory import return_freed_memory
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -324,6 +325,9 @@ class _Pipeline:
         for step in self.request.steps:
             self._say(step, "")
             steps[step]()
+            if self._recordings is not None:
+                self._recordings.let_go()  # the next step computes in processes of its own, or reads other frames
+            return_freed_memory()
         return PipelineResult(
             recordings=self.recordings,
             session=self._session,

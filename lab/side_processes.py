@@ -24,6 +24,7 @@ from typing import Any, Generic, TypeVar
 
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
+from lab.memory import return_freed_memory
 from sim.camera import Side
 
 #: What is found of one side. It and the task have to be picklable: functions by their module's name, results by value.
@@ -204,7 +205,7 @@ def serve() -> None:
             to.flush()
 
         while _carried_out(say):
-            pass
+            return_freed_memory()
 
 
 def _carried_out(say: Callable[[Any], None]) -> bool:

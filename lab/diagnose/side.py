@@ -15,6 +15,7 @@ from lab.capture_kinds.base import Equipment
 from lab.diagnose.discovery import Superseded, discover, law_of, superseded, told
 from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.blocks import measurement_model, study_of
 from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
@@ -49,7 +50,9 @@ from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import DiagnosisLists, FitResult, HeldOut, Mismatch
+from lab.formats.results import DiagnosisLists, FitResult, HeldOut, Mismatch, Skipped
+from lab.measure.study import Study
+from lab.memory import return_freed_memory
 from lab.workers import Workers
 from sim.camera import Side
 
@@ -95,6 +98,20 @@ class SideFindings:
     settling: str | None = None
 
 
+def _measure(
+    recordings: RecordingSet, side: Side, fit: FitResult | None, baseline: CameraFile | None
+) -> tuple[Study, MeasurementModel | None, tuple[Skipped, ...]]:
+    """Measure a side and free the frames, as the search looks at none. Returns the study, the measurement model (None
+    where nothing can be measured), and the measurements that the recordings don't determine."""
+    study = study_of(recordings, side, fit, baseline)
+    model, skipped = measurement_model(recordings, side, fit, baseline, study)
+    skipped = (*skipped, *unchecked(recordings, side))
+    for one in (recordings, study.recordings):
+        one.let_go()
+    return_freed_memory()
+    return study, model, skipped
+
+
 def diagnose_side(
     recordings: RecordingSet,
     side: Side,
@@ -112,15 +129,15 @@ def diagnose_side(
     bootstrap takes as long as summarising the recordings."""
     policy = policy or DecisionPolicy()
     report("checking what is stated")
-    stated = recordings.camera(side)
+    given = recordings
     recordings, misstated = misstatements(recordings, side, policy)
     wrong = tuple(one.told(side) for one in misstated)
-    if fit is not None and recordings.camera(side).cfa != stated.cfa:  # its planes were mixed
+    if fit is not None and recordings.camera(side).cfa != given.camera(side).cfa:  # its planes were mixed
         fit = fit.model_copy(update={"cameras": {s: c for s, c in fit.cameras.items() if s != side}})
     report("summarising the recordings")
-    study = study_of(recordings, side, fit, baseline)
-    model, skipped = measurement_model(recordings, side, fit, baseline, study)
-    skipped = (*skipped, *unchecked(recordings, side))
+    if recordings is not given:
+        given.let_go()
+    study, model, skipped = _measure(recordings, side, fit, baseline)
     if model is None:
         return SideFindings(side, DiagnosisLists(skipped=skipped, unexplained=wrong))
     rng = np.random.default_rng(SEED)

@@ -27,8 +27,8 @@ from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
 from sim.spectrum import FloatArray
 
-#: Limits of the caches: covariance entries (160 MB), and predictions.
-CACHED_ENTRIES, CACHED_PREDICTIONS = 2e7, 20000
+#: Limits of the caches: entries of covariances (80 MB, and as much of their factors), and predictions.
+CACHED_ENTRIES, CACHED_PREDICTIONS = 1e7, 20000
 #: Prior standard deviations within which a nuisance parameter is what the camera may have.
 MOST_PRIOR_STD = 3.0
 #: Correlation of a law's error between two channels, and between two conditions, of one measurement.

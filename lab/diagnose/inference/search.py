@@ -19,6 +19,10 @@ from lab.diagnose.inference.score import Changes, Signatures, signatures_of
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect, Effects
 
+#: Most sets whose signatures are kept, 10 MB each in a session of 200 frames: those of the current set and of its
+#: subsets, which are asked for again.
+MOST_SIGNATURES = 8
+
 
 @dataclass(frozen=True)
 class Model:
@@ -86,6 +90,8 @@ class Search:
         """Residual and signatures about a fitted set, its parameters projected out, of the candidates that aren't in
         it."""
         if fit.effects not in self._signatures:
+            if len(self._signatures) >= MOST_SIGNATURES:
+                self._signatures.pop(next(iter(self._signatures)))
             others = [c for c in self.changes if c[0].name not in fit.names]
             self._signatures[fit.effects] = signatures_of(self.model, fit.effects, others, fit.jacobian, fit.tolerated)
         return self._signatures[fit.effects]

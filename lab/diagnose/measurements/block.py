@@ -10,7 +10,7 @@ import importlib
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,10 +62,18 @@ class Measurement:
 @dataclass(frozen=True)
 class Prediction:
     """Predicted mean (n,), and its Jacobian: name of a nuisance parameter -> derivative (n,) per prior standard
-    deviation."""
+    deviation.
+
+    `columns` are the Jacobian, or compute it when it is first asked for: of most sets of effects that a search tries,
+    only the mean is."""
 
     mean: FloatArray
-    jacobian: dict[str, FloatArray]
+    columns: dict[str, FloatArray] | Callable[[], dict[str, FloatArray]]
+
+    @cached_property
+    def jacobian(self) -> dict[str, FloatArray]:
+        """The Jacobian, which is kept."""
+        return self.columns() if callable(self.columns) else self.columns
 
 
 @dataclass(frozen=True)

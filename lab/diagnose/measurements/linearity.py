@@ -175,10 +175,13 @@ def linearity_block(study: Study) -> Block:
         rates = {c: level * np.array([changed[one.name, c] for one in lights]) for c, level in baseline.items()}
         light_dn = levels.of_light_dn(effects, rates)
         lit = light_dn - noise.dark_dn_per_s * exposures
-        jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
-        jacobian |= levels.lines.jacobian(effects)
-        jacobian |= {f"rate:{lamp}:{channel}": 0.05 * lit * mine for (lamp, channel), mine in of_lamp.items()}
-        jacobian |= {name: std * lit * mine for name, (std, mine) in of_reading.items()}
+
+        def jacobian() -> dict[str, FloatArray]:
+            found = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
+            found |= levels.lines.jacobian(effects)
+            found |= {f"rate:{lamp}:{channel}": 0.05 * lit * mine for (lamp, channel), mine in of_lamp.items()}
+            return found | {name: std * lit * mine for name, (std, mine) in of_reading.items()}
+
         return Prediction(light_dn + levels.beside_light_dn(effects), jacobian)
 
     return Block(

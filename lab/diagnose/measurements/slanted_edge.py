@@ -430,14 +430,14 @@ def stopped_edge_block(study: Study) -> Block:
 def _block(measurement: Measurement, parts: list[_Edges]) -> Block:
     """Return the block of edges at one f-number, or at several."""
     sizes = [part.value.size for part in parts]
+    jacobian = {}  # the same for all effects: one for all predictions that are kept
+    for k, part in enumerate(parts):
+        before, after = sum(sizes[:k]), sum(sizes[k + 1 :])
+        for name, column in part.jacobian.items():
+            own = name if measurement is SLANTED_EDGE else f"{measurement.name} {k}: {name}"
+            jacobian[own] = np.pad(column, (before, after))
 
     def predict(effects: Effects) -> Prediction:
-        jacobian = {}
-        for k, part in enumerate(parts):
-            before, after = sum(sizes[:k]), sum(sizes[k + 1 :])
-            for name, column in part.jacobian.items():
-                own = name if measurement is SLANTED_EDGE else f"{measurement.name} {k}: {name}"
-                jacobian[own] = np.pad(column, (before, after))
         return Prediction(np.concatenate([part.predict(effects).ravel() for part in parts]), jacobian)
 
     split = len(REAL_AT)

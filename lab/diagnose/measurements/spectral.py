@@ -289,12 +289,12 @@ def narrowband_block(study: Study) -> Block:
             # effects on the spectrum alone: signals are proportional to the rates
             share = noise.gain * float(study.field.light.mean()) * exposures
             return Prediction(
-                noise.black + noise.dark_dn_per_s * exposures + share * rates, jacobian_of(effects, share)
+                noise.black + noise.dark_dn_per_s * exposures + share * rates, partial(jacobian_of, effects, share)
             )
         lit = whole.rates(effects).reshape(len(every), len(known))[light_of]
         light_dn = levels.of_light_dn(effects, dict(zip(known, lit.T, strict=True)))
         share = (light_dn - noise.dark_dn_per_s * exposures) / np.maximum(rates, 1e-30)
-        return Prediction(light_dn + levels.beside_light_dn(effects), jacobian_of(effects, share))
+        return Prediction(light_dn + levels.beside_light_dn(effects), partial(jacobian_of, effects, share))
 
     return Block(
         measurement=NARROWBAND, reach=25.0, value=value, covariance=covariance,
@@ -453,12 +453,16 @@ def chart_block(study: Study) -> Block:
         lit = read_dn - dark
         offset = study.offset(effects)
         shift = np.array([offset(p.captures[0]) for p in points])
-        jacobian = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
-        jacobian |= {k: v * lit / np.maximum(rates, 1e-30) for k, v in curves.jacobian(effects).items()}
-        jacobian["chart:scale"] = CHART_SCALE_STD * lit
-        jacobian["chart:x"] = CHART_GRADIENT_STD * lit * (col / camera.cols - 0.5) * 2
-        jacobian["chart:y"] = CHART_GRADIENT_STD * lit * (row / camera.rows - 0.5) * 2
-        jacobian |= _row_light(points, model, camera.rows, lit)
+
+        def jacobian() -> dict[str, FloatArray]:
+            found = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
+            found |= {k: v * lit / np.maximum(rates, 1e-30) for k, v in curves.jacobian(effects).items()}
+            found["chart:scale"] = CHART_SCALE_STD * lit
+            found["chart:x"] = CHART_GRADIENT_STD * lit * (col / camera.cols - 0.5) * 2
+            found["chart:y"] = CHART_GRADIENT_STD * lit * (row / camera.rows - 0.5) * 2
+            found |= _row_light(points, model, camera.rows, lit)
+            return found
+
         return Prediction(noise.black + read_dn + shift, jacobian)
 
     return Block(

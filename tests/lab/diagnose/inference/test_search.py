@@ -155,6 +155,16 @@ def test_two_effects_of_different_shapes_are_both_found() -> None:
     assert _best((_Up(size_dn=0.1), _Wave(size_dn=0.05)), 2) == {"up", "wave"}
 
 
+def test_a_search_that_keeps_few_signatures_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = (_Up(size_dn=1.2), _Bend(size_dn=-1.2), _Wave(size_dn=0.05))
+    many, few = (_search(truth, 3) for _ in range(2))
+    best = many.best()
+    monkeypatch.setattr("lab.diagnose.inference.search.MOST_SIGNATURES", 1)
+    assert few.best().effects == best.effects
+    assert few.models() == many.models()
+    assert len(few._signatures) == 1 < len(many._signatures)
+
+
 def test_scores_beside_a_law_that_holds_are_by_the_tolerance_that_it_needs() -> None:
     """A line of 5 DN may be wrong by 0.05 DN, smoothly: with the whole of that, a bend of 0.04 DN beside it scores
     nothing."""
