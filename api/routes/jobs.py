@@ -19,7 +19,7 @@ from api.service import ADMIN, CALIBRATE, HEX_ID, READ, SESSION_ID, Here, HexId,
 from lab.challenge.kept import WORK
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
-from lab.pipeline import STEPS, Goal, Step, source_recordings
+from lab.pipeline import STEPS, Goal, source_recordings
 from lab.resolve import resolve_limits, station_of
 
 router = APIRouter()
@@ -31,12 +31,10 @@ def steps_of(info: JobInfo, *, captures: bool) -> tuple[WorkStep, ...]:
     now = info.message.partition(":")[0]
     # `resolve` is a step of those pipelines that were asked for it, which the job's row doesn't have.
     names = tuple(name for name in names if name != "resolve" or name == now)
-    at = names.index(cast(Step, now)) if now in names else 0
-    if info.state in ("queued", "done"):
-        return tuple(WorkStep(name=name, state="done" if info.state == "done" else "waiting") for name in names)
+    state = "waiting" if info.state == "queued" else info.state
+    at = len(names) if state == "done" else names.index(now) if now in names else 0
     return tuple(
-        WorkStep(name=name, state="done" if n < at else info.state if n == at else "waiting")
-        for n, name in enumerate(names)
+        WorkStep(name=name, state="done" if n < at else state if n == at else "waiting") for n, name in enumerate(names)
     )
 
 

@@ -79,7 +79,7 @@ def render_comparison(comparison: ComparisonResult) -> str:
     """Return the page as HTML text."""
     number = sum(row.changed for row in comparison.changes) + sum(item.changed for item in comparison.projection)
     total = len(comparison.changes) + len(comparison.projection)
-    rows = [
+    rows: list[dict[str, Any]] = [
         {
             "change": row,
             "a": measured(row.a, row.a_std),
