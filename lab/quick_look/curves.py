@@ -27,8 +27,8 @@ BINS = 64
 
 
 class ChannelFigures(Frozen):
-    """One channel of a frame. `row`, `col`: of its first pixel. `counts`: pixels in each of the equal bins between 0 and
-    the saturation; `saturated_share`: of its pixels, those at or above the data sheet's white level."""
+    """One channel of a frame. `row`, `col`: of its first pixel. `counts`: pixels in each of the equal bins between 0
+    and the saturation; `saturated_share`: of its pixels, those at or above the data sheet's white level."""
 
     channel: str
     row: int
