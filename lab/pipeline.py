@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from lab.errors import Cancelled, InputError
-from lab.memory import return_freed_memory
+from sim.memory import return_freed_memory
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

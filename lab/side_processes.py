@@ -24,8 +24,8 @@ from typing import Any, Generic, TypeVar
 
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
-from lab.memory import return_freed_memory
 from sim.camera import Side
+from sim.memory import return_freed_memory
 
 #: What is found of one side. It and the task have to be picklable: functions by their module's name, results by value.
 F = TypeVar("F")

@@ -62,6 +62,7 @@ from sim.frame import (
     scene_light,
     unsteady_source,
 )
+from sim.memory import return_freed_memory
 from sim.scene import Scene, ScreenPattern, UniformField
 from sim.scene.render import Grid, cells, quadrilateral
 from sim.sensor.electrons import sample_from
@@ -381,7 +382,9 @@ class Bench:
                 self._lights[key] = seen, drawn
                 while len(self._lights) > _MOST_CACHED:
                     self._lights.popitem(last=False)
-            return camera, seen, drawn
+        if isinstance(seen, ScreenPattern):
+            return_freed_memory()  # the drawing of a screen takes 200 MB for a moment
+        return camera, seen, drawn
 
     def _camera(self, side: Side, stop: str) -> HiddenCamera:
         """Return a camera with its lens at a stop of `STOPS`."""

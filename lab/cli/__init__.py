@@ -15,7 +15,7 @@ import sys
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-from lab.memory import share_arenas
+from sim.memory import share_arenas
 
 share_arenas()
 

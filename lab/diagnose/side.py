@@ -52,9 +52,9 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisLists, FitResult, HeldOut, Mismatch, Skipped
 from lab.measure.study import Study
-from lab.memory import return_freed_memory
 from lab.workers import Workers
 from sim.camera import Side
+from sim.memory import return_freed_memory
 
 #: Called with the current step in words.
 Report = Callable[[str], None]

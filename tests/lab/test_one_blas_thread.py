@@ -104,7 +104,7 @@ def test_an_edge_is_measured_with_one(monkeypatch: pytest.MonkeyPatch):
 #: Threads that all hold memory at the same time, and then the number of arenas as glibc itself tells it.
 PROGRAM = """
 import ctypes, sys, threading
-from lab.memory import share_arenas
+from sim.memory import share_arenas
 if sys.argv[1] == "shared":
     share_arenas()
 libc = ctypes.CDLL(None)
@@ -142,7 +142,7 @@ def test_threads_share_two_arenas() -> None:
 FREED = """
 import os
 import numpy as np
-from lab.memory import return_freed_memory
+from sim.memory import return_freed_memory
 def resident():
     return int(open("/proc/self/statm").read().split()[1])
 held = [np.ones(8192) for _ in range(2000)]

@@ -28,13 +28,13 @@ from lab.capture_kinds.dark import DarkSequence
 from lab.capture_kinds.flat import FlatSequence
 from lab.errors import DeviceError
 from lab.formats.recording_set import inspect
-from lab.memory import share_arenas
 from mocks.bench import Bench
 from mocks.cornerstone260 import MockCornerstone260
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.stage import MockStage
 from mocks.usb import serve_usbip, stereo_pair
 from mocks.wire import FRAME_KINDS, KINDS, Endpoint, Fault, Grammar, Pty, Tcp, serve
+from sim.memory import share_arenas
 
 CAPTURES = int(os.environ.get("SOAK_CAPTURES", "48"))
 #: Rows and columns of a frame: small, as drawing and writing them takes most of the time.

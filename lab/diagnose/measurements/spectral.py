@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property, partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -100,7 +100,7 @@ class CurveJacobian:
             )
             for c in curve
         }
-        self._kept: dict[tuple[Effect, ...], tuple[FloatArray, FloatArray]] = {}
+        self._kept: dict[tuple[Effect, ...], tuple[FloatArray, Callable[[], FloatArray]]] = {}
         self._modes = curve_modes(self.wavelength)
         between = {c: _between_samples(q, self.wavelength) for c, q in camera.quantum_efficiency.items()}
         self._between = np.array([between[c] for _, c, *_ in items])
@@ -124,27 +124,35 @@ class CurveJacobian:
         wavelengths). Rows sum to 1."""
         return np.asarray(self._weight / np.maximum(self._total, 1e-300)[:, None])
 
-    def _under(self, effects: Effects) -> tuple[FloatArray, FloatArray]:
-        """Rates (n,) and their derivatives (n, modes) by the modes of the curves, e/s per prior standard deviation."""
+    def _under(self, effects: Effects) -> tuple[FloatArray, Callable[[], FloatArray]]:
+        """Rates (n,), and what computes their derivatives (n, modes) by the modes of the curves, e/s per prior standard
+        deviation: of most sets of effects, nobody asks for these."""
         spectral = acting(effects, SPECTRAL)
         if spectral not in self._kept:
-            weight, level, beyond = self._weight, self._all_level, self._all_beyond
             model = Uniform(self.study.camera, spectral)
-            if acting(spectral, frozenset({"light.spectrum"})):
-                lit = {path: model.radiance(self.wavelength, r, self.kind) for path, r in self.radiance.items()}
-                changed = np.array([lit[path] for path, *_ in self.items])
-                weight, level, beyond = changed * self._curve, changed * self._level, changed * self._beyond
+            weight, *_ = self._weights(spectral, model)
             through = model.transmittance(self.wavelength)
-            total = weight @ through
-            rate = self._rate * total / np.maximum(self._total, 1e-300)
-            table = np.column_stack([weight @ (self._modes * through).T, (weight * self._between) @ through])
-            shares = table / np.maximum(total, 1e-300)[:, None]
+            rate = self._rate * (weight @ through) / np.maximum(self._total, 1e-300)
             if len(self._kept) > 500:
                 self._kept.clear()
-            per_weight = np.array([self._per_weight[c] for _, c, *_ in self.items])
-            outside = np.column_stack([level @ through, beyond @ through]) * per_weight[:, None]
-            self._kept[spectral] = rate, np.column_stack([rate[:, None] * shares, outside])
+            self._kept[spectral] = rate, cache(partial(self._derivatives, spectral, model, rate, through))
         return self._kept[spectral]
+
+    def _weights(self, spectral: Effects, model: Uniform) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Light times curve, times the leak, and times the sensitivity beyond the curve, (n, wavelengths) each."""
+        if not acting(spectral, frozenset({"light.spectrum"})):
+            return self._weight, self._all_level, self._all_beyond
+        lit = {path: model.radiance(self.wavelength, r, self.kind) for path, r in self.radiance.items()}
+        changed = np.array([lit[path] for path, *_ in self.items])
+        return changed * self._curve, changed * self._level, changed * self._beyond
+
+    def _derivatives(self, spectral: Effects, model: Uniform, rate: FloatArray, through: FloatArray) -> FloatArray:
+        weight, level, beyond = self._weights(spectral, model)
+        table = np.column_stack([weight @ (self._modes * through).T, (weight * self._between) @ through])
+        shares = table / np.maximum(weight @ through, 1e-300)[:, None]
+        per_weight = np.array([self._per_weight[c] for _, c, *_ in self.items])
+        outside = np.column_stack([level @ through, beyond @ through]) * per_weight[:, None]
+        return np.column_stack([rate[:, None] * shares, outside])
 
     def rates(self, effects: Effects) -> FloatArray:
         """Electrons a second on axis, (n,)."""
@@ -152,7 +160,7 @@ class CurveJacobian:
 
     def jacobian(self, effects: Effects) -> dict[str, FloatArray]:
         """Name of a nuisance parameter -> derivative (n,) of the rates, e/s per prior standard deviation."""
-        table = self._under(effects)[1]
+        table = self._under(effects)[1]()
         named = {}
         for channel in self.study.channels:
             mine = np.array([item[1] == channel for item in self.items])
