@@ -13,9 +13,10 @@ export PYTHONDONTWRITEBYTECODE :=
 
 setup: $(STAMP)
 
+# Modules are compiled when they are first imported (--no-compile): most never are.
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
 	rm -rf calibench.egg-info  # pytest would rewrite the assertions of every module that it lists
 	$(BIN)/python scripts/compile_loops.py
 	touch $@

@@ -250,6 +250,7 @@ class Bench:
                 self._sensor_c = TEMPERATURES_C[name]
             else:
                 self._placed = name
+        return_freed_memory()  # of what the scenes before were drawn with
 
     def show(self, pattern: UInt8Array | None, cell_px: int = 1) -> None:
         """Show 0/1 cells on the screen (0 dark, anything else lit), each `cell_px` screen pixels square, the whole
@@ -383,7 +384,7 @@ class Bench:
                 while len(self._lights) > _MOST_CACHED:
                     self._lights.popitem(last=False)
         if isinstance(seen, ScreenPattern):
-            return_freed_memory()  # the drawing of a screen takes 200 MB for a moment
+            return_freed_memory()  # many follow each other, and each takes 200 MB for a moment
         return camera, seen, drawn
 
     def _camera(self, side: Side, stop: str) -> HiddenCamera:
