@@ -266,7 +266,9 @@ class LiveSessions:
 
     def capturer(self, station: Station) -> Capturer:
         """Return how a pipeline captures on `station`: as a session of this service, which can be followed, paused and
-        aborted like any other. Joins a session that is under way."""
+        aborted like any other. Joins a session that is under way. One that is under way now and is aborted before the
+        pipeline begins isn't resumed."""
+        under_way = frozenset(id for id, live in list(self._live.items()) if not live.ended)
 
         def captured(request: CaptureRequest, tell: Callable[[Progress], None]) -> str:
             session_id = request.session
@@ -274,7 +276,11 @@ class LiveSessions:
                 if not session_id:
                     plan = request.plan or full_plan(station, request.quick)
                     session_id = self.start(station, plan, request.name, request.notes, request.demands_certified)
-                elif self.find(session_id) is None and self._store.session(session_id).state != "finished":
+                elif (
+                    session_id not in under_way
+                    and self.find(session_id) is None
+                    and self._store.session(session_id).state != "finished"
+                ):
                     self.resume(session_id, station)
             except Conflict as error:
                 raise InputError(f"{error}; then start the job again") from error

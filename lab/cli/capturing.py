@@ -238,10 +238,7 @@ def put_back(
     """
     from lab.capture.by_hand import left_by_hand, note_put_back
 
-    store = store_to_read(data)
-    root = store.root
-    if session:
-        store.session(session)
+    root = store_to_read(data).root
     left = {one.session: one for one in left_by_hand(root)}
     if session and session not in left:
         known = f"; those are {', '.join(left)}" if left else "; nothing is"

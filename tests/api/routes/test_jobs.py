@@ -22,11 +22,11 @@ from api.routes.jobs import steps_of
 from api.security import REPORT_POLICY
 from lab.capture.store import Store
 from lab.diagnose import Diagnosis
-from lab.errors import InputError
+from lab.errors import DeviceError, InputError
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, DiagnosisResult, FitResult, NoiseFit, ReportFile, ValidationResult
 from lab.jobs import JobInfo
-from lab.pipeline import PipelineProgress, PipelineRequest, Tell
+from lab.pipeline import CaptureRequest, PipelineProgress, PipelineRequest, Tell
 from tests.api.conftest import Running, events, serving, until, until_state
 from tests.lab.doubts import doubt, offered
 
@@ -341,3 +341,18 @@ def test_only_pipelines_capture(shared: Running, body: dict[str, Any], said: str
     with shared.client("admin") as client:
         response = client.post(f"/api/v1/sessions/{session_id}/jobs", json=body)
     assert response.status_code == 422 and said in response.json()["detail"]
+
+
+def test_a_session_that_was_aborted_before_its_pipeline_began_is_not_resumed(tmp_path: Path) -> None:
+    """On a busy machine the job's thread may begin after the abort."""
+    with serving(tmp_path, delay_s=0.05) as running, running.client("admin") as client:
+        asked = {"station": "fakes", "quick": True, "sequences": ["dark"]}
+        session_id = client.post("/api/v1/sessions", json=asked).json()["id"]
+        service = running.app.state.service
+        capture = service.live.capturer(service.station("fakes"))
+        until_state(client, session_id, "running")
+        assert client.post(f"/api/v1/sessions/{session_id}/abort").status_code == 202
+        until_state(client, session_id, "interrupted")
+        with pytest.raises(DeviceError, match="aborted over the network; resume it"):
+            capture(CaptureRequest(session=session_id), lambda _: None)
+        assert client.get(f"/api/v1/sessions/{session_id}").json()["state"] == "interrupted"

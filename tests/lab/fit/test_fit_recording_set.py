@@ -11,7 +11,7 @@ import lab.fit
 from lab.errors import InputError, NotDetermined
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import FitResult, GeometryFit, NoiseFit, StereoFit
+from lab.formats.results import FitResult, GeometryFit, NoiseFit, RepeatDrift, StereoFit
 
 STEPS = {
     "noise": "lab.fit.noise.noise_fit.fit_noise",
@@ -62,7 +62,7 @@ def test_later_steps_get_what_earlier_ones_found(
 ) -> None:
     seen: dict[tuple[str, str], Any] = {}
 
-    def noise(recordings: RecordingSet, side: str) -> NoiseFit:
+    def noise(recordings: RecordingSet, side: str, drifts: tuple[RepeatDrift, ...]) -> NoiseFit:
         return NoiseFit(read_noise_e={"left": 1.0, "right": 2.0}[side])
 
     def mtf(recordings: RecordingSet, side: str, levels: NoiseFit, left_out: list[str]) -> tuple[()]:
@@ -121,7 +121,7 @@ def test_progress_goes_up_to_one_and_may_end_the_work(
 def test_damage_that_shows_late_is_no_skipped_step(
     small_set: Callable[..., RecordingSet], steps: Callable[..., None]
 ) -> None:
-    def damaged(recordings: RecordingSet, side: str) -> NoiseFit:
+    def damaged(recordings: RecordingSet, side: str, drifts: tuple[RepeatDrift, ...]) -> NoiseFit:
         raise InputError("frames/x.npy: damaged; recapture")
 
     steps(noise=damaged)
