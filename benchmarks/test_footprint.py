@@ -54,7 +54,7 @@ def test_service_and_bench_over_sessions(tmp_path: Path) -> None:
     (tmp_path / "stations").mkdir()
     us = psutil.Process()
     rows = []
-    with service_process(tmp_path) as url, ServiceClient(url, key) as client:
+    with service_process(tmp_path) as url, ServiceClient(url, key, timeout_s=300.0) as client:
         time.sleep(SETTLE_S)
         rows.append(Row("service, idle, nothing stored", by_kind(us)["service"] / MB, IDLE_MB, "MB", "limit"))
         with mock_bench(()) as file, MemoryWatch(us.pid) as watch:
