@@ -44,7 +44,10 @@ CENTROID_PASSES = 4
 
 MIN_CORNERS = 8  # of a view: a pose has six parameters
 WINDOW_PX = 9.0  # largest radius of the window of a corner
-LEAST_BEND_PX = 1e-3  # displacement of a corner by the curvature of its edges, below which they are taken as straight
+WINDOW_SHARE = 0.42  # of the side of a square, that radius
+#: Displacement of corners by the curvature of their edges (rms; median over the views), below which edges are taken as
+#: straight: half of the hundredth of a pixel that corners are fitted to. Pictures through a pinhole show 0.001 px.
+LEAST_BEND_PX = 0.005
 EDGE_SQUARES = 2  # on both sides of a corner, over which the curvature of an edge is measured
 #: Distance from the bent homography, from which a corner isn't used for it: of the median distance, and of the spacing
 #: of the corners, by which those at the rim of a wide board may be off.
@@ -307,7 +310,8 @@ class BoardView:
     """Corners of a board in one frame.
 
     `board_mm` (n, 3), z = 0; `image_px` (n, 2), (x, y); `index` (n,) numbers the corners row by row; `std_px` (n,):
-    standard deviation of a coordinate by the noise of the picture, where it is known.
+    standard deviation of a coordinate by the noise of the picture, where it is known; `bent`: whether edges were fitted
+    with the curvature that their corners show.
     """
 
     capture: CharucoCapture
@@ -315,11 +319,12 @@ class BoardView:
     board_mm: Array
     image_px: Array
     std_px: Array | None = None
+    bent: bool = False
 
     def only(self, kept: NDArray[np.bool_]) -> BoardView:
         """Return the view with the corners for which `kept` (n,) is true."""
         std = None if self.std_px is None else self.std_px[kept]
-        return BoardView(self.capture, self.index[kept], self.board_mm[kept], self.image_px[kept], std)
+        return BoardView(self.capture, self.index[kept], self.board_mm[kept], self.image_px[kept], std, self.bent)
 
 
 def luminance(frame: NDArray[np.generic], cfa: Any) -> Array:
@@ -340,9 +345,9 @@ def as_grey(picture: Array) -> NDArray[np.uint8]:
     return np.clip(255.0 * ndimage.gaussian_filter(picture, 0.7), 0, 255).astype(np.uint8)
 
 
-def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
+def find_board(picture: Array, capture: CharucoCapture, *, bent: bool = False) -> BoardView:
     """Find the corners of the board in a picture (rows, cols) of 0..1. Raises `NotDetermined` where it isn't found,
-    with the reason.
+    with the reason. `bent`: follow a lens that bends edges.
     """
     rows, cols = capture.squares
     grey = as_grey(picture)
@@ -368,13 +373,15 @@ def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
     if len(index) < (rows - 1) * (cols - 1):
         index, points = _add_missing_corners(index, points, rows - 1, cols - 1, picture.shape)
     board = board_points(capture, index)
-    fitted, trusted, std_px = refine_corners(picture, points, board[:, :2], capture.square_mm, marker_mm, rows, cols)
+    fitted, trusted, std_px = refine_corners(
+        picture, points, board[:, :2], capture.square_mm, marker_mm, rows, cols, bent=bent
+    )
     if trusted.sum() < MIN_CORNERS:
         raise NotDetermined(
             "geometry",
             f"only {trusted.sum()} corners are clear enough, {MIN_CORNERS} needed: focus or light the board better",
         )
-    return BoardView(capture, index, board, fitted, std_px).only(trusted)
+    return BoardView(capture, index, board, fitted, std_px, bent).only(trusted)
 
 
 def _charuco_corners(grey: NDArray[np.uint8], capture: CharucoCapture) -> tuple[NDArray[np.int64], Array]:
@@ -515,25 +522,36 @@ def _first_square_is_dark(grey: NDArray[np.uint8], grid: Array) -> bool:
 
 
 def refine_corners(
-    picture: Array, points: Array, board: Array, square_mm: float, marker_mm: float, rows: int, cols: int
+    picture: Array,
+    points: Array,
+    board: Array,
+    square_mm: float,
+    marker_mm: float,
+    rows: int,
+    cols: int,
+    *,
+    bent: bool = False,
 ) -> CornerFits:
     """Fit corners (n, 2), (x, y), in the picture, at the pixels that no marker touches.
 
     `points` (n, 2): first guess, (x, y), px; `board` (n, 2): places on the board, mm; `marker_mm`: side of a marker, 0
-    without; `rows`, `cols`: squares of the board. Raises `NotDetermined` where the points don't lie on a plane.
+    without; `rows`, `cols`: squares of the board; `bent`: follow a lens that bends edges, with the curvature that the
+    corners show. Raises `NotDetermined` where the points don't lie on a plane.
     """
     homography, _ = cv2.findHomography(board.astype(np.float64), points.astype(np.float64), cv2.RANSAC, 3.0)
     if homography is None:
         raise NotDetermined("geometry", "the corners found don't lie on a plane: light or place the board better")
-    to_image = _bent_homography(homography, board, points)
-    to_board = _bent_homography(np.linalg.inv(homography), points, board)
+    to_image, to_board = _plane_map(homography), _plane_map(np.linalg.inv(homography))
+    if bent:
+        to_image = _bent_map(homography, board, points)
+        to_board = _bent_map(np.linalg.inv(homography), points, board)
 
     step = 0.5 * square_mm
     along = [
         to_image(board + np.array(d) * step) - to_image(board - np.array(d) * step) for d in ((1.0, 0.0), (0.0, 1.0))
     ]
     square_px = np.minimum(np.linalg.norm(along[0], axis=1), np.linalg.norm(along[1], axis=1))
-    half = np.clip(0.42 * square_px, 2.0, WINDOW_PX)
+    half = np.clip(WINDOW_SHARE * square_px, 2.0, WINDOW_PX)
 
     def clear(at_px: Array) -> NDArray[np.bool_]:
         """Tell which pixels (n, 2) are on the board with no marker that blurs into them."""
@@ -553,31 +571,28 @@ def refine_corners(
         return np.asarray(inside & ~(near & light))
 
     light_squares = _light_squares(picture, to_image, square_mm, marker_mm, rows, cols)
-    straight = fit_corners(picture, points, along[0], along[1], half, clear)
-    bend = edge_curvatures(board, np.where(straight.trusted[:, None], straight.points, np.nan), square_mm)
-    if np.max(np.linalg.norm(bend, axis=2) * half**2) / 6.0 < LEAST_BEND_PX:
-        return straight
-    return fit_corners(picture, points, along[0], along[1], half, clear, bend)
+    fits = fit_corners(picture, points, along[0], along[1], half, clear)
+    if not bent:
+        return fits
+    known = np.where(fits.trusted[:, None], fits.points, np.nan)
+    return fit_corners(picture, points, along[0], along[1], half, clear, edge_curvatures(board, known, square_mm))
 
 
-def _bent_homography(homography: Array, source: Array, target: Array) -> Callable[[Array], Array]:
-    """Return a map of places (n, 2) that takes `source` (n, 2) to `target` (n, 2), the corners of a board: a homography
-    (3, 3), and a polynomial for what a lens that bends edges adds, of the highest degree up to 4 for which there are
-    three corners a term.
+def _plane_map(homography: Array) -> Callable[[Array], Array]:
+    """Return the map of places (n, 2) by a homography (3, 3)."""
+    return lambda at: np.asarray(
+        cv2.perspectiveTransform(np.reshape(at, (-1, 1, 2)).astype(np.float64), homography)[:, 0]
+    )
+
+
+def _bent_map(homography: Array, source: Array, target: Array) -> Callable[[Array], Array]:
+    """Return a map of places (n, 2) that takes `source` (n, 2) to `target` (n, 2), the corners of a board: by a
+    homography, from (3, 3) on, and a polynomial of up to the fourth degree for what a lens that bends edges adds.
     """
-    middle, scale = source.mean(axis=0), float(np.ptp(source, axis=0).max()) / 2.0 + 1e-9
-    degree = max((d for d in range(5) if 3 * (d + 1) * (d + 2) // 2 <= len(source)), default=0)
-
-    def plane(at: Array) -> Array:
-        return np.asarray(cv2.perspectiveTransform(at[:, None, :].astype(np.float64), homography)[:, 0])
-
-    def terms(at: Array) -> Array:
-        x, y = ((at - middle) / scale).T
-        return np.column_stack([x**i * y ** (k - i) for k in range(degree + 1) for i in range(k + 1)])
-
-    design, square = terms(source), float(np.ptp(target, axis=0).max() / np.sqrt(len(target)))
+    design, square = _polynomial(source, source, 4), float(np.ptp(target, axis=0).max() / np.sqrt(len(target)))
     near = np.ones(len(source), dtype=bool)
-    for _ in range(2):  # a corner that was found at a wrong place would bend the map about its neighbours
+    for _ in range(3):  # a corner that was found at a wrong place would bend the map about its neighbours
+        plane = _plane_map(homography)
         displaced = target - plane(source)
         coefficients = np.linalg.lstsq(design[near], displaced[near], rcond=1e-9)[0]
         distance = np.linalg.norm(displaced - design @ coefficients, axis=1)
@@ -585,9 +600,7 @@ def _bent_homography(homography: Array, source: Array, target: Array) -> Callabl
         # The given homography may follow a part of a wide board; the nearer it is to all, the less is left to bend
         whole, _ = cv2.findHomography(source[near].astype(np.float64), target[near].astype(np.float64), 0)
         homography = homography if whole is None else whole
-    displaced = target - plane(source)
-    coefficients = np.linalg.lstsq(design[near], displaced[near], rcond=1e-9)[0]
-    return lambda at: np.asarray(plane(at) + terms(at) @ coefficients)
+    return lambda at: np.asarray(plane(at) + _polynomial(at, source, 4) @ coefficients)
 
 
 def edge_curvatures(board: Array, points: Array, square_mm: float) -> Array:
@@ -596,9 +609,10 @@ def edge_curvatures(board: Array, points: Array, square_mm: float) -> Array:
 
     A fit of straight edges to curved ones is off by about curvature times window^2 / 6: 0.02 px at half the frame of a
     fisheye. A polynomial goes through the corners of the same edge up to two squares away, or the nearest four. Its
-    part along the edge is perspective's. 0 where fewer than four corners are known.
+    part along the edge is perspective's. Its noise, up to 14 / square^2 times that of a corner, is smoothed over the
+    board by a polynomial of up to the third degree. 0 where fewer than four corners are known.
     """
-    found = np.zeros((2, len(board), 2))
+    found = np.full((2, len(board), 2), np.nan)
     known = np.isfinite(points).all(axis=1)
     steps = board / square_mm
     for along in (0, 1):
@@ -613,7 +627,21 @@ def edge_curvatures(board: Array, points: Array, square_mm: float) -> Array:
             _, slope, half = np.linalg.solve(design, points[nearest])[:3]
             twice, square = 2.0 * half, float(slope @ slope)
             found[along, k] = (twice - (twice @ slope) / square * slope) / square
-    return found
+    terms = _polynomial(board, board, 3)
+    for along in (0, 1):
+        there = np.isfinite(found[along]).all(axis=1)
+        if there.any():
+            found[along] = terms @ np.linalg.lstsq(terms[there], found[along, there], rcond=1e-9)[0]
+    return np.nan_to_num(found)
+
+
+def _polynomial(at: Array, known: Array, highest: int) -> Array:
+    """Return the terms (n, k), at places (n, 2), of a polynomial that `known` places (m, 2) determine: of the highest
+    degree up to `highest` for which there are three of them a term.
+    """
+    degree = max((d for d in range(highest + 1) if 3 * (d + 1) * (d + 2) // 2 <= len(known)), default=0)
+    x, y = ((at - known.mean(axis=0)) / (0.5 * float(np.ptp(known, axis=0).max()) + 1e-9)).T
+    return np.column_stack([x**i * y ** (k - i) for k in range(degree + 1) for i in range(k + 1)])
 
 
 def _light_squares(
@@ -632,6 +660,21 @@ def _light_squares(
         level += ndimage.map_coordinates(picture, at[:, ::-1].T, order=1, mode="nearest").reshape(rows, cols)
     even = (row + col) % 2 == 0
     return np.asarray(even if level[even].mean() > level[~even].mean() else ~even)
+
+
+def bend_px(view: BoardView) -> float:
+    """Return how far straight edges, in place of the curved ones that the corners of a view show, move corners (rms,
+    px).
+    """
+    square_mm = view.capture.square_mm
+    curvature = edge_curvatures(view.board_mm[:, :2], view.image_px, square_mm)
+    away = np.linalg.norm(view.board_mm[:, None] - view.board_mm, axis=2)
+    one, other = np.nonzero(np.abs(away - square_mm) < 0.1 * square_mm)
+    if not len(one):
+        return 0.0
+    square_px = float(np.median(np.linalg.norm(view.image_px[one] - view.image_px[other], axis=1)))
+    half = float(np.clip(WINDOW_SHARE * square_px, 2.0, WINDOW_PX))
+    return float(np.sqrt(np.mean(np.sum(curvature**2, axis=2)))) * half**2 / 6.0
 
 
 def channel_corners(frame: NDArray[np.generic], cfa: Any, view: BoardView) -> dict[str, CornerFits]:
@@ -654,7 +697,9 @@ def channel_corners(frame: NDArray[np.generic], cfa: Any, view: BoardView) -> di
                 fits = dot_centres(plane, guess, rows - 1, cols - 1, view.index)
             else:
                 marker_mm = float(capture.marker_mm or 0.0) if capture.has_markers else 0.0
-                fits = refine_corners(plane, guess, view.board_mm[:, :2], capture.square_mm, marker_mm, rows, cols)
+                fits = refine_corners(
+                    plane, guess, view.board_mm[:, :2], capture.square_mm, marker_mm, rows, cols, bent=view.bent
+                )
             of_phases.append(CornerFits(2.0 * fits.points + [col, row], fits.trusted, 2.0 * fits.std_px))
         found[channel] = CornerFits(
             np.mean([fits.points for fits in of_phases], axis=0),
@@ -666,13 +711,22 @@ def channel_corners(frame: NDArray[np.generic], cfa: Any, view: BoardView) -> di
 
 def find_boards(recordings: RecordingSet, side: Side) -> tuple[list[BoardView], list[Skipped]]:
     """Find the boards of all `charuco` captures of `side`, and list the captures in which there is none, with the
-    reason.
+    reason. Where the lens bends edges so far that it counts, they are found again by corners of bent edges.
     """
+    views, rejected = _find_boards(recordings, side)
+    bends = [bend_px(view) for view in views if view.capture.dictionary != "dots"]
+    if bends and float(np.median(bends)) > LEAST_BEND_PX:
+        return _find_boards(recordings, side, bent=True)
+    return views, rejected
+
+
+def _find_boards(recordings: RecordingSet, side: Side, *, bent: bool = False) -> tuple[list[BoardView], list[Skipped]]:
+    """Find the boards of all captures, with edges that are straight or `bent`."""
     cfa = recordings.camera(side).cfa
     views, rejected = [], []
     for capture in recordings.captures(CharucoCapture, side):
         try:
-            views.append(find_board(luminance(recordings.frame(capture), cfa), capture))
+            views.append(find_board(luminance(recordings.frame(capture), cfa), capture, bent=bent))
         except NotDetermined as refused:
             rejected.append(Skipped(step=capture.id, reason=refused.reason, side=side))
     return views, rejected

@@ -20,7 +20,13 @@ from lab.fit.geometry import geometry_result
 from lab.fit.stereo import StereoPair, fit_pairs, rectification_maps
 from lab.formats.results import CameraFit, FitResult
 from lab.measure.board_calibration import calibrate, calibrate_robustly, with_model_error
-from lab.measure.board_detection import BoardView, board_points, find_board
+from lab.measure.board_detection import (
+    LEAST_BEND_PX,
+    BoardView,
+    bend_px,
+    board_points,
+    find_board,
+)
 from sim.camera import Geometry
 from sim.scene.projection import EQUIDISTANT
 from sim.scene.warp import Warp
@@ -177,7 +183,9 @@ def test_corners_of_bent_edges_are_unbiased(focal_px, distance_mm):
     fine = np.where(inside & dark, 0.1, 0.9).astype(np.float32)
     picture = fine.reshape(SHAPE[0], 8, SHAPE[1], 8).mean(axis=(1, 3))
     picture = cv2.GaussianBlur(picture, (0, 0), 0.5) + np.random.default_rng(0).normal(0, 0.005, SHAPE)
-    view = find_board(picture.astype(float), of)
+    straight = find_board(picture.astype(float), of)
+    assert bend_px(straight) > LEAST_BEND_PX
+    view = find_board(picture.astype(float), of, bent=True)
     assert len(view.index) > 50
     truth = EQUIDISTANT.project(view.board_mm + shift, EQUIDISTANT.intrinsics(matrix))
     away = truth - [319.5, 239.5]
