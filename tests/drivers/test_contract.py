@@ -13,8 +13,9 @@ from tests.peers import missing
 
 #: Each call on a silent GigE camera takes the library seconds.
 SLOW = {("camera", "aravis")}
-#: At their other end stands another program or a maker's library.
-OTHERS = {("camera", name) for name in ("alpaca", "basler", "gentl", "gphoto2", "indi", "micromanager")} | {
+#: At their other end stands another program or a maker's library. The camera of gphoto2 serves one test at a time: its
+#: own tests are `extra`, this one isn't.
+OTHERS = {("camera", name) for name in ("alpaca", "basler", "gentl", "indi", "micromanager")} | {
     ("light_source", name) for name in ("alpaca", "indi")
 }
 
