@@ -90,8 +90,12 @@ def list_stations(service: Here) -> list[StationState]:
 
 
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
-    fields = info.model_dump(exclude={"packed"}) | {"state": service.state(info)}
-    live = service.live.find(info.id)
+    live, state = service.live.find(info.id), service.state(info)
+    if live is not None and state in ("finished", "interrupted", "failed"):
+        # A run that is about to end: the registry has how, with the error.
+        live, info = None, service.store.session(info.id)
+        state = info.state
+    fields = info.model_dump(exclude={"packed"}) | {"state": state}
     # The error of an earlier run doesn't concern this one.
     error = info.error if live is None else live.capture.paused_by if live.capture is not None else None
     return fields | {"error": service.public.or_none(error)}
