@@ -29,7 +29,7 @@ from lab.fit.psf import estimate_kernel
 from lab.fit.psf.kernel import displace, normal_equations
 from lab.fit.psf.photograph import estimate_from_photograph
 from lab.fit.psf.screen_kernel import measure_field
-from lab.measure.screen_registration import ScreenPictures
+from lab.observables.screens.registration import ScreenPictures
 from sim.camera import CameraModel, Lens
 from sim.frame import Exposure, expected_electrons
 from sim.optics.imaging import MeasuredPsf
@@ -41,7 +41,7 @@ from sim.scene.scenes import ScreenPattern
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum
 from tests.lab.fit.psf.drawn_targets import KERNELS, blurred_target, gaussian, misplaced_target, misplacement, psnr_db
-from tests.lab.measure.drawn_edges import edge, gaussian_mtf, gaussian_mtf50
+from tests.lab.observables.edges.drawn_edges import edge, gaussian_mtf, gaussian_mtf50
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 EDGE_LIMIT_MS = 40.0

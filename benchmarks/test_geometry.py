@@ -17,9 +17,9 @@ from lab.capture_kinds.charuco import CharucoCapture
 from lab.fit.geometry import fit_geometry, geometry_result
 from lab.fit.stereo import fit_stereo
 from lab.formats.importers import read_checkerboard_pairs
-from lab.measure.board_calibration import calibrate, calibrate_robustly
-from lab.measure.board_detection import find_board, luminance
-from lab.measure.projection import CameraGeometry, difference, grid, grid_points, points_at
+from lab.observables.boards.calibration import calibrate, calibrate_robustly
+from lab.observables.boards.detection import find_board, luminance
+from lab.observables.boards.projection import CameraGeometry, difference, grid, grid_points, points_at
 from tests.lab.fit import conftest as drawn
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 

@@ -33,7 +33,7 @@ def module(name: str, source: str, monkeypatch: pytest.MonkeyPatch) -> ModuleTyp
     ("page", "name"),
     [
         ("add-an-effect.md", "sim.effects.notch_filter"),
-        ("add-a-measurement.md", "lab.diagnose.measurements.dark_halves"),
+        ("add-a-measurement.md", "lab.observables.darks.dark_halves"),
     ],
 )
 def test_the_file_and_its_tests_run_as_they_stand(page: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from benchmarks.real.judge import EXPLAINED, QUANTILE, JudgedFigure, SetResult
 from benchmarks.real.kept import Kept
 from benchmarks.real.sets import DeclaredSet
 from lab.challenge.proof import placed
-from lab.diagnose.measurements.block import measurement_title
+from lab.observables.observable import measurement_title
 
 HEAD = """# Real recordings
 

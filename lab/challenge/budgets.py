@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from lab.diagnose.inference.refit import Coordinate, coordinates
-from lab.diagnose.measurements.noise import GAIN_STD, READ_STD
-from lab.diagnose.measurements.spectral import freed_curve
 from lab.diagnose.outcome.model_posterior import coordinate_name, with_unnamed
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import ModelPosterior
+from lab.observables.flats.noise import GAIN_STD, READ_STD
+from lab.observables.spectra.narrowband import freed_curve
 from lab.twin.budget import USES, LinearUse, linear_use, with_darks
 from lab.twin.predict import posterior_of
 from mocks.former import WAVELENGTH_NM, ConcealedCamera, Law

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from lab.challenge.score import ChallengeScore, families_of
 from lab.challenge.truth import CaseTruth, Truths
 from lab.diagnose.inference.decide import Verdict, decide
-from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.inference.side_model import measurement_model
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import SEED
 from lab.errors import InputError

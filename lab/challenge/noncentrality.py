@@ -19,11 +19,11 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.stats import chi2
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import measurements
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.measure.study import Study
+from lab.observables.dataset import Study
+from lab.observables.observable import measurements
 from sim.effects.library import candidates
 from sim.spectrum import FloatArray
 

@@ -3,7 +3,6 @@ camera with that effect predicts.
 
 policy.py       every number by which a diagnosis decides
 metadata/       statements about camera and captures that the recordings contradict
-measurements/   measured numbers with their covariance, and their prediction by a camera model
 inference/      the measurement model; locate, score, search, weigh, name
 outcome/        what is reported: result, improved model, next capture
 visibility.py   which measurements show each effect, and which effects are rivals

@@ -16,9 +16,8 @@ from lab.diagnose.discovery import Superseded, discover, law_of, superseded, tol
 from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.side_model import measurement_model, study_of
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.blocks import measurement_model, study_of
-from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.outcome.goodness_of_fit import (
     detectability,
@@ -51,7 +50,8 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisLists, FitResult, HeldOut, Mismatch, Skipped
-from lab.measure.study import Study
+from lab.observables.dataset import Study
+from lab.observables.flats.linearity import PHOTON_TRANSFER
 from lab.workers import Workers
 from sim.camera import Side
 from sim.memory import return_freed_memory

@@ -23,7 +23,7 @@ from pydantic.fields import FieldInfo
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.rivals import parallel_pairs, signature_changes, symmetric, whitened
-from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.inference.side_model import measurement_model
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.reference_study import reference_study
 from lab.errors import InputError

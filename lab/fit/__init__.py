@@ -101,8 +101,8 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
     from lab.fit.noise.noise_fit import fit_noise
     from lab.fit.psf.recordings import fit_psf_field
     from lab.fit.spectral.recordings import fit_spectral
-    from lab.measure.mishaps import exchanged_frames
-    from lab.measure.repeats import find_drifts
+    from lab.observables.acquisition_errors import exchanged_frames
+    from lab.observables.noise.repeats import find_drifts
 
     skipped: list[Skipped] = []
 

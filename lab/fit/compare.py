@@ -1,11 +1,11 @@
 """Two calibrations of one rig: what changed beyond its uncertainty.
 
-Every number that a fit states with a standard deviation is compared, found by its name: `x` beside `x_std`. The numbers
-of a curve or a kernel share one row: that of the point with the largest difference, corrected for the number of points
-(Sidak). Dark currents are compared at the sensor temperature of A (`lab.fit.noise.dark_current`). The geometry of
-cameras is also compared by its effect: both calibrations project the same points, after the rigid motion that they
-imply between each other is removed (`lab.measure.projection`). Parameters that differ much may project alike, and the
-reverse.
+Every number that a fit states with a standard deviation is compared, found by its name: `x` beside `x_std`. The
+numbers of a curve or a kernel share one row: that of the point with the largest difference, corrected for the number
+of points (Sidak). Dark currents are compared at the sensor temperature of A (`lab.fit.noise.dark_current`). The
+geometry of cameras is also compared by its effect: both calibrations project the same points, after the rigid motion
+that they imply between each other is removed (`lab.observables.boards.projection`). Parameters that differ much may
+project alike, and the reverse.
 
 Rules by which changes fail a check (`calibench compare --fail-on`) name a figure and a tolerance: `FIGURE`, or
 `FIGURE>AMOUNT` with the amount in the figure's own unit or in percent of A (`left:noise read_noise_e>5%`). `*` in
@@ -47,7 +47,7 @@ from lab.formats.results import (
     StereoFit,
 )
 from lab.formats.results.words import plain_name, unit_of
-from lab.measure.projection import CameraGeometry, difference, grid, grid_points, implied_motion, seen_points
+from lab.observables.boards.projection import CameraGeometry, difference, grid, grid_points, implied_motion, seen_points
 from sim.camera import ProjectionKind, Side
 from sim.parameters import Frozen
 from sim.scene.projection import COUNT, Projection

@@ -1,13 +1,14 @@
 """Intrinsics of a camera from views of a board, with their uncertainty: the step on a recording set, and its result.
 
-- `lab.measure.board_detection`: corners of a ChArUco board or a checkerboard in the raw mosaic, to hundredths of a
+- `lab.observables.boards.detection`: corners of a ChArUco board or a checkerboard in the raw mosaic, to hundredths of a
   pixel;
 - `sim.scene.projection`: OpenCV's pinhole and fisheye and a splined stereographic projection, with their Jacobians;
-- `lab.measure.projection`: the uncertainty of the projection over the frame, and the difference of two calibrations;
-- `lab.measure.bundle_adjustment`: one least-squares solve for intrinsics, poses and the warp of the boards, whose
-  Jacobian and residuals give the full covariance. Errors that neighbouring corners share are an error of the model,
-  and part of it;
-- `lab.measure.board_calibration`: outlying corners and views are left out, with the reason. Projection and
+- `lab.observables.boards.projection`: the uncertainty of the projection over the frame, and the difference of two
+  calibrations;
+- `lab.observables.boards.bundle_adjustment`: one least-squares solve for intrinsics, poses and the warp of the boards,
+  whose Jacobian and residuals give the full covariance. Errors that neighbouring corners share are an error of the
+  model, and part of it;
+- `lab.observables.boards.calibration`: outlying corners and views are left out, with the reason. Projection and
   distortion are chosen by views that their fits haven't used: a richer model is refused where it predicts them worse.
   Two halves of the views are calibrated separately; what they differ by beyond their uncertainties widens the
   covariance.
@@ -38,7 +39,8 @@ from lab.formats.results import (
     ViewResiduals,
 )
 from lab.formats.results.words import PROJECTION_NAMES
-from lab.measure.board_calibration import (
+from lab.observables.boards.bundle_adjustment import Solution, warp_prior_mm
+from lab.observables.boards.calibration import (
     DIFFERENCE_SIGMA,
     MIN_VIEWS,
     OUTLYING_CORNER_STD,
@@ -49,9 +51,8 @@ from lab.measure.board_calibration import (
     list_reasons,
     widen_covariance,
 )
-from lab.measure.board_detection import MIN_CORNERS, BoardView, CornerFits, channel_corners, find_boards
-from lab.measure.bundle_adjustment import Solution, warp_prior_mm
-from lab.measure.projection import CameraGeometry, grid, grid_points
+from lab.observables.boards.detection import MIN_CORNERS, BoardView, CornerFits, channel_corners, find_boards
+from lab.observables.boards.projection import CameraGeometry, grid, grid_points
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 from sim.scene.projection import COUNT

@@ -2,16 +2,17 @@
 
 Each Bayer plane is analysed on its own grid; nothing is demosaiced.
 
-- `lab.measure.edge_finding`: where the edge lies, a cubic polynomial in the frame, found by iterated least squares;
-- `lab.measure.edge_spread`: the edge-spread function (ESF) is a cubic spline of the distance from the edge. Its knots
-  are even near the edge and ever wider apart in the tails. A spline is used because a basis of hat functions leaves a
-  ripple of h^2 E'' / 12, which samples at uneven distances turn into a bias of 0.1 % of MTF50. A prior of the
+- `lab.observables.edges.finding`: where the edge lies, a cubic polynomial in the frame, found by iterated least
+  squares;
+- `lab.observables.edges.spread`: the edge-spread function (ESF) is a cubic spline of the distance from the edge. Its
+  knots are even near the edge and ever wider apart in the tails. A spline is used because a basis of hat functions
+  leaves a ripple of h^2 E'' / 12, which samples at uneven distances turn into a bias of 0.1 % of MTF50. A prior of the
   line-spread function (LSF), the derivative of the ESF, decides what the samples leave open: a Gaussian, a Gaussian
   process about it, and the 1 / distance^2 tail of diffraction, which holds 1 % of the contrast beyond any region;
-- `lab.measure.edge_mtf`: the ESF is fitted by weighted least squares together with the gradient of the illumination.
-  The MTF is the Fourier transform of the derivative of the spline, in closed form, with its covariance. `edge_mtf` is
-  the whole estimator, on a region;
-- `lab.measure.edges`: the edges of a frame that are usable, and the MTF of one edge of a recording set;
+- `lab.observables.edges.mtf`: the ESF is fitted by weighted least squares together with the gradient of the
+  illumination. The MTF is the Fourier transform of the derivative of the spline, in closed form, with its covariance.
+  `edge_mtf` is the whole estimator, on a region;
+- `lab.observables.edges.region`: the edges of a frame that are usable, and the MTF of one edge of a recording set;
 - here, the step on all captures of a side.
 
 Once the edge is found, the estimate is linear in the pixel values. `EdgeGeometry` keeps this linear operator, and
@@ -30,8 +31,8 @@ from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MtfCurve, NoiseFit
-from lab.measure.edge_mtf import edge_mtf
-from lab.measure.edges import check_phases, edges_of, measure_edge
+from lab.observables.edges.mtf import edge_mtf
+from lab.observables.edges.region import check_phases, edges_of, measure_edge
 from sim.camera import Side
 
 __all__ = ["edge_mtf", "fit_mtf"]

@@ -2,9 +2,9 @@
 saw.
 
 One least-squares problem over everything that both cameras saw: rotation and translation of the rig, the intrinsics of
-both cameras, the warp of the boards and the pose of the board in every capture (`lab.measure.bundle_adjustment`).
-A solve for the rig alone, with the intrinsics held at the values of the single cameras, would transfer their errors to
-the rig and leave them out of its uncertainty.
+both cameras, the warp of the boards and the pose of the board in every capture
+(`lab.observables.boards.bundle_adjustment`). A solve for the rig alone, with the intrinsics held at the values of the
+single cameras, would transfer their errors to the rig and leave them out of its uncertainty.
 
 The joint covariance gives the uncertainty of a depth. A point P in the frame of the left camera is seen at q(theta,
 P), (4,) px in both frames. With A = dq/dP and B = dq/dtheta, the triangulated point moves by dP = -(A^T A)^-1 A^T (B
@@ -27,9 +27,7 @@ from lab.errors import NotDetermined
 from lab.fit.geometry import corner_errors
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
-from lab.measure.board_calibration import list_reasons
-from lab.measure.board_detection import BoardView, board_points
-from lab.measure.bundle_adjustment import (
+from lab.observables.boards.bundle_adjustment import (
     RIG,
     BundleAdjustment,
     Observation,
@@ -39,7 +37,9 @@ from lab.measure.bundle_adjustment import (
     board_pose,
     rms_px,
 )
-from lab.measure.projection import CameraGeometry, cross_matrices, grid, grid_points
+from lab.observables.boards.calibration import list_reasons
+from lab.observables.boards.detection import BoardView, board_points
+from lab.observables.boards.projection import CameraGeometry, cross_matrices, grid, grid_points
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 from sim.scene.projection import Projection

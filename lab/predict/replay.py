@@ -16,8 +16,8 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
-from lab.measure.edge_mtf import EdgeMtf
-from lab.measure.edges import measure_edge
+from lab.observables.edges.mtf import EdgeMtf
+from lab.observables.edges.region import measure_edge
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.frame import Exposure, dark_electrons, expected_electrons, is_steady, read_out

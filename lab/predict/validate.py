@@ -30,12 +30,12 @@ from lab.formats.results import (
     Skipped,
     ValidationResult,
 )
-from lab.measure.edge_mtf import EdgeMtf
-from lab.measure.edges import measure_edge
-from lab.measure.gaussian import chi2
-from lab.measure.patches import Patch as PatchLevel
-from lab.measure.patches import patch_covariance, patch_levels
-from lab.measure.study import Study
+from lab.observables.charts.patches import Patch as PatchLevel
+from lab.observables.charts.patches import patch_covariance, patch_levels
+from lab.observables.dataset import Study
+from lab.observables.edges.mtf import EdgeMtf
+from lab.observables.edges.region import measure_edge
+from lab.observables.gaussian import chi2
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect

@@ -15,7 +15,7 @@ from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import InputError, NotDetermined
 from lab.formats.recording_set import DataSheet, RecordingSet
-from lab.measure.edges import measure_edge
+from lab.observables.edges.region import measure_edge
 from sim.camera import Side
 from sim.parameters import Frozen
 from sim.sensor.mosaic import first_pixels, planes

@@ -14,7 +14,6 @@ import numpy as np
 from lab.calibration.limits import CalibrationLimits, figures_of, judged
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.diagnose.measurements.block import measurement_title
 from lab.effect_titles import at_beginning, effect_title
 from lab.errors import cannot_write
 from lab.formats.raw_file import replacing
@@ -32,6 +31,7 @@ from lab.formats.results import (
     ValidationResult,
 )
 from lab.formats.results.words import measured
+from lab.observables.observable import measurement_title
 from lab.predict.validate import BothModels
 from lab.report import answers, charts, geometry, words
 from lab.report import diagnosis as diagnosis_page

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.block import measurement_title
 from lab.effect_titles import at_beginning, effect_title
 from lab.formats.results import (
     Check,
@@ -22,6 +21,7 @@ from lab.formats.results import (
     ValidationResult,
 )
 from lab.formats.results.words import measured, plain_number
+from lab.observables.observable import measurement_title
 from lab.predict.validate import BothModels
 from lab.report import charts, words
 from lab.report.diagnosis import worst_of_each

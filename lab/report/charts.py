@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.block import measurement_title
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
     Check,
@@ -28,6 +27,7 @@ from lab.formats.results import (
     SpectralFit,
 )
 from lab.formats.results.words import measured, plain_number
+from lab.observables.observable import measurement_title
 from lab.predict.validate import SensitivityCurve
 from sim.camera import Side
 

@@ -10,7 +10,6 @@ import numpy as np
 from scipy import special
 
 from lab.diagnose.discovery.words import departure_unit
-from lab.diagnose.measurements.block import measurement_title
 from lab.diagnose.outcome.goodness_of_fit import detectable, told_as
 from lab.formats.results import (
     DiagnosisResult,
@@ -21,6 +20,7 @@ from lab.formats.results import (
     Visibility,
 )
 from lab.formats.results.words import plain_number, shown_unit
+from lab.observables.observable import measurement_title
 from lab.report.charts import AFTER, CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.pictures import difference_picture
 from sim.camera import Side

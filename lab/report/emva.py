@@ -18,8 +18,8 @@ from lab.fit.noise.pixel_maps import pixel_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelNoise, Emva1288, Emva1288Points, FitResult, NoiseFit, PixelDefects
 from lab.formats.results.words import measured, plain_number
-from lab.measure.dark_pixels import stack_of
-from lab.measure.stated_light import light_of
+from lab.observables.darks.pixels import stack_of
+from lab.observables.flats.stated_light import light_of
 from lab.report.charts import AFTER, BEFORE, CHANNEL, Figure, Trace, axis, error_bars, layout, log_axis
 from lab.report.figures import NOISE
 from lab.report.pictures import MAPS, map_picture, photograph_data_uri

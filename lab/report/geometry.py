@@ -16,7 +16,7 @@ from lab.fit.stereo import rectification_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
 from lab.formats.results.words import PROJECTION_NAMES, measured
-from lab.measure.board_detection import luminance
+from lab.observables.boards.detection import luminance
 from lab.report.charts import CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.pictures import photograph_data_uri
 from sim.camera import Side

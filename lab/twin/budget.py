@@ -21,12 +21,12 @@ import numpy as np
 from lab.capture.catalogue import StepTimes
 from lab.capture.station import Station
 from lab.diagnose.inference.refit import coordinates, moved
-from lab.diagnose.measurements.noise import GAIN_STD, READ_STD
-from lab.diagnose.measurements.spectral import freed_curve
 from lab.diagnose.outcome.model_posterior import STEP, coordinate_name, with_unnamed
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import ModelPosterior
+from lab.observables.flats.noise import GAIN_STD, READ_STD
+from lab.observables.spectra.narrowband import freed_curve
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.lab_minutes import LabCapture, lab_captures
 from lab.twin.predict import posterior_of

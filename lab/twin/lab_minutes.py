@@ -23,13 +23,13 @@ from lab.capture_kinds.dark import DarkSequence
 from lab.capture_kinds.flat import FlatSequence
 from lab.capture_kinds.narrowband import NarrowbandSequence
 from lab.capture_kinds.slanted_edge import EdgeSequence, EdgeTarget
-from lab.diagnose.measurements.linearity import RADIOMETER_STD
-from lab.diagnose.measurements.noise import VARIANCE_FLOOR
-from lab.diagnose.measurements.spectral import CHART_SCALE_STD
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import FirstEstimates
-from lab.measure.noise_figures import BLACK_FLOOR_DN
-from lab.measure.patches import reflectance_covariance
+from lab.observables.charts.patches import reflectance_covariance
+from lab.observables.flats.linearity import RADIOMETER_STD
+from lab.observables.flats.noise import VARIANCE_FLOOR
+from lab.observables.noise.figures import BLACK_FLOOR_DN
+from lab.observables.spectra.narrowband import CHART_SCALE_STD
 from sim.camera import CameraModel
 from sim.point import optical_transfer
 from sim.scene.colorchecker import reflectances

@@ -17,12 +17,6 @@ from scipy.optimize import nnls
 from lab.capture_kinds.base import Capture
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import coordinates
-from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
-from lab.diagnose.measurements.dark_level import DARK, added_dark_e_per_s
-from lab.diagnose.measurements.linearity import PHOTON_TRANSFER, misstated_levels
-from lab.diagnose.measurements.noise import GAIN_STD, NOISE, READ_STD, shot_variance
-from lab.diagnose.measurements.slanted_edge import ASIDE, SLANTED_EDGE
-from lab.diagnose.measurements.spectral import CHART
 from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian, with_unnamed
 from lab.errors import InputError, NotDetermined
 from lab.fit import Step, fit_recording_set
@@ -30,10 +24,16 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
-from lab.measure.noise_figures import BLACK_FLOOR_DN, USUAL_LAMP, NoiseFigures
-from lab.measure.patches import reflectance_covariance
-from lab.measure.rounding import QUANTISATION_DN2
-from lab.measure.study import Study
+from lab.observables.charts.patches import reflectance_covariance
+from lab.observables.codes.rounding import QUANTISATION_DN2
+from lab.observables.darks.level import DARK, added_dark_e_per_s
+from lab.observables.dataset import Study
+from lab.observables.edges.transfer import ASIDE, SLANTED_EDGE
+from lab.observables.flats.linearity import PHOTON_TRANSFER, misstated_levels
+from lab.observables.flats.noise import GAIN_STD, NOISE, READ_STD, shot_variance
+from lab.observables.noise.figures import BLACK_FLOOR_DN, USUAL_LAMP, NoiseFigures
+from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.spectra.narrowband import CHART
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.changes import Changes, carried, doubling_std_c, reference_temperature_c
 from lab.twin.relative_light import RelativeLight, rates_per_dose, relative_light

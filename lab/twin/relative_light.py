@@ -18,12 +18,12 @@ import numpy as np
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import coordinates
-from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.linearity import linearity_block, reading
 from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian, with_unnamed
 from lab.errors import InputError, NotDetermined
 from lab.formats.model_posterior import ModelPosterior
-from lab.measure.study import Study
+from lab.observables.dataset import Study
+from lab.observables.flats.linearity import linearity_block, reading
+from lab.observables.observable import Block
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import electron_rate

@@ -10,14 +10,14 @@ import numpy as np
 from scipy.stats import norm
 
 from lab.capture_kinds.base import Capture
-from lab.diagnose.measurements.block import Label, measurement_title
-from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.errors import InputError
 from lab.formats.camera_file import lens_cache, traced_table
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
-from lab.measure.gaussian import chi2
-from lab.measure.study import Study
+from lab.observables.dataset import Study
+from lab.observables.flats.linearity import PHOTON_TRANSFER
+from lab.observables.gaussian import chi2
+from lab.observables.observable import Label, measurement_title
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.predict import QUANTITIES, is_predicted, measured_blocks
 from lab.twin.sealed import PredictedName, PredictedNumber, SealedPrediction, SidePrediction, TwinNumber

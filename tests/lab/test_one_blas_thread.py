@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from lab.measure import edge_mtf
+from lab.observables.edges import mtf as edge_mtf
 from lab.one_blas_thread import one_blas_thread
-from tests.lab.measure.drawn_edges import edge
+from tests.lab.observables.edges.drawn_edges import edge
 
 
 def blas_threads() -> set[int]:

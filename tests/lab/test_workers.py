@@ -22,7 +22,7 @@ from lab.challenge.run import run_all
 from lab.challenge.truth import FIRST_FRESH_SEED
 from lab.cli import main
 from lab.diagnose.inference.bootstrap import healthy_draws
-from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.inference.side_model import measurement_model
 from lab.errors import Cancelled, InputError
 from lab.formats import recording_set
 from lab.workers import Workers

@@ -9,7 +9,7 @@ import pytest
 from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.bootstrap import healthy_draws
 from lab.diagnose.inference.score import signatures
-from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.inference.side_model import measurement_model
 from mocks.former import ConcealedCamera, Plan
 from sim.effects.library import candidates
 

@@ -12,9 +12,9 @@ from lab.fit.compare import compare
 from lab.fit.geometry import channel_geometry, geometry_result
 from lab.fit.stereo import StereoPair, depth_std, solve_rig
 from lab.formats.results import CameraFit, FitResult
-from lab.measure.board_calibration import calibrate_robustly, cross_validation
-from lab.measure.board_detection import CornerFits
-from lab.measure.projection import CameraGeometry, difference, grid, grid_points, points_at
+from lab.observables.boards.calibration import calibrate_robustly, cross_validation
+from lab.observables.boards.detection import CornerFits
+from lab.observables.boards.projection import CameraGeometry, difference, grid, grid_points, points_at
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 DRAWS, VARIANCE_DRAWS = 400, 800

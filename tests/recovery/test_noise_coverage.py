@@ -15,9 +15,9 @@ from scipy import stats
 from lab.fit.noise.noise_fit import noise_fit
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import NoiseFit
-from lab.measure.dark_pixels import DarkPixels
-from lab.measure.levels import MeasuredLevel, Stack
-from lab.measure.weighted_lines import linearity
+from lab.observables.darks.pixels import DarkPixels
+from lab.observables.noise.levels import MeasuredLevel, Stack
+from lab.observables.weighted_lines import linearity
 from sim.sensor.mosaic import planes
 
 DRAWS = 300

@@ -56,10 +56,10 @@ from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.code_density import WIDEST
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import DiscoveredLaw, VetoedName
-from lab.measure.study import Study
+from lab.observables.codes.density import WIDEST
+from lab.observables.dataset import Study
 from sim.camera import Side
 from sim.effects.base import Effects
 from sim.effects.empirical_law import PLACES, EmpiricalLaw

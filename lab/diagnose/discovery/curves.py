@@ -13,9 +13,9 @@ from scipy.linalg import cholesky, solve_triangular
 
 from lab.diagnose.discovery.profile import Look, Profile
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Block
-from lab.measure.gaussian import ROUNDING
-from lab.measure.study import Study
+from lab.observables.dataset import Study
+from lab.observables.gaussian import ROUNDING
+from lab.observables.observable import Block
 from sim.effects.base import Effects
 from sim.effects.empirical_law import PLACES, Along, EmpiricalLaw, Of, Stage
 from sim.effects.library import list_changes

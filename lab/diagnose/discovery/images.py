@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.diagnose.measurements.dark_frames import DarkCondition, conditions, usual_conditions
-from lab.diagnose.measurements.dark_readout import MOST_FRAMES, dark_readout
-from lab.diagnose.measurements.flat_field import LEAST_SIGNAL, dark_level_dn, flats
 from lab.errors import NotDetermined
-from lab.measure.noise_figures import CLIP, robust_std
-from lab.measure.study import Study, held_out_flats, held_out_of
+from lab.observables.darks.frames import DarkCondition, conditions, usual_conditions
+from lab.observables.darks.readout import MOST_FRAMES, dark_readout
+from lab.observables.dataset import Study, held_out_flats, held_out_of
+from lab.observables.flats.field import LEAST_SIGNAL, dark_level_dn, flats
+from lab.observables.noise.figures import CLIP, robust_std
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 

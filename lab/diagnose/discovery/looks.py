@@ -13,13 +13,13 @@ from scipy.signal import savgol_coeffs
 
 from lab.diagnose.discovery.images import DarkImages, Image, dark_images, flat_images, noise_by_time
 from lab.diagnose.discovery.profile import Look, Profile
-from lab.diagnose.measurements.code_density import CodeCounts, counted, counted_in_all, prepared, widths
-from lab.diagnose.measurements.dark_frames import cell_means
-from lab.diagnose.measurements.dark_readout import dark_readout
-from lab.diagnose.measurements.flat_field import FlatLevel, flats, without_dark
 from lab.errors import NotDetermined
-from lab.measure.reads import CODES, COLLECTED, GAINS, acting
-from lab.measure.study import Study
+from lab.observables.codes.density import CodeCounts, counted, counted_in_all, prepared, widths
+from lab.observables.darks.frames import cell_means
+from lab.observables.darks.readout import dark_readout
+from lab.observables.dataset import Study
+from lab.observables.flats.field import FlatLevel, flats, without_dark
+from lab.observables.reads import CODES, COLLECTED, GAINS, acting
 from sim.camera import Cfa
 from sim.effects.base import Effects
 from sim.effects.empirical_law import Along, Of, Stage

@@ -17,11 +17,11 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.score import signatures
-from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.inference.side_model import measurement_model
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
-from lab.measure.gaussian import chi2
+from lab.observables.gaussian import chi2
 from lab.one_blas_thread import one_blas_thread
 from lab.predict.replay import Replay
 from lab.workers import Workers

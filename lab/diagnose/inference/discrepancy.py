@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky, eigh, solve_triangular
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Block
 from lab.diagnose.policy import DecisionPolicy
-from lab.measure.gaussian import ROUNDING, Gaussian, chi2, conditional
+from lab.observables.gaussian import ROUNDING, Gaussian, chi2, conditional
+from lab.observables.observable import Block
 from sim.spectrum import FloatArray
 
 #: Amplitudes, relative to the block's scale, and lengths, relative to the block's `reach`, that are tried.

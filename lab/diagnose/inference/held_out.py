@@ -13,7 +13,7 @@ from lab.diagnose.inference.locate import Slice, log_tail
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.policy import DecisionPolicy
-from lab.measure.gaussian import ROUNDING, chi2, conditional
+from lab.observables.gaussian import ROUNDING, chi2, conditional
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 

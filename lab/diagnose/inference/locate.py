@@ -9,9 +9,9 @@ import numpy as np
 from scipy import special
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Block
 from lab.diagnose.policy import DecisionPolicy
-from lab.measure.gaussian import ROUNDING, Gaussian, chi2, conditional
+from lab.observables.gaussian import ROUNDING, Gaussian, chi2, conditional
+from lab.observables.observable import Block
 from sim.spectrum import FloatArray
 
 #: Distinct places on an axis from which on its quarters are slices, too: two a quarter.

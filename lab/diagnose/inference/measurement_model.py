@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Block, Prediction
-from lab.measure.gaussian import ROUNDING, BlockCovariance, Gaussian
-from lab.measure.noise_figures import NoiseFigures
+from lab.observables.gaussian import ROUNDING, BlockCovariance, Gaussian
+from lab.observables.noise.figures import NoiseFigures
+from lab.observables.observable import Block, Prediction
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
 from sim.spectrum import FloatArray

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Block
 from lab.diagnose.policy import DecisionPolicy
+from lab.observables.observable import Block
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 from sim.uniform import LEVEL

@@ -15,7 +15,7 @@ from scipy.optimize import brentq, least_squares
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
-from lab.measure.gaussian import Gaussian
+from lab.observables.gaussian import Gaussian
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
 from sim.parameters import Quantity

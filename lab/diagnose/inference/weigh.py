@@ -13,7 +13,7 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Fit, log_likelihood
 from lab.diagnose.inference.search import Search
 from lab.diagnose.policy import DecisionPolicy
-from lab.measure.gaussian import Gaussian
+from lab.observables.gaussian import Gaussian
 from sim.effects.base import Effect
 from sim.effects.library import list_changes
 from sim.effects.other_f_number import OtherFNumber

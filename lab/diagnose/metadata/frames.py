@@ -14,18 +14,18 @@ from lab.capture_kinds.base import LONGEST_EXPOSURE_S
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
-from lab.diagnose.measurements.dark_frames import TEMPERATURE_STEP_C
-from lab.diagnose.measurements.dark_level import BLACK_LEVEL, DARK
-from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
 from lab.diagnose.metadata.misstatement import LEFT_OUT, Misstatement, restated_camera
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.formats.recording_set.files import Frame
 from lab.formats.results import Skipped
-from lab.measure.code_step import find_code_step
-from lab.measure.level_lines import DARKER_SHARE
-from lab.measure.mishaps import exchanged_frames
-from lab.measure.rounding import QUANTISATION_DN2, rounding_std_dn
+from lab.observables.acquisition_errors import exchanged_frames
+from lab.observables.codes.rounding import QUANTISATION_DN2, rounding_std_dn
+from lab.observables.codes.step import find_code_step
+from lab.observables.darks.frames import TEMPERATURE_STEP_C
+from lab.observables.darks.level import BLACK_LEVEL, DARK
+from lab.observables.flats.level_lines import DARKER_SHARE
+from lab.observables.flats.linearity import PHOTON_TRANSFER
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
@@ -74,8 +74,8 @@ def misstated_exposure_unit(
 def misplaced_frames(
     recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
 ) -> Misstatement | None:
-    """Pairs of darks and flats that seem to hold each other's frames (`lab.measure.mishaps`); None where none is
-    found. They are left out."""
+    """Pairs of darks and flats that seem to hold each other's frames (`lab.observables.acquisition_errors`); None
+    where none is found. They are left out."""
     found = exchanged_frames(recordings, side)
     if found is None:
         return None

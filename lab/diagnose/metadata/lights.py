@@ -13,17 +13,17 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.diagnose.measurements.block import Measurement
-from lab.diagnose.measurements.linearity import PHOTON_TRANSFER
-from lab.diagnose.measurements.spectral import CHART, NARROWBAND
 from lab.diagnose.metadata.misstatement import LEFT_OUT, Misstatement, restated_camera
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.errors import InputError
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Frame, RecordingSet
-from lab.measure.levels import darks_near
-from lab.measure.mishaps import ALIKE, alike_planes
-from lab.measure.patches import patch_boxes
+from lab.observables.acquisition_errors import ALIKE, alike_planes
+from lab.observables.charts.patches import patch_boxes
+from lab.observables.flats.linearity import PHOTON_TRANSFER
+from lab.observables.noise.levels import darks_near
+from lab.observables.observable import Measurement
+from lab.observables.spectra.narrowband import CHART, NARROWBAND
 from sim.camera import CameraModel, Cfa, Side
 from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic
@@ -353,8 +353,8 @@ def _name(light: LitPlanes) -> str:
 def misstated_mosaic(
     recordings: RecordingSet, side: Side, policy: DecisionPolicy = DEFAULT_POLICY
 ) -> Misstatement | None:
-    """Return a stated mosaic whose planes are alike in every light (`lab.measure.mishaps`); None where they differ. The
-    maker's curves are of colours, and are left out."""
+    """Return a stated mosaic whose planes are alike in every light (`lab.observables.acquisition_errors`); None where
+    they differ. The maker's curves are of colours, and are left out."""
     found = alike_planes(recordings, side)
     if found is None:
         return None

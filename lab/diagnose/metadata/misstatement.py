@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from lab.diagnose.measurements.block import Measurement
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Unexplained
+from lab.observables.observable import Measurement
 from sim.camera import Side
 
 #: What the improved model says of captures that aren't used.

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.charuco import CharucoCapture
-from lab.diagnose.measurements.boards import BOARDS
-from lab.diagnose.measurements.pattern_fit import BERNOULLI
 from lab.diagnose.metadata.misstatement import Misstatement
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
-from lab.measure.board_detection import as_grey, luminance
-from lab.measure.screen_registration import ScreenPictures, register, screen_pictures
+from lab.observables.boards.corners import BOARDS
+from lab.observables.boards.detection import as_grey, luminance
+from lab.observables.screens.pattern_fit import BERNOULLI
+from lab.observables.screens.registration import ScreenPictures, register, screen_pictures
 from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]

@@ -17,11 +17,11 @@ from lab.capture_kinds.screen import ScreenSequence
 from lab.capture_kinds.slanted_edge import EdgeSequence, EdgeTarget, TurnTarget
 from lab.capture_kinds.stopped_edge import ApertureTarget, StoppedEdgeSequence
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.spectral import CURVE_ROUGH_STD, NARROWBAND_FLOOR
 from lab.diagnose.outcome.expected_information import Forecast
 from lab.diagnose.outcome.settling_capture import FEW_REPEATS, MORE_REPEATS, repeats_of
 from lab.formats.recording_set import RecordingSet
-from lab.measure.noise_figures import BLACK_FLOOR_DN, LAMP_FLOOR
+from lab.observables.noise.figures import BLACK_FLOOR_DN, LAMP_FLOOR
+from lab.observables.spectra.narrowband import CURVE_ROUGH_STD, NARROWBAND_FLOOR
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.optics.imaging import DiffractionLimited

@@ -26,7 +26,7 @@ from lab.formats.results import (
     Unexplained,
     Visibility,
 )
-from lab.measure.gaussian import chi2
+from lab.observables.gaussian import chi2
 from sim.camera import Side
 from sim.effects.base import Effect, Effects
 from sim.effects.library import candidates, list_changes

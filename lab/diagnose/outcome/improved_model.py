@@ -16,8 +16,6 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.inference.discrepancy import Discrepancy
 from lab.diagnose.inference.measurement_model import MeasurementModel, form_name
-from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.spectral import freed_curve
 from lab.diagnose.outcome.model_posterior import model_posterior
 from lab.errors import NotDetermined
 from lab.formats.camera_file import CameraFile
@@ -25,8 +23,10 @@ from lab.formats.camera_model import camera_model, remarks_on_values
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, ResidualPicture
 from lab.formats.results.diagnosis import IN_CURVES
-from lab.measure.patches import PATCH_COLOUR_STD, PATCH_STD, patch_boxes
-from lab.measure.stated_light import most_frequent_gain_db
+from lab.observables.charts.patches import PATCH_COLOUR_STD, PATCH_STD, patch_boxes
+from lab.observables.flats.stated_light import most_frequent_gain_db
+from lab.observables.observable import Block
+from lab.observables.spectra.narrowband import freed_curve
 from lab.predict.replay import Replay
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect

@@ -8,7 +8,6 @@ import numpy as np
 from scipy import special
 
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.block import measurement_title
 from lab.diagnose.outcome.goodness_of_fit import set_sentences, told_as
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
@@ -25,6 +24,7 @@ from lab.formats.results import (
     Rival,
 )
 from lab.formats.results.words import measured
+from lab.observables.observable import measurement_title
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.families import Family

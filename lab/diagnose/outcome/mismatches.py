@@ -18,9 +18,6 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.outlying import OutlyingLevel
 from lab.diagnose.inference.shown_in_means import is_judged_in_means, shown_in_means
 from lab.diagnose.inference.weigh import UNKNOWN, Candidate
-from lab.diagnose.measurements.block import Block
-from lab.diagnose.measurements.boards import BOARDS
-from lab.diagnose.measurements.linearity import PHOTON_TRANSFER, RADIOMETER_STD, misstated_levels
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
@@ -37,8 +34,11 @@ from lab.formats.results import (
 )
 from lab.formats.results.plausible import FIGURES
 from lab.formats.results.words import measured
-from lab.measure.board_detection import MIN_CORNERS
-from lab.measure.gaussian import Gaussian, chi2
+from lab.observables.boards.corners import BOARDS
+from lab.observables.boards.detection import MIN_CORNERS
+from lab.observables.flats.linearity import PHOTON_TRANSFER, RADIOMETER_STD, misstated_levels
+from lab.observables.gaussian import Gaussian, chi2
+from lab.observables.observable import Block
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.empirical_law import EmpiricalLaw

@@ -18,12 +18,12 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Coordinate, coordinate_prior, coordinates, moved, refit
 from lab.diagnose.inference.score import signatures
-from lab.diagnose.measurements.noise import GAIN_STD, NOISE
-from lab.diagnose.measurements.spectral import CHART
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior, NameInDoubt, RivalModel, StoredEffect
-from lab.measure.noise_figures import NoiseFigures
-from lab.measure.patches import reflectance_covariance
+from lab.observables.charts.patches import reflectance_covariance
+from lab.observables.flats.noise import GAIN_STD, NOISE
+from lab.observables.noise.figures import NoiseFigures
+from lab.observables.spectra.narrowband import CHART
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.library import effects as library

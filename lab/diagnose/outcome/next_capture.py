@@ -25,13 +25,13 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import displaced, refit
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.spectral import freed_curve
 from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
 from lab.diagnose.outcome.expected_information import Forecast
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import visibility
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import NextCapture
+from lab.observables.spectra.narrowband import freed_curve
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.library import effects as library

@@ -2,15 +2,16 @@
 
 Definitions: EMVA Standard 1288, release 4.0 (linear). The steps, one module each:
 
-- `lab.measure.levels`: means, temporal and spatial variances of the repeats of one level, without defective pixels and
-  the smooth shading; `lab.measure.stated_light`: the light that flats state;
-- `lab.measure.level_lines`: dark means against exposure, which flats clip, and a response that outliers don't move;
+- `lab.observables.noise.levels`: means, temporal and spatial variances of the repeats of one level, without defective
+  pixels and the smooth shading; `lab.observables.flats.stated_light`: the light that flats state;
+- `lab.observables.flats.level_lines`: dark means against exposure, which flats clip, and a response that outliers
+  don't move;
 - `evaluation`: which flats serve the lines, what their means scatter, and the state that all figures rest on;
 - `photon_transfer`: conversion gain and curvature from variances against means;
 - `dark_current` (black level, read noise, dark current), `fixed_pattern` (DSNU, PRNU, shading), `response` (linearity,
   full well, quantum efficiency, curvature of the variance);
 - `emva1288`: the figures by the letter of the standard, beside the physical fit;
-- `lab.measure.dark_pixels`, `pixel_maps`: figures and maps of single pixels;
+- `lab.observables.darks.pixels`, `pixel_maps`: figures and maps of single pixels;
 - `noise_fit`: the step on a recording set, and its results.
 
 Where the fit departs from the letter of the standard:

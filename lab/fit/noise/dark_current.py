@@ -10,8 +10,8 @@ import numpy as np
 from lab.errors import NotDetermined
 from lab.fit.noise.evaluation import Evaluation, in_electrons, transfer_of
 from lab.formats.results import DarkCurrentLaws
-from lab.measure.level_lines import mean_and_std
-from lab.measure.weighted_lines import chi2_factor, dark_line, least_squares
+from lab.observables.flats.level_lines import mean_and_std
+from lab.observables.weighted_lines import chi2_factor, dark_line, least_squares
 from sim.parameters import Frozen
 
 # --- temperature law -----------------------------------------------------------------------------------------------

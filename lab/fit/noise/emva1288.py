@@ -17,9 +17,9 @@ from scipy import special
 
 from lab.formats.results import Emva1288, Emva1288Points
 from lab.formats.results.words import measured
-from lab.measure.levels import BoolArray, MeasuredLevel, SpatialVariance
-from lab.measure.rounding import QUANTISATION_DN2
-from lab.measure.weighted_lines import DarkLine, chi2_factor, dark_line, linearity, root
+from lab.observables.codes.rounding import QUANTISATION_DN2
+from lab.observables.noise.levels import BoolArray, MeasuredLevel, SpatialVariance
+from lab.observables.weighted_lines import DarkLine, chi2_factor, dark_line, linearity, root
 from sim.spectrum import FloatArray
 
 HIDDEN_DN2 = 0.24  # temporal variance below which rounding hides the noise, of a step of the codes of 1 DN

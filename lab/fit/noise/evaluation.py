@@ -15,7 +15,7 @@ from scipy import special
 from lab.errors import NotDetermined
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import InconsistentLevel
-from lab.measure.level_lines import (
+from lab.observables.flats.level_lines import (
     CLIPPED_LIMIT,
     DarkSignal,
     RobustResponse,
@@ -25,8 +25,8 @@ from lab.measure.level_lines import (
     robust_response,
     saturation_of,
 )
-from lab.measure.levels import LEAST_REACH, MeasuredLevel, RecordedLevels, Remarks
-from lab.measure.weighted_lines import least_squares
+from lab.observables.noise.levels import LEAST_REACH, MeasuredLevel, RecordedLevels, Remarks
+from lab.observables.weighted_lines import least_squares
 from sim.spectrum import FloatArray
 
 # --- The photon-transfer curve: conversion gain, curvature and dark variances from temporal variances against means ---

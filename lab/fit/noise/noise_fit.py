@@ -49,13 +49,13 @@ from lab.formats.results import (
     Skipped,
 )
 from lab.formats.results.plausible import implausible_figures
-from lab.measure.code_step import find_code_step, under_highest_code
-from lab.measure.dark_pixels import DarkPixels, read_noise_distribution, stack_of
-from lab.measure.levels import DEFECT_SIGMA, MeasuredLevel, PlaneStatistics, defective_pixels, rounded_c
-from lab.measure.mishaps import alike_planes, copied_frames, exchanged_frames
-from lab.measure.repeats import find_drifts
-from lab.measure.stated_light import StatedLight, lamps_of, light_of, most_frequent_gain_db, why_not
-from lab.measure.weighted_lines import chi2_factor, root
+from lab.observables.acquisition_errors import alike_planes, copied_frames, exchanged_frames
+from lab.observables.codes.step import find_code_step, under_highest_code
+from lab.observables.darks.pixels import DarkPixels, read_noise_distribution, stack_of
+from lab.observables.flats.stated_light import StatedLight, lamps_of, light_of, most_frequent_gain_db, why_not
+from lab.observables.noise.levels import DEFECT_SIGMA, MeasuredLevel, PlaneStatistics, defective_pixels, rounded_c
+from lab.observables.noise.repeats import find_drifts
+from lab.observables.weighted_lines import chi2_factor, root
 from sim.camera import Side
 
 # --- fixed pattern ---------------------------------------------------------------------------------------------------

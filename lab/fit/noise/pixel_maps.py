@@ -12,10 +12,10 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
-from lab.measure.code_step import find_code_step
-from lab.measure.dark_pixels import stack_of
-from lab.measure.levels import BoolArray, Stack, darks_near, defective_pixels, shading
-from lab.measure.rounding import QUANTISATION_DN2
+from lab.observables.codes.rounding import QUANTISATION_DN2
+from lab.observables.codes.step import find_code_step
+from lab.observables.darks.pixels import stack_of
+from lab.observables.noise.levels import BoolArray, Stack, darks_near, defective_pixels, shading
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from lab.fit.noise.evaluation import CURVE_LIMIT, LINE_LIMIT, Evaluation, in_electrons
-from lab.measure.levels import MeasuredLevel
-from lab.measure.weighted_lines import Linearity, chi2_factor, least_squares, linearity
+from lab.observables.noise.levels import MeasuredLevel
+from lab.observables.weighted_lines import Linearity, chi2_factor, least_squares, linearity
 from sim.spectrum import FloatArray
 
 # --- response ------------------------------------------------------------------------------------------------------

@@ -4,9 +4,8 @@ Model: blurred = kernel * sharp + noise, kernel >= 0, sum 1 (`estimate_kernel`).
 
 - `kernel`: the estimator: normal equations, prior, optimum under the constraints, covariance, and the registration of
   a target that was drawn a little off its place;
-- `lab.measure.screen_registration`: captures of one pose, levelled between black and white, and where the pattern lies
-  in the
-  frame, from the checkerboard;
+- `lab.observables.screens.registration`: captures of one pose, levelled between black and white, and where the pattern
+  lies in the frame, from the checkerboard;
 - `screen_kernel`: the pattern drawn on samples of half a pixel; registration and kernel in turn, for each channel on
   its own pixels of the mosaic, and over the field; the kernel that this finds for a given transfer function;
 - `recordings`: the step on a recording set, with a test of radial symmetry;

@@ -14,7 +14,7 @@ from scipy import ndimage
 from lab.errors import NotDetermined
 from lab.fit.psf.kernel import KernelEstimate, solve_kernel
 from lab.fit.psf.screen_kernel import DrawnPattern, screen_kernel
-from lab.measure.screen_registration import LEAST_CORRELATION, ScreenWarp
+from lab.observables.screens.registration import LEAST_CORRELATION, ScreenWarp
 from lab.one_blas_thread import one_blas_thread
 
 Array = NDArray[np.floating[Any]]

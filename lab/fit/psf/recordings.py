@@ -17,7 +17,7 @@ from lab.errors import NotDetermined
 from lab.fit.psf.screen_kernel import ScreenKernel, measure_field
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import PsfKernel, PsfSymmetry
-from lab.measure.screen_registration import screen_pictures
+from lab.observables.screens.registration import screen_pictures
 from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]

@@ -20,7 +20,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from lab.errors import NotDetermined
 from lab.fit.psf.kernel import KernelEstimate, NormalEquations, on_simplex, solve_kernel
-from lab.measure.screen_registration import ScreenPictures, ScreenWarp, draw_by_area, register
+from lab.observables.screens.registration import ScreenPictures, ScreenWarp, draw_by_area, register
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases

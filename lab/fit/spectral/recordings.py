@@ -31,10 +31,10 @@ from lab.fit.spectral.sensitivity import (
 )
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MakerDeparture, NoiseFit, RepeatDrift, SpectralFit
-from lab.measure.code_step import find_code_step
-from lab.measure.levels import darks_near
-from lab.measure.plane_means import PlaneMean, plane_means
-from lab.measure.weighted_lines import DarkLine, dark_line
+from lab.observables.codes.step import find_code_step
+from lab.observables.noise.levels import darks_near
+from lab.observables.plane_means import PlaneMean, plane_means
+from lab.observables.weighted_lines import DarkLine, dark_line
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 from sim.optics.illumination import irradiance_factor

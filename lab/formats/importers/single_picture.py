@@ -118,7 +118,7 @@ def read_slanted_edge(path: Path, options: ImportOptions) -> RecordingSet:
     Raises InputError with all that isn't stated, in one line, or where no edge is found in the picture.
     """
     from lab.errors import NotDetermined
-    from lab.measure.edges import find_edges
+    from lab.observables.edges.region import find_edges
 
     frame, camera, notes = _picture(path, options, lambda image: _one_channel(image, options), ())
     try:

@@ -603,7 +603,8 @@ DriftShape = Literal["trend", "decay", "warm_up", "step"]
 
 
 class RepeatDrift(Frozen):
-    """What the means of repeated frames show over time beyond white scatter; how it is found: `lab.measure.repeats`.
+    """What the means of repeated frames show over time beyond white scatter; how it is found:
+    `lab.observables.noise.repeats`.
 
     `kind`: of the captures; `captures`: all repeats of the setting in order, `changing`: those in which the curve
     changes. `amplitude_dn`: change of the curve from the first of these to the last. `time_constant_s`, or `_frames`

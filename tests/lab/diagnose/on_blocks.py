@@ -11,12 +11,12 @@ import numpy as np
 from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Block, Measurement
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.measure.gaussian import chi2
-from lab.measure.study import Study
+from lab.observables.dataset import Study
+from lab.observables.gaussian import chi2
+from lab.observables.observable import Block, Measurement
 from mocks.former import ConcealedCamera, Law, Plan
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect

@@ -13,7 +13,7 @@ from lab.challenge.draw import recording_set, recordings_of
 from lab.diagnose import diagnose, discovery, examine
 from lab.diagnose.discovery import PredictiveTable, discover, law_of
 from lab.diagnose.discovery.profile import Profile, curve_forms, description_length, fitted, formulas
-from lab.diagnose.measurements.blocks import study_of
+from lab.diagnose.inference.side_model import study_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.fit import FOR_DIAGNOSIS, fit_recording_set
 from lab.formats.importers import ImportOptions, read_foreign

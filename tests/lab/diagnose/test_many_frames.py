@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lab.diagnose.measurements.dark_frames import dark_frames
 from lab.diagnose.metadata.frames import misstated_dark_exposure
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.measure.mishaps import exchanged_frames
-from lab.measure.noise_figures import TemporalVariance
-from lab.measure.study import Study, mean_frame
+from lab.observables.acquisition_errors import exchanged_frames
+from lab.observables.darks.frames import dark_frames
+from lab.observables.dataset import Study, mean_frame
+from lab.observables.noise.figures import TemporalVariance
 
 SIDE_PX = 128
 BLACK_DN, READ_DN, GAIN = 64.0, 3.0, 0.4

@@ -12,12 +12,12 @@ from lab.challenge.draw import recordings_of
 from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.outlying import freed, outlying_levels
-from lab.diagnose.measurements.dark_level import dark_level_block
-from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.outcome.mismatches import located, unexplained
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet
+from lab.observables.darks.level import dark_level_block
+from lab.observables.flats.linearity import linearity_block
 from mocks.former import ConcealedCamera, Plan
 from tests.lab.diagnose.on_blocks import measured_model, verdict
 

@@ -7,14 +7,14 @@ import pytest
 
 from lab.diagnose import diagnose
 from lab.diagnose.inference.locate import mismatches
-from lab.diagnose.measurements.blocks import measurement_model
-from lab.diagnose.measurements.linearity import linearity_block, misstated_levels
+from lab.diagnose.inference.side_model import measurement_model
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.camera_model import assumptions, camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
+from lab.observables.flats.linearity import linearity_block, misstated_levels
 from sim.effects.base import Effect
 from sim.effects.nonlinearity import Nonlinearity
 from tests.lab.diagnose.on_blocks import measured_model, names, rendered, sigmas, study, verdict

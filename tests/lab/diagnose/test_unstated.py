@@ -13,11 +13,11 @@ import pytest
 from lab.challenge.draw import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.inference.decide import decide
-from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.inference.side_model import measurement_model
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.measure.study import Study
+from lab.observables.dataset import Study
 from mocks.former import ConcealedCamera, Plan
 
 

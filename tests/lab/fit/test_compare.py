@@ -25,7 +25,7 @@ from lab.formats.results import (
     SpectralFit,
     StereoFit,
 )
-from lab.measure.board_calibration import calibrate_robustly
+from lab.observables.boards.calibration import calibrate_robustly
 from tests.lab.fit.projected import SHAPE, poses, seen
 
 

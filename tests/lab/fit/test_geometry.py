@@ -16,8 +16,8 @@ from lab.errors import NotDetermined
 from lab.fit.geometry import _fit_shift, board_warps, channel_geometry, fit_geometry, geometry_result
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import GeometryFit
-from lab.measure.board_calibration import calibrate_robustly
-from lab.measure.board_detection import CornerFits, find_board, fit_corners, luminance
+from lab.observables.boards.calibration import calibrate_robustly
+from lab.observables.boards.detection import CornerFits, find_board, fit_corners, luminance
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 

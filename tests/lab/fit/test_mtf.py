@@ -11,8 +11,8 @@ import pytest
 
 from lab.errors import NotDetermined
 from lab.fit.mtf import edge_mtf, fit_mtf
-from lab.measure.edges import find_edges
-from tests.lab.measure.drawn_edges import edge, gaussian_mtf50, squares
+from lab.observables.edges.region import find_edges
+from tests.lab.observables.edges.drawn_edges import edge, gaussian_mtf50, squares
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data" / "sfrmat5_edges"
 

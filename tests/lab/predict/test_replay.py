@@ -12,7 +12,7 @@ from lab.challenge.draw import recordings_of
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.measure.study import Study
+from lab.observables.dataset import Study
 from lab.predict.replay import Replay
 from mocks.former import ConcealedCamera, Plan
 from sim.effects.library import effect

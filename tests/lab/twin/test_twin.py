@@ -14,8 +14,8 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.cli import main
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.refit import refit
+from lab.diagnose.inference.side_model import measurement_model
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.outcome.model_posterior import names_in_doubt
 from lab.diagnose.policy import DecisionPolicy

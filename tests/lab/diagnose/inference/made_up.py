@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.block import Block, Label, Prediction
+from lab.observables.observable import Block, Label, Prediction
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.point import TRANSFER, Blur

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.measure.gaussian import BlockCovariance, Gaussian, chi2
+from lab.observables.gaussian import BlockCovariance, Gaussian, chi2
 
 
 def test_gaussians_agree_with_their_formulas() -> None:

@@ -13,9 +13,9 @@ from lab.diagnose.inference.held_out import held_out_mismatches, predicts_held_o
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.block import Prediction
 from lab.diagnose.outcome.mismatches import located, vetoed_names
 from lab.diagnose.policy import DecisionPolicy
+from lab.observables.observable import Prediction
 from sim.effects.base import Effects
 from sim.effects.charge_diffusion import ChargeDiffusion
 from tests.lab.diagnose.inference.made_up import CAMERA, NOISE, contrast_model, spectral_model

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lab.diagnose.measurements.block import Prediction
+from lab.observables.observable import Prediction
 from sim.effects.library import effect
 from tests.lab.diagnose.inference.made_up import contrast_model
 

@@ -18,8 +18,8 @@ from lab.diagnose.inference.refit import (
     profile_interval,
     refit,
 )
-from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.policy import DecisionPolicy
+from lab.observables.observable import Block, Label, Prediction
 from sim.effects.base import Effect
 from sim.effects.library import effect
 from sim.effects.light_flicker import LightFlicker

@@ -10,7 +10,7 @@ import pytest
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.score import Signatures, signatures
-from lab.diagnose.measurements.block import Block
+from lab.observables.observable import Block
 from sim.effects.base import Effect
 from sim.effects.library import effect, effects
 from tests.lab.diagnose.inference.made_up import CAMERA, FREQUENCY, NOISE, contrast_model

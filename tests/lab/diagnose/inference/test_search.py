@@ -16,9 +16,9 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.score import prototype_changes, signatures_of
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.policy import DecisionPolicy
-from lab.measure.gaussian import BlockCovariance
+from lab.observables.gaussian import BlockCovariance
+from lab.observables.observable import Block, Label, Prediction
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.families import Family

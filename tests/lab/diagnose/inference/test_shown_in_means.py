@@ -7,16 +7,16 @@ from functools import cache
 from lab.diagnose import diagnose
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.shown_in_means import is_judged_in_means, must_show_in_means, shown_in_means
-from lab.diagnose.measurements.blocks import measurement_model
-from lab.diagnose.measurements.linearity import linearity_block
-from lab.diagnose.measurements.noise import variance_block
-from lab.diagnose.measurements.noise_neighbours import neighbour_block
+from lab.diagnose.inference.side_model import measurement_model
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.outcome.mismatches import unexplained
 from lab.diagnose.policy import DecisionPolicy
 from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
+from lab.observables.flats.linearity import linearity_block
+from lab.observables.flats.noise import variance_block
+from lab.observables.noise.neighbours import neighbour_block
 from sim.effects.adc_step import AdcStep
 from sim.effects.brighter_fatter import BrighterFatter
 from sim.effects.inter_pixel_capacitance import InterPixelCapacitance

@@ -36,7 +36,7 @@ from mocks.former.laws import (
 from tests.lab.diagnose.metadata.lies import restated, told, with_cells, with_dark_exposures, with_exchanged_wavelengths
 from tests.lab.diagnose.on_blocks import former
 from tests.lab.fit.noise.synthetic_sensor import Sensor, recording_set
-from tests.lab.measure.test_exchanged_frames import swapped
+from tests.lab.observables.test_exchanged_frames import swapped
 
 MOSAICS = ("RGGB", "BGGR", "GRBG", "GBRG")
 

@@ -9,8 +9,8 @@ import numpy as np
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.formats.camera_file import default_camera
+from lab.observables.observable import Block, Label, Prediction
 from sim.effects.base import Effect
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.point import TRANSFER, Blur

@@ -17,7 +17,7 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.fit.geometry import fit_geometry, geometry_result
 from lab.formats.importers import read_checkerboard_pairs
 from lab.formats.results import CameraFit, FitResult, GeometryFit, Unexplained
-from lab.measure.board_calibration import calibrate_robustly
+from lab.observables.boards.calibration import calibrate_robustly
 from tests.lab.diagnose.on_blocks import former
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 

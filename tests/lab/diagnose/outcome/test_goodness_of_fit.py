@@ -14,9 +14,6 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.search import Model, ModelSet
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.block import Prediction
-from lab.diagnose.measurements.linearity import linearity_block
-from lab.diagnose.measurements.spectral import narrowband_block
 from lab.diagnose.outcome.goodness_of_fit import (
     detectability,
     detectable,
@@ -30,6 +27,9 @@ from lab.diagnose.outcome.goodness_of_fit import (
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import NamedEffect, Rival, SideModels, Unexplained, Visibility
+from lab.observables.flats.linearity import linearity_block
+from lab.observables.observable import Prediction
+from lab.observables.spectra.narrowband import narrowband_block
 from lab.report.diagnosis import _visibility
 from mocks.former.laws import RowNoiseLaw
 from sim.effects.amplifier_glow import AmplifierGlow

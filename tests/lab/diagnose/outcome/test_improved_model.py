@@ -13,13 +13,13 @@ from lab.challenge.draw import recordings_of
 from lab.diagnose import Diagnosis, examine
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.measurement_model import MeasurementModel, form_name
-from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.outcome.improved_model import _nearest_form, improved_model, residual_pictures
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.measure.gaussian import chi2
+from lab.observables.gaussian import chi2
+from lab.observables.observable import Block, Label, Prediction
 from lab.predict.simulate import SimulateOptions, simulate
 from mocks.former import ConcealedCamera, Plan
 from mocks.former import laws as concealed_laws

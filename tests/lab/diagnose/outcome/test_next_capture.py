@@ -14,7 +14,6 @@ from lab.capture.station import Station
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
 from lab.diagnose.outcome.next_capture import doubt_of, next_sentence
 from lab.diagnose.outcome.settling_capture import settling_sentence
@@ -24,6 +23,7 @@ from lab.errors import InputError
 from lab.formats.camera_file import default_camera
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import NextCapture, Unexplained
+from lab.observables.observable import Block, Label, Prediction
 from sim.effects.astigmatism import Astigmatism
 from sim.effects.base import Effect
 from sim.effects.black_level_drift import BlackLevelDrift

@@ -17,9 +17,7 @@ from scipy.spatial.transform import Rotation
 from lab.fit.geometry import geometry_result
 from lab.fit.stereo import StereoPair, rig_observations, solve_rig
 from lab.formats.importers import read_checkerboard_pairs
-from lab.measure.board_calibration import MODELS, calibrate, calibrate_robustly, free_intrinsics, with_model_error
-from lab.measure.board_detection import find_boards
-from lab.measure.bundle_adjustment import (
+from lab.observables.boards.bundle_adjustment import (
     BundleAdjustment,
     Observation,
     RigParameters,
@@ -27,7 +25,9 @@ from lab.measure.bundle_adjustment import (
     first_camera,
     first_state,
 )
-from lab.measure.projection import CameraGeometry
+from lab.observables.boards.calibration import MODELS, calibrate, calibrate_robustly, free_intrinsics, with_model_error
+from lab.observables.boards.detection import find_boards
+from lab.observables.boards.projection import CameraGeometry
 from sim.scene.projection import PINHOLE
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 

@@ -13,7 +13,7 @@ import pytest
 
 from lab.errors import NotDetermined
 from lab.formats.results import DistortionModel
-from lab.measure.board_calibration import Calibration, calibrate_robustly, cross_validation
+from lab.observables.boards.calibration import Calibration, calibrate_robustly, cross_validation
 from tests.lab.fit.projected import SHAPE, Truth, poses, seen
 
 

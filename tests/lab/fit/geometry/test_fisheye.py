@@ -19,8 +19,8 @@ from lab.fit.compare import compare
 from lab.fit.geometry import geometry_result
 from lab.fit.stereo import StereoPair, fit_pairs, rectification_maps
 from lab.formats.results import CameraFit, FitResult
-from lab.measure.board_calibration import calibrate, calibrate_robustly, with_model_error
-from lab.measure.board_detection import (
+from lab.observables.boards.calibration import calibrate, calibrate_robustly, with_model_error
+from lab.observables.boards.detection import (
     LEAST_BEND_PX,
     BoardView,
     bend_px,

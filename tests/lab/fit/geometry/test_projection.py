@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.measure.board_calibration import calibrate_robustly
-from lab.measure.projection import (
+from lab.observables.boards.calibration import calibrate_robustly
+from lab.observables.boards.projection import (
     CameraGeometry,
     cross_matrices,
     difference,

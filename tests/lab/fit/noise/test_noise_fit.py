@@ -13,7 +13,7 @@ from lab.fit.noise.dark_current import temperature_law
 from lab.fit.noise.evaluation import fit_transfer
 from lab.fit.noise.noise_fit import fit_level_table, noise_fit
 from lab.formats.recording_set import DataSheet
-from lab.measure.levels import MeasuredLevel
+from lab.observables.noise.levels import MeasuredLevel
 from tests.lab.fit.noise.synthetic_sensor import TRUTHS, Sensor, levels, measured, scores
 
 

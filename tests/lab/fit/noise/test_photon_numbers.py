@@ -10,7 +10,7 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult, NoiseFit
-from lab.measure.stated_light import photon_numbers, why_not
+from lab.observables.flats.stated_light import photon_numbers, why_not
 from lab.report.emva import data_sheets
 
 SHAPE, PITCH_UM, WAVELENGTH_NM = (96, 96), 5.0, 530.0

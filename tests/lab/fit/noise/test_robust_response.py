@@ -7,8 +7,8 @@ import pytest
 
 from lab.fit.noise.noise_fit import noise_fit
 from lab.formats.results import NoiseFit
-from lab.measure.level_lines import RobustResponse, robust_response
-from lab.measure.levels import MeasuredLevel
+from lab.observables.flats.level_lines import RobustResponse, robust_response
+from lab.observables.noise.levels import MeasuredLevel
 from tests.lab.fit.noise.synthetic_sensor import Sensor, levels
 
 BEND = 0.02  # of the response at saturation

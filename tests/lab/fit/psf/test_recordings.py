@@ -20,7 +20,7 @@ from lab.fit.psf import recordings
 from lab.fit.psf.recordings import PsfFit, fit_psf_field, radial_symmetry
 from lab.fit.psf.screen_kernel import ScreenField, ScreenKernel, measure_field
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
-from lab.measure.screen_registration import ScreenPictures, register, screen_pictures, target_corners
+from lab.observables.screens.registration import ScreenPictures, register, screen_pictures, target_corners
 from tests.lab.fit.psf.drawn_targets import (
     gaussian,
 )

@@ -1,1 +1,0 @@
-"""What the diagnosis measures, one file a kind of measurement."""

@@ -1,0 +1,1 @@
+"""Calibration boards: corners, camera geometry, and pairs of cameras."""

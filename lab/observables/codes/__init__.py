@@ -1,0 +1,1 @@
+"""Codes of the converter: their step, rounding, and the histogram of codes in uniform light."""

@@ -1,0 +1,437 @@
+"""The code-density test of the converter: the histogram of codes in uniform light.
+
+Noise and shading make the histogram of many frames smooth on the scale of the noise's standard deviation at each level.
+Structure on a finer scale comes from the converter (differential nonlinearity), or from processing of the codes after
+it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.linalg import block_diag
+from scipy.special import ndtr
+
+from lab.capture_kinds.flat import FlatCapture
+from lab.capture_kinds.narrowband import NarrowbandCapture
+from lab.errors import NotDetermined
+from lab.observables.dataset import Study, held_out_flats, held_out_of
+from lab.observables.observable import Block, Label, Measurement, Prediction
+from sim.effects.base import Effects
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+#: Step of the codes, DN, from which on they were shifted or scaled: one stuck bit gives 2, two stuck bits are taken
+#: as a shift.
+SHIFTED_FROM = 4
+LEAST_NOISE = 3.0  # standard deviation of the light's noise, codes; below, noise doesn't smooth the histogram
+LEAST_COUNT = 30.0  # of a code that is looked at
+WIDEST = 24  # codes on either side of a smooth curve
+DEGREE = 4
+LEAST_CODES = 24
+PLACES = 128  # parts of the converter's range, at whose borders steps are looked for
+LEAST_SPACING = 4  # codes from one place to the next
+FAR = 1.3  # of the noise's standard deviation: distance over which the curve beside a place is fitted
+DEGREE_BESIDE = 1
+STEP_COUNT = 3.0  # of each code about a place; the sum over a place has a hundred times as many
+STEP_FLOOR = 0.01  # of the codes from place to place: what smooth curves leave, most beside steep ones
+COMB_FLOOR = 3e-4
+VARIANCE_FLOOR = 0.03  # of a chi2's number of codes
+#: Frequencies of the combs, cycles a code.
+COMBS = (1 / 2, 3 / 8, 1 / 4, 1 / 8)
+AROUND = 9  # side of the box in a plane of the mosaic whose mean is the light at a pixel, px
+#: Width of the levels whose pixels share one normal distribution, over the standard deviation of the noise.
+STEP_OF_LEVELS = 0.2
+PARTS = 4  # of the range of codes, each with a chi2 of its own
+FINE = 8  # samples a code at which the converter's law is evaluated where it isn't straight
+#: Codes by which the middle of 1 / `FINE` of a code may land off the mean of its ends, where the law is straight.
+JUMP = 1e-3
+STRAIGHT = 1e-9  # codes: second difference of a law between codes, of rounding alone
+MARGIN = 64  # codes beyond those that are counted
+
+
+@dataclass(frozen=True)
+class CodeCounts:
+    """The histogram over the codes that can be tested; arrays are (codes,)."""
+
+    first: int  # the lowest code
+    count: FloatArray  # of pixels
+    expected: FloatArray  # counts by the light and its noise, for an ideal converter
+    smooth: FloatArray  # smoothed counts
+    rough: sparse.csr_array  # (codes, codes): counts -> residuals, the identity less the smoothing filter
+    noise: FloatArray  # standard deviation of the light's noise, codes
+    used: np.ndarray  # mask: counted often enough, and all neighbours of the filter present
+
+
+def code_block(study: Study) -> Block:
+    """Code-density test of all uniform light: steps (DN) by the code, combs of a few codes' period, and the variance of
+    the counts about a smooth curve."""
+    counts = study.once(counted)
+    labels: list[Label] = []
+    places: list[tuple[float, float]] = []
+    sets: dict[bool, tuple[CodeCounts, sparse.csr_array, list[_Part]]] = {}
+    values, covariances, scales = [], [], []
+    for held_out in (False, True):
+        codes = prepared(study, counts[held_out])
+        if codes is None:
+            continue
+        (steps, boundaries), parts = _steps(study, codes), _parts(codes)
+        combs, names = _combs(codes)
+        residual = codes.rough @ codes.count
+        values += [
+            steps @ codes.count,
+            combs @ codes.count,
+            np.array([p.excess(residual) - p.number / p.chi2_std for p in parts]),
+        ]
+        # unequal codes show in proportion to the number of pixels counted: seen and held-out frames have different ones
+        scales += [np.ones(len(steps) + len(combs)), np.array([p.ofwidths for p in parts])]
+        linear = np.vstack([steps, combs])
+        floor = np.concatenate([np.full(len(steps), STEP_FLOOR * _spacing(study)), np.full(len(combs), COMB_FLOOR)])
+        covariances += [
+            _covariance(linear, codes, counts[held_out]) + np.diag(np.square(floor)),
+            np.diag([1.0 + (VARIANCE_FLOOR * p.number / p.chi2_std) ** 2 for p in parts]),
+        ]
+        members = tuple(counts[held_out].captures)
+        labels += [
+            Label(float(codes.first + b), "step", f"code {codes.first + b}", members, held_out) for b in boundaries
+        ]
+        labels += [Label(x, "comb", words, members, held_out) for x, words in names]
+        for p in parts:
+            low, high = codes.first + p.at.start, codes.first + p.at.stop - 1
+            labels.append(Label(0.5 * (low + high), "variance", f"codes {low} to {high}", members, held_out))
+        # discrepancies of combs: independent between periods and phases, the same for seen and held-out frames
+        far = 10.0 * study.camera.white_level_dn
+        places += [(float(codes.first + b), 0.0) for b in boundaries]
+        places += [(0.0, far * k) for k in range(len(names))]
+        places += [(label.x, 0.0) for label in labels[len(places) :]]
+        sets[held_out] = codes, sparse.csr_array(linear), parts
+    if not labels:
+        raise NotDetermined(
+            "code_density", f"no even light over {LEAST_CODES} codes and more whose noise exceeds {LEAST_NOISE:g} codes"
+        )
+
+    def predict(effects: Effects) -> Prediction:
+        found: list[FloatArray] = []
+        scatter: dict[str, tuple[int, float]] = {}
+        for held_out, (codes, linear, parts) in sets.items():
+            change = codes.expected * (widths(codes, effects, study) - 1.0)
+            moved = codes.rough @ change
+            excess = np.array([p.excess(moved) for p in parts])
+            at = sum(map(len, found)) + int(linear.shape[0])
+            found += [linear @ change, excess]
+            for k in np.flatnonzero(excess > 0.0):
+                scatter[f"codes:{held_out}:{k}"] = at + int(k), parts[k].scatter(float(excess[k]))
+        mean = np.concatenate(found)
+        return Prediction(mean, {name: std * (np.arange(len(mean)) == i) for name, (i, std) in scatter.items()})
+
+    return Block(
+        measurement=CODE_DENSITY, reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
+        covariance=block_diag(*covariances), labels=tuple(labels), reads=frozenset({"codes.codes"}), predict=predict,
+        scale=np.concatenate(scales),
+        along=np.array(places),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """Counts of every code in some frames, (white level + 1,), and the counts that light and noise give an ideal
+    converter; `groups`: pixels of one level, as their first code, their number, and the probabilities of their
+    codes."""
+
+    count: FloatArray
+    expected: FloatArray
+    captures: list[str]
+    groups: list[tuple[int, int, FloatArray]]
+
+    def take(self, study: Study, capture: Any) -> None:
+        """Add a capture's frame."""
+        frame = study.recordings.frame(capture)
+        self.count[:] += np.bincount(frame.ravel(), minlength=len(self.count))[: len(self.count)]
+        for plane in mosaic.planes(frame, study.camera.cfa).values():
+            for first, number, probability in _levels(np.asarray(plane, np.float32), study):
+                last = min(first + len(probability), len(self.expected))
+                self.expected[first:last] += number * probability[: last - first]
+                self.groups.append((first, number, probability))
+        self.captures.append(capture.id)
+
+
+def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
+    """Yield a plane's pixels by level, as `_Counts.groups`.
+
+    Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels, and by as much beside it as its row is on
+    the whole. Its variance is proportional to the signal above black, and scaled so that its mean is the measured mean
+    square of the departures.
+    """
+    surface = ndimage.uniform_filter(plane, AROUND, mode="reflect")
+    surface = surface + (plane - surface).mean(axis=1, keepdims=True)
+    own = AROUND**2 / (AROUND**2 - 1.0) / (1.0 - 1.0 / plane.shape[1])
+    signal = max(float(surface.mean()) - study.noise.black, 1.0)
+    variance = own * float(np.mean(np.square(plane - surface), dtype=float))
+    # pixels are binned by level, in steps narrow beside the noise; the variance of the levels within a bin is added
+    step = max(STEP_OF_LEVELS * np.sqrt(variance), 1.0)
+    above = surface.ravel().astype(float) - float(surface.min())
+    group = (above / step).astype(int)
+    number = np.bincount(group)
+    share = np.maximum(number, 1)
+    mean = np.bincount(group, above) / share
+    within = np.maximum(np.bincount(group, np.square(above)) / share - np.square(mean), 0.0)
+    for n, middle, added in zip(number, mean + float(surface.min()), within, strict=True):
+        if n == 0:
+            continue
+        sigma = np.sqrt(max(variance * max(middle - study.noise.black, 1.0) / signal + added, 1e-2))
+        low = max(int(middle - 6.0 * sigma), 0)
+        edges = (np.arange(low, int(middle + 6.0 * sigma) + 3) - 0.5 - middle) / sigma
+        yield low, int(n), np.diff(ndtr(edges))
+
+
+def counted(study: Study) -> dict[bool, _Counts]:
+    """Counts of all flat and narrowband frames without gain in dB: seen (False) and held out (True). Raises
+    NotDetermined where codes lie `SHIFTED_FROM` or more apart."""
+    if study.step_dn >= SHIFTED_FROM:
+        raise NotDetermined(
+            "code_density",
+            f"codes lie {study.step_dn:.5g} DN apart, as those of fewer bits that were shifted or scaled: their steps "
+            "aren't judged; write the frames as they left the converter",
+        )
+    size = int(study.camera.white_level_dn) + 1
+    counts = {out: _Counts(np.zeros(size), np.zeros(size), [], []) for out in (False, True)}
+    out = set(study.once(held_out_flats))
+    groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    out |= set().union(*(held_out_of(g, i, len(groups)) for i, g in enumerate(groups))) if groups else set()
+    for kind in (FlatCapture, NarrowbandCapture):
+        for capture in study.recordings.captures(kind, study.side):
+            if not capture.gain_db:
+                counts[capture.id in out].take(study, capture)
+    return counts
+
+
+def counted_in_all(study: Study) -> dict[bool, _Counts]:
+    """Counts of `counted`, and of all other frames with light, without what their light gives an ideal converter.
+
+    Their histogram is as smooth by the noise of the light as that of even light. Of each kind every third capture is
+    held out.
+    """
+    found = {}
+    for out, even in study.once(counted).items():
+        found[out] = _Counts(even.count.copy(), np.zeros(len(even.count)), list(even.captures), [])
+    number: dict[str, int] = {}
+    for capture in study.recordings.captures(side=study.side):
+        if capture.kind in {"dark", "flat", "narrowband"} or getattr(capture, "gain_db", None):
+            continue
+        number[capture.kind] = number.get(capture.kind, -1) + 1
+        own, frame = found[number[capture.kind] % 3 == 1], study.recordings.frame(capture)
+        own.count[:] += np.bincount(frame.ravel(), minlength=len(own.count))[: len(own.count)]
+        own.captures.append(capture.id)
+    return found
+
+
+def prepared(study: Study, counts: _Counts) -> CodeCounts | None:
+    """Return the histogram over the usable codes, None where they are too few."""
+    level = np.arange(len(counts.count), dtype=float)
+    noise = np.sqrt(np.maximum(study.noise.gain * (level - study.noise.black), 0.0) + study.noise.read_dn**2)
+    high = min(float(study.saturation_dn), float(len(level) - 1))
+    usable = (noise >= LEAST_NOISE) & (level < high - 6.0 * noise)
+    if usable.sum() < LEAST_CODES:
+        return None
+    first, last = int(np.flatnonzero(usable)[0]), int(np.flatnonzero(usable)[-1])
+    count, expected, noise = (a[first : last + 1] for a in (counts.count, counts.expected, noise))
+    half = np.clip(noise.astype(int), 3, WIDEST)
+    index = np.arange(len(count))
+    inside = (index >= half) & (index < len(count) - half)
+    weights, columns, rows = [], [], []
+    for width in np.unique(half):
+        at = index[inside & (half == width)]
+        own = -_smoothing(int(width))
+        own[width] += 1.0
+        rows.append(np.repeat(at, len(own)))
+        columns.append((at[:, None] + np.arange(-width, width + 1)).ravel())
+        weights.append(np.tile(own, len(at)))
+    if not rows:
+        return None
+    rough = sparse.csr_array(
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(len(count), len(count))
+    )
+    smooth = np.maximum(count - rough @ count, 0.0)
+    used = inside & (smooth >= LEAST_COUNT)
+    if used.sum() < LEAST_CODES:
+        return None
+    return CodeCounts(first, count, expected, smooth, rough, noise, used)
+
+
+@cache
+def _smoothing(half: int) -> FloatArray:
+    """Weights (2 half + 1,) of the Savitzky-Golay filter: the value in the middle of the polynomial of degree `DEGREE`
+    that least squares fit to 2 half + 1 values."""
+    x = np.arange(-half, half + 1) / half
+    return np.asarray(np.linalg.pinv(np.vander(x, DEGREE + 1, increasing=True))[0])
+
+
+def _covariance(linear: FloatArray, codes: CodeCounts, counts: _Counts) -> FloatArray:
+    """Covariance of `linear` (m, codes) @ counts. Each pixel has one code: the counts of a group's pixels are
+    multinomial."""
+    found = (linear * np.maximum(codes.expected, 1.0)) @ linear.T
+    means = []
+    for first, number, probability in counts.groups:
+        low, high = max(first, codes.first), min(first + len(probability), codes.first + len(codes.count))
+        if low < high:
+            part = linear[:, low - codes.first : high - codes.first] @ probability[low - first : high - first]
+            means.append(np.sqrt(number) * part)
+    return np.asarray(found - np.transpose(means) @ np.array(means))
+
+
+def _combs(codes: CodeCounts) -> tuple[FloatArray, list[tuple[float, str]]]:
+    """Weights (combs, codes) of the counts that give the combs' amplitudes relative to the mean count, and (mean code,
+    words) of each.
+
+    For every frequency of `COMBS`: the cosine and, below 1/2 cycle a code, the sine part of the residuals' Fourier sum.
+    """
+    index = np.arange(len(codes.count))
+    table, names = [], []
+    for f in COMBS:
+        use = codes.used & (codes.noise >= max(LEAST_NOISE, 1.2 / f))
+        total = float(codes.smooth[use].sum())
+        if use.sum() < LEAST_CODES:
+            continue
+        for turn in (0.0, 0.25) if f < 0.5 else (0.0,):
+            wave = np.cos(2.0 * np.pi * (f * (index + codes.first) - turn)) * use
+            table.append(2.0 / total * (codes.rough.T @ wave))
+            names.append((codes.first + float(index[use].mean()), f"every {1 / f:.3g} codes"))
+    return np.array(table).reshape(len(table), len(index)), names
+
+
+def _spacing(study: Study) -> int:
+    """Codes from one place to the next."""
+    return max(round(2.0**study.camera.bit_depth / PLACES), LEAST_SPACING)
+
+
+def _steps(study: Study, codes: CodeCounts) -> tuple[FloatArray, list[int]]:
+    """Weights of the counts that give how many codes' worth is missing about each of `PLACES` parts of the converter's
+    range, and these codes.
+
+    Codes count the less, the further they are from the place, and not at all from the next place on: what is missing
+    anywhere is shared by the two places beside it. It is missing against `expected` and the parabola that it lacks on
+    either side of both neighbours."""
+    spacing = _spacing(study)
+    table, at = [], []
+    for k in range(1, int(2.0**study.camera.bit_depth / spacing)):
+        place = k * spacing - codes.first
+        if not 0 <= place < len(codes.count):
+            continue
+        far = max(8, round(FAR * float(codes.noise[place])))
+        low, high = place - spacing - far, place + spacing + far
+        if low < 0 or high > len(codes.count) or codes.expected[low:high].min() < STEP_COUNT:
+            continue
+        x = np.arange(low, high) - place + 0.5
+        near = np.maximum(1.0 - np.abs(x) / spacing, 0.0)
+        beside = np.minimum(1.0 - near, np.maximum((spacing + far - np.abs(x)) / far, 0.0))
+        basis = np.vander(x / (spacing + far), DEGREE_BESIDE + 1, increasing=True)
+        expected = codes.expected[low:high]
+        # the curve's coefficients are `of_counts` @ counts
+        of_counts = np.linalg.solve((basis.T * (beside * expected)) @ basis, basis.T * beside)
+        weights = np.zeros(len(codes.count))
+        share = (near * expected) @ basis @ of_counts - near
+        weights[low:high] = share * near.sum() / (near * expected).sum()
+        table.append(weights)
+        at.append(place)
+    return np.array(table).reshape(len(table), len(codes.count)), at
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part of the range of codes, whose residuals have one chi2."""
+
+    at: slice  # its codes
+    number: int  # of codes used
+    variance: FloatArray  # of the residuals; infinite at codes that aren't used
+    chi2_std: float  # standard deviation of the residuals' chi2
+    ofwidths: float  # excess where the codes' widths have a relative variance of 1, independent of each other
+
+    def excess(self, residual: FloatArray) -> float:
+        """chi2 of the residuals (codes,) over its standard deviation."""
+        return float(np.sum(np.square(residual[self.at]) / self.variance)) / self.chi2_std
+
+    def scatter(self, excess: float) -> float:
+        """Standard deviation of a predicted excess by the residuals' noise: chi2 of noncentrality l has the variance
+        2 n + 4 l."""
+        return float(np.sqrt(4.0 * excess / self.chi2_std))
+
+
+def _parts(codes: CodeCounts) -> list[_Part]:
+    """Return the parts with codes enough. Var(chi2) = 2 n sum_k r_k^2 with the residuals' autocorrelation r of the
+    smoothing filter."""
+    square = codes.rough.power(2)
+    variance = np.asarray(square @ np.maximum(codes.smooth, 1.0))
+    unequal = np.asarray(square @ np.square(codes.smooth))
+    found = []
+    for part in np.array_split(np.flatnonzero(codes.used), PARTS):
+        if len(part) < LEAST_CODES:
+            continue
+        at = slice(int(part[0]), int(part[-1]) + 1)
+        kept = codes.used[at]
+        row = codes.rough[[int(part[len(part) // 2])]].toarray().ravel()
+        row = row[np.flatnonzero(row)]
+        shared = np.correlate(row, row, mode="full") / float(row @ row)
+        number = int(kept.sum())
+        chi2_std = float(np.sqrt(2.0 * number * np.sum(shared**2)))
+        ofwidths = float(np.sum(unequal[at][kept] / variance[at][kept])) / chi2_std
+        found.append(_Part(at, number, np.where(kept, variance[at], np.inf), chi2_std, ofwidths))
+    return found
+
+
+def widths(codes: CodeCounts, effects: Effects, study: Study) -> FloatArray:
+    """Width (codes,) of each code: the interval of the converter's input that gives it, 1 for an ideal converter.
+
+    The input is cut at the edges of the ideal converter's codes. Where the converter's law is straight over several of
+    these intervals, what lands on each code is exact; other intervals are sampled `FINE` times, and samples in which it
+    bends as often again.
+    """
+    size, law = len(codes.count), Uniform(study.camera, effects).codes
+    edge = np.asarray(np.arange(size + 2 * MARGIN + 1) - 0.5 - MARGIN, float)  # from the first counted code on
+    lands = law(edge + codes.first) - codes.first
+    bend = np.abs(np.diff(lands, 2)) > STRAIGHT
+    bent = np.zeros(len(edge) - 1, bool)
+    bent[:-1] |= bend
+    bent[1:] |= bend
+    found = np.zeros(size)
+    begin, step = edge[:-1][bent], 1.0
+    for is_last in (False, True):
+        # a sample is an interval of `step` codes, which the law stretches and two codes may share
+        step /= FINE
+        begin = (begin[:, None] + step * np.arange(FINE)).ravel()
+        one, other, middle = (law(begin + share * step + codes.first) - codes.first for share in (0.0, 1.0, 0.5))
+        low, high = np.minimum(one, other), np.maximum(one, other)
+        bends = np.abs(middle - 0.5 * (low + high)) > JUMP * (FINE * step)
+        if is_last:  # it lands where its middle lands, as wide as without the law
+            low[bends], high[bends] = middle[bends] - 0.5 * step, middle[bends] + 0.5 * step
+        else:  # is looked at more finely
+            low, high, begin = low[~bends], high[~bends], begin[bends]
+        code = np.rint(high).astype(int)
+        stretch = high - low
+        above = np.where(stretch > 0.0, np.clip((high - code + 0.5) / np.maximum(stretch, 1e-12), 0.0, 1.0), 1.0)
+        for at, share in ((code, above), (code - 1, 1.0 - above)):
+            inside = (at >= 0) & (at < size)
+            found += np.bincount(at[inside], share[inside], minlength=size) * step
+    turns = np.flatnonzero(np.diff(np.r_[True, bent, True]))
+    for begin, end in zip(turns[::2], turns[1::2], strict=True):
+        low, high = lands[begin], lands[end]
+        first, last = (int(np.clip(np.rint(y), 0, size - 1)) for y in (low, high))
+        cuts = np.clip(np.arange(first, last + 2) - 0.5, low, high)
+        cuts[0], cuts[-1] = max(cuts[0], -0.5), min(cuts[-1], size - 0.5)
+        found[first : last + 1] += np.maximum(np.diff(cuts), 0.0) * (end - begin) / (high - low)
+    return found
+
+
+CODE_DENSITY = Measurement(
+    "code_density",
+    title="code-density test",
+    order=240,
+    axis="level",
+    unit="DN",
+    make=code_block,
+    quantity="step, DN, or excess variance of counts",
+)

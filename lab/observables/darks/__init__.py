@@ -1,0 +1,1 @@
+"""Dark frames: level, temporal noise, glow over the field, patterns of rows and columns, defective pixels."""

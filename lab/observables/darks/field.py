@@ -1,0 +1,98 @@
+"""The dark signal by place in the frame: glow of the read-out, other dark current that isn't uniform, and what
+read-out adds by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lab.errors import NotDetermined
+from lab.observables.darks.frames import CELL_FLOOR_DN, CELLS, cell_means, dark_frames
+from lab.observables.darks.level import dark_current_map
+from lab.observables.dataset import Study
+from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.reads import ADDED, DARK_CURRENT
+from sim.effects.base import Effects
+from sim.sensor.lines import Lines
+from sim.uniform import Uniform
+
+CELL_PX = 4  # the least side of a cell
+
+
+def dark_field_block(study: Study) -> Block:
+    """Means over 4 x 6 cells of the mean dark frame of each condition, less the frame's mean, DN.
+
+    The level of each mean frame is a nuisance parameter. Raises NotDetermined where cells are narrower than `CELL_PX`.
+    """
+    frames = [f for f in study.once(dark_frames) if f.fixed]
+    points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
+    rows, cols = CELLS
+    count = rows * cols
+    if min(study.camera.rows // rows, study.camera.cols // cols) < CELL_PX:
+        raise NotDetermined(
+            "dark_field",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: too small to be split into cells, which need "
+            f"{rows * CELL_PX} x {cols * CELL_PX} px",
+        )
+    value = np.concatenate([part.cells.ravel() - part.cells.mean() for *_, part in points])
+    row, col = (g.ravel() for g in np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij"))
+    size = study.camera.rows * study.camera.cols / count
+    changing: list[float] = []
+    fixed: list[float] = []
+    line_dn2: dict[Lines, float] = {"rows": 0.0, "columns": 0.0}
+    for f, _, part in points:
+        moving = next(iter(f.changing.values()), None)
+        white = moving.white_dn2 if moving is not None else part.white_dn2
+        cell = max(moving.cells_dn2, white / size) if moving is not None else white / size
+        changing.append(cell / part.frames)
+        fixed.append(max(part.white_dn2 - white / part.frames, 0.0) / size)
+        for lines, most in line_dn2.items():
+            noise = moving.line_dn2[lines] / part.frames if moving is not None else 0.0
+            line_dn2[lines] = max(most, part.line_dn2[lines] - noise)
+    pattern = np.eye(count) * float(np.max(fixed))
+    pattern += (row[:, None] == row) * line_dn2["rows"] * rows / study.camera.rows
+    pattern += (col[:, None] == col) * line_dn2["columns"] * cols / study.camera.cols
+    covariance = np.kron(np.ones((len(points), len(points))), pattern) + np.diag(
+        np.repeat(changing, count) + (CELL_FLOOR_DN * study.step_dn) ** 2
+    )
+    exposures = np.array([f.condition.exposure_s for f, *_ in points])
+    half = 0.5 * np.hypot(rows, cols)
+    radius = np.hypot(row - (rows - 1) / 2, col - (cols - 1) / 2) / half
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.zeros(len(value))
+        model = Uniform(study.camera, effects)
+        if model.adds_signal:
+            added = cell_means(model.added_e.astype(np.float32))
+            mean += np.tile((study.noise.gain * (added - added.mean())).ravel(), len(points))
+        if model.changes_dark_current:
+            dark_at = dark_current_map(study, effects)
+            for i, (f, *_) in enumerate(points):
+                cells = cell_means(dark_at(f.condition.temperature_c).astype(np.float32))
+                here = study.noise.gain * f.condition.exposure_s * (cells - cells.mean())
+                mean[i * count : (i + 1) * count] += here.ravel()
+        jacobian = {}
+        for i in range(len(points)):
+            column = np.zeros(len(value))
+            column[i * count : (i + 1) * count] = 1.0
+            jacobian[f"dark_field:{i}"] = column
+        return Prediction(mean, jacobian)
+
+    longest = max(float(exposures.max()), 1e-9)
+    return Block(
+        measurement=DARK_FIELD, reach=0.5, value=value, covariance=np.asarray(covariance, float),
+        labels=tuple(Label(float(radius[k]), "all", f.condition.name, part.captures, out) for f, out,
+        part in points for k in range(count)),
+        reads=DARK_CURRENT | ADDED, predict=predict, scale=np.repeat(np.maximum(exposures / longest, 0.1), count),
+    )  # fmt: skip
+
+
+DARK_FIELD = Measurement(
+    "dark_field",
+    title="dark signal over the field",
+    order=130,
+    axis="field",
+    unit="of half the diagonal",
+    make=dark_field_block,
+    quantity="dark signal less the frame's mean, DN",
+    conditions="exposure and temperature",
+)

@@ -1,0 +1,414 @@
+"""What read-out does in dark frames: noise that rows share anew in every frame, and fixed offsets of rows and columns.
+Light frames have both as well, additively in DN."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from lab.errors import NotDetermined
+from lab.observables.darks.frames import (
+    CELL_FLOOR_DN,
+    DarkCondition,
+    DarkNoise,
+    DarkPattern,
+    DarkStatistics,
+    by_part,
+    captures_of,
+    conditions,
+    dark_frames,
+    fine_conditions,
+)
+from lab.observables.dataset import Study
+from lab.observables.noise.line_spectra import LEVEL_BAND, Bands, log_mean_bias, log_mean_variance
+from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.reads import ADDED, LINES, READ_SPECTRUM
+from sim.effects.base import Effects
+from sim.sensor import mosaic
+from sim.sensor.lines import Lines
+from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+# --- dark lines ------------------------------------------------------------------------------------------------------
+# Row and column noise of dark frames, fixed row and column patterns, and the correlation of noise along rows and
+# columns.
+
+
+BANDS = 6  # of a spectrum across lines
+POWER_FLOOR = 0.02  # relative standard deviation of a band's power: a healthy read-out isn't exactly white
+LEAST_FREQUENCIES = 2  # below the level band: `Bands` makes no band of fewer
+LEAST_LINE_DN = 0.3  # of codes of a step of 1 DN: temporal noise of a pixel below which codes are too coarse
+
+
+def temporal_line_block(lines: Lines, study: Study) -> Block:
+    """Temporal row (column) noise: ln of the power spectrum of the lines' means over that of white noise, by frequency
+    band.
+
+    0 where pixels are independent. Raises NotDetermined without repeats, and where codes are too coarse.
+    """
+    frames = study.once(dark_frames)
+    name = "row_noise" if lines == "rows" else "column_noise"
+    fine = fine_conditions(f"dark_{name}", frames, LEAST_LINE_DN * study.step_dn)
+    parts = by_part(fine)
+    frequency = next(iter(parts.values()))[0].lines[lines][0]
+    # narrow bands at low frequencies tell a ripple of a few cycles a frame from correlated row noise
+    bands = Bands.of(frequency, 8, 1.5)
+    length = study.camera.cols if lines == "rows" else study.camera.rows
+    value, variance, labels, inverse = [], [], [], []
+    for out, part in parts.items():
+        weight = np.array([min(c.contrasts, 6) for c in part], float)
+        power = np.average([c.lines[lines][1] for c in part], axis=0, weights=weight)
+        modes, level = bands.modes * weight.sum(), sum(c.lines[lines][2] for c in part)
+        value.append(np.log(bands.mean(power)) - log_mean_bias(modes) - log_mean_bias(level))
+        variance.append(log_mean_variance(modes) + 1.0 / level + POWER_FLOOR**2)
+        inverse.append(np.full(len(modes), float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))))
+        ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
+        labels += [Label(float(x), "all", "temporal", ids, out) for x in bands.middle]
+    over = np.concatenate(inverse)
+    sets, whites = len(parts), [1.0 / float(one[0]) for one in inverse]
+
+    def predict(effects: Effects) -> Prediction:
+        model, total = Uniform(study.camera, effects), np.zeros(len(frequency))
+        for one in model.lines:
+            if one.lines == lines:
+                total += one.spectrum_e2(frequency, fixed=False)
+        shared = over * np.tile(study.noise.gain**2 * length * bands.mean(total), sets)
+        # the means of rows hold the read noise's power at frequency 0, those of columns its spectrum
+        along = frequency if lines == "columns" else np.zeros(len(frequency))
+        own = np.concatenate([bands.mean(_coloured_power(study, model, along, white)) for white in whites])
+        return Prediction(np.log1p(shared + own), {})
+
+    n = len(labels)
+    return Block(
+        measurement=ROW_NOISE if lines == "rows" else COLUMN_NOISE, reach=0.1, value=np.concatenate(value),
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES | READ_SPECTRUM,
+        predict=predict, scale=np.ones(n),
+    )  # fmt: skip
+
+
+def _coloured_power(study: Study, model: Uniform, frequency_cy_per_px: FloatArray, white_dn2: float) -> FloatArray:
+    """Return the power of a pixel's noise at frequencies along the row over `white_dn2`, the power in `LEVEL_BAND`,
+    less 1. Read noise is a part of it, the rest is white."""
+    read_dn2 = study.noise.read_dn**2
+    level_dn2 = read_dn2 * float(np.mean(model.read_power(np.linspace(*LEVEL_BAND, 33))))
+    found_dn2 = max(white_dn2 - level_dn2, 0.0) + read_dn2 * model.read_power(frequency_cy_per_px)
+    return np.asarray(found_dn2 / max(white_dn2, level_dn2) - 1.0)
+
+
+def fixed_line_block(lines: Lines, study: Study) -> Block:
+    """Fixed row (column) pattern in the mean frame of the shortest exposure.
+
+    The numbers are ln of the power spectrum of the lines' means over that of white noise, by frequency band, and the
+    mean of odd lines less that of even ones, DN. Raises NotDetermined where codes are too coarse.
+    """
+    frames = study.once(dark_frames)
+    name = "row_pattern" if lines == "rows" else "column_pattern"
+    first = next(f for f in frames if f.fixed)
+    if min(part.white_dn2 for part in first.fixed.values()) < 1e-3:
+        raise NotDetermined(
+            f"dark_{name}", "dark frames have no noise and no pattern: codes are too coarse to show one"
+        )
+    frequency = next(iter(first.fixed.values())).lines[lines][0]
+    bands = Bands.of(frequency, BANDS)
+    length = study.camera.cols if lines == "rows" else study.camera.rows
+    size = study.camera.rows * study.camera.cols
+    value: list[FloatArray] = []
+    labels: list[Label] = []
+    factor: list[FloatArray] = []
+    share = _fixed_share(first, lines, length)
+    for out, part in first.fixed.items():
+        _, power, level = part.lines[lines]
+        value.append(np.log(bands.mean(power)) - log_mean_bias(bands.modes) - log_mean_bias(level))
+        labels += [Label(float(x), "all", "fixed", part.captures, out) for x in bands.middle]
+        factor.append(np.full(len(bands.middle), study.noise.gain**2 * length / part.white_dn2))
+    pieces = len(first.fixed)
+    one = np.diag(log_mean_variance(bands.modes))
+    correlation = np.array([[1.0 if a == b else share[a] * share[b] for b in first.fixed] for a in first.fixed])
+    covariance = np.kron(correlation, one) + np.eye(pieces * len(one)) * (POWER_FLOOR**2 + 0.01**2)
+    parity = np.array([part.parity_dn[lines] for part in first.fixed.values()])
+    scatter = np.array([4.0 * _line_dn2(part, lines, length) * length / size for part in first.fixed.values()])
+    # powers are squares: lines themselves have the root of the powers' correlation
+    parity_cov = (
+        np.sqrt(np.outer(scatter, scatter) * correlation) + np.eye(pieces) * (CELL_FLOOR_DN * study.step_dn) ** 2
+    )
+    n = len(covariance)
+    whole = np.zeros((n + pieces, n + pieces))
+    whole[:n, :n], whole[n:, n:] = covariance, parity_cov
+    labels += [Label(0.5, "all", "odd and even", part.captures, out) for out, part in first.fixed.items()]
+    std = np.sqrt(np.diag(parity_cov))
+
+    def predict(effects: Effects) -> Prediction:
+        still, moving, odd = np.zeros(len(frequency)), np.zeros(len(frequency)), 0.0
+        model = Uniform(study.camera, effects)
+        if model.adds_signal:
+            means = model.added_e.mean(axis=1 if lines == "rows" else 0)
+            # the periodogram's frequencies above 0 and below 0.5 cy/px
+            still += (np.abs(np.fft.rfft(means)) ** 2 / len(means))[1 : 1 + len(frequency)]
+            odd += float(means[1::2].mean() - means[::2].mean())
+        for one in model.lines:
+            if one.lines == lines:
+                still += one.spectrum_e2(frequency, fixed=True)
+                moving += one.spectrum_e2(frequency, fixed=False)
+                odd += one.odd_even_e
+        parts = zip(factor, first.fixed.values(), strict=True)
+        power = np.concatenate([np.log1p(f * bands.mean(still + moving / part.frames)) for f, part in parts])
+        return Prediction(np.concatenate([power, np.full(pieces, study.noise.gain * odd)]), {})
+
+    return Block(
+        measurement=ROW_PATTERN if lines == "rows" else COLUMN_PATTERN, reach=0.1,
+        value=np.concatenate([*value, parity]), covariance=whole, labels=tuple(labels),
+        reads=LINES | ADDED, predict=predict,
+        scale=np.concatenate([np.ones(n), 10.0 * std]),
+    )  # fmt: skip
+
+
+def _line_dn2(part: DarkPattern | DarkNoise, lines: Lines, length: int) -> float:
+    """Variance of the mean of a line of `length` pixels, DN^2: by pixels' and by lines' own noise."""
+    return part.white_dn2 / length + part.line_dn2[lines]
+
+
+def _fixed_share(frames: DarkStatistics, lines: Lines, length: int) -> dict[bool, float]:
+    """Share of the variance of the mean frame's lines that is fixed, and so common to seen and held-out frames, by
+    part. `length`: of a line, px."""
+    changing = next((_line_dn2(c, lines, length) for c in frames.changing.values()), None)
+    if changing is None:
+        return dict.fromkeys(frames.fixed, 0.0)
+    return {
+        out: float(np.clip(1.0 - changing / part.frames / _line_dn2(part, lines, length), 0.0, 1.0))
+        for out, part in frames.fixed.items()
+    }
+
+
+def correlation_block(study: Study) -> Block:
+    """Correlation of temporal noise along rows and columns: ln of its power at low frequencies over that of white
+    noise.
+
+    The means of the lines are excluded. 0 where pixels are independent. Raises NotDetermined where codes are too coarse
+    or frames too small.
+    """
+    fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN * study.step_dn)
+    value, variance, labels = [], [], []
+    along: list[tuple[str, Bands, FloatArray, float]] = []  # lines, bands, frequencies, DN^2 of white noise
+    for out, part in by_part(fine).items():
+        ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
+        weight = np.array([min(c.contrasts, 6) for c in part], float)
+        for lines in ("rows", "columns"):
+            frequency = part[0].along[lines][0]
+            if len(frequency) < LEAST_FREQUENCIES:
+                continue
+            power = np.average([c.along[lines][1] for c in part], axis=0, weights=weight)
+            modes = np.sum([c.along[lines][2] for c in part], axis=0)
+            level = sum(c.lines[lines][2] for c in part)
+            bands = Bands.of(frequency, 3)
+            total = np.array([modes[a:b].sum() for a, b in zip(bands.first, bands.last, strict=True)])
+            value.append(np.log(bands.mean(power)) - log_mean_bias(total) - log_mean_bias(level))
+            variance.append(1.0 / total + 1.0 / level + POWER_FLOOR**2)
+            labels += [Label(float(x), "all", f"along {lines}", ids, out) for x in bands.middle]
+            white_dn2 = 1.0 / float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))
+            along.append((lines, bands, frequency, white_dn2))
+    if not labels:
+        raise NotDetermined(
+            "dark_correlation",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share is measured from "
+            f"{int(np.ceil(LEAST_FREQUENCIES / LEVEL_BAND[0]))} px along rows or columns on",
+        )
+
+    def predict(effects: Effects) -> Prediction:
+        # row and column noise has no spectrum along its lines; that of read noise along columns is its mean over rows
+        model, means = Uniform(study.camera, effects), []
+        for lines, bands, frequency, white_dn2 in along:
+            if lines == "rows":
+                power = bands.mean(_coloured_power(study, model, frequency, white_dn2))
+            else:
+                every = _coloured_power(study, model, np.linspace(0.0, 0.5, 257), white_dn2)
+                power = np.full(len(bands.middle), every.mean())
+            means.append(np.log1p(power))
+        return Prediction(np.concatenate(means), {})
+
+    return Block(
+        measurement=DARK_CORRELATION, reach=0.03, value=np.concatenate(value),
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES | READ_SPECTRUM,
+        predict=predict, scale=np.ones(len(labels)),
+    )  # fmt: skip
+
+
+DARK_CORRELATION = Measurement(
+    "dark_correlation",
+    title="correlation along the lines of dark frames",
+    order=180,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=correlation_block,
+    quantity="power over white noise, ln",
+    conditions="direction",
+)
+ROW_NOISE = Measurement(
+    "dark_row_noise",
+    title="row noise of dark frames",
+    order=140,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(temporal_line_block, "rows"),
+    quantity="power over single pixels', ln",
+)
+COLUMN_NOISE = Measurement(
+    "dark_column_noise",
+    title="column noise of dark frames",
+    order=150,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(temporal_line_block, "columns"),
+    quantity="power over single pixels', ln",
+)
+ROW_PATTERN = Measurement(
+    "dark_row_pattern",
+    title="fixed row pattern of dark frames",
+    order=160,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(fixed_line_block, "rows"),
+    quantity="power over single pixels', ln",
+    conditions="pattern",
+)
+COLUMN_PATTERN = Measurement(
+    "dark_column_pattern",
+    title="fixed column pattern of dark frames",
+    order=170,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(fixed_line_block, "columns"),
+    quantity="power over single pixels', ln",
+    conditions="pattern",
+)
+
+
+# --- dark readout ------------------------------------------------------------
+
+
+MOST_FRAMES = 12  # of a condition
+#: Prior relative standard deviation of the cube root of a band's power about its neighbours': a factor of 2.2 in power.
+NEIGHBOUR_STD = 0.3
+NEIGHBOURS = 2  # bands on either side
+#: Relative standard deviation by which the power of rows in light departs from that in the dark: the chip is warmer or
+#: cooler, and the read-out busier.
+LIGHT_STD = 0.15
+#: Share of the fixed offsets by which they may be others in light: a CMOS camera's even and odd rows differ by 0.09 DN
+#: in the dark, and don't in light.
+OFFSETS_STD = 0.5
+
+
+@dataclass(frozen=True)
+class DarkRowPower:
+    """Power of the rows of single frames beyond that of pixels' noise, by band of frequency, DN^2, and its standard
+    deviation."""
+
+    power_dn2: FloatArray  # (bands,)
+    std_dn2: FloatArray  # (bands,)
+
+
+@dataclass(frozen=True)
+class DarkReadOut:
+    """Statistics of repeated dark frames. A row of a spectrum is the mean over as many neighbouring ones as the
+    mosaic's period has."""
+
+    contrasts: int  # independent differences of repeats
+    power_dn2: FloatArray  # (rows / 2 + 1,): of the rows of single frames, by cycles a frame
+    white_dn2: float  # of it, by the noise of pixels
+    offsets_dn: NDArray[np.float32]  # (rows, cols): mean frame less its mean
+    frames: int  # that it is the mean of
+
+    def noise(self, bands: Sequence[range]) -> DarkRowPower:
+        """Return the noise of rows in `bands`, each a range of cycles a frame.
+
+        With a = `contrasts` x cycles of the band, its power P is gamma-distributed about the true one, tau, and P^(1/3)
+        has the mean tau^(1/3) G(a + 1/3) / G(a) / a^(1/3), G the gamma function. Without other knowledge tau^(1/3) then
+        has the variance (a P)^(2/3) (G(a - 2/3) / G(a) - (G(a - 1/3) / G(a))^2). It is weighed with the mean over the
+        neighbouring bands by `NEIGHBOUR_STD`, as a power may be small by chance: two repeats have two degrees of
+        freedom in the lowest band.
+        """
+        shape = self.contrasts * np.array([len(band) for band in bands], float)
+        scale = np.cbrt(shape * [self.power_dn2[list(band)].mean() for band in bands])
+        root = scale * np.exp(gammaln(shape) - gammaln(shape + 1.0 / 3.0))
+        square, mean = (np.exp(gammaln(shape - n / 3.0) - gammaln(shape)) for n in (2.0, 1.0))
+        own = scale**2 * (square - mean**2)
+        near = [slice(max(k - NEIGHBOURS, 0), k + NEIGHBOURS + 1) for k in range(len(bands))]
+        around = np.array([np.average(root[at], weights=shape[at]) for at in near])
+        usual = around**2 * (NEIGHBOUR_STD**2 + np.array([1.0 / (9.0 * shape[at].sum()) for at in near]))
+        weight = usual / (usual + own)
+        likely = weight * root + (1.0 - weight) * around
+        power = likely**3 - self.white_dn2
+        std = 3.0 * likely**2 * np.sqrt(own * weight)
+        return DarkRowPower(power, np.hypot(std, LIGHT_STD * np.maximum(power, 0.0)))
+
+    def offsets(self, bands: Sequence[range], step: int) -> DarkRowPower:
+        """Return the power of the rows of `offsets_dn` that isn't in those of light frames: their noise, and what may
+        differ by `OFFSETS_STD`."""
+        rows = row_profile(self.offsets_dn, step)
+        fixed = np.abs(np.fft.rfft(rows)) ** 2 / len(rows)
+        modes = np.array([len(band) for band in bands], float)
+        noise, whole = (
+            np.array([of[list(band)].mean() for band in bands]) for of in (self.power_dn2 / self.frames, fixed)
+        )
+        return DarkRowPower(noise, np.hypot(noise / np.sqrt(modes), OFFSETS_STD**2 * whole))
+
+
+def row_profile(frame: NDArray[np.floating], step: int) -> FloatArray:
+    """Means of the rows, over `step` neighbouring ones each, the period of the mosaic."""
+    rows = frame.shape[0] // step
+    return np.asarray(frame.mean(1, dtype=float)[: rows * step].reshape(rows, step).mean(1))
+
+
+def dark_readout(study: Study) -> DarkReadOut | None:
+    """Return what repeated dark frames show of the read-out; None where there are none, or their codes are too coarse
+    to show it.
+
+    Noise is measured by Helmert contrasts: frame k less the mean of those before it, times sqrt(k / (k + 1)). Fixed
+    offsets are those of exposures up to the longest flat's, as a dark current that differs from pixel to pixel grows
+    with the exposure."""
+    every = conditions(study) if study.recordings.captures("dark", study.side) else []
+    step, longest_s = mosaic.step(study.camera.cfa), max((g[0].exposure_s for g in study.flat_levels()), default=0.0)
+    power, pixel_dn2, contrasts = np.zeros(0), 0.0, 0
+    total, frames = np.zeros((study.camera.rows, study.camera.cols), np.float32), 0
+    for condition in every:
+        if len(condition.captures) < 2:
+            continue
+        lines, own, mean = _read(study, condition, step)
+        if own <= (LEAST_LINE_DN * study.step_dn) ** 2:
+            continue
+        power = lines.sum(0) + (power if contrasts else 0.0)
+        pixel_dn2, contrasts = pixel_dn2 + len(lines) * own, contrasts + len(lines)
+        if not frames or condition.exposure_s <= longest_s:
+            count = len(lines) + 1
+            total, frames = total + np.float32(count) * (mean - mean.mean(dtype=float)), frames + count
+    if not contrasts:
+        return None
+    return DarkReadOut(
+        contrasts=contrasts,
+        power_dn2=power / contrasts,
+        white_dn2=pixel_dn2 / contrasts / (step * study.camera.cols),
+        offsets_dn=np.asarray(total / np.float32(frames), np.float32),
+        frames=frames,
+    )
+
+
+def _read(study: Study, condition: DarkCondition, step: int) -> tuple[FloatArray, float, NDArray[np.float32]]:
+    """Of the repeats of one condition: power of the rows of each contrast (contrasts, rows / 2 + 1), DN^2; variance of
+    a pixel without that of whole rows, DN^2; and the mean frame, DN."""
+    lines, pixel = [], []
+    mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
+    for k, capture in enumerate(condition.captures[:MOST_FRAMES]):
+        away = np.asarray(study.recordings.frame(capture), np.float32) - mean
+        mean += away / np.float32(k + 1)
+        if k == 0:
+            continue
+        away *= np.float32(np.sqrt(k / (k + 1.0)))
+        profile = row_profile(away, step)
+        lines.append(np.abs(np.fft.rfft(profile)) ** 2 / len(profile))
+        away -= away.mean(1, keepdims=True)
+        pixel.append(float(np.mean(np.square(away), dtype=float)) / (1.0 - 1.0 / study.camera.cols))
+    return np.array(lines), float(np.mean(pixel)), mean

@@ -1,0 +1,1 @@
+"""Slanted edges: where they lie, their spread function, and their transfer function."""

@@ -1,0 +1,1 @@
+"""Temporal and spatial noise of repeats: by level, line, pixel and neighbour; repeats over time."""

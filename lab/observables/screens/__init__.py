@@ -1,0 +1,1 @@
+"""Patterns on a screen: registration, contrast of cells, and the blur of a random pattern."""

@@ -1,0 +1,353 @@
+"""Screens: light in dark squares, and the lines of the screen's pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage, special
+
+from lab.capture_kinds.bernoulli import BernoulliCapture
+from lab.capture_kinds.black import BlackCapture
+from lab.capture_kinds.checkerboard import CheckerboardCapture
+from lab.capture_kinds.white import WhiteCapture
+from lab.errors import NotDetermined
+from lab.observables.charts.patches import Surroundings, halo_light, harmonics
+from lab.observables.dataset import Study, held_out_of, mean_frame
+from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.plane_means import channel_pixels
+from lab.observables.reads import REFLECTIONS, SHOWN, acting
+from lab.observables.screens.pattern_fit import mean_rate
+from sim.camera import CameraModel
+from sim.effects.base import Effects
+from sim.frame import screen_light, with_reflections
+from sim.point import even_share, optical_transfer, wide_contrast
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+# share of the lit screen's level: light of lit parts that the model doesn't follow, and of the screen's surroundings
+SCREEN_FLOOR = 6e-4
+
+
+def screen_block(study: Study) -> Block:
+    """Mean level in the dark squares of a pattern on a screen, less that of the dark screen, by channel, DN.
+
+    Only pixels at least 7 px away from lit ones count. The baseline's point spread function reaches them, which is
+    predicted from the lit pixels. A veil adds a share of the frame's mean. Raises NotDetermined without white, black
+    and patterned captures of one pose and exposure, or without dark squares wide enough.
+    """
+    recordings, side, camera, noise = study.recordings, study.side, study.camera, study.noise
+    by_pose: dict[str, dict[str, list[Any]]] = {}
+    shown: list[WhiteCapture | BlackCapture | CheckerboardCapture | BernoulliCapture] = [
+        *recordings.captures(WhiteCapture, side), *recordings.captures(BlackCapture, side),
+        *recordings.captures(CheckerboardCapture, side), *recordings.captures(BernoulliCapture, side),
+    ]  # fmt: skip
+    for capture in shown:
+        by_pose.setdefault(capture.screen.pose, {}).setdefault(capture.kind, []).append(capture)
+    points = []
+    for kinds in by_pose.values():
+        if "white" not in kinds or "black" not in kinds:
+            continue
+        levels = {k: mean_frame(recordings, kinds[k]) for k in ("white", "black")}
+        exposure = kinds["white"][0].exposure_s
+        if kinds["black"][0].exposure_s != exposure:
+            continue
+        for kind in ("checkerboard", "bernoulli"):
+            patterned = kinds.get(kind, [])
+            if not patterned or patterned[0].exposure_s != exposure:
+                continue
+            out = held_out_of(patterned, 0, 0) if len(patterned) > 1 else set()
+            for part in ([c for c in patterned if c.id not in out], [c for c in patterned if c.id in out]):
+                if part:
+                    points += _dark_squares(
+                        study,
+                        part,
+                        mean_frame(recordings, part),
+                        levels["white"],
+                        levels["black"],
+                        part[0].id in out,
+                        len(kinds["black"]),
+                    )
+    if not points:
+        raise NotDetermined(
+            "screen", "no white, black and patterned captures of one screen with dark squares wide enough"
+        )
+    value = np.array([p.value for p in points])
+    tail, beyond = np.array([p.tail for p in points]), np.array([p.beyond for p in points])
+    lift = np.array([p.lift for p in points])
+    covariance = np.diag(np.array([p.std for p in points]) ** 2 + 2 * noise.jitter_dn**2)
+    ids = [p.kind for p in points]
+    same = np.array([[a == b for b in ids] for a in ids])
+    white = np.array([p.white for p in points])
+    channel, digits = np.array([p.channel for p in points]), np.array([p.digits for p in points])
+    covariance += (
+        same * np.outer(tail, tail) * study.tail_std**2
+        + np.outer(beyond, beyond)
+        + np.outer(white, white) * SCREEN_FLOOR**2
+        + np.diag(np.square(1e-4 * white))
+        + same * (channel[:, None] == channel) * np.outer(digits, digits)
+    )
+
+    def predict(effects: Effects) -> Prediction:
+        shift = halo_light([p.around for p in points], effects, camera)
+        model = Uniform(camera, effects)
+        if not model.is_linear:
+            low = np.maximum(tail, 0.0) / noise.gain
+            base = np.array([p.black for p in points]) / noise.gain
+            shift = (model.response(base + low) - model.response(base)) * noise.gain - tail
+        if acting(effects, REFLECTIONS):
+            shift = shift + np.array([_copied(p, effects, camera) for p in points])
+        return Prediction(wide_contrast(camera, effects) * tail + even_share(camera, effects) * lift + shift, {})
+
+    return Block(
+        measurement=SCREEN, reach=1e9, value=value, covariance=covariance,
+        labels=tuple(Label(float(i), p.channel, p.kind, p.captures, p.held_out) for i, p in enumerate(points)),
+        reads=REFLECTIONS | {"image.veils", "signal.response"}, predict=predict,
+        scale=np.array([p.white for p in points]),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _DarkSquares:
+    """The dark squares of one pattern in one channel; levels in DN."""
+
+    kind: str
+    channel: str
+    captures: tuple[str, ...]
+    held_out: bool
+    value: float  # mean level less that of the dark screen
+    std: float  # of `value` by shot and read noise
+    tail: float  # predicted level by the baseline's point spread function
+    picture: FloatArray  # pattern less dark screen, one plane of the mosaic
+    use: NDArray[np.bool_]  # mask of the dark squares' pixels in it
+    around: Surroundings  # of these pixels
+    beyond: float  # standard deviation of `tail` by light from beyond the frame
+    lift: float  # mean of the whole frame less that of the dark screen
+    white: float  # mean of the lit screen less that of the dark screen
+    black: float  # mean of the dark screen above the black level
+    digits: float  # standard deviation of `value` by rounding
+
+
+def _copied(squares: _DarkSquares, effects: Effects, camera: CameraModel) -> float:
+    """Change of the level in the dark squares by reflections of the whole image, DN."""
+    shown = with_reflections(camera, squares.picture, effects)
+    return float(shown[squares.use].mean() - squares.picture[squares.use].mean())
+
+
+def _dark_squares(
+    study: Study,
+    part: Sequence[Any],
+    shown: FloatArray,
+    white: FloatArray,
+    black: FloatArray,
+    held_out: bool,
+    blacks: int,
+) -> list[_DarkSquares]:
+    """Return the dark squares of a pattern in each channel. `part`: its captures; `shown`, `white`, `black`: mean
+    frames of the pattern, of the lit and of the dark screen; `blacks`: number of dark-screen captures."""
+    camera, noise = study.camera, study.noise
+    found = []
+    step = mosaic.step(camera.cfa)
+    lit_by_channel: dict[str, Any] = {}
+    for channel in study.channels:
+        row, col = mosaic.phases(camera.cfa)[channel][0]
+        plane = (slice(row, None, step), slice(col, None, step))
+        full = (white - black)[plane]
+        share = (shown - black)[plane] / np.maximum(full, 1e-6)
+        bright = full > 0.3 * np.quantile(full, 0.95)
+        lit_by_channel[channel] = plane, full, np.where(bright, np.clip(share, 0.0, 1.0), 0.0), bright
+    for channel, (plane, full, share, bright) in lit_by_channel.items():
+        lit = share > 0.25
+        away = ndimage.distance_transform_edt(~lit) * step
+        # what lies beyond the frame's border may be lit
+        inside = ndimage.distance_transform_edt(np.pad(bright, 1))[1:-1, 1:-1] * step
+        for reach in (12.0, 9.0, 7.0):
+            use = (away >= reach) & (inside >= reach)
+            if use.sum() >= 60:
+                break
+        else:
+            continue
+        pad = [(0, n) for n in share.shape]
+        picture = np.where((share > 0.5) & bright, full, 0.0)
+        fy = np.fft.fftfreq(2 * share.shape[0], step)[:, None]
+        fx = np.fft.rfftfreq(2 * share.shape[1], step)[None, :]
+        radiance = study.spectrum(part[0].screen.radiance) if part[0].screen.radiance else None
+        otf = np.real(optical_transfer(camera, channel, radiance, fx, fy))
+        # pixels above half the contrast are drawn as lit: the total is right, and far away the outline doesn't matter.
+        # How far a screen goes on beyond the frame's border isn't known: the tail is the mean of two cases, no light
+        # there, and the mirror image
+        ends, endless = (
+            np.fft.irfft2(np.fft.rfft2(whole) * otf, whole.shape)[: share.shape[0], : share.shape[1]][use].mean()
+            for whole in (np.pad(picture, pad), np.pad(picture, pad, mode="symmetric"))
+        )
+        added = (shown - black)[plane]
+        difference = added[use]
+        lights = np.maximum([float(frame[plane][use].mean()) - noise.black for frame in (shown, black)], 0.0)
+        variance = (noise.gain * lights[1] + noise.read_dn**2) * (1 / len(part) + 1 / blacks)
+        means = [float(channel_pixels(f, study.camera.cfa, channel).mean()) for f in (shown, black)]
+        found.append(
+            _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
+                         float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
+                         added, use, Surroundings.of(harmonics(added), use), 0.5 * float(endless - ends),
+                         means[0] - means[1], float(full[bright].mean()),
+                         float(black[plane][use].mean()) - noise.black,
+                         float(np.linalg.norm(noise.rounding_std_dn(lights))))
+        )  # fmt: skip
+    return found
+
+
+SCREEN = Measurement(
+    "screen",
+    title="light in the dark squares of screen patterns",
+    order=400,
+    axis="level",
+    unit="DN",
+    make=screen_block,
+    quantity="light beyond the dark screen's, DN",
+    conditions="pattern",
+    places="dark squares",
+)
+
+
+# --- The grid of a screen's own pixels: the strongest spectral line of the lit screen's image -------------------------
+
+
+CERTAIN = 8.0  # standard deviations beyond which strength is stated on a logarithmic scale
+GRID_STD = 1.3  # of the strongest line's normal quantile; above 1, as the noise's mean is measured
+GRID_DETREND_PX = 8.0  # standard deviation of the Gaussian by which shading is removed
+GRID_LOWEST = 0.12  # cycles a sample below which shading remains
+GRID_LARGEST = 512  # largest side of the box, samples
+GRID_OF_CAMERA = 12.0  # power over a flat's mean from which on a line of flats is the camera's
+
+
+@dataclass(frozen=True)
+class _Line:
+    """The strongest spectral line of a lit screen."""
+
+    channel: str
+    captures: tuple[str, ...]
+    cycles_per_px: float
+    power: float  # over the noise's mean
+    per_amplitude: float  # power over the noise's mean of a grid of amplitude 1
+    places: int  # effective number of independent frequencies
+
+    def normal(self, power: float) -> float:
+        """Standard normal quantile of the probability that the largest of `places` exponential variables of mean 1 is
+        at most `power`. Above `CERTAIN`, quantile q becomes CERTAIN (1 + ln(q / CERTAIN))."""
+        rare = np.log(self.places) - power  # ln of the probability to exceed it, where that is small
+        normal = float(np.sqrt(-2.0 * rare)) if rare < -600.0 else -float(special.ndtri(-np.expm1(-np.exp(rare))))
+        # only the order of magnitude matters there
+        return normal if normal < CERTAIN else CERTAIN * (1.0 + float(np.log(normal / CERTAIN)))
+
+
+def grid_block(study: Study) -> Block:
+    """Strength of the strongest spectral line of the lit screen by channel, as a standard normal quantile.
+
+    Lines along rows and columns, and lines that flats show as well, are the camera's and left out. Raises NotDetermined
+    without white captures, and where the screen fills too little of the frame.
+    """
+    groups = study.groups(WhiteCapture, lambda c: (c.screen.pose, c.exposure_s))
+    if not groups:
+        raise NotDetermined("screen_grid", "no white captures")
+    found: list[_Line] = []
+    reason = ""
+    for group in groups:
+        for channel in study.channels:
+            try:
+                found.append(_line(study, group, channel))
+            except NotDetermined as refused:
+                reason = refused.reason
+    if not found:
+        raise NotDetermined("screen_grid", reason)
+    half = np.arange(48) * 0.37 * study.camera.pixel_pitch_um
+    x, y = np.meshgrid(half, half)
+
+    def predict(effects: Effects) -> Prediction:
+        shown = screen_light(study.camera, np.ones_like(x), x, y, effects)
+        size = 2.0 * float(np.std(shown)) / float(np.mean(shown))
+        return Prediction(
+            np.array(
+                [max(line.normal(size**2 * line.per_amplitude + 1.0), 0.0) if size > 0 else 0.0 for line in found]
+            ),
+            {},
+        )
+
+    return Block(
+        measurement=SCREEN_GRID, reach=1e9,
+        value=np.array([line.normal(line.power) for line in found]), covariance=GRID_STD**2 * np.eye(len(found)),
+        labels=tuple(Label(line.cycles_per_px, line.channel, "lit screen", line.captures, False) for line in found),
+        reads=SHOWN, predict=predict, scale=np.ones(len(found)),
+    )  # fmt: skip
+
+
+def _line(study: Study, group: Sequence[Any], channel: str) -> _Line:
+    """Return the strongest line in one channel of the mean of some captures."""
+    step = mosaic.step(study.camera.cfa)
+    row, col = mosaic.phases(study.camera.cfa)[channel][0]
+    plane = mean_rate(study, group)[row::step, col::step]
+    bright = plane > 0.5 * np.quantile(plane, 0.98)
+    box = _box(bright)
+    power, noise, window = _power(plane[box], step)
+    fy, fx = fft.fftfreq(window.shape[0])[:, None], fft.rfftfreq(window.shape[1])[None, :]
+    count = (fx > 2.5 / window.shape[1]) & (np.abs(fy) > 2.5 / window.shape[0]) & (np.hypot(fx, fy) > GRID_LOWEST)
+    flats = study.flat_levels()
+    if flats:
+        lit = mean_frame(study.recordings, flats[len(flats) // 2])[row::step, col::step] - study.noise.black
+        of_flats, level, _ = _power(lit[box], step)
+        count &= ndimage.maximum_filter(of_flats / level, 3) < GRID_OF_CAMERA
+    relative = np.where(count, power / noise, 0.0)
+    i, j = np.unravel_index(int(np.argmax(relative)), relative.shape)
+    # a product of two cosines of amplitude 1 has four lines of a quarter
+    unit = (0.25 * window.sum()) ** 2 / noise[i, j]
+    return _Line(
+        channel, tuple(c.id for c in group), float(np.hypot(fy[i, 0], fx[0, j])) / step, float(relative[i, j]),
+        float(unit), int(0.6 * count.sum())
+    )  # fmt: skip
+
+
+def _box(bright: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return a rectangle inside the lit part. Raises NotDetermined where that is too small."""
+    slices = []
+    for axis in (0, 1):
+        share = bright.mean(axis=1 - axis)
+        use = np.flatnonzero(share > 0.9 * share.max())
+        low, high = int(use[0]) + 4, int(use[-1]) - 3
+        spare = max(high - low - GRID_LARGEST, 0) // 2
+        slices.append(slice(low + spare, high - spare))
+    box = slices[0], slices[1]
+    if min(s.stop - s.start for s in box) < 24 or bright[box].mean() < 0.98:
+        raise NotDetermined("screen_grid", "the lit screen fills too little of the frame")
+    return box
+
+
+def _power(plane: FloatArray, step: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Power spectrum of a plane over its smooth part less 1, the mean power of noise at every frequency, and the window
+    (Hann)."""
+    smooth = ndimage.gaussian_filter(plane, GRID_DETREND_PX / step, mode="nearest")
+    window = np.outer(np.hanning(plane.shape[0]), np.hanning(plane.shape[1]))
+    relative = plane / np.maximum(smooth, 1e-12) - 1.0
+    # outlying pixels are clipped
+    relative = np.clip(relative, *np.quantile(relative, [0.0005, 0.9995]))
+    power = np.abs(fft.rfft2(relative * window)) ** 2
+    fy, fx = fft.fftfreq(plane.shape[0])[:, None], fft.rfftfreq(plane.shape[1])[None, :]
+    ring = np.minimum((np.hypot(fy, fx) * 20.0).astype(int), 13)
+    noise = np.ones_like(power)
+    for k in range(14):
+        if np.any(ring == k):
+            noise[ring == k] = np.median(power[ring == k]) / np.log(2.0)
+    return power, np.maximum(noise, 1e-300), window
+
+
+SCREEN_GRID = Measurement(
+    "screen_grid",
+    title="pixel grid of the screen",
+    order=450,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=grid_block,
+    quantity="strength of the line, sigma",
+)

@@ -1,0 +1,1 @@
+"""Narrowband light against the sensitivity of the channels."""

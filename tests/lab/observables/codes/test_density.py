@@ -1,0 +1,217 @@
+"""Codes in even light: converters' steps, combs and gaps, on cameras of the second image former and on drawn counts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lab.challenge.draw import recordings_of
+from lab.diagnose.inference.decide import decide
+from lab.diagnose.inference.locate import mismatches
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.policy import DecisionPolicy
+from lab.formats.camera_model import camera_model
+from lab.observables.codes.density import code_block, widths
+from lab.observables.darks.level import dark_level_block
+from lab.observables.dataset import Study
+from lab.observables.flats.linearity import linearity_block
+from lab.observables.flats.noise import variance_block
+from lab.observables.spectra.narrowband import chart_block
+from mocks.former import ConcealedCamera, Law, Plan
+from mocks.former.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
+from sim.effects.adc_ripple import AdcRipple
+from sim.effects.bit_weights import BitWeights
+from sim.effects.library import effect
+from sim.uniform import Uniform
+from tests.lab.diagnose.on_blocks import rendered, study
+
+
+def _study(seed: int, laws: Sequence[Law] = (), cfa: str | None = None) -> Study:
+    recordings = recordings_of(
+        ConcealedCamera(seed, laws, cfa=cfa, rows=96, cols=128), Plan(("dark", "flat", "narrowband"))
+    )
+    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+
+
+@pytest.mark.parametrize("seed", [772011, 772012, 772013])
+def test_even_converters_show_nothing(seed: int) -> None:
+    """chi2 of n numbers over n: 1 within 3 sqrt(2 / n) above, and no place stands out."""
+    study = _study(seed)
+    block = code_block(study)
+    chi2 = float(block.value @ np.linalg.solve(block.covariance, block.value)) / len(block.value)
+    assert chi2 < 1.0 + 3.0 * np.sqrt(2.0 / len(block.value))
+    model = MeasurementModel((block,), study.camera)
+    assert not mismatches(model, model.gaussian(), DecisionPolicy())
+
+
+def test_steps_are_measured_where_they_stand() -> None:
+    """A highest bit that is 3 DN too heavy leaves 3 codes out at half scale: within 3.5 of the standard uncertainties
+    and its law's tolerance, seen and held out. Places at 8 DN of 4096 and more beyond it see none of it."""
+    law = AdcNonlinearityLaw(3.0, 0, 2)
+    study = _study(772302, (law,))
+    block = code_block(study)
+    std = np.sqrt(np.diag(block.covariance))
+    expected = block.predict((effect("adc_nonlinearity")(error_dn=law.signed_strength),)).mean
+    spacing = 4096 / 128
+    steps = [i for i, label in enumerate(block.labels) if label.channel == "step"]
+    beside = [i for i in steps if abs(block.labels[i].x - 2048.0) <= 4 * spacing]
+    middle = [i for i in steps if block.labels[i].x == 2048.0]
+    assert len(middle) == 2
+    # half of a hat of 32 codes about the gap's two halves: all but 1.5 of 32 codes of it
+    assert expected[middle] == pytest.approx(law.signed_strength, rel=0.3)
+    for i in steps:
+        allowed = np.hypot(3.5 * std[i], 0.2 * expected[i])
+        assert abs(block.value[i] - (expected[i] if i in beside else 0.0)) < allowed, block.labels[i]
+
+
+@pytest.mark.parametrize("variant", [0, 1])
+def test_wrong_bits_are_named(variant: int) -> None:
+    law = AdcNonlinearityLaw(4.0, variant, 2)
+    study = _study(772302, (law,))
+    blocks = (linearity_block(study), variance_block(study), code_block(study))
+    verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
+    assert [c.effect.name for c in verdict.named] == ["adc_nonlinearity"]
+    found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std["error_dn"]
+    assert std is not None
+    assert abs(found["error_dn"] - law.signed_strength) < 3.0 * std
+
+
+def test_a_step_at_any_code_is_named() -> None:
+    """A comparator that is off by 4 DN at 1664 codes: no bit stands there, and no response to light does that to
+    histograms. Height and place within three standard deviations; the place is looked for from 64 codes apart, and told
+    to a few."""
+    law = AdcNonlinearityLaw(4.0, 4, 7)
+    place = 4096.0 * (0.15 + 0.6 * law.uniform[1])
+    study = _study(772302, (law,))
+    blocks = (linearity_block(study), variance_block(study), code_block(study))
+    verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
+    assert [c.told_name for c in verdict.named] == ["adc_step"]
+    found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std
+    assert abs(found["code_dn"] - place) < 3.0 * (std["code_dn"] or 0.0)
+    assert (std["code_dn"] or np.inf) < 4096 / 128
+    assert abs(found["step_dn"] - law.signed_strength) < 3.0 * (std["step_dn"] or 0.0)
+
+
+@pytest.mark.parametrize("law", [DigitalGainLaw(10.0), LossyCodesLaw(0.05)], ids=lambda law: law.name)
+def test_other_combs_are_located_and_at_most_their_family_is_named(law: Law) -> None:
+    study = _study(772021, (law,))
+    model = MeasurementModel((code_block(study),), study.camera)
+    verdict = decide(model, np.random.default_rng(0), DecisionPolicy())
+    assert verdict.before[0].block.measurement.name == "code_density"
+    assert {c.told_name for c in verdict.named} <= {"converter"}
+
+
+def test_unequal_codes_show_alike_in_seen_and_in_held_out_frames() -> None:
+    """Over the block's scale, which holds the number of counted pixels, the counts' excess variance is the variance of
+    the codes' widths. A gain of 1.1 leaves one code of eleven out and makes the others 1.1 wide: 1.1^2 10 / 11 - 1 =
+    0.1. Filters and unequal counts add some per cent, which a part of a few hundred codes knows to 3 sqrt(2 / 300) = 25
+    %."""
+    block = code_block(_study(772302, (DigitalGainLaw(10.0),)))
+    at = [i for i, label in enumerate(block.labels) if label.channel == "variance"]
+    held_out = np.array([block.labels[i].held_out for i in at])
+    assert block.value[at][~held_out].mean() > 1.5 * block.value[at][held_out].mean()
+    assert block.value[at] / block.scale[at] == pytest.approx(np.full(len(at), 0.1), rel=0.25)
+
+
+def test_the_excess_of_unequal_codes_scatters_as_a_noncentral_chi2() -> None:
+    """Of six cameras with widths of 1.4, 0.3, 1.4 and 0.9: the mean square of N = 48 pulls of the excess variance under
+    the true law is below 1 + 4 sqrt(2 / N). Their excess is up to 900 standard deviations of an even converter's, which
+    would scatter a tenth as much."""
+    law, pulls = BitWeights(last_dn=0.4, second_dn=-0.3), list[float]()
+    for seed in range(6):
+        block = code_block(study(rendered(900 + seed, (law,))))
+        told = block.predict((law,))
+        std = np.sqrt(np.diag(block.covariance) + np.square(list(told.jacobian.values())).sum(axis=0))
+        of_variance = [label.channel == "variance" for label in block.labels]
+        pulls += ((block.value - told.mean) / std)[of_variance].tolist()
+    assert np.mean(np.square(pulls)) < 1.0 + 4.0 * np.sqrt(2.0 / len(pulls))
+
+
+@pytest.mark.parametrize("variant", [2, 3])
+def test_a_ripple_is_named_and_a_saw_tooth_is_the_converter(variant: int) -> None:
+    """2.5 DN sin(2 pi code / 512 + phase): amplitude and period within three standard deviations. A saw tooth over 1024
+    codes is off by its converter's gain where a boundary stands: its bits' weights are the nearest law, or hold."""
+    law = AdcNonlinearityLaw(2.5 if variant == 2 else 5.0, variant, 3)
+    study = _study(772302, (law,))
+    blocks = (linearity_block(study), variance_block(study), code_block(study))
+    verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
+    assert [type(c.effect).family.value for c in verdict.named] == ["converter"]
+    if variant == 3:
+        assert verdict.named[0].effect.name == "adc_nonlinearity"
+        return
+    found, std = verdict.named[0].effect, verdict.named[0].std
+    assert isinstance(found, AdcRipple)
+    assert verdict.named[0].told_name == "adc_ripple"
+    amplitude = np.hypot(found.sine_dn, found.cosine_dn)
+    assert abs(amplitude - 2.5) < 3.0 * np.hypot(std["sine_dn"] or 0.0, std["cosine_dn"] or 0.0)
+    assert abs(found.period_dn - 512.0) < 3.0 * (std["period_dn"] or 0.0)
+
+
+def test_codes_are_averaged_over_noise_in_a_mean() -> None:
+    """Far from its step a converter's error is itself; on it, half; offset and gain as without."""
+    camera = _study(772011, cfa="MONO").camera
+    one = effect("adc_nonlinearity")(error_dn=4.0)
+    for level, wanted in ((1000.0, -4.0 * 1000.0 / 4096.0), (2048.0, 2.0 - 2.0), (3000.0, 4.0 - 4.0 * 3000.0 / 4096.0)):
+        electrons = np.array([(level - camera.black_level_dn) / camera.conversion_gain_dn_per_e])
+        plain, coded = (Uniform(camera, acting).mean_dn({"Y": electrons})["Y"] for acting in ((), (one,)))
+        assert coded - plain == pytest.approx(wanted, abs=0.1)  # 48 values stand for the noise: 4 DN / 48
+
+
+def test_what_the_converter_does_at_black_moves_darks_as_all_other_levels() -> None:
+    """A ripple of 16 times the range is nearly an offset: of darks and flats alike, so that the black level takes it
+    up. One of a quarter of the range moves darks by its value there, averaged over their noise."""
+    study = _study(7)
+    white, wide = study.camera.white_level_dn, AdcRipple(cosine_dn=0.5, period_dn=65536.0)
+    for make in (dark_level_block, linearity_block):
+        block = make(study)
+        before = block.predict(()).mean
+        wanted = 0.5 * np.cos(2.0 * np.pi * before / wide.period_dn)
+        np.testing.assert_allclose(block.predict((wide,)).mean - before, wanted, atol=2e-3)
+    dark, short = dark_level_block(study), AdcRipple(sine_dn=0.4, cosine_dn=0.3, period_dn=0.25 * white)
+    before = dark.predict(()).mean
+    turn = 2.0 * np.pi * before / short.period_dn
+    blurred = np.exp(-0.5 * (2.0 * np.pi * study.noise.gain * study.camera.read_noise_e / short.period_dn) ** 2)
+    wanted = blurred * (0.4 * np.sin(turn) + 0.3 * np.cos(turn))
+    np.testing.assert_allclose(dark.predict((short,)).mean - before, wanted, atol=1e-3)
+
+
+def test_patches_of_a_chart_lie_off_by_what_the_converter_does_at_their_level() -> None:
+    """A ripple of a quarter of the range: its value at each patch, averaged over the noise there. The mean over noise
+    by 48 values is good to 1e-3; levels that shot noise and shading move by less than 1e-3 of a period aren't
+    counted."""
+    recordings = recordings_of(ConcealedCamera(7, (), cfa="RGGB", rows=96, cols=128), Plan(("dark", "flat", "chart")))
+    looked_at = Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+    block, white = chart_block(looked_at), looked_at.camera.white_level_dn
+    ripple = AdcRipple(sine_dn=0.4, cosine_dn=0.3, period_dn=0.25 * white)
+    before, gain = block.predict(()).mean, looked_at.noise.gain
+    noise_dn = gain * np.sqrt((before - looked_at.noise.black) / gain + looked_at.camera.read_noise_e**2)
+    turn = 2.0 * np.pi * before / ripple.period_dn
+    blurred = np.exp(-0.5 * (2.0 * np.pi * noise_dn / ripple.period_dn) ** 2)
+    wanted = blurred * (0.4 * np.sin(turn) + 0.3 * np.cos(turn))
+    np.testing.assert_allclose(block.predict((ripple,)).mean - before, wanted, atol=2e-3)
+
+
+def test_widths_of_codes_are_what_fine_samples_of_the_input_give() -> None:
+    """A step between two codes, a step of many, a saw tooth of three bits and a ripple with a step, against 512 samples
+    a code: an interval that straddles a step is sampled 64 times, so that a width is off by 1 / 64 of a code at most,
+    and by less than 1e-3 elsewhere."""
+    study = _study(7)
+    first, size = 300, 3000
+    codes = SimpleNamespace(count=np.zeros(size), first=first)
+    steps = effect("adc_step")
+    laws = (
+        (steps(step_dn=-2.3, code_dn=1234.2),),
+        (steps(step_dn=17.0, code_dn=2048.0),),
+        (effect("adc_nonlinearity")(error_dn=4.0),),
+        (AdcRipple(sine_dn=1.0, period_dn=256.0), steps(step_dn=0.7, code_dn=900.0)),
+    )
+    x = (np.arange((size + 200) * 512) + 0.5) / 512 - 0.5 + first - 100
+    for acting in laws:
+        landed = np.rint(Uniform(study.camera, acting).codes(x)).astype(int) - first
+        wanted = np.bincount(landed[(landed >= 0) & (landed < size)], minlength=size) / 512
+        off = np.abs(widths(codes, acting, study) - wanted)  # type: ignore[arg-type]
+        assert off.max() < 1.0 / 64.0 + 1e-3
+        assert np.sum(off > 5e-3) <= 8

@@ -1,0 +1,165 @@
+"""Flats over the frame: shading, and signal that is added to the light's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import numpy as np
+import pytest
+
+from lab.formats.recording_set import RecordingSet
+from lab.observables.darks.field import dark_field_block
+from lab.observables.darks.level import dark_level_block
+from lab.observables.darks.readout import fixed_line_block
+from lab.observables.dataset import Study
+from lab.observables.flats.field import (
+    ALIKE,
+    _adjacent,
+    _cell_means,
+    _cell_points,
+    _pattern_variance,
+    shading_block,
+)
+from lab.observables.flats.green_balance import green_block
+from lab.observables.flats.linearity import linearity_block
+from lab.observables.flats.rows import flicker_block
+from lab.observables.observable import Block
+from mocks.former.laws import (
+    DustShadowLaw,
+    MicrolensAngleLaw,
+    NonUniformIlluminationLaw,
+    TapGainLaw,
+    VignettingDecentreLaw,
+    VignettingLaw,
+)
+from tests.lab.diagnose.on_blocks import former, measured_model, names, rendered, sigmas, study, verdict
+from tests.sim.local_effects import ReadOutRamp
+
+LOOKED_AT = (shading_block, linearity_block)
+
+
+def test_healthy_cells_scatter_as_they_should() -> None:
+    """4 cameras: the mean of chi2's departures within 3 / sqrt(4) of its standard deviations, and 0.5 for the free axis
+    and level."""
+    found = [sigmas(measured_model(former(s, cfa=c), shading_block)) for s in (1, 2) for c in ("MONO", "BGGR")]
+    assert abs(np.mean(found)) < 3.0 / np.sqrt(4) + 0.5
+    assert max(found) < 4.0
+
+
+@pytest.mark.parametrize("variant", [0, *(pytest.param(v, marks=pytest.mark.slow) for v in (1, 2))])
+def test_vignetting_is_named_whatever_its_power(variant: int) -> None:
+    """As the square of the radius, as the overlap of two discs, as the fourth power."""
+    found = verdict(former(21, VignettingLaw(4.0, variant, 1), cfa="RGGB"), *LOOKED_AT)
+    assert names(found) == ["vignetting"]
+    if variant == 0:
+        one = found.named[0]
+        std = one.std["corner_loss_percent"]
+        assert std is not None
+        assert abs(one.effect.model_dump()["corner_loss_percent"] - 4.0) < 3.0 * std
+
+
+@pytest.mark.parametrize("variant", [pytest.param(0, marks=pytest.mark.slow), 1])
+def test_a_fall_off_about_another_point_is_named(variant: int) -> None:
+    found = verdict(former(22, VignettingDecentreLaw(0.3, variant, 2)), *LOOKED_AT)
+    assert names(found) == ["vignetting_decentre"]
+
+
+def test_microlenses_at_another_angle_are_named_and_vignetting_is_not() -> None:
+    """By the second image former; each parameter within 4 of its own standard deviations."""
+    blocks = (*LOOKED_AT, green_block)
+    law = MicrolensAngleLaw(6.0, 0, 9)
+    found = verdict(former(21, law, cfa="RGGB"), *blocks)
+    assert names(found) == ["microlens_angle"]
+    for name, truth in law.library_parameters().items():
+        std = found.named[0].std[name]
+        assert std is not None
+        assert getattr(found.named[0].effect, name) == pytest.approx(truth, abs=4.0 * std)
+    assert names(verdict(former(21, VignettingLaw(4.0, 0, 1), cfa="RGGB"), *blocks)) == ["vignetting"]
+
+
+@pytest.mark.parametrize("variant", [pytest.param(0, marks=pytest.mark.slow), 1])
+def test_a_slope_is_uneven_light_with_or_without_a_bow(variant: int) -> None:
+    truth = NonUniformIlluminationLaw(1.5, variant, 3)
+    found = verdict(former(23, truth, cfa="GRBG"), *LOOKED_AT)
+    assert names(found) == ["non_uniform_illumination"]
+    for name, value in truth.library_parameters().items():
+        std = found.named[0].std[name]
+        assert std is not None
+        assert abs(found.named[0].effect.model_dump()[name] - value) < 3.0 * std
+
+
+def test_what_no_law_fits_is_seen_and_gets_no_name() -> None:
+    found = verdict(former(24, DustShadowLaw(2.0, 0, 4)), *LOOKED_AT)
+    assert not found.named
+    assert {s.block.measurement.name for s in found.before} == {"flat_field"}
+
+
+def test_a_brighter_half_is_a_tap() -> None:
+    assert names(verdict(former(24, TapGainLaw(1.0)), *LOOKED_AT)) == ["taps"]
+
+
+def test_a_pattern_that_neighbours_share_counts_more() -> None:
+    """White pattern: its own variance, within 3 sqrt(2 / 192) of blocks' differences and the same for the median;
+    common pattern: at most ALIKE times as much."""
+    rng = np.random.default_rng(3)
+    white = 1.0 + 0.01 * rng.standard_normal((192, 256))
+    assert _pattern_variance(white, 0.0) == pytest.approx(1e-4, rel=0.2)
+    alike = 0.8 * (white - 1.0) + 0.02 * np.kron(rng.standard_normal((48, 64)), np.ones((4, 4)))
+    single = _pattern_variance(1.0 + 0.8 * (white - 1.0), 0.0)
+    assert single < _pattern_variance(1.0 + alike, 0.0) <= ALIKE * _adjacent(1.0 + alike, 1)
+
+
+def test_means_over_cells_are_exact_for_the_fourth_power() -> None:
+    """x^4 over a cell from a to b: (b^5 - a^5) / (5 (b - a))."""
+    camera = study(former(1, kinds=("dark", "flat"))).camera
+    place = _cell_points(camera, 0.0, 0.0)
+    edges = (np.linspace(0, camera.cols, 9) - camera.cols / 2) * camera.pixel_pitch_um
+    exact = np.diff(edges**5) / (5.0 * np.diff(edges))
+    np.testing.assert_allclose(_cell_means(place.x_um**4).reshape(6, 8)[2], exact, rtol=1e-9)
+
+
+# --- What read-out adds to the pixels of every frame: each measurement that it changes predicts it --------------------
+
+
+RAMP = ReadOutRamp(last_row_e=40.0)
+
+
+@cache
+def recorded() -> RecordingSet:
+    return rendered(5, (RAMP,))
+
+
+def without_darks(recordings: RecordingSet) -> RecordingSet:
+    return recordings.without({c.id for c in recordings.captures("dark", "left")})
+
+
+@pytest.mark.parametrize(
+    ("make", "recordings"),
+    [
+        (dark_field_block, recorded),
+        (partial(fixed_line_block, "rows"), recorded),
+        (shading_block, recorded),
+        (flicker_block, lambda: without_darks(recorded())),
+    ],
+    ids=["dark_field", "dark_row_pattern", "flat_field", "flat_rows"],
+)
+def test_what_read_out_adds_is_predicted(
+    make: Callable[[Study], Block], recordings: Callable[[], RecordingSet]
+) -> None:
+    """Without the effect the numbers lie far off, with it chi-squared is within 4 of its standard deviations."""
+    model = measured_model(recordings(), make)
+    assert sigmas(model) > 12.0
+    assert abs(sigmas(model, (RAMP,))) < 4.0
+
+
+def test_the_rows_of_flats_have_the_offsets_of_dark_rows() -> None:
+    """The dark frames' mean rows are subtracted: no effect has to tell them once more."""
+    assert abs(sigmas(measured_model(recorded(), flicker_block))) < 4.0
+
+
+def test_its_mean_is_a_part_of_the_black_level() -> None:
+    """The level that dark frames have at no exposure is measured with it."""
+    model = measured_model(recorded(), dark_level_block)
+    assert abs(sigmas(model)) < 4.0
+    np.testing.assert_array_equal(model.mean((RAMP,)), model.mean(()))
