@@ -3,7 +3,6 @@ colours. Nothing is exchanged or restated here: what is found is a proposal."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
@@ -15,8 +14,8 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.formats.recording_set import Frame, RecordingSet
-from lab.observables.codes.step import count_codes, step_of
+from lab.formats.recording_set import CodeCounts, RecordingSet
+from lab.observables.codes.step import step_of
 from lab.observables.flats.level_lines import CLIPPED_LIMIT, robust_response
 from lab.observables.flats.stated_light import light_of, most_frequent_gain_db
 from lab.observables.noise.levels import rounded_c
@@ -71,20 +70,19 @@ def copied_frames(recordings: RecordingSet, side: Side, captures: Sequence[Captu
     first: dict[bytes, Capture] = {}
     found = []
     for capture in recordings.captures(side=side) if captures is None else captures:
-        frame = recordings.frame(capture)
-        if frame.std(dtype=np.float32) < NOISELESS_DN:
+        codes = recordings.codes(capture)
+        if codes.every.std_dn < NOISELESS_DN:
             continue
-        mark = hashlib.blake2b(frame.tobytes(), digest_size=16).digest()
-        twin = first.setdefault(mark, capture)
-        if twin is not capture and twin.frame != capture.frame and _is_noisy(frame):
+        twin = first.setdefault(codes.digest, capture)
+        if twin is not capture and twin.frame != capture.frame and _is_noisy(codes.every):
             found.append((capture, twin))
     return CopiedFrames(side, tuple(found))
 
 
-def _is_noisy(frame: Frame) -> bool:
+def _is_noisy(counts: CodeCounts) -> bool:
     """Return whether a frame has a standard deviation of `NOISELESS_DN` steps of its codes, and can't be equal to
     another by chance."""
-    return float(frame.std(dtype=np.float32)) >= NOISELESS_DN * step_of(count_codes(frame))
+    return counts.std_dn >= NOISELESS_DN * step_of(counts)
 
 
 # --- exchanged frames ----------------------------------------------------------------------------------------------
@@ -189,8 +187,8 @@ def _judged(
     camera = recordings.camera(side)
     looked_at = []
     for capture in (*darks, *flats):
-        frame = recordings.frame(capture)
-        looked_at.append((float(frame.mean()), float(np.mean(frame >= camera.saturation_dn)) > CLIPPED_SHARE))
+        counts = recordings.codes(capture).every
+        looked_at.append((counts.mean_dn, counts.share_from(camera.saturation_dn) > CLIPPED_SHARE))
     mean, clipped = (np.array(values) for values in zip(*looked_at, strict=True))
     dark_mean, flat_mean = mean[: len(darks)], mean[len(darks) :]
     lines = _dark_lines(darks, dark_mean)
@@ -336,17 +334,17 @@ def alike_planes(recordings: RecordingSet, side: Side) -> AlikePlanes | None:
     if camera.cfa == "MONO":
         return None
     darks = recordings.captures(DarkCapture, side)
-    black = float(recordings.frame(darks[0]).mean()) if darks else (camera.black_level_dn or 0.0)
+    black = recordings.codes(darks[0]).every.mean_dn if darks else (camera.black_level_dn or 0.0)
     brightest: dict[tuple[Hashable, ...], tuple[float, float, Capture]] = {}
     for capture in (*recordings.captures(FlatCapture, side), *recordings.captures(NarrowbandCapture, side)):
-        frame = recordings.frame(capture)
-        signal = float(frame.mean()) - black
+        codes = recordings.codes(capture)
+        signal = codes.every.mean_dn - black
         light = (capture.kind, getattr(capture, "wavelength_nm", None), getattr(capture, "radiance", None))
         if signal < BRIGHT_SHARE * camera.saturation_dn or (light in brightest and signal <= brightest[light][0]):
             continue
-        if float(np.mean(frame >= camera.saturation_dn)) > CLIPPED_LIMIT:
+        if codes.every.share_from(camera.saturation_dn) > CLIPPED_LIMIT:
             continue
-        means = np.array([plane.mean() for plane in _planes(np.asarray(frame, float))])
+        means = np.array([cell.mean_dn for cell in codes.cells])
         brightest[light] = signal, float(np.abs(means - means.mean()).max()), capture
     if not brightest or any(away > ALIKE * signal + ALIKE_DN for signal, away, _ in brightest.values()):
         return None

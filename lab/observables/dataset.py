@@ -21,7 +21,7 @@ from lab.observables.acquisition_errors import CopiedFrames, copied_frames
 from lab.observables.codes.step import CodeStep, find_code_step
 from lab.observables.flats.stated_light import lamps_of, most_frequent_gain_db
 from lab.observables.noise.figures import NoiseFigures, noise_figures
-from lab.observables.plane_means import plane_means
+from lab.observables.plane_means import channel_means
 from lab.observables.reads import LAG, acting
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effects
@@ -129,7 +129,7 @@ class Study:
         """Return the means of a capture by channel, computed once. A channel clips where `CLIPPED_SHARE` of its
         pixels do."""
         if capture.id not in self._levels:
-            found = plane_means(self.recordings.frame(capture), self.camera.cfa, self.saturation_dn)
+            found = channel_means(self.recordings.codes(capture), self.camera.cfa, self.saturation_dn)
             self._levels[capture.id] = Levels(
                 {c: one.mean_dn if one.clipped_share < CLIPPED_SHARE else None for c, one in found.items()},
                 {c: one.pixels for c, one in found.items()},
@@ -300,14 +300,12 @@ def clipping_level_dn(study: Study) -> float:
     piles = []
     for kind in ("flat", "narrowband", "white"):
         for capture in study.recordings.captures(kind, study.side):
-            frame = study.recordings.frame(capture)
+            codes = study.recordings.codes(capture)
             for channel in study.channels:
-                row, col = mosaic.phases(study.camera.cfa)[channel][0]
-                step = mosaic.step(study.camera.cfa)
-                values = np.asarray(frame[row::step, col::step])
-                if values.max() < 0.25 * white:
+                counts = codes.of_channel(study.camera.cfa, channel)[0]
+                if counts.highest_dn < 0.25 * white:
                     continue
-                middle, high, top = np.quantile(values, [0.97, 0.99, 0.999])
+                middle, high, top = counts.quantiles([0.97, 0.99, 0.999])
                 if gain is None:
                     # a tenth of the shot noise for a full well of 1e5 e: less than any unclipped plane has
                     least = 0.1 * np.sqrt(max(top - black, 1.0) * white / 1e5)

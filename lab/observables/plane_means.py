@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.formats.recording_set import FrameCodes
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases, step
 from sim.spectrum import FloatArray
@@ -44,9 +45,14 @@ def plane_means(frame: NDArray[Any], cfa: Cfa, saturation_dn: float, step_dn: fl
     `frame` (rows, cols), DN, begins on a whole period of the mosaic; a pixel of `saturation_dn` or more is clipped.
     `step_dn`: step of the codes.
     """
+    return channel_means(FrameCodes.count(frame), cfa, saturation_dn, step_dn)
+
+
+def channel_means(codes: FrameCodes, cfa: Cfa, saturation_dn: float, step_dn: float = 1.0) -> dict[str, PlaneMean]:
+    """Return the mean of each channel of a frame by its codes; arguments as of `plane_means`."""
     found = {}
     for channel in phases(cfa):
-        values = channel_pixels(frame, cfa, channel)
-        clipped = float(np.mean(values >= saturation_dn))
-        found[channel] = PlaneMean(float(values.mean()), float(values.std()), values.size, clipped, step_dn)
+        counts = codes.channel(cfa, channel)
+        clipped = counts.share_from(saturation_dn)
+        found[channel] = PlaneMean(counts.mean_dn, counts.std_dn, counts.pixels, clipped, step_dn)
     return found

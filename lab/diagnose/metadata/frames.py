@@ -16,8 +16,7 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.metadata.misstatement import LEFT_OUT, Misstatement, restated_camera
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
-from lab.formats.recording_set import RecordingSet
-from lab.formats.recording_set.files import Frame
+from lab.formats.recording_set import CodeCounts, RecordingSet
 from lab.formats.results import Skipped
 from lab.observables.acquisition_errors import exchanged_frames
 from lab.observables.codes.rounding import QUANTISATION_DN2, rounding_std_dn
@@ -104,9 +103,9 @@ def exchanged_kinds(
     if min(len(darks), len(flats)) < policy.least_swapped_frames:
         return None
     exposure, level = (
-        np.array(v) for v in zip(*((c.exposure_s, float(recordings.frame(c).mean())) for c in darks), strict=True)
+        np.array(v) for v in zip(*((c.exposure_s, recordings.codes(c).every.mean_dn) for c in darks), strict=True)
     )
-    lit = np.array([float(recordings.frame(c).mean()) for c in flats])
+    lit = np.array([recordings.codes(c).every.mean_dn for c in flats])
     longest = level[exposure == exposure.max()].mean()
     least = DARKER_SHARE * recordings.camera(side).saturation_dn
     if float(np.median(level)) < float(lit.max()) + least or longest < float(level.min()) + least:
@@ -145,16 +144,16 @@ def misstated_bit_depth(
     piled: dict[str, int] = {}
     highest = 0
     for capture in recordings.captures(side=side):
-        frame = recordings.frame(capture)
-        top = int(frame.max())
+        counts = recordings.codes(capture).every
+        top = counts.highest_dn
         if top.bit_length() >= camera.bit_depth:
             return None
         if top < highest:
             continue
         if top > highest:
             highest, piled = top, {}
-        count = int(np.count_nonzero(frame == top))
-        if count >= max(policy.clipped_pixels, policy.clipped_frame_share * frame.size):
+        count = int(counts.number[-1])
+        if count >= max(policy.clipped_pixels, policy.clipped_frame_share * counts.pixels):
             piled[capture.id] = count
     bits = highest.bit_length()
     if (
@@ -222,7 +221,7 @@ def misstated_dark_exposure(
     if len(levels) < LEAST_EXPOSURES or count.min() < LEAST_REPEATS:
         return None
     step_dn = find_code_step(recordings, side).step_dn
-    mean, noise = np.array([_mean_and_variance(recordings.frame(c), step_dn) for c in alike]).T
+    mean, noise = np.array([_mean_and_variance(recordings.codes(c).every, step_dn) for c in alike]).T
     table = _drifts(exposure, [c.time.timestamp() if c.time is not None else None for c in alike])
     found = _candidates(exposure, mean, noise, table, _floor_dn(recordings, alike, step_dn), policy)
     if not found:
@@ -258,9 +257,9 @@ def _near(temperature_c: float | None, usual_c: float) -> bool:
     return temperature_c is not None and abs(temperature_c - usual_c) <= TEMPERATURE_STEP_C
 
 
-def _mean_and_variance(frame: Frame, step_dn: float) -> tuple[float, float]:
+def _mean_and_variance(counts: CodeCounts, step_dn: float) -> tuple[float, float]:
     """Mean of a frame, DN, and the variance of that mean by the spread of its pixels, DN^2."""
-    return float(frame.mean()), max(float(frame.var()), QUANTISATION_DN2 * step_dn**2) / frame.size
+    return counts.mean_dn, max(counts.variance_dn2, QUANTISATION_DN2 * step_dn**2) / counts.pixels
 
 
 def _floor_dn(recordings: RecordingSet, darks: Sequence[DarkCapture], step_dn: float) -> FloatArray:
@@ -354,7 +353,7 @@ def misstated_black_level(
     first = min(darks, key=lambda c: c.exposure_s)
     alike = [c for c in darks if (c.gain_db, c.temperature_c) == (first.gain_db, first.temperature_c)]
     exposure = np.array([c.exposure_s for c in alike])
-    mean = np.array([float(recordings.frame(c).mean()) for c in alike])
+    mean = np.array([recordings.codes(c).every.mean_dn for c in alike])
     if np.ptp(exposure) == 0.0:
         return None
     scale = float(exposure.max())
@@ -400,7 +399,7 @@ def unchecked(recordings: RecordingSet, side: Side) -> Iterator[Skipped]:
     camera = recordings.camera(side)
     highest = 0
     for capture in recordings.captures(side=side):
-        highest = max(highest, int(recordings.frame(capture).max()))
+        highest = max(highest, recordings.codes(capture).every.highest_dn)
         if highest.bit_length() >= camera.bit_depth:
             break
     else:

@@ -124,7 +124,7 @@ def _dark_levels(recordings: RecordingSet, side: Side) -> dict[float, float]:
     lit = [*recordings.captures(NarrowbandCapture, side), *recordings.captures(ChartCapture, side)]
     for dark in darks_near(recordings.captures(DarkCapture, side), lit):
         first.setdefault(dark.exposure_s, dark)
-    found = {exposure_s: float(recordings.frame(dark).mean()) for exposure_s, dark in first.items()}
+    found = {exposure_s: recordings.codes(dark).every.mean_dn for exposure_s, dark in first.items()}
     return found or {0.0: recordings.camera(side).black_level_dn or 0.0}
 
 

@@ -6,6 +6,7 @@ at all. The kinds of capture are in `lab.capture_kinds`."""
 from lab.formats.recording_set.checks import clipped_share, inspect
 from lab.formats.recording_set.files import RAWS, FolderFiles, Frame, RecordingFiles, Target, load_frame
 from lab.formats.recording_set.folder import ArchiveForm, archive, packed, read, write
+from lab.formats.recording_set.frame_codes import CodeCounts, FrameCodes
 from lab.formats.recording_set.manifest import (
     DataSheet,
     InstrumentSnapshot,
@@ -22,9 +23,11 @@ from lab.formats.recording_set.recordings import RecordingSet, frame_problem
 __all__ = [
     "RAWS",
     "ArchiveForm",
+    "CodeCounts",
     "DataSheet",
     "FolderFiles",
     "Frame",
+    "FrameCodes",
     "InstrumentSnapshot",
     "Manifest",
     "RecordingError",

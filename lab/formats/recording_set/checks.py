@@ -17,6 +17,7 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import InputError
 from lab.formats.recording_set.files import Frame
+from lab.formats.recording_set.frame_codes import FrameCodes
 from lab.formats.recording_set.manifest import DataSheet, Findings
 from lab.formats.recording_set.recordings import RecordingSet
 from sim.camera import CameraModel, Lens, Side
@@ -199,19 +200,7 @@ class ClippedLevel:
     scatter_dn: dict[str, float]
 
 
-def channel_planes(frame: Frame, camera: DataSheet) -> dict[str, list[Frame]]:
-    """Return the planes of each channel: two for `G`, the whole frame for `Y`."""
-    step = 1 if camera.cfa == "MONO" else 2
-    planes: dict[str, list[Frame]] = defaultdict(list)
-    for row in range(step):
-        for col in range(step):
-            plane = frame[row::step, col::step]
-            if plane.size:
-                planes["Y" if step == 1 else camera.cfa[2 * row + col]].append(plane)
-    return planes
-
-
-def clipped_share(frame: Frame, camera: DataSheet) -> dict[str, float]:
+def clipped_share(codes: FrameCodes, camera: DataSheet) -> dict[str, float]:
     """Share of each channel's pixels at the channel's highest code, if that is above half of the range, else at the
     white level.
 
@@ -221,10 +210,9 @@ def clipped_share(frame: Frame, camera: DataSheet) -> dict[str, float]:
     black = camera.black_level_dn or 0.0
     middle = black + (camera.saturation_dn - black) / 2
     shares = {}
-    for channel, planes in channel_planes(frame, camera).items():
-        highest = max(float(plane.max()) for plane in planes)
-        at = highest if highest > middle else camera.saturation_dn
-        shares[channel] = sum(int(np.count_nonzero(plane >= at)) for plane in planes) / sum(p.size for p in planes)
+    for channel in camera.channels:
+        counts = codes.channel(camera.cfa, channel)
+        shares[channel] = counts.share_from(counts.highest_dn if counts.highest_dn > middle else camera.saturation_dn)
     return shares
 
 
@@ -239,12 +227,13 @@ def _light(recordings: RecordingSet, flat: FlatCapture) -> tuple[float, str]:
     return flat.exposure_s * float(np.trapezoid(spectrum.value, spectrum.wavelength_nm)), "radiance"
 
 
-def flat_level(recordings: RecordingSet, flat: FlatCapture, frame: Frame, clipped: dict[str, float]) -> ClippedLevel:
+def flat_level(recordings: RecordingSet, flat: FlatCapture, clipped: dict[str, float]) -> ClippedLevel:
     """Return the level of one flat. Raises InputError where its spectrum can't be used."""
     light, scale = _light(recordings, flat)
-    planes = channel_planes(frame, recordings.camera(flat.side))
-    mean_dn = {name: float(np.mean([plane.mean() for plane in planes[name]])) for name in planes}
-    scatter_dn = {name: float(np.mean([plane.std() for plane in planes[name]])) for name in planes}
+    camera, codes = recordings.camera(flat.side), recordings.codes(flat)
+    cells = {name: codes.of_channel(camera.cfa, name) for name in camera.channels}
+    mean_dn = {name: float(np.mean([one.mean_dn for one in own])) for name, own in cells.items()}
+    scatter_dn = {name: float(np.mean([one.std_dn for one in own])) for name, own in cells.items()}
     where = f"{recordings.where(flat.frame)} (capture {flat.id})"
     return ClippedLevel(flat.id, where, flat.gain_db, light, scale, mean_dn, clipped, scatter_dn)
 
@@ -456,15 +445,17 @@ def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> 
             continue
         loaded(capture, frame, number / len(captures))
         if isinstance(capture, DarkCapture):
-            levels[capture.side].append(_frame_level(recordings, capture, float(frame.mean()), 0.0, None))
+            mean_dn = recordings.codes(capture).every.mean_dn
+            levels[capture.side].append(_frame_level(recordings, capture, mean_dn, 0.0, None))
         if not capture.clipping_matters:
             continue
-        clipped = clipped_share(frame, camera)
+        codes = recordings.codes(capture)
+        clipped = clipped_share(codes, camera)
         if isinstance(capture, FlatCapture):
             with suppress(InputError):  # a spectrum that can't be used is reported with the spectra
-                flat = flat_level(recordings, capture, frame, clipped)
+                flat = flat_level(recordings, capture, clipped)
                 flats[capture.side].append(flat)
-                level = _frame_level(recordings, capture, float(frame.mean()), flat.light, flat.scale)
+                level = _frame_level(recordings, capture, codes.every.mean_dn, flat.light, flat.scale)
                 levels[capture.side].append(replace(level, is_clipped=max(clipped.values()) > ANY_CLIPPED))
         elif max(clipped.values()) > CLIPPED_LIMIT:
             clipped_of[capture.side, capture.kind].append(capture.id)

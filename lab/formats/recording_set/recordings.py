@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lab.capture_kinds.base import Capture, in_folder
 from lab.errors import InputError
 from lab.formats.recording_set.files import Frame, JoinedFiles, MemoryFiles, OverlaidFiles, RecordingFiles, Target
+from lab.formats.recording_set.frame_codes import FrameCodes
 from lab.formats.recording_set.manifest import DataSheet, Manifest
 from sim.camera import Side
 from sim.spectrum import Spectrum
@@ -23,7 +24,7 @@ C = TypeVar("C", bound=Capture)
 
 class RecordingSet:
     """A manifest with its frames, spectra and targets. Frames are loaded when asked for, and `cache_bytes` of them are
-    kept.
+    kept. The codes of every frame are counted once and stay.
 
     It comes from a folder by `read`, or from memory: `frames`, `spectra` and `targets` by the paths in the manifest. It
     can be shared between threads and sent to another process.
@@ -48,6 +49,7 @@ class RecordingSet:
         self._files: RecordingFiles = files or MemoryFiles(frames or {}, spectra or {}, targets or {})
         self._cache: OrderedDict[str, Frame] = OrderedDict()
         self._held = 0
+        self._codes: dict[str, FrameCodes] = {}
         self._lock = threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -117,14 +119,18 @@ class RecordingSet:
         files: RecordingFiles | None = None,
         cache_bytes: int | None = None,
     ) -> RecordingSet:
-        """Return a set with an empty cache of frames; what isn't given is this set's."""
-        return RecordingSet(
+        """Return a set with an empty cache of frames; what isn't given is this set's. Where the files are the same, it
+        shares the codes that were counted."""
+        copy = RecordingSet(
             self.manifest if manifest is None else manifest,
             source=self.source,
             warnings=self.warnings if warnings is None else warnings,
             files=self._files if files is None else files,
             cache_bytes=self.cache_bytes if cache_bytes is None else cache_bytes,
         )
+        if files is None:
+            copy._codes = self._codes
+        return copy
 
     def capture(self, id: str) -> Capture:
         """Return the capture called `id`; InputError where there is none."""
@@ -155,6 +161,12 @@ class RecordingSet:
                 while self._held > self.cache_bytes:
                     self._held -= self._cache.popitem(last=False)[1].nbytes
         return frame
+
+    def codes(self, capture: Capture) -> FrameCodes:
+        """Return how often each code comes in the frame of a capture. Counted once, whatever the manifest states."""
+        if capture.frame not in self._codes:
+            self._codes[capture.frame] = FrameCodes.count(self.frame(capture), with_digest=True)
+        return self._codes[capture.frame]
 
     def let_go(self) -> None:
         """Free the cached frames."""

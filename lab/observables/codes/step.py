@@ -9,24 +9,18 @@ import json
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import CodeCounts, RecordingSet
 from sim.camera import Side
 
-Counts = NDArray[np.int64]
-
-CODES = 1 << 16  # of 16 bits
 #: Share of the pixels whose codes may be none of the step: pixels that were replaced after the conversion.
 OFF_SHARE = 1e-3
 #: Shares of the pixels whose codes, the most frequent first, give the step in turn.
 CORE_SHARES = (0.9, 0.99, 1.0)
 #: Probability that codes of a step of 1 DN look like those of a larger one by chance.
 CHANCE = 1e-6
-#: Pixels of a frame that are counted, at most: a million hold every code that matters.
-MOST_PIXELS = 1 << 20
 #: Frames that are looked at, at most: evenly over the settings.
 MOST_FRAMES = 64
 
@@ -81,15 +75,17 @@ def find_code_step(recordings: RecordingSet, side: Side) -> CodeStep:
     chosen = list(first.values())
     if len(chosen) > MOST_FRAMES:
         chosen = [chosen[int(k)] for k in np.linspace(0, len(chosen) - 1, MOST_FRAMES).round()]
-    total = np.zeros(CODES, np.int64)
+    parts: list[CodeCounts] = []
     own: dict[str, float] = {}
     for capture in chosen:
-        counts = count_codes(recordings.frame(capture))
+        counts = recordings.codes(capture).every
         own[capture.id] = step_of(counts, has_one_mode=isinstance(capture, DarkCapture))
-        total += counts
+        parts.append(counts)
+    total = CodeCounts.total(parts)
     step_dn = step_of(total, has_one_mode=all(isinstance(capture, DarkCapture) for capture in chosen))
     coarser = {id: step for id, step in own.items() if step >= 2.0 * step_dn}
-    offset_dn = int(np.argmax(total)) % int(step_dn)
+    frequent_dn = total.lowest + int(np.argmax(total.number)) if total.number.size else 0
+    offset_dn = frequent_dn % int(step_dn)
     return CodeStep(step_dn, offset_dn, tuple(coarser), max(coarser.values(), default=1.0))
 
 
@@ -103,15 +99,8 @@ def under_highest_code(recordings: RecordingSet, side: Side, code: CodeStep) -> 
     return recordings.under(manifest.model_copy(update={"cameras": cameras}))
 
 
-def count_codes(frame: NDArray[np.uint16]) -> Counts:
-    """Return how often each code comes (65536,), in at most about `MOST_PIXELS` pixels: whole rows, evenly spaced by an
-    odd number."""
-    apart = -(-frame.size // MOST_PIXELS)
-    return np.bincount(frame[:: apart + (apart % 2 == 0)].ravel(), minlength=CODES)
-
-
-def step_of(counts: Counts, *, has_one_mode: bool = False) -> float:
-    """Return the step of codes of which `counts` (65536,) come, DN; 1 where they don't tell.
+def step_of(counts: CodeCounts, *, has_one_mode: bool = False) -> float:
+    """Return the step of codes of which `counts` come, DN; 1 where they don't tell.
 
     The greatest common divisor g of the differences of the frequent codes is the step, where almost all pixels have
     codes of it. Codes that were scaled to more bits and rounded have g = 1, but no two nearer than their step d: then
@@ -122,10 +111,11 @@ def step_of(counts: Counts, *, has_one_mode: bool = False) -> float:
     `has_one_mode`: the pixels' distribution has one mode, as that of a dark. Then a code between the most frequent and
     another is expected at least as often as that other, and none comes by a chance of exp(-count): three codes suffice.
     """
-    codes = np.flatnonzero(counts)[:-1] if not has_one_mode else np.flatnonzero(counts)
-    if codes.size < 2:
+    there = np.flatnonzero(counts.number)
+    there = there if has_one_mode else there[:-1]
+    if there.size < 2:
         return 1.0
-    number = counts[codes]
+    codes, number = counts.lowest + there, counts.number[there]
     frequent = np.argsort(-number, kind="stable")
     covered = np.cumsum(number[frequent])
     for share in CORE_SHARES:

@@ -17,9 +17,9 @@ from scipy import ndimage
 
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import CodeCounts, FrameCodes, RecordingSet
 from lab.formats.results import NoiseFit
-from lab.observables.codes.step import count_codes, step_of
+from lab.observables.codes.step import step_of
 from lab.observables.edges.finding import Region, region_planes
 from lab.observables.edges.mtf import DEFAULT_FREQUENCY_CY_PER_PX, EdgeMtf, planes_mtf
 from sim.camera import Cfa
@@ -197,7 +197,7 @@ def measure_edge(
     mean = np.mean([f.astype(float) for f in frames], axis=0) if len(frames) > 1 else frames[0]
     planes = region_planes(mean, region, camera.cfa, channel, black)
     frequency = DEFAULT_FREQUENCY_CY_PER_PX if frequency_cy_per_px is None else frequency_cy_per_px
-    code = step_of(np.sum([count_codes(frame) for frame in frames], axis=0))
+    code = step_of(CodeCounts.total(FrameCodes.count(frame).every for frame in frames))
     return planes_mtf(planes, frequency, code=code, frames=len(frames))
 
 

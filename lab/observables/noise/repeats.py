@@ -24,10 +24,10 @@ finding in `FALSE_ALARM` of all recordings of a kind at most.
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import groupby, pairwise
 from typing import Any
 
@@ -56,7 +56,7 @@ class RepeatedSetting:
     """The n repeats of one setting in order of capture.
 
     `elapsed` (n,): s since the first where `is_timed`, else numbers of frames; `run` (n,): number of the uninterrupted
-    run of this setting; `mean_dn` (n,); `noise_dn`: standard deviation of a mean by the noise of its pixels.
+    run of this setting; `mean_dn` (n,); `frame_of`: frame (rows, cols) of a capture, DN.
     """
 
     captures: tuple[Capture, ...]
@@ -64,7 +64,20 @@ class RepeatedSetting:
     is_timed: bool
     run: NDArray[np.integer[Any]]
     mean_dn: FloatArray
-    noise_dn: float
+    frame_of: Callable[[Capture], NDArray[Any]]
+
+    @cached_property
+    def noise_dn(self) -> float:
+        """Standard deviation of a mean by the noise of its pixels, DN, from differences of successive frames. Only this
+        reads frames."""
+        squares, pixels = [], 1
+        before: NDArray[np.float32] | None = None
+        for capture in self.captures:
+            frame = self.frame_of(capture).astype(np.float32)
+            if before is not None:
+                squares.append(0.5 * float(np.var(frame - before, dtype=np.float64)))
+            before, pixels = frame, frame.size
+        return math.sqrt(max(float(np.median(squares)), QUANTISATION_DN2) / pixels)
 
     @property
     def text(self) -> str:
@@ -79,7 +92,7 @@ def find_drifts(
     """Return what repeats of one camera show over time beyond white scatter, the most significant of a kind first.
 
     `kinds`: capture kinds to look at, None: all; `left_out`: ids of captures that aren't used. Boards are left out, as
-    they move between captures. Every frame is read once, and no more than two are held in memory.
+    they move between captures. Frames are read where a drift is found, no more than two at a time.
     """
     by_kind: dict[str, list[RepeatedSetting]] = {}
     for setting in _settings(recordings, side, kinds, frozenset(left_out)):
@@ -130,7 +143,7 @@ def _settings(
         every = [(number, capture) for number, part in enumerate(parts) for capture in part if is_wanted(capture)]
         if len(every) < 2:
             continue
-        means, noise_dn = _means(recordings, [capture for _, capture in every])
+        means = _means(recordings, [capture for _, capture in every])
         repeats = [(run, capture, mean) for (run, capture), mean in zip(every, means, strict=True) if mean is not None]
         if len(repeats) < 2:
             continue
@@ -143,7 +156,7 @@ def _settings(
             is_timed=has_times,
             run=np.array([run for run, _, _ in repeats]),
             mean_dn=np.array([mean for _, _, mean in repeats]),
-            noise_dn=noise_dn,
+            frame_of=recordings.frame,
         )
 
 
@@ -170,26 +183,15 @@ def _setting_words(capture: Capture) -> Iterator[str]:
         yield f"{rounded_c(capture.temperature_c):g} deg C"
 
 
-def _means(recordings: RecordingSet, captures: Iterable[Capture]) -> tuple[list[float | None], float]:
-    """Means of frames, DN, None of a copy of an earlier one, and the standard deviation of a mean by the noise of its
-    pixels, from the differences of successive frames."""
+def _means(recordings: RecordingSet, captures: Iterable[Capture]) -> list[float | None]:
+    """Return the means of frames, DN; None of a copy of an earlier one."""
     means: list[float | None] = []
-    squares, pixels = [0.0], 1
-    before: NDArray[np.float32] | None = None
     known: set[bytes] = set()
     for capture in captures:
-        stored = recordings.frame(capture)
-        mark = hashlib.blake2b(stored.tobytes(), digest_size=16).digest()
-        if mark in known:
-            means.append(None)
-            continue
-        known.add(mark)
-        frame = stored.astype(np.float32)
-        means.append(float(frame.mean(dtype=np.float64)))
-        if before is not None:
-            squares.append(0.5 * float(np.var(frame - before, dtype=np.float64)))
-        before, pixels = frame, frame.size
-    return means, math.sqrt(max(float(np.median(squares[1:] or squares)), QUANTISATION_DN2) / pixels)
+        codes = recordings.codes(capture)
+        means.append(None if codes.digest in known else codes.every.mean_dn)
+        known.add(codes.digest)
+    return means
 
 
 # --- the test ------------------------------------------------------------------------------------------------------

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lab.fit.noise.noise_fit import fit_noise
-from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.recording_set import FrameCodes, Manifest, RecordingSet
 from lab.observables.codes.rounding import rounding_std_dn, variance_before_rounding, variance_rounding_std
-from lab.observables.codes.step import count_codes, find_code_step, step_of
+from lab.observables.codes.step import find_code_step, step_of
 
 SHAPE = (120, 150)
 READ_E = 12.0
@@ -112,11 +112,11 @@ def test_few_codes_tell_no_step() -> None:
     """Two levels without noise, or three: any pair of codes has a common divisor of their difference."""
     frame = np.zeros((20, 30), np.uint16)
     frame[:, 15:] = 960
-    assert step_of(count_codes(frame)) == 1.0
+    assert step_of(FrameCodes.count(frame).every) == 1.0
     frame[:, 25:] = 320
-    assert step_of(count_codes(frame)) == 1.0
-    assert step_of(count_codes(frame), has_one_mode=True) == 320.0  # no dark has such a distribution
-    assert step_of(count_codes(np.full((20, 30), 64, np.uint16)), has_one_mode=True) == 1.0
+    assert step_of(FrameCodes.count(frame).every) == 1.0
+    assert step_of(FrameCodes.count(frame).every, has_one_mode=True) == 320.0  # no dark has such a distribution
+    assert step_of(FrameCodes.count(np.full((20, 30), 64, np.uint16)).every, has_one_mode=True) == 1.0
 
 
 def test_rounding_scales_with_the_step() -> None:
