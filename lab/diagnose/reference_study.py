@@ -60,9 +60,10 @@ TILTS_DEG = (
 )
 
 
-def reference_study(seed: int = 1) -> RecordingSet:
-    """Return the recording set of the session, of both sides. `seed`: of its noise and of the random pattern."""
-    rig = _rig()
+def reference_study(seed: int = 1, camera: CameraModel | None = None) -> RecordingSet:
+    """Return the recording set of the session, of both sides. `seed`: of its noise and of the random pattern; `camera`:
+    on both sides, None: `reference_camera()`."""
+    rig = _rig(camera or reference_camera())
     frames: dict[str, Any] = {}
     spectra: dict[str, Spectrum] = {}
     captures: list[dict[str, Any]] = []
@@ -72,8 +73,8 @@ def reference_study(seed: int = 1) -> RecordingSet:
     targets = {"targets/checkerboard.npy": checkerboard, "targets/bernoulli.npy": noise}
     pair: tuple[tuple[Side, CameraModel], ...] = (("left", rig.left), ("right", rig.right))
     cameras = {}
-    for side, camera in pair:
-        drawn = _SideSession(rig, camera, side, np.random.default_rng([seed, side == "right"]))
+    for side, own in pair:
+        drawn = _SideSession(rig, own, side, np.random.default_rng([seed, side == "right"]))
         drawn.session(targets)
         cameras[side] = drawn.stated()
         frames |= drawn.frames
@@ -83,8 +84,8 @@ def reference_study(seed: int = 1) -> RecordingSet:
     return RecordingSet(manifest, frames, spectra, targets, source="reference study")
 
 
-def _rig() -> StereoRig:
-    """Two cameras 10 mm apart with sensors that see into the near infrared, so that a grating's second order shows."""
+def reference_camera() -> CameraModel:
+    """Return a camera with a sensor that sees into the near infrared, so that a grating's second order shows."""
 
     def curve(peak: float, centre_nm: float, width_nm: float) -> Spectrum:
         visible = np.exp(-0.5 * ((WAVELENGTH_NM - centre_nm) / width_nm) ** 2) + 0.04
@@ -93,7 +94,7 @@ def _rig() -> StereoRig:
 
     focal_px = FOCAL_LENGTH_MM * 1000.0 / PITCH_UM
     matrix = ((focal_px, 0.0, 0.5 * (COLS - 1)), (0.0, focal_px, 0.5 * (ROWS - 1)), (0.0, 0.0, 1.0))
-    camera = CameraModel(
+    return CameraModel(
         rows=ROWS, cols=COLS, pixel_pitch_um=PITCH_UM, fill_factor=0.9, cfa="RGGB", bit_depth=12, black_level_dn=64.0,
         white_level_dn=4095.0,
         conversion_gain_dn_per_e=0.38, full_well_e=10500.0, read_noise_e=2.4, dark_current_e_per_s=5.0,
@@ -103,6 +104,10 @@ def _rig() -> StereoRig:
         33.0)},
         lens=Lens(f_number=4.0, focal_length_mm=FOCAL_LENGTH_MM), geometry=Geometry(camera_matrix=matrix),
     )  # fmt: skip
+
+
+def _rig(camera: CameraModel) -> StereoRig:
+    """Return two cameras 10 mm apart."""
     straight = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     return StereoRig(left=camera, right=camera, rotation=straight, translation_mm=(-10.0, 0.0, 0.0))
 

@@ -1,0 +1,139 @@
+"""Calibration of the observables: does each scatter about its prediction as its covariance says?
+
+On healthy cameras the predictive distribution of an observable, nuisance parameters marginalised, gives
+
+    chi2 = r' C^-1 r,    r = y - m,    chi2 ~ chi2_n
+
+with n numbers. Over many sets the mean of chi2 / n is 1 within its standard error, and the probability integral
+transform F(chi2; n) is uniform (Kolmogorov-Smirnov, Holm over the observables). Below 1, the covariance is too wide
+and hides departures; above 1, it is too narrow and makes departures of noise.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.special import chdtr
+from scipy.stats import kstest
+
+from evaluation.own_chain import healthy_session
+from lab.challenge.draw import draw
+from lab.diagnose.inference.side_model import measurement_model
+from lab.fit import fit_recording_set
+from lab.formats.recording_set import RecordingSet
+from lab.observables.observable import measurements
+from sim.spectrum import FloatArray
+
+#: Seed of the sets: one for development.
+SEED = 4711
+#: Eigenvalue of the correlation matrix below which a direction is rounding alone.
+LEAST_EIGENVALUE = 1e-6
+#: Probability by chance, over all observables of a table, that one is marked.
+CHANCE = 0.01
+
+
+def of_second_simulator(number: int) -> RecordingSet:
+    """Return healthy set `number` of the second simulator."""
+    return draw(SEED, number, "small" if number % 2 else "medium", kind="healthy", sizing="unmeasured").recordings
+
+
+#: Healthy sets by the simulator that draws them.
+SOURCES: dict[str, Callable[[int], RecordingSet]] = {
+    "own chain": lambda number: healthy_session([SEED, number]),
+    "second simulator": of_second_simulator,
+}
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """One observable of one healthy set; `observable` "all": all of them together."""
+
+    source: str
+    set: int
+    observable: str
+    chi2: float
+    n: int
+
+
+def calibrate(file: Path, sets: int, sources: Sequence[str]) -> list[Calibrated]:
+    """Return the results of `sets` healthy sets of each source. Those in `file` aren't measured again."""
+    found = list(_kept(file))
+    done = {(one.source, one.set) for one in found}
+    for number in range(1, sets + 1):
+        for source in sources:
+            if (source, number) in done:
+                continue
+            own = list(_of_set(source, number))
+            with file.open("a", encoding="utf-8") as lines:
+                lines.write(json.dumps([asdict(one) for one in own]) + "\n")
+            found += own
+    return [one for one in found if one.set <= sets and one.source in sources]
+
+
+def _kept(file: Path) -> Iterator[Calibrated]:
+    if file.exists():
+        for line in file.read_text(encoding="utf-8").splitlines():
+            yield from (Calibrated(**one) for one in json.loads(line))
+
+
+def _of_set(source: str, number: int) -> Iterator[Calibrated]:
+    """Yield chi2 and n of every observable of the left camera, and of all together."""
+    recordings = SOURCES[source](number)
+    model, _ = measurement_model(recordings, "left", fit_recording_set(recordings))
+    if model is None:
+        return
+    gaussian = model.gaussian()
+    away = model.value - gaussian.mean
+    for index, (block, at) in enumerate(zip(model.blocks, model.slices, strict=True)):
+        yield Calibrated(source, number, block.measurement.name, *_chi2(away[at], gaussian.block_covariance(index)))
+    yield Calibrated(source, number, "all", *_chi2(away, gaussian.covariance))
+
+
+def _chi2(away: FloatArray, covariance: FloatArray) -> tuple[float, int]:
+    """chi2 of residuals (n,), and the number of directions of their covariance (n, n) that aren't rounding alone."""
+    std = np.sqrt(np.diag(covariance))
+    size, direction = np.linalg.eigh(covariance / np.outer(std, std))
+    use = size > LEAST_EIGENVALUE
+    return float(np.sum(np.square(direction.T[use] @ (away / std)) / size[use])), int(use.sum())
+
+
+def table(found: Iterable[Calibrated]) -> str:
+    """Return the table as Markdown: a row an observable and source, in the order of the report.
+
+    Bold: the transform isn't uniform (Holm over the table at `CHANCE`).
+    """
+    rows: dict[tuple[str, str], list[Calibrated]] = {}
+    for one in found:
+        rows.setdefault((one.observable, one.source), []).append(one)
+    order = [measurement.name for measurement in measurements()]
+    keys = sorted(rows, key=lambda key: (order.index(key[0]) if key[0] in order else len(order), key[1]))
+    p = {key: kstest([chdtr(one.n, one.chi2) for one in rows[key]], "uniform").pvalue for key in keys}
+    lines = [
+        "| observable | simulator | sets | numbers | chi2 a number | KS p |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    rejected = _holm(p)
+    for name, source in keys:
+        own = rows[name, source]
+        share = np.array([one.chi2 / one.n for one in own])
+        std = share.std(ddof=1) / np.sqrt(len(share)) if len(share) > 1 else np.nan
+        value = f"{share.mean():.2f} ± {std:.2f}"
+        lines.append(
+            f"| `{name}` | {source} | {len(own)} | {np.mean([one.n for one in own]):.0f} | "
+            f"{f'**{value}**' if (name, source) in rejected else value} | {p[name, source]:.2g} |"
+        )
+    return "\n".join(lines)
+
+
+def _holm(p: dict[tuple[str, str], float]) -> set[tuple[str, str]]:
+    """Return the keys that Holm's procedure rejects at `CHANCE`."""
+    rejected: set[tuple[str, str]] = set()
+    for number, key in enumerate(sorted(p, key=lambda key: p[key])):
+        if p[key] > CHANCE / (len(p) - number):
+            break
+        rejected.add(key)
+    return rejected
