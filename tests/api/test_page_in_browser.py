@@ -291,6 +291,10 @@ def test_a_session_by_keyboard_alone(browser: Any, lab: Running) -> None:
     watched.tab_to("checkbox")
     watched.press("Space", "#plan-words:has-text('2 sequences')")
     watched.press("Space", "#plan-words:has-text('3 sequences')")
+    watched.tab_to("Then: .*")
+    watched.press("Enter", "#then[open] select[name=then]")
+    watched.tab_to("then")
+    watched.press("Home", "#then-words:text-is('Then: nothing')")  # a pipeline's fit would be newer than the test's
     lab.bench.delay_s = 0.05
     watched.tab_to("Start a session")
     watched.press("Enter", ".station.busy a:has-text('by keyboard')")
@@ -355,6 +359,40 @@ def test_a_session_by_keyboard_alone(browser: Any, lab: Running) -> None:
     watched.tab_to("Log out")
     watched.press("Enter", "#login-form")
     assert watched.focused()["name"] == "key"
+    watched.close()
+
+
+@pytest.mark.parametrize(
+    ("view", "control"),
+    [
+        ("/", "#stations .run a"),
+        ("/stations/fakes", "#station-run .run a"),
+        ("/sessions", "#sessions tr:has(.state.finished) input:enabled"),
+        ("/sessions/RUNS/live", "#session-facts a"),
+        ("/calibrations/FIT", "#calibration-facts a"),
+    ],
+)
+def test_the_focus_stays_on_its_control_while_the_page_is_drawn_anew(
+    browser: Any, lab: Running, ids: dict[str, str], view: str, control: str
+) -> None:
+    """Two rounds of the page while a session goes on: what had the focus has it still, so that no key is lost."""
+    watched = Watched(browser, lab)
+    page = watched.page
+    page.clock.install()
+    watched.log_in(lab)
+    lab.bench.delay_s = 0.1
+    page.click("#start")
+    runs = page.wait_for_selector(".station.busy .run a").get_attribute("href").split("/")[2]
+    watched.go("/".join((ids | {"RUNS": runs}).get(part, part) for part in view.split("/")), control)
+    page.focus(control)
+    before = watched.focused()
+    for _ in range(2):
+        page.clock.run_for(5000)
+        page.wait_for_load_state("networkidle")
+        assert watched.focused() == before
+    page.click("#halt")
+    page.wait_for_selector("#halt-told:has-text('shutter closed')")
+    lab.bench.delay_s = 0.0
     watched.close()
 
 
