@@ -1,14 +1,14 @@
 """The operator's page in a real Chromium: axe, light and dark, a phone's width, the keyboard, the halt button, a
 calibration certified.
 
-`make chromium` installs the browser. Without one these tests are skipped on a desk, and fail in CI.
+`make chromium peers` installs the browser and its driver. Without them these tests are skipped on a desk, and fail in
+CI.
 """
 
 from __future__ import annotations
 
 import base64
 import re
-import shutil
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ from tests.api.routes.test_confirm import PERSON, begun, confirm
 from tests.api.routes.test_findings import diagnosis
 from tests.lab.calibration.test_life import fitted
 from tests.lab.fake_bench import Bench
-from tests.peers import missing
+from tests.peers import browser_program
 
 pytestmark = pytest.mark.extra  # drives a browser
 
@@ -82,17 +82,9 @@ VIEWS = {
 }
 
 
-def chromium() -> str:
-    """The browser's program."""
-    for name in ("chromium", "chromium-browser", "google-chrome"):
-        if found := shutil.which(name):
-            return found
-    missing("no Chromium; `make chromium` installs it")
-
-
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    program = chromium()
+    program = browser_program()
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -666,11 +658,11 @@ def test_a_key_that_may_only_read_gets_no_halt_button(browser: Any, lab: Running
 def test_a_missing_browser_fails_in_ci_and_is_skipped_on_a_desk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.setenv("CI", "true")
-    with pytest.raises(pytest.fail.Exception, match="make chromium"):
-        chromium()
+    with pytest.raises(pytest.fail.Exception, match=r"make (chromium|peers)"):
+        browser_program()
     monkeypatch.delenv("CI")
     with pytest.raises(pytest.skip.Exception):
-        chromium()
+        browser_program()
 
 
 def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:
