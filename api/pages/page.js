@@ -98,8 +98,29 @@ export function element(tag, properties = {}, ...children) {
  * @type {WeakMap<Element, unknown>} */
 const itemIds = new WeakMap();
 
+/** Gives the keyboard's focus to the control in `place` that is of the kind and the name of the one that had it.
+ * @param {Element} place
+ * @param {Element} had */
+function focusAgain(place, had) {
+  const called = (/** @type {Element} */ one) => one.textContent || one.getAttribute("aria-label");
+  const same = [...place.querySelectorAll(had.localName)].find((one) => called(one) === called(had));
+  if (same instanceof HTMLElement) same.focus({ preventScroll: true });
+}
+
+/** Replaces words and links only where something changed; the keyboard's focus stays on the link that it was on.
+ * @param {HTMLElement} place
+ * @param {...(Node | string)} children without listeners: two that read the same are the same */
+export function replace(place, ...children) {
+  const made = element("div", {}, ...children);
+  if (made.innerHTML === place.innerHTML) return;
+  const had = document.activeElement;
+  const held = had !== place && place.contains(had);
+  place.replaceChildren(...made.childNodes);
+  if (held && had) focusAgain(place, had);
+}
+
 /** Replaces the rows only where something changed, so that a button doesn't vanish under the pointer. The keyboard's focus stays on
- * what it was on: the same link or button of the row of the same id.
+ * what it was on: the same control of the row of the same id.
  * @template Item
  * @param {keyof Elements} place
  * @param {Item[]} items
@@ -110,19 +131,16 @@ export function show(place, items, row) {
   const text = JSON.stringify(items);
   if (list.dataset.shown === text) return;
   list.dataset.shown = text;
-  const held = [...list.children].find((one) => one.contains(document.activeElement));
-  const label = document.activeElement?.textContent;
+  const had = document.activeElement;
+  const held = [...list.children].find((one) => one.contains(had));
   const rows = items.map((item) => {
     const made = row(item);
     itemIds.set(made, /** @type {{id?: unknown}} */ (item).id);
     return made;
   });
   list.replaceChildren(...rows);
-  if (!held) return;
-  const again = rows.find((one) => itemIds.get(one) === itemIds.get(held));
-  /** @type {NodeListOf<HTMLElement> | undefined} */
-  const reached = again?.querySelectorAll("a, button");
-  [...(reached ?? [])].find((one) => one.textContent === label)?.focus();
+  const again = held && rows.find((one) => itemIds.get(one) === itemIds.get(held));
+  if (again && had) focusAgain(again, had);
 }
 
 /** @param {number} seconds */

@@ -5,7 +5,7 @@ import { showFrames, leaveFrames } from "./frames.js";
 import { showFindings } from "./findings.js";
 import { figureRow, searchIn } from "./figures.js";
 import { showOwnJobs } from "./jobs.js";
-import { $, LIVE, addView, address, api, ask, change, element, goTo, may, named, post, remove, show, showView, time, told } from "./page.js";
+import { $, LIVE, addView, address, api, ask, change, element, goTo, may, named, post, remove, replace, show, showView, time, told } from "./page.js";
 import { actionsOf, verdictWords } from "./sessions.js";
 import { showWatched, watch } from "./watch.js";
 
@@ -31,11 +31,9 @@ $("session-asks").append(asks.whole);
 document.addEventListener("session-progress", ({ detail }) => {
   if (shown !== `sessions/${detail.id}`) return;
   asks.show(detail.id, detail.asks);
-  if (detail.total) steps.textContent = `${detail.done} of ${detail.total}`; // as the head of the page has it
+  const steps = $("session-facts").querySelector(".steps-done");
+  if (detail.total && steps) steps.textContent = `${detail.done} of ${detail.total}`; // as the head of the page has it
 });
-/** How many steps of the session that stands there are done. */
-const steps = element("span");
-
 /** @param {string} label @param {string | Node | null | undefined} value */
 const fact = (label, value) => (value ? [element("div", {}, element("dt", { textContent: label }), element("dd", {}, value))] : []);
 
@@ -46,20 +44,20 @@ function showHead(one, jobs) {
   $("session-title").textContent = name;
   const station = session?.station && element("a", { href: `#/sessions?search=${encodeURIComponent(session.station)}`, textContent: session.station });
   const cameras = Object.values(one.cameras).join(", ");
-  if (session) steps.textContent = `${Math.max(session.steps_done, session.progress?.done ?? 0)} of ${session.steps}`;
+  const steps = session && `${Math.max(session.steps_done, session.progress?.done ?? 0)} of ${session.steps}`;
   const facts = [
     ...fact("Id", one.id),
     ...fact("State", session && element("span", { className: `state ${session.state}`, textContent: session.state })),
     ...fact("Station", station),
     ...fact("Cameras", cameras),
     ...fact("Begun (UTC)", time(session?.created)),
-    ...fact("Steps done", session && steps),
+    ...fact("Steps done", steps && element("span", { className: "steps-done", textContent: steps })),
     ...fact("Captures", String("counts" in one ? one.captures : one.captures.reduce((sum, each) => sum + each.captures, 0))),
     ...fact("Verdict", verdictWords(one.verdict)),
     ...fact("Report", reportOf(one, jobs)),
     ...fact("Calibration", one.results?.fit ? element("a", { href: `#/calibrations/${one.results.fit}`, textContent: one.results.fit }) : ""),
   ];
-  $("session-facts").replaceChildren(...facts);
+  replace($("session-facts"), ...facts);
   asks.show(one.id, session?.asks);
   $("session-error").textContent = session?.error ?? "";
   $("session-then").textContent = session?.then ? `Then: ${session.then.words}` : "";
@@ -202,7 +200,7 @@ async function showSource(first, kind, id, tab) {
   if (at === "live") await showWatched();
   else if (at === "findings") {
     await showFindings(source, one.results.diagnose);
-    $("findings-report").replaceChildren(reportOf(one, jobs) ?? "No report yet: start one above.");
+    replace($("findings-report"), reportOf(one, jobs) ?? "No report yet: start one above.");
   }
   else if (at === "figures") await showFigures(source, one.results.fit);
   else if (at === "frames") await showFrames(source, one);

@@ -2,7 +2,7 @@
 // there and a halt; and a view each, with its instruments' health.
 
 import { asksBanner } from "./asks.js";
-import { $, LIVE, addView, api, ask, cells, clock, duration, element, forgetHalt, halt, may, mayHalt, named, post, show, tellHalts, time, told } from "./page.js";
+import { $, LIVE, addView, api, ask, cells, clock, duration, element, forgetHalt, halt, may, mayHalt, named, post, replace, show, tellHalts, time, told } from "./page.js";
 
 // A browser keeps six connections to a service open; the streams leave some of them for requests.
 const STREAMS = 3;
@@ -233,7 +233,7 @@ function showRun(parts, session, safety, asks) {
     showBench(parts, null, safety);
     return showStrip(parts);
   }
-  parts.name.replaceChildren(element("a", { href: `#/sessions/${session.id}/live`, textContent: session.name || session.id }));
+  replace(parts.name, element("a", { href: `#/sessions/${session.id}/live`, textContent: session.name || session.id }));
   parts.buttons.Pause.disabled = session.state !== "running";
   parts.buttons.Resume.disabled = !["paused", "pausing"].includes(session.state);
   if (begun) {
@@ -288,10 +288,13 @@ export async function showStations(stations, sessions) {
   }
 }
 
-/** Cards stand at the desk; a station's own view has its card.
+/** Cards stand at the desk; a station's own view has its card. One that stays where it is keeps the focus within it.
  * @param {string | null} own */
 export function placeCards(own = null) {
-  for (const [id, parts] of cards) (id === own ? $("station-run") : $("stations")).append(parts.whole);
+  for (const [id, { whole }] of cards) {
+    const place = $(id === own ? "station-run" : "stations");
+    if (whole.parentElement !== place) place.append(whole);
+  }
 }
 
 // --- a station ------------------------------------------------------------------------------------------------------

@@ -1,14 +1,14 @@
 """The operator's page in a real Chromium: axe, light and dark, a phone's width, the keyboard, the halt button, a
 calibration certified.
 
-`make chromium` installs the browser. Without one these tests are skipped on a desk, and fail in CI.
+`make chromium peers` installs the browser and its driver. Without them these tests are skipped on a desk, and fail in
+CI.
 """
 
 from __future__ import annotations
 
 import base64
 import re
-import shutil
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ from tests.api.routes.test_confirm import PERSON, begun, confirm
 from tests.api.routes.test_findings import diagnosis
 from tests.lab.calibration.test_life import fitted
 from tests.lab.fake_bench import Bench
-from tests.peers import missing
+from tests.peers import browser_program
 
 pytestmark = pytest.mark.extra  # drives a browser
 
@@ -82,17 +82,9 @@ VIEWS = {
 }
 
 
-def chromium() -> str:
-    """The browser's program."""
-    for name in ("chromium", "chromium-browser", "google-chrome"):
-        if found := shutil.which(name):
-            return found
-    missing("no Chromium; `make chromium` installs it")
-
-
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    program = chromium()
+    program = browser_program()
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -291,6 +283,10 @@ def test_a_session_by_keyboard_alone(browser: Any, lab: Running) -> None:
     watched.tab_to("checkbox")
     watched.press("Space", "#plan-words:has-text('2 sequences')")
     watched.press("Space", "#plan-words:has-text('3 sequences')")
+    watched.tab_to("Then: .*")
+    watched.press("Enter", "#then[open] select[name=then]")
+    watched.tab_to("then")
+    watched.press("Home", "#then-words:text-is('Then: nothing')")  # a pipeline's fit would be newer than the test's
     lab.bench.delay_s = 0.05
     watched.tab_to("Start a session")
     watched.press("Enter", ".station.busy a:has-text('by keyboard')")
@@ -355,6 +351,40 @@ def test_a_session_by_keyboard_alone(browser: Any, lab: Running) -> None:
     watched.tab_to("Log out")
     watched.press("Enter", "#login-form")
     assert watched.focused()["name"] == "key"
+    watched.close()
+
+
+@pytest.mark.parametrize(
+    ("view", "control"),
+    [
+        ("/", "#stations .run a"),
+        ("/stations/fakes", "#station-run .run a"),
+        ("/sessions", "#sessions tr:has(.state.finished) input:enabled"),
+        ("/sessions/RUNS/live", "#session-facts a"),
+        ("/calibrations/FIT", "#calibration-facts a"),
+    ],
+)
+def test_the_focus_stays_on_its_control_while_the_page_is_drawn_anew(
+    browser: Any, lab: Running, ids: dict[str, str], view: str, control: str
+) -> None:
+    """Two rounds of the page while a session goes on: what had the focus has it still, so that no key is lost."""
+    watched = Watched(browser, lab)
+    page = watched.page
+    page.clock.install()
+    watched.log_in(lab)
+    lab.bench.delay_s = 0.1
+    page.click("#start")
+    runs = page.wait_for_selector(".station.busy .run a").get_attribute("href").split("/")[2]
+    watched.go("/".join((ids | {"RUNS": runs}).get(part, part) for part in view.split("/")), control)
+    page.focus(control)
+    before = watched.focused()
+    for _ in range(2):
+        page.clock.run_for(5000)
+        page.wait_for_load_state("networkidle")
+        assert watched.focused() == before
+    page.click("#halt")
+    page.wait_for_selector("#halt-told:has-text('shutter closed')")
+    lab.bench.delay_s = 0.0
     watched.close()
 
 
@@ -628,11 +658,11 @@ def test_a_key_that_may_only_read_gets_no_halt_button(browser: Any, lab: Running
 def test_a_missing_browser_fails_in_ci_and_is_skipped_on_a_desk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.setenv("CI", "true")
-    with pytest.raises(pytest.fail.Exception, match="make chromium"):
-        chromium()
+    with pytest.raises(pytest.fail.Exception, match=r"make (chromium|peers)"):
+        browser_program()
     monkeypatch.delenv("CI")
     with pytest.raises(pytest.skip.Exception):
-        chromium()
+        browser_program()
 
 
 def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:

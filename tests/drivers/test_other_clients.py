@@ -1,7 +1,7 @@
 """Clients that know nothing of calibench, on each mock after the project's driver has used the instrument and let it
 go.
 
-They are packages of the index (the extra `dev`); those spectroradiometers for which the index has none that this
+They are packages of the index (the extra `peers`); those spectroradiometers for which the index has none that this
 environment takes are told their makers' commands on a plain serial port. For USB3 Vision cameras it has none, either;
 seabreeze is what the driver of the Ocean Optics spectrometers stands on.
 """
@@ -47,7 +47,7 @@ def client(name: str) -> Any:
     try:
         __import__(name)
     except ImportError as error:
-        missing(f"{error}; install calibench[dev]")
+        missing(f"{error}; `make peers` installs it")
     return sys.modules[name]
 
 

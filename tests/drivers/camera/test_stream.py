@@ -200,6 +200,7 @@ def test_a_single_shot_isnt_taken_from_a_frame_that_came_twice(pair: Pair) -> No
         assert [frame.raw[0, 0] for frame in frames] == [number, number]
 
 
+@pytest.mark.extra  # a maker's library
 def test_series_of_emulated_cameras_with_a_torn_frame() -> None:
     try:
         EmulatedBasler()

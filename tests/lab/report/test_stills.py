@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from lab.report import charts, provenance_of, render_report
 from lab.report.answers import proofs
 from lab.report.pictures import map_picture, write_maps
 from lab.report.stills import LEFT, RIGHT, WIDTH, still
-from tests.peers import missing
+from tests.peers import browser_program
 
 
 def numbers(path: str) -> list[float]:
@@ -184,7 +183,7 @@ WIDTHS = """() => [...document.querySelectorAll(".chart")].filter(box => box.que
 def test_charts_are_drawn_anew_for_paper(
     small_set: Callable[..., RecordingSet], made_up: Callable[..., Any], tmp_path: Path
 ) -> None:
-    program = shutil.which("chromium") or missing("no Chromium; `make chromium` installs it")
+    program = browser_program()
     from playwright.sync_api import sync_playwright
 
     recordings = small_set()
@@ -218,7 +217,7 @@ def test_charts_are_drawn_anew_for_paper(
 def test_axe_finds_nothing_and_a_phone_needs_no_scroll_sideways(
     small_set: Callable[..., RecordingSet], made_up: Callable[..., Any], tmp_path: Path
 ) -> None:
-    program = shutil.which("chromium") or missing("no Chromium; `make chromium` installs it")
+    program = browser_program()
     from axe_playwright_python.sync_playwright import Axe
     from playwright.sync_api import sync_playwright
 
