@@ -10,6 +10,7 @@ from sim.effects.astigmatism import Astigmatism
 from sim.effects.coma import Coma
 from sim.effects.defocus import Defocus
 from sim.effects.spherical_aberration import SphericalAberration
+from sim.effects.trefoil import Trefoil
 from sim.effects.veiling_glare import VeilingGlare
 from sim.optics.pupil import pupil_otf, seidel
 from sim.point import transfer_at
@@ -27,10 +28,11 @@ def test_a_smaller_pupil_is_the_middle_of_the_larger_one() -> None:
 SIZE = 1.2
 #: An effect whose path error at the rim of f/4 is 1.2 um, the power of the pupil that it goes with (Seidel), and the
 #: mean square over the pupil of its slope along x about its mean, for a path error of 1: of r^4 (4 r^2 x)^2 = 2, of
-#: r^2 x (3 x^2 + y^2)^2 - 1 = 1/2, of x^2 - y^2, and of r^2, (2 x)^2 = 1.
+#: r^2 x (3 x^2 + y^2)^2 - 1 = 1/2, of x^3 - 3 x y^2 (3 x^2 - 3 y^2)^2 = 3/2, of x^2 - y^2, and of r^2, (2 x)^2 = 1.
 RIM_LAWS = {
     "spherical": (SphericalAberration(w040_um=SIZE), 4, 2.0),
     "coma": (Coma(w131_x_um=SIZE), 3, 0.5),
+    "trefoil": (Trefoil(w333_x_um=SIZE), 3, 1.5),
     "astigmatism": (Astigmatism(defocus_x_um=SIZE * 128.0, defocus_y_um=SIZE * 128.0), 2, 1.0),
     "defocus": (Defocus(defocus_um=SIZE * 128.0), 2, 1.0),
 }

@@ -18,8 +18,8 @@ from lab.formats.recording_set import RecordingSet
 from lab.observables.boards.corners import BOARDS
 from lab.observables.boards.detection import as_grey, luminance
 from lab.observables.screens.pattern_fit import BERNOULLI
-from lab.observables.screens.registration import ScreenPictures, register, screen_pictures
-from sim.camera import Side
+from lab.observables.screens.registration import ScreenPictures, reference_pixels, register, screen_pictures
+from sim.camera import Cfa, Side
 
 Array = NDArray[np.floating[Any]]
 Grey = NDArray[np.uint8]
@@ -307,7 +307,7 @@ def misstated_cell_size(
     for one in pictures:
         stated = one.first.screen.cell_camera_px
         if stated is not None and stated not in sizes:
-            measured = _cell_px(one, stated)
+            measured = _cell_px(one, stated, recordings.camera(side).cfa)
             if measured is not None:
                 sizes[stated] = measured
     off = {stated: size for stated, size in sizes.items() if abs(size / stated - 1.0) > policy.cell_size_tolerance}
@@ -338,12 +338,17 @@ def misstated_cell_size(
     )
 
 
-def _cell_px(pictures: ScreenPictures, stated: float) -> float | None:
+def _cell_px(pictures: ScreenPictures, stated: float, cfa: Cfa) -> float | None:
     """Side of a cell in camera px: the square root of its area in the middle of the pattern; None where the pattern
     isn't found."""
     try:
         warp = register(
-            pictures.checkerboard, pictures.bernoulli, pictures.checkerboard_target, pictures.bernoulli_target, stated
+            pictures.checkerboard,
+            pictures.bernoulli,
+            pictures.checkerboard_target,
+            pictures.bernoulli_target,
+            stated,
+            reference_pixels(pictures.checkerboard.shape, cfa),
         )
     except NotDetermined:
         return None

@@ -20,7 +20,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from lab.errors import NotDetermined
 from lab.fit.psf.kernel import KernelEstimate, NormalEquations, on_simplex, solve_kernel
-from lab.observables.screens.registration import ScreenPictures, ScreenWarp, draw_by_area, register
+from lab.observables.screens.registration import ScreenPictures, ScreenWarp, draw_by_area, reference_pixels, register
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases
@@ -267,7 +267,12 @@ def measure_field(
         raise ValueError(f"oversample = {oversample} must be 2 or 4 samples a pixel")
     cell = pictures.first.screen.cell_camera_px
     warp = register(
-        pictures.checkerboard, pictures.bernoulli, pictures.checkerboard_target, pictures.bernoulli_target, cell
+        pictures.checkerboard,
+        pictures.bernoulli,
+        pictures.checkerboard_target,
+        pictures.bernoulli_target,
+        cell,
+        reference_pixels(pictures.checkerboard.shape, cfa),
     )
     places, step = phases(cfa), period(cfa)
     reference = "Y" if cfa == "MONO" else "G"

@@ -33,7 +33,7 @@ from lab.errors import NotDetermined
 from lab.observables.dataset import Study, held_out_of
 from lab.observables.observable import Block, Label, Measurement, Prediction
 from lab.observables.reads import REFLECTIONS, SHOWN, acting
-from lab.observables.screens.registration import ScreenWarp, draw_by_area, register
+from lab.observables.screens.registration import ScreenWarp, draw_by_area, reference_pixels, register
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
 from sim.frame import screen_light, with_reflections
@@ -469,13 +469,14 @@ EVEN_ORDER = 8
 #: With more freedom (order 6) it takes a displacement that goes with the phase of the cells on the pixels for an OTF:
 #: 0.025 px where 0.01 px is reached.
 REGISTERED_ORDER, REGISTERED_CY_PER_PX = 4, 1.5
+JUDGED_ORDER = 8  # of the change of the OTF beside which a displacement has to lower the residual
 EVEN_TERMS = sum(order + 1 for order in range(0, EVEN_ORDER + 1, 2))
 GHOST_BLUR_PX = 3.0  # standard deviation of the Gaussian blur of the ghost's term
 LEAST_BEYOND = (
     5e-4  # contrast (rms) of the parts beyond the bands from which on they are fitted; weaker ones are taken as drawn
 )
 LEAST_ODD = 1e-9  # contrast (rms) of an odd part below which it is rounding
-REFINEMENTS = 3  # Gauss-Newton steps of the registration
+REFINEMENTS = 3  # most Gauss-Newton steps of the registration
 FEWEST_CELLS = 400  # of a random pattern, whose spectrum is then even to 5 %
 MOST_MOVES = 4  # times that a displaced channel is drawn anew: a linear step finds about half of a shift by half a cell
 SCALING = np.array(
@@ -604,13 +605,12 @@ def _measured(
     whole = np.average(seen, axis=0, weights=[len(p) for p in parts])
     warp = register(
         (mean_rate(study, boards) - black) / contrast, whole, study.recordings.target(boards[0].target),
-        (target > 0.5).astype(np.uint8), group[0].screen.cell_camera_px,
+        (target > 0.5).astype(np.uint8), group[0].screen.cell_camera_px, reference_pixels(whole.shape, camera.cfa),
     )  # fmt: skip
     light = study.spectrum(group[0].screen.radiance) if group[0].screen.radiance else None
     window = pattern_window(whole, warp, target.shape)
     reference = "Y" if camera.cfa == "MONO" else "G"
-    for _ in range(REFINEMENTS):
-        warp = _refined(study, whole, target, warp, window, reference, light)
+    warp = _refine_warp(study, whole, target, warp, window, reference, light)
     canvas = Canvas.of(target, warp, window)
     # the same nodes for all channels, so that an effect's OTF is evaluated once
     otfs = [lens_otf(study, channel, light) for channel in camera.channels]
@@ -722,7 +722,7 @@ def _shown_by(study: Study, design: _LinearModel, canvas: Canvas) -> Callable[[E
     return coefficients
 
 
-def _refined(
+def _refine_warp(
     study: Study,
     seen: FloatArray,
     target: FloatArray,
@@ -731,26 +731,84 @@ def _refined(
     channel: str,
     light: Spectrum | None,
 ) -> ScreenWarp:
-    """Return the registration `warp`, improved on the pattern itself by a Gauss-Newton step."""
-    canvas, otf = Canvas.of(target, warp, window), lens_otf(study, channel, light)
-    mask = channel_pixels(study, canvas, channel, seen)
-    whole = canvas.whole
-    lens = whole.spectrum * otf(np.minimum(np.hypot(whole.fx, whole.fy), otf.x[-1]))
-    drawn = lens * aperture_otf(whole.fx, whole.fy, study.camera.fill_factor)
-    picture, across, down = (
-        canvas.sampled(part)[mask] for part in (drawn, 2j * np.pi * whole.fx * drawn, 2j * np.pi * whole.fy * drawn)
-    )
-    terms = warp.basis(mask_points(mask, window))
-    # a smooth change of the OTF is fitted as well: with the phase of the cells on the pixels, aliases look like a
-    # displacement
-    fx, fy = (np.clip(f, -REGISTERED_CY_PER_PX, REGISTERED_CY_PER_PX) for f in (whole.fx, whole.fy))
-    powers = even_powers(fx, fy, REGISTERED_ORDER, REGISTERED_CY_PER_PX)
-    smooth = [canvas.sampled(term * lens)[mask] for term in powers]
-    columns = np.concatenate([across * terms, down * terms, smooth, [np.ones_like(picture)]])
-    scale = np.sqrt(np.mean(columns**2, axis=1))[:, None]
-    columns = columns / scale
-    step = np.linalg.lstsq(columns @ columns.T, columns @ (seen[window][mask] - picture), rcond=1e-12)[0] / scale[:, 0]
-    return warp.displace(step[: 2 * len(terms)].reshape(2, -1))
+    """Improve the registration `warp` on the pattern itself, by Gauss-Newton steps, each of which has to lower the
+    residual.
+
+    Where cells are a whole number of pixels and stand square, the pattern's aliases are coherent: a strong blur that
+    the step's smooth OTF doesn't follow then looks like a displacement, up to 0.2 px, and the next steps go on from
+    there. The residual is therefore compared with a smooth OTF of `JUDGED_ORDER`. A displacement that it doesn't show
+    is left at what the corners say."""
+    best = _PlacedPattern.of(study, seen, target, warp, window, channel, light)
+    for _ in range(REFINEMENTS):
+        tried = _PlacedPattern.of(study, seen, target, best.step(), window, channel, light)
+        if tried.left_rms >= best.left_rms:
+            break
+        best = tried
+    return best.warp
+
+
+@dataclass(frozen=True)
+class _PlacedPattern:
+    """A pattern drawn where `warp` places it, and what of the recorded image it leaves in one channel's n pixels."""
+
+    warp: ScreenWarp
+    slopes: FloatArray  # (2 terms, n): change of the drawn picture by each term of the displacement in x, then in y
+    #: (k, n): products of even powers of the frequency and the lens's OTF, by their order, and last a constant
+    smooth: FloatArray
+    residual: FloatArray  # (n,): recorded less drawn image
+
+    @staticmethod
+    def of(
+        study: Study,
+        seen: FloatArray,
+        target: FloatArray,
+        warp: ScreenWarp,
+        window: tuple[slice, slice],
+        channel: str,
+        light: Spectrum | None,
+    ) -> _PlacedPattern:
+        """Draw the cells `target` for the window of the recorded image `seen`. Raises NotDetermined for too few
+        pixels."""
+        canvas, otf = Canvas.of(target, warp, window), lens_otf(study, channel, light)
+        mask = channel_pixels(study, canvas, channel, seen)
+        whole = canvas.whole
+        lens = whole.spectrum * otf(np.minimum(np.hypot(whole.fx, whole.fy), otf.x[-1]))
+        drawn = lens * aperture_otf(whole.fx, whole.fy, study.camera.fill_factor)
+        picture, across, down = (
+            canvas.sampled(part)[mask] for part in (drawn, 2j * np.pi * whole.fx * drawn, 2j * np.pi * whole.fy * drawn)
+        )
+        terms = warp.basis(mask_points(mask, window))
+        # a smooth change of the OTF is fitted as well: with the phase of the cells on the pixels, aliases look like a
+        # displacement
+        fx, fy = (np.clip(f, -REGISTERED_CY_PER_PX, REGISTERED_CY_PER_PX) for f in (whole.fx, whole.fy))
+        powers = even_powers(fx, fy, JUDGED_ORDER, REGISTERED_CY_PER_PX)
+        smooth = [canvas.sampled(term * lens)[mask] for term in powers]
+        return _PlacedPattern(
+            warp,
+            np.concatenate([across * terms, down * terms]),
+            np.array([*smooth, np.ones_like(picture)]),
+            seen[window][mask] - picture,
+        )
+
+    @cached_property
+    def left_rms(self) -> float:
+        """Root mean square residual with a free smooth change of the OTF."""
+        left = self.residual - _solve(self.smooth, self.residual) @ self.smooth
+        return float(np.sqrt(np.mean(np.square(left))))
+
+    def step(self) -> ScreenWarp:
+        """Return the registration after a Gauss-Newton step, with a smooth OTF of `REGISTERED_ORDER`."""
+        powers = (REGISTERED_ORDER // 2 + 1) ** 2
+        columns = np.concatenate([self.slopes, self.smooth[:powers], self.smooth[-1:]])
+        change = _solve(columns, self.residual)[: len(self.slopes)]
+        return self.warp.displace(change.reshape(2, -1))
+
+
+def _solve(columns: FloatArray, value: FloatArray) -> FloatArray:
+    """Return the least squares coefficients (k,) of `columns` (k, n) for `value` (n,)."""
+    scale = np.sqrt(np.mean(columns**2, axis=1))
+    unit = columns / scale[:, None]
+    return np.asarray(np.linalg.lstsq(unit @ unit.T, unit @ value, rcond=1e-12)[0] / scale)
 
 
 def _band_masks(canvas: Canvas) -> Iterator[tuple[tuple[float, float], float | None, NDArray[np.bool_]]]:

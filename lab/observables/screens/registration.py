@@ -26,13 +26,15 @@ from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.observables.boards.detection import fit_corners
-from sim.camera import Side
-from sim.sensor.mosaic import planes
+from sim.camera import Cfa, Side
+from sim.sensor.mosaic import phases, planes
+from sim.sensor.mosaic import step as period
 
 Array = NDArray[np.floating[Any]]
 
 ORDER = 3  # of the displacement, in x and y together
 MIN_CORNERS = 12
+LEAST_RADIUS_PX = 4.0  # of a corner's window, in which green pixels alone, 25 of them, tell its nine parameters
 LEAST_CORRELATION = 0.5  # of the levelled picture with the pattern; below it, the picture shows another one
 
 
@@ -164,12 +166,14 @@ def register(
     checkerboard_target: NDArray[np.uint8],
     bernoulli_target: NDArray[np.uint8],
     cell_px: float | None,
+    fitted: NDArray[np.bool_],
 ) -> ScreenWarp:
     """Register pictures of a checkerboard and a Bernoulli pattern: the warp to their targets.
 
     The pictures (rows, cols) are levelled, 0 dark .. 1 lit, NaN where the screen isn't; the targets (rows, cols) hold
-    a value per cell. `cell_px`: nominal size of a cell in camera px; None where the whole target is in view. Raises
-    `NotDetermined` where corners or pattern aren't found.
+    a value per cell. `cell_px`: nominal size of a cell in camera px; None where the whole target is in view. `fitted`
+    (rows, cols): pixels to which the corners are fitted, see `reference_pixels`. Raises `NotDetermined` where corners
+    or pattern aren't found.
     """
     rows, cols = target_corners(checkerboard_target)
     seen = np.isfinite(checkerboard)
@@ -180,15 +184,35 @@ def register(
     square_px = cell_px * float(rows[1] - rows[0])
     picture = np.where(seen, checkerboard, 0.0)
     points, grid, across, down = _number_corners(picture, seen, square_px)
-    half = np.full(len(points), float(np.clip(0.4 * square_px, 2.5, 9.0)))
-    fitted, trusted, _ = fit_corners(picture, points, across, down, half)
-    points, grid = fitted[trusted], grid[trusted]
+    radius = float(np.clip(0.4 * square_px, 2.5, 9.0))
+    if radius < LEAST_RADIUS_PX:
+        fitted = np.ones(picture.shape, dtype=bool)
+
+    def in_channel(at: Array) -> NDArray[np.bool_]:
+        """Tell which places (n, 2), (x, y), px, are pixels of the channel. Those beyond the frame aren't used."""
+        row, col = (np.clip(at[:, axis].astype(int), 0, picture.shape[1 - axis] - 1) for axis in (1, 0))
+        return fitted[row, col]
+
+    found, trusted, _ = fit_corners(picture, points, across, down, np.full(len(points), radius), in_channel)
+    points, grid = found[trusted], grid[trusted]
     if len(points) < MIN_CORNERS:
         raise NotDetermined(
             "psf", f"{len(points)} corners of the checkerboard found, {MIN_CORNERS} needed: focus the screen better"
         )
     cells = _match_cells(points, grid, rows, cols, bernoulli, bernoulli_target)
     return _fit_warp(points, cells)
+
+
+def reference_pixels(shape: tuple[int, ...], cfa: Cfa) -> NDArray[np.bool_]:
+    """Return the mask (rows, cols) of a frame's green pixels, or of all pixels of a MONO sensor.
+
+    Corners are fitted to them alone: beside a lens with lateral colour, those of the whole mosaic would lie between the
+    places of its channels. Their diagonals sample an edge along rows or columns at every pixel, which those of red
+    or blue don't: where edges stand square, these can't tell a displacement from a blur."""
+    mask = np.zeros(shape, dtype=bool)
+    for row, col in phases(cfa)["Y" if cfa == "MONO" else "G"]:
+        mask[row :: period(cfa), col :: period(cfa)] = True
+    return mask
 
 
 def target_corners(target: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

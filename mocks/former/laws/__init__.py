@@ -151,6 +151,7 @@ LISTED: tuple[type[Law], ...] = (
     CoverGlassFringeLaw,
     ColouredReadNoiseLaw,
     MicrolensAngleLaw,
+    TrefoilLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
@@ -176,7 +177,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     DigitalGainLaw,
     LossyCodesLaw,
     MotionLaw,
-    TrefoilLaw,
     HaloLaw,
     InterPixelCapacitanceLaw,
     PinkNoiseLaw,

@@ -91,13 +91,19 @@ class ComaLaw(Law):
 
 
 class TrefoilLaw(Law):
-    """Wavefront W (x^3 - 3 x y^2)."""
+    """Wavefront W rho^3 cos 3 (t - t0). Variants: alone along columns; turned by a random angle, with a fifth of
+    tetrafoil, rho^4 cos 4 (t - t0)."""
 
-    name, unit, nominal, limits, power, shown_by = "trefoil", "um", 0.2, (0.02, 1.5), 2.0, OPTICAL
-    families = frozenset({"directional_contrast_loss"})
+    name = effect = "trefoil"
+    variants, unit, nominal, limits, power, shown_by = 2, "um", 0.2, (0.02, 1.5), 2.0, OPTICAL
 
     def path_error_um(self, x: Array, y: Array, wavelength_nm: float) -> Array:
-        return self.strength * self.camera.open_pupil**3 * (x**3 - 3 * x * y * y)
+        turn = np.exp(-2j * np.pi * self.uniform[0]) if self.variant == 1 else 1.0
+        z = self.camera.open_pupil * (x + 1j * y) * turn
+        return self.strength * np.real(z**3 + (0.2 * z**4 if self.variant == 1 else 0.0))
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"w333_x_um": self.strength} if self.variant == 0 else {}
 
 
 class AxialColourLaw(Law):

@@ -139,7 +139,9 @@ def pixel_gaussian(sigma_px, support):
 
 
 def test_registration_finds_the_screen_to_a_hundredth_of_a_pixel(pictures):
-    warp = register(pictures.checkerboard, pictures.bernoulli, BOARD, PATTERN, 4.0)
+    warp = register(
+        pictures.checkerboard, pictures.bernoulli, BOARD, PATTERN, 4.0, np.ones(pictures.checkerboard.shape, bool)
+    )
     row, col = np.meshgrid(np.arange(40, 160, 10.0), np.arange(40, 210, 10.0), indexing="ij")
     found = warp.cells(np.column_stack([col.ravel(), row.ravel()]))
     y, x = cells(row.ravel(), col.ravel())
@@ -150,7 +152,8 @@ def test_registration_finds_the_screen_to_a_hundredth_of_a_pixel(pictures):
 
 def test_registration_works_where_the_screen_is_larger_than_the_frame(pictures):
     part = np.s_[40:170, 50:230]
-    warp = register(pictures.checkerboard[part], pictures.bernoulli[part], BOARD, PATTERN, 4.0)
+    checkerboard = pictures.checkerboard[part]
+    warp = register(checkerboard, pictures.bernoulli[part], BOARD, PATTERN, 4.0, np.ones(checkerboard.shape, bool))
     y, x = cells(100.0, 140.0)
     found = warp.cells(np.array([[90.0, 60.0]]))[0]
     assert np.abs(found - [x, y]).max() * CELL_PX < 0.03
