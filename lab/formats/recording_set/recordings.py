@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Container, Mapping
+from collections.abc import Callable, Container, Hashable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args, overload
+from typing import Any, TypeVar, cast, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.base import Capture, in_folder
-from lab.errors import InputError
+from lab.errors import InputError, NotDetermined
 from lab.formats.recording_set.files import Frame, JoinedFiles, MemoryFiles, OverlaidFiles, RecordingFiles, Target
 from lab.formats.recording_set.manifest import DataSheet, Manifest
 from sim.camera import Side
 from sim.spectrum import Spectrum
 
 C = TypeVar("C", bound=Capture)
+T = TypeVar("T")
 
 
 class RecordingSet:
@@ -48,10 +49,12 @@ class RecordingSet:
         self._files: RecordingFiles = files or MemoryFiles(frames or {}, spectra or {}, targets or {})
         self._cache: OrderedDict[str, Frame] = OrderedDict()
         self._held = 0
+        #: What was summarised of the frames: the same for all sets that have these frames.
+        self._summaries: dict[Hashable, object] = {}
         self._lock = threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_cache": OrderedDict(), "_held": 0, "_lock": None}
+        return self.__dict__ | {"_cache": OrderedDict(), "_held": 0, "_summaries": {}, "_lock": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ |= state | {"_lock": threading.Lock()}
@@ -118,13 +121,16 @@ class RecordingSet:
         cache_bytes: int | None = None,
     ) -> RecordingSet:
         """Return a set with an empty cache of frames; what isn't given is this set's."""
-        return RecordingSet(
+        copy = RecordingSet(
             self.manifest if manifest is None else manifest,
             source=self.source,
             warnings=self.warnings if warnings is None else warnings,
             files=self._files if files is None else files,
             cache_bytes=self.cache_bytes if cache_bytes is None else cache_bytes,
         )
+        if files is None:
+            copy._summaries = self._summaries
+        return copy
 
     def capture(self, id: str) -> Capture:
         """Return the capture called `id`; InputError where there is none."""
@@ -161,6 +167,20 @@ class RecordingSet:
         with self._lock:
             self._cache.clear()
             self._held = 0
+
+    def summarised(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return `make()`, a summary of frames, computed once for `key` and for all sets of the same frames, whatever
+        their manifests state. Where it raised NotDetermined, that is raised again. `key` has to hold all that the
+        summary depends on, frames by their paths."""
+        if key not in self._summaries:
+            try:
+                self._summaries[key] = make()
+            except NotDetermined as refused:
+                self._summaries[key] = refused
+        found = self._summaries[key]
+        if isinstance(found, NotDetermined):
+            raise found
+        return cast(T, found)
 
     def spectrum(self, path: str) -> Spectrum:
         """Return the spectrum that the manifest calls `path`."""

@@ -15,16 +15,9 @@ from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.dataset import Study
 from lab.observables.edges.region import check_phases
-from lab.observables.edges.transfer import (
-    ASIDE,
-    REAL_AT,
-    _Edges,
-    edge_block,
-    measured_edges,
-    profile_interpolation,
-    spread_operator,
-    stopped_edge_block,
-)
+from lab.observables.edges.side import SideEdge, edges_of_side
+from lab.observables.edges.slanted_edge import ASIDE, edge_block, stopped_edge_block
+from lab.observables.edges.transfer import REAL_AT
 from lab.observables.gaussian import chi2
 from lab.observables.observable import Block
 from mocks.former import ConcealedCamera, Law, Plan
@@ -32,7 +25,7 @@ from mocks.former import laws as concealed
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.effects.library import effect
-from sim.point import edge_profile, optical_transfer
+from sim.point import optical_transfer
 from sim.stages import Charge, Stray
 
 EDGES = Plan(("dark", "slanted_edge"))
@@ -42,8 +35,8 @@ def _study(recordings: RecordingSet) -> Study:
     return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
-def _edges(study: Study) -> _Edges:
-    return _Edges(study, measured_edges(study, SlantedEdgeCapture), study.camera)
+def _edges(study: Study) -> list[SideEdge]:
+    return edges_of_side(study, SlantedEdgeCapture, "slanted_edge")
 
 
 def _recorded(
@@ -85,21 +78,6 @@ def test_a_models_numbers_are_its_transfer_function(cfa: str, f_number: float) -
             optical_transfer(camera, camera.channels[0], light, f * np.cos(turn), f * np.sin(turn), acting)
         )
         np.testing.assert_allclose(block.predict(acting).mean[rows[:-3]], wanted[:-3], atol=3e-3)
-
-
-def test_a_direct_sum_over_the_samples_agrees() -> None:
-    """The estimators' rows on a grid of distances against normal equations with every sample at its own distance:
-    within 1e-5 of the contrast."""
-    study = _recorded(cfa="MONO", f_number=2.0)
-    edges = _edges(study)
-    geometry = edges.edges[0].measured.geometry
-    reach = geometry.reach_px + 1.0
-    light = study.recordings.spectrum(str(edges.edges[0].part[0].light_radiance))
-    on_grid = edge_profile(study.camera, "Y", light, 5.0, profile_interpolation(reach)[1])
-    exact = edge_profile(study.camera, "Y", light, 5.0, geometry.distance_px)
-    weighted = exact * geometry.weight
-    right = np.concatenate([geometry.basis.T @ weighted, geometry.gradients @ weighted])
-    np.testing.assert_allclose(spread_operator(geometry, reach) @ on_grid, right, atol=1e-5 * np.abs(right).max())
 
 
 def test_noise_is_what_the_covariance_says() -> None:
@@ -178,7 +156,7 @@ def test_shading_is_no_blur() -> None:
 
 def test_directions_point_to_the_light() -> None:
     study = _recorded(cfa="MONO", f_number=4.0)
-    found = sorted({round(e.direction_deg) for e in _edges(study).edges})
+    found = sorted({round(e.direction_deg) for e in _edges(study)})
     assert found == [-40, 3, 5, 95]
 
 
