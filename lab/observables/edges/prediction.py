@@ -135,7 +135,7 @@ class PredictedEdges:
         """Covariance (n, n) of all edges' numbers: noise, rounding and floor. Edges on the same pixels in the same
         direction share the fixed part of their noise (PRNU)."""
         size = self.value.shape[1]
-        noise = [one.covariance_with(float(share)) for one, share in zip(self._read, self._offset, strict=True)]
+        noise = [one.covariance_of(share) for one, share in zip(self._read, self._offset, strict=True)]
         factors = [np.linalg.cholesky(one + 1e-16 * np.eye(size)) for one in noise]
         out = np.zeros((self.value.size,) * 2)
         for i, a in enumerate(self.edges):
@@ -157,7 +157,9 @@ class PredictedEdges:
 
     def _numbers(self, rows: FloatArray) -> FloatArray:
         """OTFs at `frequencies`, (edges, frequencies), from the estimators' `rows` (edges, rows)."""
-        return np.array([one.numbers(row) for one, row in zip(self._read, rows, strict=True)])
+        return np.array(
+            [one.predicted(row, share) for one, row, share in zip(self._read, rows, self._offset, strict=True)]
+        )
 
     def _reported(
         self, effects: tuple[Effect, ...], more: FloatArray | None = None, otf: ComplexArray | None = None
@@ -380,8 +382,7 @@ class PredictedEdges:
         return np.asarray((0.5 + rising + self._offset[:, None]) * self._shaded)
 
     def _shade(self, edge: int, effects: Effects) -> FloatArray:
-        """Illumination (distances,) over that at the edge, averaged along the edge, with effects. Its gradient across
-        the edge is the recorded one."""
+        """Illumination (distances,) over that at the edge, averaged along the edge, with effects."""
         x_um, y_um, light, fit = self._lighting[edge]
         model = Uniform(self._camera, effects)
         light = model.shade_light(light, x_um, y_um)
@@ -389,11 +390,9 @@ class PredictedEdges:
             radiance, place = self.edges[edge].part[0].light_radiance, FieldPoints(x_um, y_um, light)
             rates = {c: light * self._rate(self._sights.index((c, radiance))) for c in self._camera.channels}
             light = model.stray_light(rates, place)[self.edges[edge].channel]
-        terms = fit @ light / (fit[0] @ light)
-        if (gradient := self._read[edge].gradient) is not None:
-            terms[1] = gradient * UNEVEN_PX  # no model predicts that of the target
+        terms = fit @ light
         reach = self.edges[edge].summary.reach_px
-        return np.asarray(polynomial.polyval(np.clip(self._distance_px, -reach, reach) / UNEVEN_PX, terms))
+        return np.asarray(polynomial.polyval(np.clip(self._distance_px, -reach, reach) / UNEVEN_PX, terms / terms[0]))
 
     @cached_property
     def _lighting(self) -> list[tuple[FloatArray, ...]]:

@@ -11,8 +11,8 @@ division by the contrast, so that a prediction goes through it exactly. What the
 leaves out of the prediction, too. No prior of the line spread enters: the covariance is that of the noise alone.
 
 A gradient of the illumination across the edge is free where the edge adds light. What it does to the dark side depends
-on how much of the dark codes is light, which only a black level tells: the prediction adds it, from the gradient that
-was recorded (`gradient`).
+on how much of the dark codes is light, which only a black level tells. The prediction adds it (`predicted`), from the
+gradient on the light side by which the recording departs from the model.
 """
 
 from __future__ import annotations
@@ -48,40 +48,42 @@ SEEN_STD, LEAST_MTF = 4.0, 0.005
 class EdgeTransfer:
     """The OTF of one edge: real parts at `REAL_AT`, then imaginary parts at `IMAGINARY_AT`, of the highest frequency.
 
-    The estimator's rows are the contrast, then contrast x shift, and contrast x departures.
+    The estimator's rows are the contrast, then contrast x shift, contrast x departures, and contrast x relative
+    gradient of the illumination across the edge, per px.
     """
 
     operator: FloatArray  # (rows, distances): from a profile at the summary's `grid_px` to the rows
     recorded: FloatArray  # (rows,)
     reference: FloatArray  # (numbers,): of the recorded profile
-    covariance: FloatArray  # (numbers, numbers): of the noise
+    covariance: FloatArray  # (numbers + 1, numbers + 1): of the noise of the numbers and of the gradient
     rounding: FloatArray  # (waves, numbers): changes by rounding to whole codes, one standard deviation each
-    gradient: float | None  # of the illumination across the edge, relative, per px; None: the region is too small
-    by_gradient: FloatArray  # (numbers,): changes by a unit gradient of light at the level of the contrast on both sides
-    gradient_covariance: FloatArray  # (numbers,): of the numbers with `gradient`
-    gradient_variance: float
+    by_slope: FloatArray  # (numbers,): changes by a slope of the profile of the contrast per px
 
     @property
     def value(self) -> FloatArray:
         """Return the numbers."""
-        return self.numbers(self.recorded)
+        return self._numbers(self.recorded)
 
     @property
     def shift_px(self) -> float:
         """Return the shift of the recorded profile against itself by the estimator, px: nearly 0."""
         return float(self.recorded[1] / self.recorded[0])
 
-    def numbers(self, rows: FloatArray) -> FloatArray:
-        """Return the numbers for the estimator's `rows`."""
-        return np.asarray(rows[2:] / rows[0] + self.reference)
+    def _numbers(self, rows: FloatArray) -> FloatArray:
+        """Return the numbers of the estimator's `rows`."""
+        return np.asarray(rows[2:-1] / rows[0] + self.reference)
 
-    def covariance_with(self, dark_share: float) -> FloatArray:
-        """Return the covariance (numbers, numbers) of the numbers less what the recorded gradient does to light on both
-        sides, `dark_share` of the contrast.
+    def predicted(self, rows: FloatArray, dark_share: float) -> FloatArray:
+        """Return the numbers for the `rows` of a model's profile whose dark side has light, `dark_share` of the
+        contrast: with the gradient of that light by which the recording departs from the model.
         """
-        change = dark_share * self.by_gradient
-        mixed = np.outer(change, self.gradient_covariance)
-        return np.asarray(self.covariance - mixed - mixed.T + self.gradient_variance * np.outer(change, change))
+        departs = self.recorded[-1] / self.recorded[0] - rows[-1] / rows[0]
+        return np.asarray(self._numbers(rows) + dark_share * departs * self.by_slope)
+
+    def covariance_of(self, dark_share: float) -> FloatArray:
+        """Return the covariance (numbers, numbers) of the numbers about those of `predicted`."""
+        change = np.concatenate([np.eye(len(self.by_slope)), -dark_share * self.by_slope[:, None]], axis=1)
+        return np.asarray(change @ self.covariance @ change.T)
 
 
 def highest_frequency(edges: Sequence[EdgeSummary]) -> float:
@@ -134,17 +136,15 @@ def read_transfer(edge: EdgeSummary, highest: float, shapes: FloatArray) -> Edge
     normal = columns.T @ matrix @ columns
     normal[np.arange(3, count), np.arange(3, count)] += DEPARTURE_STD**-2
     used = slice(0, count + min(len(matrix) - size, ACROSS + 1))  # not the gradient of the dark side
-    solve = (np.linalg.inv(normal[used, used]) @ columns[:, used].T)[1:count]
+    solve = np.zeros((count, len(matrix)))
+    solve[:-1] = (np.linalg.inv(normal[used, used]) @ columns[:, used].T)[1:count]
+    if edge.has_gradient_across:
+        solve[-1] = (np.linalg.inv(normal) @ columns.T)[count + ACROSS] / 100.0
     recorded = solve @ right
 
     departure = recorded[2:] / recorded[0]
     jacobian = np.concatenate([-departure[:, None], np.zeros((len(departure), 1)), np.eye(len(departure))], axis=1)
     by_right = jacobian @ solve / recorded[0]
-    by_slope, gradient, covariance, variance = np.zeros(len(departure)), None, np.zeros(len(departure)), 0.0
-    if edge.has_gradient_across:
-        row = (np.linalg.inv(normal) @ columns.T)[count + ACROSS] / 100.0
-        gradient, covariance, variance = float(row @ right), by_right @ matrix @ row, float(row @ matrix @ row)
-        by_slope = by_right @ (edge.right_side @ grid)
     split = len(REAL_AT)
     otf = optical_transfer(spline, esf, measured_at(highest))
     return EdgeTransfer(
@@ -152,11 +152,8 @@ def read_transfer(edge: EdgeSummary, highest: float, shapes: FloatArray) -> Edge
         recorded=recorded,
         reference=np.concatenate([otf[:split].real, otf[split:].imag]),
         covariance=by_right @ matrix @ by_right.T,
-        rounding=edge.rounding @ by_right.T,
-        gradient=gradient,
-        by_gradient=by_slope,
-        gradient_covariance=covariance,
-        gradient_variance=variance,
+        rounding=edge.rounding @ by_right[:-1].T,
+        by_slope=by_right[:-1] @ (edge.right_side @ grid),
     )
 
 
