@@ -68,7 +68,8 @@ GRID_PX = 0.05  # step of the grid of distances on which other profiles are give
 class EdgeSummary:
     """One edge in the pixels of one colour, in codes, with k spline coefficients and g gradients of the illumination.
 
-    `curve`: where it lies. `reach_px`: the largest distance of a sample from it. `spline`: basis of the profile.
+    `curve`: where it lies. `reach_px`: the largest distance of a sample from it. `samples`: their number. `spline`: basis of the
+    profile.
     `gram` (k + g + 1, k + g + 1): A^T W A, where A holds the columns of the spline, the gradients and the values, which
     are 0 on the dark and 1 on the light side, and W the inverse variances of the values. `inverse` (k + g, k + g): of
     the normal matrix with the prior of the line spread; it takes A^T W values to the solution. `solution` (k + g,), its
@@ -83,6 +84,7 @@ class EdgeSummary:
     angle_deg: float
     angle_deg_std: float
     reach_px: float
+    samples: int
     spline: Spline
     gram: Array
     inverse: Array
@@ -165,13 +167,13 @@ class Quantisation:
     size: float
     frames: int
 
-    def std_of(self, residual: Array) -> float:
+    def std_of(self, residual: Array, fitted: int) -> float:
         """Return the standard deviation of the values about a profile, from their residuals (n,): the noise, and the
-        error of rounding.
+        error of rounding. `fitted`: the number of parameters that were fitted to these values.
         """
-        std = _robust_std(residual, self.size)
+        std = _robust_std(residual, self.size) * np.sqrt(len(residual) / max(len(residual) - fitted, 1))
         if not self.size:
-            return std
+            return float(std)
         return float(np.hypot(std, self.size * rounding_std_dn(self.frames * (std / self.size) ** 2)))
 
     def waves(self, level: Array, variance: Array) -> list[Array]:
@@ -254,10 +256,11 @@ def _fit_profile(
                 priors, matrix, right, start, LOG_LIKELIHOOD_RANGE if pass_number == PASSES - 1 else 0.0
             )
         solution = inverse @ right
+        fitted = 1 + len(gradients) // 2  # of a side: its level, and gradients
         esf = placed.values(solution[:size])
         residual = value - esf - solution[size:] @ gradients
         std_dark, std_light = (
-            noise_std / contrast if noise_std else quantisation.std_of(residual[tail] * contrast) / contrast
+            noise_std / contrast if noise_std else quantisation.std_of(residual[tail] * contrast, fitted) / contrast
             for tail in (dark_tail, light_tail)
         )
         variance = std_dark**2 + np.clip(esf, 0.0, 1.0) * (std_light**2 - std_dark**2) + STD_FLOOR**2
@@ -276,6 +279,7 @@ def _fit_profile(
         angle_deg=angle_from_vertical_deg(edge.tilt, edge.transposed),
         angle_deg_std=angle_std_deg(placed.derivatives(solution[:size]), distance, foot, variance, gradients, edge),
         reach_px=float(np.abs(distance).max()),
+        samples=len(distance),
         spline=spline,
         gram=gram,
         inverse=inverse,

@@ -18,6 +18,9 @@ from lab.observables.edges.measured import edges_of, measure_edge
 from lab.observables.edges.profile import EdgeSummary
 from lab.observables.edges.region import check_phases
 
+LEAST_REACH_PX = 8.0  # of the samples from the edge: with less, levels and blur aren't told apart without bias
+#: Of an edge: their residuals tell the noise. As 1 / variance of half of n values is too large by 4 / n, so is chi2.
+LEAST_SAMPLES = 240
 LEAST_PAIRS = 64  # pixels on the light side whose two repeats tell the temporal noise
 MOST_FIXED = 0.95  # of the variance of the noise
 
@@ -83,6 +86,7 @@ def edges_of_side(study: Study, kind: type[EdgeCapture], step: str) -> list[Side
                     try:
                         summary = measure_edge(study.recordings, part, channel, study.fitted, region)
                         check_phases(step, study.stated.cfa, channel, region, summary.angle_deg)
+                        _refuse_narrow(step, part[0], channel, summary)
                     except NotDetermined as refused:
                         reasons.append(refused.reason)
                         continue
@@ -91,6 +95,22 @@ def edges_of_side(study: Study, kind: type[EdgeCapture], step: str) -> list[Side
     if not edges:
         raise NotDetermined(step, reasons[0])
     return edges
+
+
+def _refuse_narrow(step: str, capture: EdgeCapture, channel: str, summary: EdgeSummary) -> None:
+    """Raise `NotDetermined` where the samples beside an edge are too few to tell its levels from its blur."""
+    if summary.reach_px < LEAST_REACH_PX:
+        raise NotDetermined(
+            step,
+            f"{capture.id}: the samples of {channel} reach {summary.reach_px:.1f} px from the edge, "
+            f"{LEAST_REACH_PX:g} px are needed: widen the region",
+        )
+    if summary.samples < LEAST_SAMPLES:
+        raise NotDetermined(
+            step,
+            f"{capture.id}: the region holds {summary.samples} samples of {channel}, {LEAST_SAMPLES} are needed to "
+            "tell their noise: widen the region",
+        )
 
 
 def f_number_of(capture: EdgeCapture) -> float | None:
