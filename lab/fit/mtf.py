@@ -9,13 +9,15 @@ Each Bayer plane is analysed on its own grid; nothing is demosaiced.
   leaves a ripple of h^2 E'' / 12, which samples at uneven distances turn into a bias of 0.1 % of MTF50. A prior of the
   line-spread function (LSF), the derivative of the ESF, decides what the samples leave open: a Gaussian, a Gaussian
   process about it, and the 1 / distance^2 tail of diffraction, which holds 1 % of the contrast beyond any region;
-- `lab.observables.edges.mtf`: the ESF is fitted by weighted least squares together with the gradient of the
-  illumination. The MTF is the Fourier transform of the derivative of the spline, in closed form, with its covariance.
-  `edge_mtf` is the whole estimator, on a region;
-- `lab.observables.edges.region`: the edges of a frame that are usable, and the MTF of one edge of a recording set;
+- `lab.observables.edges.profile`: the ESF is fitted by weighted least squares together with gradients of the
+  illumination. This is the summary of an edge, which the diagnosis reads, too;
+- `lab.observables.edges.mtf`: the MTF is the Fourier transform of the derivative of the spline, in closed form, with
+  its covariance. `edge_mtf` is the whole estimator, on a region;
+- `lab.observables.edges.region`: the edges of a frame that are usable; `lab.observables.edges.measured`: the edges of
+  captures, each summarised once;
 - here, the step on all captures of a side.
 
-Once the edge is found, the estimate is linear in the pixel values. `EdgeGeometry` keeps this linear operator, and
+Once the edge is found, the estimate is linear in the pixel values. `EdgeSummary` keeps this linear operator, and
 `EdgeMtf.predict` sends a predicted edge profile through it. A comparison of the two is free of the bias of the
 estimator.
 
@@ -31,8 +33,9 @@ from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MtfCurve, NoiseFit
-from lab.observables.edges.mtf import edge_mtf
-from lab.observables.edges.region import check_phases, edges_of, measure_edge
+from lab.observables.edges.measured import edges_of, measure_edge
+from lab.observables.edges.mtf import edge_mtf, read_mtf
+from lab.observables.edges.region import check_phases
 from sim.camera import Side
 
 __all__ = ["edge_mtf", "fit_mtf"]
@@ -44,8 +47,8 @@ def fit_mtf(
     """Fit one MTF curve for every slanted-edge capture of `side` and every channel (R, G, B; or Y), captures in their
     order.
 
-    A capture without a region gives the curves of all edges found in its frame, each with its region. The black level
-    is that of `noise` where it was fitted, else the stated one. The angle is given in the half turn next to the nominal
+    A capture without a region gives the curves of all edges found in its frame, each with its region. `noise`: see
+    `measure_edge`. The angle is given in the half turn next to the nominal
     one of the capture. Edges that can't be used are left out, among them those that cross less than one sample period
     of their channel; `left_out` gets a line for each. Raises `NotDetermined` where none can be used.
     """
@@ -65,7 +68,7 @@ def fit_mtf(
         regions = [capture.region] if capture.region else [f.region for f in found if not f.refused]
         for region, channel in itertools.product(regions, ("Y",) if camera.cfa == "MONO" else ("R", "G", "B")):
             try:
-                edge = measure_edge(recordings, [capture], channel, noise, region=region)
+                edge = read_mtf(measure_edge(recordings, [capture], channel, noise, region))
                 check_phases("mtf", camera.cfa, channel, region, edge.angle_deg)
             except NotDetermined as refused:
                 reasons.append(f"{capture.id} ({channel}): {refused.reason}")

@@ -16,8 +16,8 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
-from lab.observables.edges.mtf import EdgeMtf
-from lab.observables.edges.region import measure_edge
+from lab.observables.edges.measured import measure_edge
+from lab.observables.edges.profile import EdgeSummary
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.frame import Exposure, dark_electrons, expected_electrons, is_steady, read_out
@@ -89,7 +89,7 @@ class Replay:
             electrons = self._levelled(capture, exposure, electrons, effects)
         return exposure, electrons
 
-    def _scene(self, capture: Capture, edge: EdgeMtf | None) -> Scene:
+    def _scene(self, capture: Capture, edge: EdgeSummary | None) -> Scene:
         if isinstance(capture, SlantedEdgeCapture) and edge is not None:
             light = self.recordings.spectrum(capture.light_radiance) if capture.light_radiance else _EQUAL
             dark = Spectrum.of(*(light.arrays[0], 0.0 * light.arrays[1]))
@@ -99,7 +99,7 @@ class Replay:
             raise NotDetermined("replay", f"{capture.id} ({capture.kind}) doesn't tell what stood before the camera")
         return scene
 
-    def _edge(self, capture: SlantedEdgeCapture) -> EdgeMtf:
+    def _edge(self, capture: SlantedEdgeCapture) -> EdgeSummary:
         """Return the edge that the slanted-edge estimator finds in the green (or only) channel."""
         channel = "G" if "G" in self.camera.channels else self.camera.channels[0]
         return measure_edge(self.recordings, [capture], channel)
@@ -130,13 +130,12 @@ class Replay:
         return out
 
 
-def _placed(region: tuple[int, int, int, int], edge: EdgeMtf) -> EdgeRegion:
+def _placed(region: tuple[int, int, int, int], edge: EdgeSummary) -> EdgeRegion:
     """Return a straight edge at the centre and the angle that the estimator found."""
-    geometry = edge.geometry
-    row, col = geometry.centre_px
-    if geometry.transposed:
-        row += geometry.edge_px[0]
+    row, col = edge.curve.centre
+    if edge.curve.transposed:
+        row += edge.curve.poly[0]
     else:
-        col += geometry.edge_px[0]
+        col += edge.curve.poly[0]
     placed = EdgeRegion(region, edge.angle_deg)
     return replace(placed, offset_px=float(placed.distance_px(np.asarray(row), np.asarray(col))))

@@ -33,8 +33,8 @@ from lab.formats.results import (
 from lab.observables.charts.patches import Patch as PatchLevel
 from lab.observables.charts.patches import patch_covariance, patch_levels
 from lab.observables.dataset import Study
-from lab.observables.edges.mtf import EdgeMtf
-from lab.observables.edges.region import measure_edge
+from lab.observables.edges.measured import measure_edge
+from lab.observables.edges.mtf import EdgeMtf, read_mtf
 from lab.observables.gaussian import chi2
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import CameraModel, Side
@@ -228,7 +228,7 @@ def _edges(
         curves, residuals, blocks, reference = [], [], [], []
         for channel in model.channels:
             try:
-                measured = measure_edge(recordings, repeats, channel, fit.noise, MTF_FREQUENCIES)
+                measured = read_mtf(measure_edge(recordings, repeats, channel, fit.noise), MTF_FREQUENCIES)
             except NotDetermined as refused:
                 reason = refused.reason
                 continue

@@ -15,7 +15,8 @@ from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import InputError, NotDetermined
 from lab.formats.recording_set import DataSheet, RecordingSet
-from lab.observables.edges.region import measure_edge
+from lab.observables.edges.measured import measure_edge
+from lab.observables.edges.mtf import read_mtf
 from sim.camera import Side
 from sim.parameters import Frozen
 from sim.sensor.mosaic import first_pixels, planes
@@ -215,7 +216,7 @@ class GrowingCurves:
         if not self._first(capture, name):
             return
         channel = "Y" if recordings.camera(capture.side).cfa == "MONO" else "G"
-        found = measure_edge(recordings, [capture], channel, frequency_cy_per_px=FREQUENCIES_CY_PER_PX)
+        found = read_mtf(measure_edge(recordings, [capture], channel), FREQUENCIES_CY_PER_PX)
         self._edges.append(
             EdgeLook(
                 side=capture.side,

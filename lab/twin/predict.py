@@ -28,7 +28,7 @@ from lab.observables.charts.patches import reflectance_covariance
 from lab.observables.codes.rounding import QUANTISATION_DN2
 from lab.observables.darks.level import DARK, added_dark_e_per_s
 from lab.observables.dataset import Study
-from lab.observables.edges.transfer import ASIDE, SLANTED_EDGE
+from lab.observables.edges.slanted_edge import ASIDE, SLANTED_EDGE
 from lab.observables.flats.linearity import PHOTON_TRANSFER, misstated_levels
 from lab.observables.flats.noise import GAIN_STD, NOISE, READ_STD, shot_variance
 from lab.observables.noise.figures import BLACK_FLOOR_DN, USUAL_LAMP, NoiseFigures

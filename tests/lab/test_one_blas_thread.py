@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from lab.observables.edges import mtf as edge_mtf
+from lab.observables.edges import profile
+from lab.observables.edges.mtf import edge_mtf
 from lab.one_blas_thread import one_blas_thread
 from tests.lab.observables.edges.drawn_edges import edge
 
@@ -90,12 +91,10 @@ def test_the_last_to_leave_gives_them_back():
 
 def test_an_edge_is_measured_with_one(monkeypatch: pytest.MonkeyPatch):
     seen: list[set[int]] = []
-    measured = edge_mtf.measure_mtf
-    monkeypatch.setattr(
-        edge_mtf, "measure_mtf", lambda *arguments: (seen.append(blas_threads()), measured(*arguments))[1]
-    )
-    edge_mtf.edge_mtf(np.asarray(edge(64, 5.0, 0.5)))
-    assert seen == [{1}]
+    fitted = profile.posterior
+    monkeypatch.setattr(profile, "posterior", lambda *arguments: (seen.append(blas_threads()), fitted(*arguments))[1])
+    edge_mtf(np.asarray(edge(64, 5.0, 0.5)))
+    assert seen == [{1}, {1}]  # in the last two passes
 
 
 # --- Threads share their arenas of memory -----------------------------------------------------------------------------

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Container, Mapping
+from collections.abc import Callable, Container, Hashable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args, overload
+from typing import Any, TypeVar, cast, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.base import Capture, in_folder
-from lab.errors import InputError
+from lab.errors import InputError, NotDetermined
 from lab.formats.recording_set.files import Frame, JoinedFiles, MemoryFiles, OverlaidFiles, RecordingFiles, Target
 from lab.formats.recording_set.frame_codes import FrameCodes
 from lab.formats.recording_set.manifest import DataSheet, Manifest
@@ -20,6 +20,7 @@ from sim.camera import Side
 from sim.spectrum import Spectrum
 
 C = TypeVar("C", bound=Capture)
+T = TypeVar("T")
 
 
 class RecordingSet:
@@ -50,10 +51,12 @@ class RecordingSet:
         self._cache: OrderedDict[str, Frame] = OrderedDict()
         self._held = 0
         self._codes: dict[str, FrameCodes] = {}
+        #: What was summarised of the frames: the same for all sets that have these frames.
+        self._summaries: dict[Hashable, object] = {}
         self._lock = threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_cache": OrderedDict(), "_held": 0, "_lock": None}
+        return self.__dict__ | {"_cache": OrderedDict(), "_held": 0, "_summaries": {}, "_lock": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ |= state | {"_lock": threading.Lock()}
@@ -130,6 +133,7 @@ class RecordingSet:
         )
         if files is None:
             copy._codes = self._codes
+            copy._summaries = self._summaries
         return copy
 
     def capture(self, id: str) -> Capture:
@@ -173,6 +177,20 @@ class RecordingSet:
         with self._lock:
             self._cache.clear()
             self._held = 0
+
+    def summarised(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return `make()`, a summary of frames, computed once for `key` and for all sets of the same frames, whatever
+        their manifests state. Where it raised NotDetermined, that is raised again. `key` has to hold all that the
+        summary depends on, frames by their paths."""
+        if key not in self._summaries:
+            try:
+                self._summaries[key] = make()
+            except NotDetermined as refused:
+                self._summaries[key] = refused
+        found = self._summaries[key]
+        if isinstance(found, NotDetermined):
+            raise found
+        return cast(T, found)
 
     def spectrum(self, path: str) -> Spectrum:
         """Return the spectrum that the manifest calls `path`."""

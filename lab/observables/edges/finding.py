@@ -27,6 +27,7 @@ ORDERS = np.arange(1.0, EDGE_ORDER + 1)  # of its terms beyond the constant
 Region = tuple[int, int, int, int]  # row0, col0, row1, col1, end excluded
 
 FEW_PHASES_PX = 0.6  # widest gap between distances of a quarter of the edge; above it the edge is taken as straight
+ACROSS = 2  # the column of `illumination_gradients` across the edge, of the light that the edge adds
 REFINED_PX = 6.0  # half-width of the zone that decides where the edge is
 MOST_REACH_PX = 60.0
 
@@ -128,20 +129,17 @@ class Plane:
     step: int = 1
 
 
-def region_planes(
-    frame: NDArray[np.generic], region: Region, cfa: Cfa, channel: str, black_level_dn: float
-) -> list[Plane]:
-    """Cut the planes of a channel (two for green) within `region` out of a raw frame (rows, cols), in DN above
-    `black_level_dn`.
+def region_planes(frame: NDArray[np.generic], region: Region, cfa: Cfa, channel: str) -> list[Plane]:
+    """Cut the planes of a channel (two for green) within `region` out of a raw frame (rows, cols), in codes.
 
     `region`: (row0, col0, row1, col1), end excluded. The planes keep their coordinates on the sensor.
     """
     row0, col0, row1, col1 = region
     step = period(cfa)
     found = []
-    for first_row, first_col in phases(cfa)[channel]:
+    for first_row, first_col in sorted(phases(cfa)[channel]):
         r, c = row0 + (first_row - row0) % step, col0 + (first_col - col0) % step
-        found.append(Plane(frame[r:row1:step, c:col1:step].astype(float) - black_level_dn, r, c, step))
+        found.append(Plane(frame[r:row1:step, c:col1:step].astype(float), r, c, step))
     return found
 
 
@@ -218,16 +216,17 @@ def level_planes(samples: Samples, distance: Array, inner: float, outer: float) 
     return value, dark_sum / samples.count, light_sum / samples.count
 
 
-def illumination_gradients(distance: Array, along_px: Array, light: Array, room: bool) -> Array:
-    """Return the columns (1 or 2, n) of a planar gradient of the illumination, per 100 px: along the edge, and across
-    it if `room`.
+def illumination_gradients(distance: Array, along_px: Array, profile: Array, room: bool) -> Array:
+    """Return the columns (2 or 4, n) of planar gradients of the illumination, per 100 px: along the edge, and across
+    it if `room`; each of the light that the edge adds and of that which both sides have.
 
-    `light` (n,) is the profile that the gradient multiplies. Without an outer zone (`room` False) a gradient across
-    the edge can't be told from the tails of the profile.
+    `profile` (n,): 0 on the dark and 1 on the light side. What part of the dark side's codes is light isn't known, so
+    that its gradient is free. Without an outer zone (`room` False) a gradient across the edge can't be told from the
+    tails of the profile.
     """
-    rows = [along_px * light / 100.0]
+    rows = [along_px * profile / 100.0, along_px / 100.0]
     if room:
-        rows.append(distance * light / 100.0)
+        rows += [distance * profile / 100.0, distance / 100.0]
     return np.array(rows)
 
 

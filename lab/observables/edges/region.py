@@ -1,13 +1,12 @@
-"""Slanted edges of a recording set: `find_edges` in a frame, `measure_edge` for one edge.
+"""The edges of a frame for which no region is stated (`find_edges`).
 
-Edges without a stated region are looked for in the frame (`find_edges`). An edge has to cross enough phases of the
-pixels for its angle, and with that its MTF, to be determined (`check_phases`).
+An edge has to cross enough phases of the pixels for its angle, and with that its MTF, to be determined
+(`check_phases`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,13 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
-from lab.formats.recording_set import CodeCounts, FrameCodes, RecordingSet
-from lab.formats.results import NoiseFit
-from lab.observables.codes.step import step_of
 from lab.observables.edges.finding import Region, region_planes
-from lab.observables.edges.mtf import DEFAULT_FREQUENCY_CY_PER_PX, EdgeMtf, planes_mtf
+from lab.observables.edges.profile import summarise_edge
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases
 from sim.sensor.mosaic import step as period
@@ -121,14 +116,12 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
                 reason = f"the edge at row {middle[0]:.0f}, column {middle[1]:.0f} is saturated; expose it shorter"
                 continue
             try:
-                planes = region_planes(values, region, cfa, channel, 0.0)
-                edge = planes_mtf(planes, np.array([0.1, 0.25]))
+                edge = summarise_edge(region_planes(values, region, cfa, channel))
             except NotDetermined as refused:
                 reason = f"at row {middle[0]:.0f}, column {middle[1]:.0f}: {refused.reason}"
                 continue
-            noise = max(edge.noise_std_dark, edge.noise_std_light)
-            contrast = edge.light_level - edge.dark_level
-            if edge.residual_chi2_per_sample > 2.0 or noise > 0.1 * contrast or contrast < 0.05 * (high - low):
+            is_faint = max(edge.noise_std) > 0.1 * edge.contrast or edge.contrast < 0.05 * (high - low)
+            if edge.residual_chi2_per_sample > 2.0 or is_faint:
                 reason = (
                     f"what lies at row {middle[0]:.0f}, column {middle[1]:.0f} isn't one edge between two even fields"
                 )
@@ -160,48 +153,3 @@ def _refusal(cfa: Cfa, channel: str, region: Region, angle_deg: float) -> str:
             f"at row {0.5 * (region[0] + region[2]):.0f}, column {0.5 * (region[1] + region[3]):.0f}: {refused.reason}"
         )
     return ""
-
-
-def measure_edge(
-    recordings: RecordingSet,
-    captures: Sequence[SlantedEdgeCapture],
-    channel: str,
-    noise: NoiseFit | None = None,
-    frequency_cy_per_px: ArrayLike | None = None,
-    region: Region | None = None,
-) -> EdgeMtf:
-    """Measure the MTF of one slanted edge in one channel (R, G, B or Y).
-
-    `captures` are repeats of the same settings; their mean is analysed. The edge is the one in `region` (row0, col0,
-    row1, col1). Without it, it is the one in the region of the capture, or else the longest that `find_edges` finds.
-    The noise is the residual between the frame and the fitted edge; it includes the photo response non-uniformity,
-    which repeats don't average out. Raises `NotDetermined` where the black level is unknown, the region is saturated
-    or clipped at 0, or holds no edge.
-    """
-    first = captures[0]
-    camera = recordings.camera(first.side)
-    black = noise.black_level_dn if noise is not None and noise.black_level_dn is not None else camera.black_level_dn
-    if black is None:
-        raise NotDetermined("mtf", "the black level is neither fitted nor stated: add dark frames")
-    frames = [recordings.frame(c) for c in captures]
-    row0, col0, row1, col1 = region = region or first.region or edges_of(recordings, first)[0].region
-    saturated = float(np.mean(frames[0][row0:row1, col0:col1] >= camera.saturation_dn))
-    if saturated > 0.002:
-        raise NotDetermined("mtf", f"{first.id}: {100 * saturated:.1f} % of the region is saturated; expose it shorter")
-    empty = float(np.mean(frames[0][row0:row1, col0:col1] <= 0))
-    if black > 0.0 and empty > 0.002:
-        raise NotDetermined(
-            "mtf",
-            f"{first.id}: {100 * empty:.1f} % of the region is at 0, below the black level {black:g}: it is clipped",
-        )
-    mean = np.mean([f.astype(float) for f in frames], axis=0) if len(frames) > 1 else frames[0]
-    planes = region_planes(mean, region, camera.cfa, channel, black)
-    frequency = DEFAULT_FREQUENCY_CY_PER_PX if frequency_cy_per_px is None else frequency_cy_per_px
-    code = step_of(CodeCounts.total(FrameCodes.count(frame).every for frame in frames))
-    return planes_mtf(planes, frequency, code=code, frames=len(frames))
-
-
-def edges_of(recordings: RecordingSet, capture: SlantedEdgeCapture) -> tuple[FoundEdge, ...]:
-    """Find the edges of the frame of a capture, those that can be used first; see `find_edges`."""
-    camera = recordings.camera(capture.side)
-    return find_edges(recordings.frame(capture), camera.cfa, camera.saturation_dn)

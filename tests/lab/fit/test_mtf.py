@@ -81,12 +81,13 @@ def recordings(frames, captures, cfa="RGGB"):
         camera=lambda side: camera,
         captures=lambda kind=None, side=None: captures,
         frame=lambda capture: frames[capture.id],
+        summarised=lambda key, make: make(),
     )
 
 
 def capture(name, **more):
     stated = {"region": (31, 20, 191, 180), "angle_deg": 95.0, "field_mm": (0.0, 0.0)}
-    return SimpleNamespace(id=name, side="left", **(stated | more))
+    return SimpleNamespace(id=name, frame=name, side="left", **(stated | more))
 
 
 def test_fit_takes_every_channel_of_the_mosaic_on_its_own_grid():

@@ -13,7 +13,8 @@ from scipy.special import erf, ndtr
 from lab.errors import NotDetermined
 from lab.fit.mtf import edge_mtf
 from lab.observables.edges.finding import Plane, half_way_px
-from lab.observables.edges.mtf import planes_mtf
+from lab.observables.edges.mtf import read_mtf
+from lab.observables.edges.profile import summarise_edge
 from lab.observables.edges.spread import SortedSamples, Spline
 from tests.lab.observables.edges.drawn_edges import edge, gaussian_mtf, gaussian_mtf50, noisy, squares
 
@@ -108,7 +109,7 @@ def test_standard_deviation_is_as_predicted_where_the_dark_side_has_one_code(dar
     for k in range(40):
         light = 120.0 * edge(90, 5.0, 0.6, offset_px=0.05 * k, dark=0.0) + dark_dn + 0.01 * k
         seen = np.round(10.0 + light + np.sqrt(light / 50.0 + 0.0025) * rng.standard_normal(light.shape))
-        found = planes_mtf([Plane(seen - 10.0)], frequency, code=1.0)
+        found = read_mtf(summarise_edge([Plane(seen)], code=1.0), frequency)
         pulls.append((found.mtf - gaussian_mtf(0.6, frequency)) / found.mtf_std)
     assert np.mean(np.square(pulls), axis=0) == pytest.approx(np.full(5, 1.0), abs=0.9)
 
@@ -172,7 +173,7 @@ def test_two_planes_of_unequal_gain_on_their_own_grids():
         Plane(1.00 * edge(100, 5.0, 0.6, row0=0, col0=1, step=2), 0, 1, 2),
         Plane(1.07 * edge(100, 5.0, 0.6, row0=1, col0=0, step=2), 1, 0, 2),
     ]
-    found = planes_mtf(planes)
+    found = read_mtf(summarise_edge(planes))
     # frequencies are of the full sensor although each plane is sampled at every second pixel
     np.testing.assert_allclose(found.mtf, gaussian_mtf(0.6, found.frequency_cy_per_px), atol=2e-4)
 
@@ -219,7 +220,7 @@ def test_the_edge_lies_half_way_where_its_samples_fall_on_few_distances(offset_p
     rng = np.random.default_rng(5)
     for _ in range(10):
         image = noisy(edge(60, np.degrees(np.arctan2(3, 4)), 0.7, offset_px=offset_px, step=2), rng)
-        found = planes_mtf([Plane(image, step=2)])
+        found = read_mtf(summarise_edge([Plane(image, step=2)]))
         # its standard deviation is 0.01 px; a tenth of the blur's width is next to nothing for the estimator
         assert abs(half_way_px(found.distance_px, found.esf)) < 0.07
 
@@ -227,7 +228,7 @@ def test_the_edge_lies_half_way_where_its_samples_fall_on_few_distances(offset_p
 def test_greens_of_an_edge_at_45_deg_are_refused():
     image = noisy(edge(200, 45.0, 0.55), np.random.default_rng(9))
     with pytest.raises(NotDetermined, match=r"1\.4 px apart"):
-        planes_mtf([Plane(image[0::2, 1::2], 0, 1, 2), Plane(image[1::2, 0::2], 1, 0, 2)])
+        summarise_edge([Plane(image[0::2, 1::2], 0, 1, 2), Plane(image[1::2, 0::2], 1, 0, 2)])
 
 
 def test_mtf10_and_the_profiles_are_the_gaussians():

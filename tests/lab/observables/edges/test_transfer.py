@@ -14,17 +14,11 @@ from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.dataset import Study
+from lab.observables.edges.mtf import read_mtf
 from lab.observables.edges.region import check_phases
-from lab.observables.edges.transfer import (
-    ASIDE,
-    REAL_AT,
-    _Edges,
-    edge_block,
-    measured_edges,
-    profile_interpolation,
-    spread_operator,
-    stopped_edge_block,
-)
+from lab.observables.edges.side import SideEdge, edges_of_side
+from lab.observables.edges.slanted_edge import ASIDE, edge_block, stopped_edge_block
+from lab.observables.edges.transfer import REAL_AT
 from lab.observables.gaussian import chi2
 from lab.observables.observable import Block
 from mocks.former import ConcealedCamera, Law, Plan
@@ -32,7 +26,7 @@ from mocks.former import laws as concealed
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.effects.library import effect
-from sim.point import edge_profile, optical_transfer
+from sim.point import optical_transfer
 from sim.stages import Charge, Stray
 
 EDGES = Plan(("dark", "slanted_edge"))
@@ -42,8 +36,8 @@ def _study(recordings: RecordingSet) -> Study:
     return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
-def _edges(study: Study) -> _Edges:
-    return _Edges(study, measured_edges(study, SlantedEdgeCapture), study.camera)
+def _edges(study: Study) -> list[SideEdge]:
+    return edges_of_side(study, SlantedEdgeCapture, "slanted_edge")
 
 
 def _recorded(
@@ -58,48 +52,39 @@ def _misfit(block: Block, *acting: Effect, aside: bool | None = None) -> float:
     """chi2 of n numbers over its limit 1.1 n + 3 sqrt(2 n): three standard deviations of chi2, and a tenth for errors
     that edges in the same place share. Above 1 the prediction is wrong. `aside`: of asymmetries (True) or contrasts
     (False) alone."""
-    model = block.predict(acting)
-    covariance = block.covariance + sum(np.outer(s, s) for s in model.jacobian.values())
     where = np.array([aside is None or label.condition.endswith(ASIDE) == aside for label in block.labels])
     n = int(where.sum())
-    value = chi2((block.value - model.mean)[where], covariance[np.ix_(where, where)])
-    return value / (1.1 * n + 3.0 * np.sqrt(2.0 * n))
+    return _chi2(block, *acting, where=where) / (1.1 * n + 3.0 * np.sqrt(2.0 * n))
+
+
+def _chi2(block: Block, *acting: Effect, where: np.ndarray | slice = slice(None)) -> float:
+    """chi2 of the numbers that `where` selects."""
+    model = block.predict(acting)
+    covariance = block.covariance + sum(np.outer(s, s) for s in model.jacobian.values())
+    return chi2((block.value - model.mean)[where], covariance[where][:, where])
 
 
 @pytest.mark.parametrize(("cfa", "f_number"), [("MONO", 2.0), ("RGGB", 2.0), ("MONO", 8.0)])
 def test_a_models_numbers_are_its_transfer_function(cfa: str, f_number: float) -> None:
     """The estimator's rows applied to a model's profile give its transfer function at the measured frequencies, also of
     sharp lenses, whose detail lies far beyond the pixels' Nyquist frequency. A cubic between 11 frequencies is good to
-    3e-3; the highest three depend on what lies beyond."""
+    3e-3; the highest three depend on what lies beyond. Recording and prediction have the contrast of the recorded
+    profile in common, which is known to the standard uncertainty of the lowest frequency's MTF: three of these."""
     study = _recorded(cfa=cfa, f_number=f_number, pitch=4.5)
     camera, block = study.camera, edge_block(study)
-    labels = [label for label in block.labels if label.condition == "5 deg" and label.channel == camera.channels[0]]
+    channel = camera.channels[0]
+    labels = [label for label in block.labels if label.condition == "5 deg" and label.channel == channel]
     rows = [block.labels.index(label) for label in labels][: len(REAL_AT)]
     f, turn = np.array([block.labels[i].x for i in rows]), np.deg2rad(5.0)
     light = study.recordings.spectrum(str(study.recordings.captures("slanted_edge")[0].light_radiance))
+    edge = next(e for e in _edges(study) if e.channel == channel and e.part[0].id in labels[0].captures)
+    contrast_std = read_mtf(edge.summary, f[:1]).mtf_std[0]
     blurs: tuple[tuple[Effect, ...], ...] = (
         (), (effect("defocus")(defocus_um=0.8 * f_number**2),), (effect("pixel_aperture")(side_change_um=0.3),),
     )  # fmt: skip
     for acting in blurs:
-        wanted = np.real(
-            optical_transfer(camera, camera.channels[0], light, f * np.cos(turn), f * np.sin(turn), acting)
-        )
-        np.testing.assert_allclose(block.predict(acting).mean[rows[:-3]], wanted[:-3], atol=3e-3)
-
-
-def test_a_direct_sum_over_the_samples_agrees() -> None:
-    """The estimators' rows on a grid of distances against normal equations with every sample at its own distance:
-    within 1e-5 of the contrast."""
-    study = _recorded(cfa="MONO", f_number=2.0)
-    edges = _edges(study)
-    geometry = edges.edges[0].measured.geometry
-    reach = geometry.reach_px + 1.0
-    light = study.recordings.spectrum(str(edges.edges[0].part[0].light_radiance))
-    on_grid = edge_profile(study.camera, "Y", light, 5.0, profile_interpolation(reach)[1])
-    exact = edge_profile(study.camera, "Y", light, 5.0, geometry.distance_px)
-    weighted = exact * geometry.weight
-    right = np.concatenate([geometry.basis.T @ weighted, geometry.gradients @ weighted])
-    np.testing.assert_allclose(spread_operator(geometry, reach) @ on_grid, right, atol=1e-5 * np.abs(right).max())
+        wanted = np.real(optical_transfer(camera, channel, light, f * np.cos(turn), f * np.sin(turn), acting))
+        np.testing.assert_allclose(block.predict(acting).mean[rows[:-3]], wanted[:-3], atol=3e-3 + 3.0 * contrast_std)
 
 
 def test_noise_is_what_the_covariance_says() -> None:
@@ -133,14 +118,19 @@ def test_a_blur_that_is_alike_on_both_sides_has_no_asymmetry() -> None:
 
 def test_crosstalk_between_colours_changes_their_edges() -> None:
     """In light of 460 and 640 nm much of a pixel's charge comes from neighbours of another colour: the transfer of the
-    whole mosaic explains it, that of one channel doesn't."""
-    block = edge_block(
-        _recorded(
-            concealed.CrosstalkLaw(4.0, 0), cfa="RGGB", f_number=4.0, rows=96, plan=Plan(EDGES.kinds, lights=True)
+    whole mosaic explains it, that of one channel doesn't. Of two cameras together, as the two greens, whose profiles
+    differ then, are taken as one."""
+    lit = Plan(EDGES.kinds, lights=True)
+    of_one, of_all, count = 0.0, 0.0, 0
+    for seed in (7, 31):
+        block = edge_block(
+            _recorded(concealed.CrosstalkLaw(4.0, 0), seed=seed, cfa="RGGB", f_number=4.0, rows=96, plan=lit)
         )
-    )
-    assert _misfit(block) > 1.0
-    assert _misfit(block, effect("crosstalk")(share_percent=4.0)) < 1.0
+        of_one, of_all = of_one + _chi2(block), of_all + _chi2(block, effect("crosstalk")(share_percent=4.0))
+        count += len(block.value)
+    limit = 1.1 * count + 3.0 * np.sqrt(2.0 * count)
+    assert of_one > 1.2 * limit
+    assert of_all < limit
 
 
 class _EvenStray(Effect):
@@ -178,7 +168,7 @@ def test_shading_is_no_blur() -> None:
 
 def test_directions_point_to_the_light() -> None:
     study = _recorded(cfa="MONO", f_number=4.0)
-    found = sorted({round(e.direction_deg) for e in _edges(study).edges})
+    found = sorted({round(e.direction_deg) for e in _edges(study)})
     assert found == [-40, 3, 5, 95]
 
 

@@ -15,7 +15,7 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.dataset import Study, held_out_flats
-from lab.observables.edges.transfer import edge_block
+from lab.observables.edges.slanted_edge import edge_block
 from lab.observables.flats.linearity import linearity_block
 from lab.observables.flats.noise import variance_block
 from lab.observables.noise.neighbours import correlations, neighbour_block, tone_block

@@ -24,7 +24,7 @@ from lab.formats.recording_set import RecordingSet
 from lab.observables.boards.corners import colour_block
 from lab.observables.charts.patches import Surroundings, harmonics
 from lab.observables.dataset import Study
-from lab.observables.edges.transfer import edge_block
+from lab.observables.edges.slanted_edge import edge_block
 from lab.observables.observable import Block, measurements
 from lab.observables.screens import pattern_fit
 from lab.observables.screens.cells import grid_block, screen_block

@@ -1,0 +1,146 @@
+"""The slanted edges of one side: their regions, seen and held-out repeats, and the share of their noise that repeats
+have in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lab.capture_kinds.slanted_edge import EdgeCapture
+from lab.capture_kinds.stopped_edge import StoppedEdgeCapture
+from lab.errors import NotDetermined
+from lab.observables.dataset import Study, held_out_of
+from lab.observables.edges.finding import Region
+from lab.observables.edges.measured import edges_of, measure_edge
+from lab.observables.edges.profile import EdgeSummary
+from lab.observables.edges.region import check_phases
+
+LEAST_REACH_PX = 8.0  # of the samples from the edge: with less, levels and blur aren't told apart without bias
+#: Of an edge: their residuals tell the noise. As 1 / variance of half of n values is too large by 4 / n, so is chi2.
+LEAST_SAMPLES = 240
+LEAST_PAIRS = 64  # pixels on the light side whose two repeats tell the temporal noise
+MOST_FIXED = 0.95  # of the variance of the noise
+
+
+@dataclass(frozen=True)
+class SideEdge:
+    """One edge in one channel, summarised of the mean of its seen or of its held-out repeats."""
+
+    part: tuple[EdgeCapture, ...]  # the repeats
+    channel: str
+    summary: EdgeSummary
+    held_out: bool
+    region: Region
+    fixed_share: float  # share of the noise's variance that repeats have in common (PRNU)
+
+    @property
+    def direction_deg(self) -> float:
+        """Return the direction of the normal towards the light side, from x (columns) to y (rows)."""
+        curve = self.summary.curve
+        x, y = (-curve.tilt, 1.0) if curve.transposed else (1.0, -curve.tilt)
+        angle = float(np.rad2deg(np.arctan2(curve.sign * y, curve.sign * x)))
+        return angle + 360.0 if angle <= -90.0 else angle
+
+    @property
+    def orientation(self) -> str:
+        """The edge's nominal angle, or the measured one where none is stated, in words."""
+        nominal = self.part[0].angle_deg
+        return f"{self.summary.angle_deg if nominal is None else nominal:.3g} deg"
+
+    @property
+    def setting(self) -> tuple[Region, float, str]:
+        """Equal for edges on the same pixels in the same direction."""
+        return self.region, round(self.direction_deg), self.channel
+
+
+def edges_of_side(study: Study, kind: type[EdgeCapture], step: str) -> list[SideEdge]:
+    """Return all edges of the captures of a kind, by region and channel. Edges are searched for where no region is
+    stated.
+
+    Raises NotDetermined of `step` where f-number or pixel pitch isn't stated, without captures of the kind, and where
+    no edge is measured.
+    """
+    if not study.diffraction_is_known:
+        raise NotDetermined(step, "f-number or pixel pitch isn't stated: no diffraction to hold the edges against")
+    groups = study.groups(
+        kind,
+        lambda c: (f_number_of(c), c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm),
+    )
+    if not groups:
+        raise NotDetermined(step, f"no {step} captures")
+    edges: list[SideEdge] = []
+    reasons = []
+    for i, group in enumerate(groups):
+        out = held_out_of(group, i, len(groups))
+        try:
+            regions = [group[0].region] if group[0].region else [f.region for f in edges_of(study.recordings, group[0])]
+        except NotDetermined as refused:
+            reasons.append(refused.reason)
+            continue
+        for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
+            for channel in study.channels if part else ():
+                for region in regions:
+                    try:
+                        summary = measure_edge(study.recordings, part, channel, study.fitted, region)
+                        check_phases(step, study.stated.cfa, channel, region, summary.angle_deg)
+                        _refuse_narrow(step, part[0], channel, summary)
+                    except NotDetermined as refused:
+                        reasons.append(refused.reason)
+                        continue
+                    share = _fixed_share(study, group, len(part), channel, region, summary)
+                    edges.append(SideEdge(tuple(part), channel, summary, part[0].id in out, region, share))
+    if not edges:
+        raise NotDetermined(step, reasons[0])
+    return edges
+
+
+def _refuse_narrow(step: str, capture: EdgeCapture, channel: str, summary: EdgeSummary) -> None:
+    """Raise `NotDetermined` where the samples beside an edge are too few to tell its levels from its blur."""
+    if summary.reach_px < LEAST_REACH_PX:
+        raise NotDetermined(
+            step,
+            f"{capture.id}: the samples of {channel} reach {summary.reach_px:.1f} px from the edge, "
+            f"{LEAST_REACH_PX:g} px are needed: widen the region",
+        )
+    if summary.samples < LEAST_SAMPLES:
+        raise NotDetermined(
+            step,
+            f"{capture.id}: the region holds {summary.samples} samples of {channel}, {LEAST_SAMPLES} are needed to "
+            "tell their noise: widen the region",
+        )
+
+
+def f_number_of(capture: EdgeCapture) -> float | None:
+    """Return the f-number of a capture; None: the data sheet's."""
+    return capture.f_number if isinstance(capture, StoppedEdgeCapture) else None
+
+
+def _fixed_share(
+    study: Study, group: Sequence[EdgeCapture], frames: int, channel: str, region: Region, summary: EdgeSummary
+) -> float:
+    """Share of the noise variance of a mean of `frames` frames that is fixed (PRNU): 1 - temporal variance / total
+    variance.
+
+    The temporal variance is taken from the difference of two repeats on the light side, else from shot and read noise.
+    0 where neither is known.
+    """
+    if len(group) > 1:
+        row0, col0, row1, col1 = region
+        mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))[row0:row1, col0:col1]
+        first, second = (
+            np.asarray(study.recordings.frame(c)[row0:row1, col0:col1], float)[mask] for c in (group[0], group[1])
+        )
+        light = 0.5 * (first + second) > 0.5 * sum(summary.levels) + 0.35 * summary.contrast
+        apart = (first - second)[light]
+        if apart.size < LEAST_PAIRS:
+            return 0.0
+        temporal = 0.5 * float(np.var(apart))
+    elif study.stated.conversion_gain_dn_per_e is not None:
+        temporal = study.noise.gain * (summary.levels[1] - study.noise.black) + study.noise.read_dn**2
+    else:
+        return 0.0
+    total = max(summary.noise_std[1] ** 2, 1e-300)
+    return float(np.clip(1.0 - temporal / frames / total, 0.0, MOST_FIXED))
