@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Container, Mapping
+from collections.abc import Callable, Container, Hashable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args, overload
+from typing import Any, TypeVar, cast, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.base import Capture, in_folder
-from lab.errors import InputError
+from lab.errors import InputError, NotDetermined
 from lab.formats.recording_set.files import Frame, JoinedFiles, MemoryFiles, OverlaidFiles, RecordingFiles, Target
 from lab.formats.recording_set.manifest import DataSheet, Manifest
 from sim.camera import Side
 from sim.spectrum import Spectrum
 
 C = TypeVar("C", bound=Capture)
+T = TypeVar("T")
 
 
 class RecordingSet:
@@ -48,10 +49,11 @@ class RecordingSet:
         self._files: RecordingFiles = files or MemoryFiles(frames or {}, spectra or {}, targets or {})
         self._cache: OrderedDict[str, Frame] = OrderedDict()
         self._held = 0
+        self._summaries: dict[Hashable, Any] = {}
         self._lock = threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_cache": OrderedDict(), "_held": 0, "_lock": None}
+        return self.__dict__ | {"_cache": OrderedDict(), "_held": 0, "_summaries": self.summaries, "_lock": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ |= state | {"_lock": threading.Lock()}
@@ -117,14 +119,18 @@ class RecordingSet:
         files: RecordingFiles | None = None,
         cache_bytes: int | None = None,
     ) -> RecordingSet:
-        """Return a set with an empty cache of frames; what isn't given is this set's."""
-        return RecordingSet(
+        """Return a set with an empty cache of frames; what isn't given is this set's. Summaries hold for the same
+        frames under the same manifest."""
+        copy = RecordingSet(
             self.manifest if manifest is None else manifest,
             source=self.source,
             warnings=self.warnings if warnings is None else warnings,
             files=self._files if files is None else files,
             cache_bytes=self.cache_bytes if cache_bytes is None else cache_bytes,
         )
+        if manifest is None and files is None:
+            copy.keep(self.summaries)
+        return copy
 
     def capture(self, id: str) -> Capture:
         """Return the capture called `id`; InputError where there is none."""
@@ -155,6 +161,35 @@ class RecordingSet:
                 while self._held > self.cache_bytes:
                     self._held -= self._cache.popitem(last=False)[1].nbytes
         return frame
+
+    def once(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return the summary of frames called `key`, made by `make` when it is first asked for. Where that raised
+        NotDetermined, it is raised again.
+
+        A summary is small beside its frames: it outlives them (`let_go`), and goes with the set to other processes.
+        """
+        if key not in self._summaries:
+            try:
+                made: Any = make()
+            except NotDetermined as refused:
+                made = refused
+            with self._lock:
+                self._summaries.setdefault(key, made)
+        found = self._summaries[key]
+        if isinstance(found, NotDetermined):
+            raise NotDetermined(found.step, found.reason)
+        return cast(T, found)
+
+    @property
+    def summaries(self) -> dict[Hashable, Any]:
+        """The summaries that were made so far, by key, without those that couldn't be made."""
+        with self._lock:
+            return {key: one for key, one in self._summaries.items() if not isinstance(one, NotDetermined)}
+
+    def keep(self, summaries: Mapping[Hashable, Any]) -> None:
+        """Keep summaries that another process made of this set."""
+        with self._lock:
+            self._summaries |= summaries
 
     def let_go(self) -> None:
         """Free the cached frames."""
