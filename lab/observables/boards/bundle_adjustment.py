@@ -433,9 +433,7 @@ class BundleAdjustment:
         """Collect the residuals and Jacobians of each pose at the end of a solve."""
         self._set_distortion_prior(solution.state)
         shared, by_pose = self.jacobian(solution.state)
-        squares = np.concatenate(
-            [one.view.board_mm[:, :2] / one.view.capture.square_mm for one in self.observations]
-        ).astype(float)
+        squares = np.concatenate([one.view.squares for one in self.observations])
         residuals = np.concatenate(solution.residuals)
         # where the corners are predicted: measured places would bring the noise of the residuals into what they are
         # compared with

@@ -108,17 +108,21 @@ class CorrelatedErrors:
     between_cameras: float
     likelihood_ratio: float
 
-    def covariance(self, pose: PoseErrors) -> Array:
-        """Return the covariance V (n, n), px^2, of one coordinate of the corners of a pose."""
-        shared = correlation(pose, self.length_squares, self.between_cameras)
+    def covariance(self, squares: Array, camera: NDArray[np.int64]) -> Array:
+        """Return the covariance V (n, n), px^2, of one coordinate of the corners of a pose: `squares` (n, 2), `camera`
+        (n,), see `PoseErrors`.
+        """
+        shared = correlation(squares, camera, self.length_squares, self.between_cameras)
         return np.asarray(self.amplitude_px**2 * shared + self.noise_px**2 * np.eye(len(shared)))
 
 
-def correlation(pose: PoseErrors, length_squares: tuple[float, float], between_cameras: float) -> Array:
+def correlation(
+    squares: Array, camera: NDArray[np.int64], length_squares: tuple[float, float], between_cameras: float
+) -> Array:
     """Return the correlations C K (n, n) of the corners of a pose."""
-    at = pose.squares / np.array(length_squares)
+    at = squares / np.array(length_squares)
     square = np.sum((at[:, None, :] - at[None, :, :]) ** 2, axis=2)
-    same = pose.camera[:, None] == pose.camera[None, :]
+    same = camera[:, None] == camera[None, :]
     return np.asarray(np.exp(-0.5 * square) * np.where(same, 1.0, between_cameras))
 
 
@@ -185,7 +189,7 @@ def fit_lens_error(
         if errors is None:
             middle += noise_px**2 * (free.T @ free)
         else:
-            v = errors.covariance(pose)
+            v = errors.covariance(pose.squares, pose.camera)
             middle += free.T @ (v @ free.reshape(len(v), -1)).reshape(free.shape)
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     absorbed = np.linalg.solve(normal / np.outer(scale, scale), mixed / scale[:, None]) / scale[:, None]  # A^-1 J^T F
@@ -233,7 +237,7 @@ def sandwich_covariance(poses: Sequence[PoseErrors], errors: CorrelatedErrors, p
     free, model = [], []
     for pose in poses:
         free.append(_free_of_pose(pose, pose.shared))
-        model.append(errors.covariance(pose))
+        model.append(errors.covariance(pose.squares, pose.camera))
     scale = np.sqrt(np.maximum(sum(np.sum(one**2, axis=0) for one in free) + prior, 1e-300))
     free = [one / scale for one in free]
     normals = np.array([one.T @ one for one in free])

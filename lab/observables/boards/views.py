@@ -35,6 +35,11 @@ class BoardView:
     std_px: Array | None = None
     bent: bool = False
 
+    @property
+    def squares(self) -> Array:
+        """Places (n, 2) of the corners on the board, in squares."""
+        return np.asarray(self.board_mm[:, :2] / self.capture.square_mm, float)
+
     def only(self, kept: NDArray[np.bool_]) -> BoardView:
         """Return the view with the corners for which `kept` (n,) is true."""
         std = None if self.std_px is None else self.std_px[kept]
