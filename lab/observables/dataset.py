@@ -21,7 +21,7 @@ from lab.observables.acquisition_errors import CopiedFrames, copied_frames
 from lab.observables.codes.step import CodeStep, find_code_step
 from lab.observables.flats.stated_light import lamps_of, most_frequent_gain_db
 from lab.observables.noise.figures import NoiseFigures, noise_figures
-from lab.observables.plane_means import plane_means
+from lab.observables.plane_means import HIGHEST_SHARE, capture_means, channel_means
 from lab.observables.reads import LAG, acting
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effects
@@ -32,7 +32,7 @@ from sim.uniform import FieldPoints, Uniform
 T = TypeVar("T")
 C = TypeVar("C", bound=Capture)
 TAIL_STD = 0.1  # relative standard deviation of the light that the baseline's point spread function sends far
-CLIPPED_SHARE = 2e-4  # of a plane's pixels: with fewer clipped ones its mean is used
+CLIPPED_SHARE = HIGHEST_SHARE  # of a plane's pixels: with fewer clipped ones its mean is used
 WARMTH_STD = 0.1  # prior relative change of the dark current per degree C: it doubles within 5 to 10 degrees
 
 
@@ -126,14 +126,16 @@ class Study:
         return mask
 
     def levels(self, capture: Capture) -> Levels:
-        """Return the means of a capture by channel, computed once. A channel clips where `CLIPPED_SHARE` of its
-        pixels do."""
+        """Return the means of a capture by channel, computed once. A channel clips where `CLIPPED_SHARE` of the pixels
+        of one of its planes do."""
         if capture.id not in self._levels:
-            found = plane_means(self.recordings.frame(capture), self.camera.cfa, self.saturation_dn)
+            found = channel_means(capture_means(self.recordings, capture).whole, self.camera.cfa)
+            whole = {c: one.mean_dn for c, one in found.items()}
+            clips = {c: one.clipped_share(self.saturation_dn) >= CLIPPED_SHARE for c, one in found.items()}
             self._levels[capture.id] = Levels(
-                {c: one.mean_dn if one.clipped_share < CLIPPED_SHARE else None for c, one in found.items()},
+                {c: None if clips[c] else mean for c, mean in whole.items()},
                 {c: one.pixels for c, one in found.items()},
-                {c: one.mean_dn for c, one in found.items()},
+                whole,
             )
         return self._levels[capture.id]
 

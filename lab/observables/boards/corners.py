@@ -19,10 +19,11 @@ from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
 from lab.observables.boards.corner_fits import CornerFits
-from lab.observables.boards.detection import CELL, find_board, levelled, luminance
+from lab.observables.boards.detection import find_board, levelled, luminance
 from lab.observables.boards.dots import dot_centres
 from lab.observables.boards.refinement import bend_px, refine_corners
 from lab.observables.boards.views import BoardView
+from lab.observables.plane_means import CELL
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import phases
 

@@ -28,10 +28,9 @@ from lab.errors import NotDetermined
 from lab.observables.boards.dots import dot_centres, dot_grid
 from lab.observables.boards.refinement import refine_corners
 from lab.observables.boards.views import MIN_CORNERS, BoardView, board_points, grid_steps
+from lab.observables.plane_means import CELL
 
 Array = NDArray[np.floating[Any]]
-#: First pixels (row, column) of the planes of the 2 x 2 cell of a mosaic.
-CELL = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 
 def luminance(frame: NDArray[np.generic]) -> Array:

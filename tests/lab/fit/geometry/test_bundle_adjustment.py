@@ -15,12 +15,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lab.fit.geometry import geometry_result
-from lab.fit.stereo import StereoPair, rig_observations, solve_rig
+from lab.fit.stereo import rig_observations, solve_rig
 from lab.formats.importers import read_checkerboard_pairs
 from lab.observables.boards.bundle_adjustment import BundleAdjustment, Observation, RigParameters, Solution
 from lab.observables.boards.calibration import MODELS, calibrate, calibrate_robustly, free_intrinsics, with_model_error
 from lab.observables.boards.corners import board_corners
 from lab.observables.boards.first_state import first_camera, first_state
+from lab.observables.boards.pairs import StereoPair
 from lab.observables.boards.projection import CameraGeometry
 from sim.scene.projection import PINHOLE
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
