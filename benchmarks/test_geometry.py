@@ -93,13 +93,12 @@ def test_calibration_of_known_cameras(board: str, warp_mm: tuple[float, float, f
 def test_corners_of_drawn_boards() -> None:
     """Corners found in mosaics of a Bayer camera, against their places."""
     recordings = drawn.make_boards(sides=("left",))
-    cfa = recordings.camera("left").cfa
     off: dict[str, list[np.ndarray]] = {"ours": [], "theirs": []}
     seconds = {"ours": 0.0, "theirs": 0.0}
     for capture, (turn, middle) in zip(recordings.captures(CharucoCapture, "left"), drawn.POSES, strict=False):
         rotation = cv2.Rodrigues(np.array(turn, dtype=float))[0]
         shift = np.array(middle, dtype=float) - rotation @ (np.array([8, 6, 0.0]) * 12.0)
-        picture = luminance(recordings.frame(capture), cfa)
+        picture = luminance(recordings.frame(capture))
         view, spent = timed(lambda p=picture, c=capture: find_board(p, c))
         seconds["ours"] += spent
         grey = np.clip(255 * picture, 0, 255).astype(np.uint8)

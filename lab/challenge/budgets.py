@@ -17,7 +17,7 @@ from lab.diagnose.outcome.model_posterior import coordinate_name, with_unnamed
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import ModelPosterior
 from lab.observables.flats.noise import GAIN_STD, READ_STD
-from lab.observables.spectra.narrowband import freed_curve
+from lab.observables.spectra.curves import freed_curve
 from lab.twin.budget import USES, LinearUse, linear_use, with_darks
 from lab.twin.predict import posterior_of
 from mocks.former import WAVELENGTH_NM, ConcealedCamera, Law

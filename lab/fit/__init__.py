@@ -5,15 +5,15 @@ them.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import RecordingSet, Summaries
 from lab.formats.results import CameraFit, FitResult, GeometryFit, Skipped, StereoFit
 from lab.formats.results.plausible import implausible_figures
 from lab.one_blas_thread import one_blas_thread
@@ -34,10 +34,12 @@ WORTH_PROCESSES_PX = 2e7
 
 @dataclass(frozen=True)
 class SideFit:
-    """The fits of one side, and the steps that its recordings don't determine."""
+    """The fits of one side, the steps that its recordings don't determine, and the summaries that were made of its
+    frames (`RecordingSet.once`)."""
 
     camera: CameraFit
     skipped: tuple[Skipped, ...]
+    summaries: Summaries
 
 
 @one_blas_thread
@@ -67,6 +69,8 @@ def fit_recording_set(
     if len(sides) > 1 and _pixels(recordings) > WORTH_PROCESSES_PX:
         tasks = {side: partial(fit_side, recordings.for_one_of(len(sides)), side, steps) for side in sides}
         fitted = in_processes(recordings, tasks, told, "fit")
+        for one in fitted.values():  # the pair is fitted, and a diagnosis rests, on the same
+            recordings.keep(one.summaries)
     else:
         fitted = {side: fit_side(recordings, side, steps, partial(told, side)) for side in sides}
     cameras = {side: one.camera for side, one in fitted.items()}
@@ -138,7 +142,8 @@ def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told
         skipped.extend(Skipped(step="mtf", reason=reason, side=side) for reason in edges_left_out)
     # independent of the order of the threads; a fit may name a part of its step
     order: dict[str, int] = {name: number for number, name in enumerate(STEPS)}
-    return SideFit(camera, tuple(sorted(skipped, key=lambda item: order.get(item.step, len(order)))))
+    ordered = tuple(sorted(skipped, key=lambda item: order.get(item.step, len(order))))
+    return SideFit(camera, ordered, recordings.summaries)
 
 
 def _step(work: Callable[[], T], side: Side | None) -> tuple[T | None, tuple[Skipped, ...]]:

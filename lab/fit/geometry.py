@@ -1,13 +1,13 @@
 """Intrinsics of a camera from views of a board, with their uncertainty: the step on a recording set, and its result.
 
-- `lab.observables.boards.detection`: corners of a ChArUco board or a checkerboard in the raw mosaic, to hundredths of a
-  pixel;
+- `lab.observables.boards.corners`: corners of ChArUco boards or checkerboards in the raw frames, to hundredths of a
+  pixel, found once for fits and diagnosis;
 - `sim.scene.projection`: OpenCV's pinhole and fisheye and a splined stereographic projection, with their Jacobians;
 - `lab.observables.boards.projection`: the uncertainty of the projection over the frame, and the difference of two
   calibrations;
 - `lab.observables.boards.bundle_adjustment`: one least-squares solve for intrinsics, poses and the warp of the boards,
   whose Jacobian and residuals give the full covariance. Errors that neighbouring corners share are an error of the
-  model, and part of it;
+  model, and part of it (`correlated_errors`);
 - `lab.observables.boards.calibration`: outlying corners and views are left out, with the reason. Projection and
   distortion are chosen by views that their fits haven't used: a richer model is refused where it predicts them worse.
   Two halves of the views are calibrated separately; what they differ by beyond their uncertainties widens the
@@ -25,8 +25,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.capture_kinds.charuco import CharucoCapture
-from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
     BoardWarp,
@@ -45,14 +43,15 @@ from lab.observables.boards.calibration import (
     MIN_VIEWS,
     OUTLYING_CORNER_STD,
     Calibration,
-    calibrate_robustly,
+    calibration_of,
     cross_validation,
     first_view_of_boards,
-    list_reasons,
     widen_covariance,
 )
-from lab.observables.boards.detection import MIN_CORNERS, BoardView, CornerFits, channel_corners, find_boards
+from lab.observables.boards.corner_fits import CornerFits
+from lab.observables.boards.corners import board_corners, channel_corners, plane_corners
 from lab.observables.boards.projection import CameraGeometry, grid, grid_points
+from lab.observables.boards.views import MIN_CORNERS, BoardView
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 from sim.scene.projection import COUNT
@@ -164,26 +163,24 @@ def _fit_shift(shift: Array, jacobian: Array, trusted: NDArray[np.bool_]) -> tup
 @one_blas_thread
 def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
     """Fit the camera matrix and distortion of `side` to its `charuco` captures (plain checkerboards: see
-    `board_detection`).
-
-    Raises `NotDetermined` below 3 good views, where the board isn't what the captures say, or where all views are
-    parallel to each other: without perspective, focal length and distance can't be separated.
+    `lab.observables.boards.detection`). Raises `NotDetermined` as `calibration_of` does.
     """
-    if not recordings.captures(CharucoCapture, side):
-        raise NotDetermined("geometry", "no charuco captures")
-    views, missed = find_boards(recordings, side)
-    camera = recordings.camera(side)
-    shape = (camera.rows, camera.cols)
-    if len(views) < MIN_VIEWS:
-        raise NotDetermined(
-            "geometry", f"{len(views)} views of the board can be used, {MIN_VIEWS} are needed{list_reasons(missed)}"
-        )
-    calibration = calibrate_robustly(views, shape, side)
+    calibration, boards, cfa = (
+        calibration_of(recordings, side),
+        board_corners(recordings, side),
+        recordings.camera(side).cfa,
+    )
     channels: tuple[ChannelGeometry, ...] = ()
-    if camera.cfa != "MONO":
-        frames = (channel_corners(recordings.frame(view.capture), camera.cfa, view) for view in calibration.views)
-        channels = channel_geometry(calibration, list(frames))
-    return geometry_result(calibration, missed, channels)
+    if cfa != "MONO":
+        found = boards.by_capture()
+        corners = []
+        for view in calibration.views:
+            whole = found[view.capture.id]
+            fits = channel_corners(plane_corners(recordings, whole), cfa)
+            kept = np.isin(whole.index, view.index)
+            corners.append({channel: one.only(kept) for channel, one in fits.items()})
+        channels = channel_geometry(calibration, corners)
+    return geometry_result(calibration, boards.missed, channels)
 
 
 def geometry_result(

@@ -6,15 +6,12 @@ both cameras, the warp of the boards and the pose of the board in every capture
 (`lab.observables.boards.bundle_adjustment`). A solve for the rig alone, with the intrinsics held at the values of the
 single cameras, would transfer their errors to the rig and leave them out of its uncertainty.
 
-The joint covariance gives the uncertainty of a depth. A point P in the frame of the left camera is seen at q(theta,
-P), (4,) px in both frames. With A = dq/dP and B = dq/dtheta, the triangulated point moves by dP = -(A^T A)^-1 A^T (B
-dtheta - dq).
+The joint covariance gives the uncertainty of a depth (`lab.fit.depth`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -22,24 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
+from lab.fit.depth import depth_uncertainty
 from lab.fit.geometry import corner_errors
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
+from lab.formats.results import GeometryFit, Rectification, Skipped, StereoFit
 from lab.observables.boards.bundle_adjustment import (
     RIG,
     BundleAdjustment,
     Observation,
     RigParameters,
     Solution,
-    board_key,
-    board_pose,
     rms_px,
 )
 from lab.observables.boards.calibration import list_reasons
-from lab.observables.boards.detection import BoardView, board_points
-from lab.observables.boards.projection import CameraGeometry, cross_matrices, grid, grid_points
+from lab.observables.boards.corners import board_corners
+from lab.observables.boards.first_state import board_pose
+from lab.observables.boards.pairs import StereoPair, pair_views, rig_poses
+from lab.observables.boards.projection import CameraGeometry
+from lab.observables.boards.views import BoardView, board_key
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 from sim.scene.projection import Projection
@@ -53,14 +51,6 @@ REVERSED_DEG = 10.0  # turn beside the other pairs, below which the renumbered v
 SIDES_SIGMA = 2.6  # significance of 1 %, above which the right camera stands on the left
 NO_RIG = 5.0  # times the single cameras' rms (and at least 1 px), above which no rig explains the pairs
 DEPTHS_MM = (500.0, 1000.0, 2000.0)
-
-
-@dataclass(frozen=True)
-class StereoPair:
-    """One pose as both cameras saw it."""
-
-    left: BoardView
-    right: BoardView
 
 
 @one_blas_thread
@@ -78,7 +68,8 @@ def fit_stereo(
     mapped. Raises `NotDetermined` below 2 pairs, or where no rig explains them.
     """
     shapes = tuple((recordings.camera(side).rows, recordings.camera(side).cols) for side in ("left", "right"))
-    return fit_pairs(pair_views(recordings, left, right), left, right, shapes, depths_mm)
+    pairs = pair_views(fitted_views(recordings, "left", left), fitted_views(recordings, "right", right))
+    return fit_pairs(pairs, left, right, shapes, depths_mm)
 
 
 def fit_pairs(
@@ -109,7 +100,7 @@ def fit_pairs(
         if len(pairs) == MIN_PAIRS or of_pairs[worst] <= limit:
             break
         reason = f"rms {of_pairs[worst]:.2f} px, where the other pairs have {np.median(of_pairs):.2f} px"
-        rejected.append(Skipped(step=f"pose {pairs[worst].left.capture.pose}", reason=reason))
+        rejected.append(Skipped(step=f"pose {pairs[worst].pose}", reason=reason))
         pairs = [pair for k, pair in enumerate(pairs) if k != worst]
     solution = BundleAdjustment(rig_observations(pairs), solution.free, shapes[0]).with_correlated_errors(solution)
     if not _explains(solution, alone) or not solution.determined:
@@ -117,7 +108,7 @@ def fit_pairs(
         raise NotDetermined(
             "stereo",
             f"no rig explains the pairs (rms {solution.rms_px:.1f} px, each camera alone {alone:.2f} px; worst: pose "
-            f"{pairs[worst].left.capture.pose}, {of_pairs[worst]:.1f} px{list_reasons(rejected)}): check that equal "
+            f"{pairs[worst].pose}, {of_pairs[worst]:.1f} px{list_reasons(rejected)}): check that equal "
             "poses are the same pose of the board, that the rig was rigid, and that neither camera's frames are "
             f"mirrored{late}",
         )
@@ -149,27 +140,17 @@ def _shifted_pose(
     return ""
 
 
-def pair_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> list[StereoPair]:
-    """Pair the views of both cameras with the same `pose`, in the order of the left camera; the first of each where a
-    pose was repeated.
-    """
-    of_left, of_right = _views_by_pose(recordings, "left", left), _views_by_pose(recordings, "right", right)
-    return [StereoPair(view, of_right[pose]) for pose, view in of_left.items() if pose in of_right]
-
-
-def _views_by_pose(recordings: RecordingSet, side: Side, fit: GeometryFit) -> dict[str, BoardView]:
-    """Return the views that the fit of a camera rests on, by pose, without the corners that it left out."""
-    captures = {capture.id: capture for capture in recordings.captures(CharucoCapture, side)}
-    found: dict[str, BoardView] = {}
-    for view in fit.residuals:
-        capture = captures.get(view.capture)
-        if capture is None:
+def fitted_views(recordings: RecordingSet, side: Side, fit: GeometryFit) -> list[BoardView]:
+    """Return the views that the fit of a camera rests on, without the corners that it left out."""
+    views = board_corners(recordings, side).by_capture()
+    found = []
+    for one in fit.residuals:
+        view = views.get(one.capture)
+        if view is None:
             raise NotDetermined(
-                "stereo", f"the {side} geometry rests on '{view.capture}', which isn't here: fit it again"
+                "stereo", f"the {side} geometry rests on '{one.capture}', which isn't here: fit it again"
             )
-        seen = np.column_stack([view.x_px, view.y_px])
-        index = np.array(view.corner, dtype=np.int64)
-        found.setdefault(capture.pose, BoardView(capture, index, board_points(capture, index), seen))
+        found.append(view.only(np.isin(view.index, one.corner)))
     return found
 
 
@@ -212,7 +193,7 @@ def _split_by_numbering(
             f"other pairs, and by {off_reversed:.1f} deg with one view renumbered; use a board with markers, or an "
             "odd number of rows plus columns"
         )
-        rejected.append(Skipped(step=f"pose {pair.left.capture.pose}", reason=reason))
+        rejected.append(Skipped(step=f"pose {pair.pose}", reason=reason))
     return kept, rejected
 
 
@@ -235,23 +216,16 @@ def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit
     """
     cameras = CameraGeometry.of_fit(left), CameraGeometry.of_fit(right)
     observations = rig_observations(pairs)
-    poses, turns, translations = [], [], []
-    for pair in pairs:
-        (rotation_one, translation_one), (rotation_two, translation_two) = (
-            board_pose(view, camera) for view, camera in zip((pair.left, pair.right), cameras, strict=True)
-        )
-        rotation = rotation_two @ rotation_one.T
-        poses.append((rotation_one, translation_one))
-        turns.append(Rotation.from_matrix(rotation).as_rotvec())
-        translations.append(translation_two - rotation @ translation_one)
+    poses = rig_poses(pairs, *cameras)
+    rotation, translation_mm = poses.median
     start = RigParameters(
         projections=tuple(camera.projection for camera in cameras),
         intrinsics=np.array([camera.intrinsics for camera in cameras]),
-        rotation=Rotation.from_rotvec(np.median(turns, axis=0)).as_matrix(),
-        translation_mm=np.median(translations, axis=0),
+        rotation=rotation,
+        translation_mm=translation_mm,
         warps_mm=np.zeros((1 + max(one.board for one in observations), 3)),
-        rotations=np.array([turn for turn, _ in poses]),
-        translations_mm=np.array([shift for _, shift in poses]),
+        rotations=poses.rotations,
+        translations_mm=poses.translations_mm,
     )
     return BundleAdjustment(observations, np.array([free_of(left), free_of(right)]), shape).solve(start)
 
@@ -316,75 +290,6 @@ def _side_remarks(state: RigParameters, x_std_mm: float) -> list[str]:
     return [exchanged]
 
 
-# --- depth -----------------------------------------------------------------------------------------------------------
-
-
-def triangulation_jacobian(solution: Solution, points: Array) -> tuple[Array, Array]:
-    """Return the Jacobian of where both cameras see `points` (n, 3), left then right: by the point (n, 4, 3), and by
-    the shared parameters (n, 4, parameters).
-    """
-    state, free = solution.state, solution.free
-    shared = np.zeros((len(points), 4, len(solution.names)))
-    by_point = np.empty((len(points), 4, 3))
-    _, by_point[:, :2], by_camera = state.camera(0).project_with_jacobian(points)
-    first = int(free[0].sum())
-    shared[:, :2, :first] = by_camera[:, :, free[0]]
-    turned = points @ state.rotation.T
-    _, point_jacobian, by_camera = state.camera(1).project_with_jacobian(turned + state.translation_mm)
-    by_point[:, 2:] = point_jacobian @ state.rotation
-    at = solution.names.index(RIG[0])
-    shared[:, 2:, first:at] = by_camera[:, :, free[1]]
-    shared[:, 2:, at : at + 3] = -point_jacobian @ cross_matrices(turned)
-    shared[:, 2:, at + 3 : at + 6] = point_jacobian
-    return by_point, shared
-
-
-def depth_std(solution: Solution, points: Array, corner_px_std: float) -> tuple[Array, Array]:
-    """Return the standard deviation (n,), mm, of the triangulated depth of `points` (n, 3): by the calibration, and by
-    calibration and corners together.
-
-    `corner_px_std`: standard deviation of a coordinate of a corner in both pictures.
-    """
-    by_point, shared = triangulation_jacobian(solution, points)
-    inverse = np.linalg.pinv(by_point)[:, 2, :]  # (n, 4): the row of the depth
-    by_parameter = -np.einsum("nk,nkp->np", inverse, shared)
-    calibration = np.einsum("np,pq,nq->n", by_parameter, solution.covariance, by_parameter)
-    matching = corner_px_std**2 * np.sum(inverse**2, axis=1)
-    return np.sqrt(calibration), np.sqrt(calibration + matching)
-
-
-def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tuple[int, int]]) -> DepthUncertainty:
-    """Map `depth_std` over the frame of the left camera at one depth, where the right camera sees the point.
-
-    `depth_mm`: of the points, along the axis of the left camera; `shapes`: (rows, cols) of the left and right frames.
-    """
-    x, y = grid(shapes[0])
-    state = solution.state
-    points = state.camera(0).at_depth(grid_points(x, y), depth_mm)
-    there = np.all(np.isfinite(points), axis=1)
-    seen = np.full((len(points), 2), np.nan)
-    on_right = points[there] @ state.rotation.T + state.translation_mm
-    front = state.camera(1).projection.sees(on_right)
-    there[there] = front
-    seen[there] = state.camera(1).project(on_right[front])
-    rows, cols = shapes[1]
-    there &= (seen[:, 0] >= 0) & (seen[:, 0] <= cols - 1) & (seen[:, 1] >= 0) & (seen[:, 1] <= rows - 1)
-    maps = np.full((2, len(points)), np.nan)
-    if there.any():
-        maps[:, there] = depth_std(solution, points[there], solution.noise_px)
-    calibration, total = maps.reshape(2, len(y), len(x))
-    return DepthUncertainty(
-        depth_mm=float(depth_mm),
-        x_px=x.tolist(),
-        y_px=y.tolist(),
-        calibration_mm_std=_open_rows(calibration),
-        total_mm_std=_open_rows(total),
-    )
-
-
-# --- rectification ---------------------------------------------------------------------------------------------------
-
-
 def rectification(state: RigParameters, pairs: Sequence[StereoPair], shape: tuple[int, int]) -> Rectification:
     """Compute the rectification of OpenCV, with the rms difference of the rows of the corners that both cameras saw.
 
@@ -402,7 +307,7 @@ def rectification(state: RigParameters, pairs: Sequence[StereoPair], shape: tupl
     rotation_one, rotation_two, new_one, new_two, to_depth = found[:5]
     gaps = []
     for pair in pairs:
-        _, at_left, at_right = np.intersect1d(pair.left.index, pair.right.index, return_indices=True)
+        at_left, at_right = pair.common
         rows_px = [
             _rectified_rows(view.image_px[at], camera, turn, new)
             for view, at, camera, turn, new in (
@@ -477,8 +382,3 @@ def _cameras_of(stereo: StereoFit) -> tuple[CameraGeometry, CameraGeometry]:
         if matrix is not None
     )  # fmt: skip
     return left, right
-
-
-def _open_rows(values: Array) -> tuple[tuple[float | None, ...], ...]:
-    """Return a matrix, row by row, with None where it isn't finite."""
-    return tuple(tuple(float(value) if np.isfinite(value) else None for value in row) for row in values)

@@ -126,14 +126,16 @@ class Study:
         return mask
 
     def levels(self, capture: Capture) -> Levels:
-        """Return the means of a capture by channel, computed once. A channel clips where `CLIPPED_SHARE` of its
-        pixels do."""
+        """Return the means of a capture by channel, computed once. A channel clips where `CLIPPED_SHARE` of the pixels
+        of one of its planes do."""
         if capture.id not in self._levels:
-            found = channel_means(self.recordings.codes(capture), self.camera.cfa, self.saturation_dn)
+            found = channel_means(self.recordings.codes(capture), self.camera.cfa)
+            whole = {c: one.mean_dn for c, one in found.items()}
+            clips = {c: one.clipped_share(self.saturation_dn) >= CLIPPED_SHARE for c, one in found.items()}
             self._levels[capture.id] = Levels(
-                {c: one.mean_dn if one.clipped_share < CLIPPED_SHARE else None for c, one in found.items()},
+                {c: None if clips[c] else mean for c, mean in whole.items()},
                 {c: one.pixels for c, one in found.items()},
-                {c: one.mean_dn for c, one in found.items()},
+                whole,
             )
         return self._levels[capture.id]
 

@@ -280,7 +280,7 @@ def rectified_picture(recordings: RecordingSet, stereo: StereoFit, width_px: int
         maps = rectification_maps(stereo, (camera.rows, camera.cols))
         halves = []
         for side, captures in (("left", left), ("right", right)):
-            frame = luminance(recordings.frame(captures[pose]), camera.cfa)
+            frame = luminance(recordings.frame(captures[pose]))
             picture = np.clip(255.0 * frame, 0, 255).astype(np.uint8)
             halves.append(cv2.remap(picture, *maps["left" if side == "left" else "right"], cv2.INTER_LINEAR))
     except (InputError, NotDetermined):

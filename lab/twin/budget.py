@@ -26,7 +26,7 @@ from lab.errors import InputError
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import ModelPosterior
 from lab.observables.flats.noise import GAIN_STD, READ_STD
-from lab.observables.spectra.narrowband import freed_curve
+from lab.observables.spectra.curves import freed_curve
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.lab_minutes import LabCapture, lab_captures
 from lab.twin.predict import posterior_of

@@ -25,11 +25,11 @@ from lab.capture_kinds.narrowband import NarrowbandSequence
 from lab.capture_kinds.slanted_edge import EdgeSequence, EdgeTarget
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import FirstEstimates
+from lab.observables.charts.chart import CHART_SCALE_STD
 from lab.observables.charts.patches import reflectance_covariance
 from lab.observables.flats.linearity import RADIOMETER_STD
 from lab.observables.flats.noise import VARIANCE_FLOOR
 from lab.observables.noise.figures import BLACK_FLOOR_DN
-from lab.observables.spectra.narrowband import CHART_SCALE_STD
 from sim.camera import CameraModel
 from sim.point import optical_transfer
 from sim.scene.colorchecker import reflectances

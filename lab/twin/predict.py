@@ -24,6 +24,7 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
+from lab.observables.charts.chart import CHART
 from lab.observables.charts.patches import reflectance_covariance
 from lab.observables.codes.rounding import QUANTISATION_DN2
 from lab.observables.darks.level import DARK, added_dark_e_per_s
@@ -33,7 +34,6 @@ from lab.observables.flats.linearity import PHOTON_TRANSFER, misstated_levels
 from lab.observables.flats.noise import GAIN_STD, NOISE, READ_STD, shot_variance
 from lab.observables.noise.figures import BLACK_FLOOR_DN, USUAL_LAMP, NoiseFigures
 from lab.observables.observable import Block, Label, Measurement, Prediction
-from lab.observables.spectra.narrowband import CHART
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.changes import Changes, carried, doubling_std_c, reference_temperature_c
 from lab.twin.relative_light import RelativeLight, rates_per_dose, relative_light

@@ -9,11 +9,13 @@ import pytest
 from scipy.optimize import least_squares
 
 from lab.fit.compare import compare
+from lab.fit.depth import depth_std
 from lab.fit.geometry import channel_geometry, geometry_result
-from lab.fit.stereo import StereoPair, depth_std, solve_rig
+from lab.fit.stereo import solve_rig
 from lab.formats.results import CameraFit, FitResult
 from lab.observables.boards.calibration import calibrate_robustly, cross_validation
-from lab.observables.boards.detection import CornerFits
+from lab.observables.boards.corner_fits import CornerFits
+from lab.observables.boards.pairs import StereoPair
 from lab.observables.boards.projection import CameraGeometry, difference, grid, grid_points, points_at
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 

@@ -19,11 +19,12 @@ from lab.errors import InputError
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Frame, RecordingSet
 from lab.observables.acquisition_errors import ALIKE, alike_planes
+from lab.observables.charts.chart import CHART
 from lab.observables.charts.patches import patch_boxes
 from lab.observables.flats.linearity import PHOTON_TRANSFER
 from lab.observables.noise.levels import darks_near
 from lab.observables.observable import Measurement
-from lab.observables.spectra.narrowband import CHART, NARROWBAND
+from lab.observables.spectra.narrowband import NARROWBAND
 from sim.camera import CameraModel, Cfa, Side
 from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic

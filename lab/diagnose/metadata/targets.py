@@ -15,8 +15,8 @@ from lab.diagnose.metadata.misstatement import Misstatement
 from lab.diagnose.policy import DEFAULT_POLICY, DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
-from lab.observables.boards.corners import BOARDS
 from lab.observables.boards.detection import as_grey, luminance
+from lab.observables.boards.residuals import BOARDS
 from lab.observables.screens.pattern_fit import BERNOULLI
 from lab.observables.screens.registration import ScreenPictures, reference_pixels, register, screen_pictures
 from sim.camera import Cfa, Side
@@ -221,14 +221,13 @@ def misstated_board(
         boards.setdefault((capture.dictionary, capture.squares, capture.square_mm, capture.marker_mm), []).append(
             capture
         )
-    cfa = recordings.camera(side).cfa
     lines: list[str] = []
     changed: dict[str, dict[str, Any]] = {}
     chi2, n = 0.0, 0
     for captures in boards.values():
         stated = captures[0]
         spread = captures[:: max(1, len(captures) // LOOKED_AT)][:LOOKED_AT]
-        layout = board_layout([as_grey(luminance(recordings.frame(one), cfa)) for one in spread], stated, policy)
+        layout = board_layout([as_grey(luminance(recordings.frame(one))) for one in spread], stated, policy)
         if layout is None or layout.pictures < policy.board_frames:
             continue
         update, told = _contradicted(stated, layout, policy)

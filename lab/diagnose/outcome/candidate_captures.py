@@ -21,7 +21,8 @@ from lab.diagnose.outcome.expected_information import Forecast
 from lab.diagnose.outcome.settling_capture import FEW_REPEATS, MORE_REPEATS, repeats_of
 from lab.formats.recording_set import RecordingSet
 from lab.observables.noise.figures import BLACK_FLOOR_DN, LAMP_FLOOR
-from lab.observables.spectra.narrowband import CURVE_ROUGH_STD, NARROWBAND_FLOOR
+from lab.observables.spectra.curves import CURVE_ROUGH_STD
+from lab.observables.spectra.narrowband import NARROWBAND_FLOOR
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.optics.imaging import DiffractionLimited

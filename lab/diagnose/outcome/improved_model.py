@@ -26,7 +26,7 @@ from lab.formats.results.diagnosis import IN_CURVES
 from lab.observables.charts.patches import PATCH_COLOUR_STD, PATCH_STD, patch_boxes
 from lab.observables.flats.stated_light import most_frequent_gain_db
 from lab.observables.observable import Block
-from lab.observables.spectra.narrowband import freed_curve
+from lab.observables.spectra.curves import freed_curve
 from lab.predict.replay import Replay
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect

@@ -34,8 +34,8 @@ from lab.formats.results import (
 )
 from lab.formats.results.plausible import FIGURES
 from lab.formats.results.words import measured
-from lab.observables.boards.corners import BOARDS
-from lab.observables.boards.detection import MIN_CORNERS
+from lab.observables.boards.residuals import BOARDS
+from lab.observables.boards.views import MIN_CORNERS
 from lab.observables.flats.linearity import PHOTON_TRANSFER, RADIOMETER_STD, misstated_levels
 from lab.observables.gaussian import Gaussian, chi2
 from lab.observables.observable import Block

@@ -20,10 +20,10 @@ from lab.diagnose.inference.refit import Coordinate, coordinate_prior, coordinat
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.model_posterior import PATCH, FirstEstimates, ModelPosterior, NameInDoubt, RivalModel, StoredEffect
+from lab.observables.charts.chart import CHART
 from lab.observables.charts.patches import reflectance_covariance
 from lab.observables.flats.noise import GAIN_STD, NOISE
 from lab.observables.noise.figures import NoiseFigures
-from lab.observables.spectra.narrowband import CHART
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.library import effects as library

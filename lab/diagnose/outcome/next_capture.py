@@ -31,7 +31,7 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import visibility
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import NextCapture
-from lab.observables.spectra.narrowband import freed_curve
+from lab.observables.spectra.curves import freed_curve
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.library import effects as library

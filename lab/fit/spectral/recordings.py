@@ -33,7 +33,7 @@ from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MakerDeparture, NoiseFit, RepeatDrift, SpectralFit
 from lab.observables.codes.step import find_code_step
 from lab.observables.noise.levels import darks_near
-from lab.observables.plane_means import PlaneMean, plane_means
+from lab.observables.plane_means import ChannelMean, central_codes, central_part, channel_means
 from lab.observables.weighted_lines import DarkLine, dark_line
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
@@ -41,7 +41,6 @@ from sim.optics.illumination import irradiance_factor
 from sim.sensor.mosaic import phases, step
 from sim.spectrum import FloatArray, photons_from_energy
 
-CENTRAL_SHARE = 0.25  # of rows and columns: the region on axis over which signals are averaged
 CLIPPED_LIMIT = 1e-4  # share of clipped pixels above which a mean is too low
 SATURATED_SHARE = 0.98  # of the fitted full well
 FLAT_RANGE = (0.2, 0.9)  # of saturation: flats that may help out
@@ -85,7 +84,7 @@ class SpectralCaptures:
                     "visible by 10 nm or finer",
                 )
         self.gain, self.gain_std = self._conversion_gain()
-        self.region = self._central_region()
+        self.region = central_part((self.camera.rows, self.camera.cols))
         self._step_dn = find_code_step(self.recordings, self.side).step_dn
         self.pixels = {channel: self._pixel_count(channel) for channel in phases(self.camera.cfa)}
         self.photons = self._photons_per_radiance()
@@ -135,16 +134,6 @@ class SpectralCaptures:
             * self._fall_off()
         )
 
-    def _central_region(self) -> tuple[slice, slice]:
-        """Return the rows and columns of the region, whole periods of the mosaic."""
-        period = step(self.camera.cfa)
-        spans = []
-        for size in (self.camera.rows, self.camera.cols):
-            half = max(round(size * CENTRAL_SHARE / 2 / period), 1) * period
-            middle = size // 2 // period * period
-            spans.append(slice(max(middle - half, 0), min(middle + half, size)))
-        return spans[0], spans[1]
-
     def _fall_off(self) -> float:
         """Return the mean cos^4 over the region, about the centre of the frame."""
         if self.camera.focal_length_mm is None or self.camera.pixel_pitch_um is None:
@@ -155,10 +144,9 @@ class SpectralCaptures:
         x = (cols - 0.5 * (self.camera.cols - 1)) * scale
         return float(np.mean(1.0 / (1.0 + y[:, None] ** 2 + x**2) ** 2))
 
-    def _means(self, capture: Capture) -> dict[str, PlaneMean]:
-        """Return the mean of each channel in the region, which starts on whole periods of the mosaic."""
-        frame = self.recordings.frame(capture)[self.region]
-        return plane_means(frame, self.camera.cfa, self.camera.saturation_dn, self._step_dn)
+    def _means(self, capture: Capture) -> dict[str, ChannelMean]:
+        """Return the mean of each channel in the region."""
+        return channel_means(central_codes(self.recordings, capture), self.camera.cfa)
 
     def _pixel_count(self, channel: str) -> int:
         """Count the pixels of a channel in the region."""
@@ -189,7 +177,7 @@ class SpectralCaptures:
         for dark in darks_near(self.recordings.captures(DarkCapture, self.side), self.narrowband):
             for channel, one in self._means(dark).items():
                 own = found.setdefault((dark.gain_db or 0.0, channel), [])
-                std = float(np.hypot(one.mean_std_dn, self.drift_dn.get(dark.id, 0.0)))
+                std = float(np.hypot(one.mean_std_dn(self._step_dn), self.drift_dn.get(dark.id, 0.0)))
                 own.append((dark.exposure_s, one.mean_dn, std))
         for key, rows in found.items():
             self.darks[key] = dark_line(*np.array(rows).T)
@@ -198,7 +186,7 @@ class SpectralCaptures:
         """Return the conversion gain, DN/e, at a gain in dB."""
         return self.gain * 10.0 ** ((gain_db or 0.0) / 20.0)
 
-    def _electron_rate(self, capture: Capture, channel: str, found: PlaneMean) -> tuple[float, float, bool, float]:
+    def _electron_rate(self, capture: Capture, channel: str, found: ChannelMean) -> tuple[float, float, bool, float]:
         """Return the electrons per second, their standard deviation, whether the capture saturates, and its share of
         saturation.
 
@@ -210,10 +198,11 @@ class SpectralCaptures:
         limit = self.camera.saturation_dn - dark
         if self.noise is not None and self.noise.full_well_e is not None:
             limit = min(limit, self.noise.full_well_e * gain)
-        clipped = found.clipped_share > CLIPPED_LIMIT or signal > SATURATED_SHARE * limit
+        clipped = found.clipped_share(self.camera.saturation_dn) > CLIPPED_LIMIT or signal > SATURATED_SHARE * limit
         scale = 1.0 / (gain * capture.exposure_s)
         # The pixels differ by shot noise, read noise and PRNU
-        std = float(np.sqrt(found.mean_std_dn**2 + dark_std**2 + self.drift_dn.get(capture.id, 0.0) ** 2))
+        noise = found.mean_std_dn(self._step_dn)
+        std = float(np.sqrt(noise**2 + dark_std**2 + self.drift_dn.get(capture.id, 0.0) ** 2))
         return signal * scale, std * scale, clipped, signal / limit
 
     def _lights(self) -> tuple[FloatArray, dict[str, FloatArray]]:

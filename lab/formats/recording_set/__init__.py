@@ -6,7 +6,7 @@ at all. The kinds of capture are in `lab.capture_kinds`."""
 from lab.formats.recording_set.checks import clipped_share, inspect
 from lab.formats.recording_set.files import RAWS, FolderFiles, Frame, RecordingFiles, Target, load_frame
 from lab.formats.recording_set.folder import ArchiveForm, archive, packed, read, write
-from lab.formats.recording_set.frame_codes import CodeCounts, FrameCodes
+from lab.formats.recording_set.frame_codes import CELLS, CodeCounts, FrameCodes
 from lab.formats.recording_set.manifest import (
     DataSheet,
     InstrumentSnapshot,
@@ -18,9 +18,10 @@ from lab.formats.recording_set.manifest import (
     parse_manifest,
     text_problems,
 )
-from lab.formats.recording_set.recordings import RecordingSet, frame_problem
+from lab.formats.recording_set.recordings import RecordingSet, Summaries, frame_problem
 
 __all__ = [
+    "CELLS",
     "RAWS",
     "ArchiveForm",
     "CodeCounts",
@@ -34,6 +35,7 @@ __all__ = [
     "RecordingFiles",
     "RecordingSet",
     "Snapshots",
+    "Summaries",
     "Target",
     "archive",
     "clipped_share",

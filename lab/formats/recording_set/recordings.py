@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Container, Hashable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast, get_args, overload
 
@@ -21,6 +22,23 @@ from sim.spectrum import Spectrum
 
 C = TypeVar("C", bound=Capture)
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Summaries:
+    """Summaries of frames by key: those that hold whatever is stated, and those under one manifest."""
+
+    of_frames: dict[Hashable, Any] = field(default_factory=dict)
+    of_manifest: dict[Hashable, Any] = field(default_factory=dict)
+
+    @property
+    def made(self) -> Summaries:
+        """A copy without those that couldn't be made."""
+        one, two = (
+            {key: found for key, found in kept.items() if not isinstance(found, NotDetermined)}
+            for kept in (self.of_frames, self.of_manifest)
+        )
+        return Summaries(one, two)
 
 
 class RecordingSet:
@@ -50,13 +68,11 @@ class RecordingSet:
         self._files: RecordingFiles = files or MemoryFiles(frames or {}, spectra or {}, targets or {})
         self._cache: OrderedDict[str, Frame] = OrderedDict()
         self._held = 0
-        self._codes: dict[str, FrameCodes] = {}
-        #: What was summarised of the frames: the same for all sets that have these frames.
-        self._summaries: dict[Hashable, object] = {}
+        self._summaries = Summaries()
         self._lock = threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_cache": OrderedDict(), "_held": 0, "_summaries": {}, "_lock": None}
+        return self.__dict__ | {"_cache": OrderedDict(), "_held": 0, "_summaries": self._summaries.made, "_lock": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ |= state | {"_lock": threading.Lock()}
@@ -123,7 +139,7 @@ class RecordingSet:
         cache_bytes: int | None = None,
     ) -> RecordingSet:
         """Return a set with an empty cache of frames; what isn't given is this set's. Where the files are the same, it
-        shares the codes that were counted."""
+        shares the summaries of frames, and under the same manifest all of them."""
         copy = RecordingSet(
             self.manifest if manifest is None else manifest,
             source=self.source,
@@ -132,8 +148,8 @@ class RecordingSet:
             cache_bytes=self.cache_bytes if cache_bytes is None else cache_bytes,
         )
         if files is None:
-            copy._codes = self._codes
-            copy._summaries = self._summaries
+            own = self._summaries.of_manifest if manifest is None else {}
+            copy._summaries = Summaries(self._summaries.of_frames, own)
         return copy
 
     def capture(self, id: str) -> Capture:
@@ -168,29 +184,50 @@ class RecordingSet:
 
     def codes(self, capture: Capture) -> FrameCodes:
         """Return how often each code comes in the frame of a capture. Counted once, whatever the manifest states."""
-        if capture.frame not in self._codes:
-            self._codes[capture.frame] = FrameCodes.count(self.frame(capture), with_digest=True)
-        return self._codes[capture.frame]
+        return self.once(
+            ("codes", capture.frame),
+            lambda: FrameCodes.count(self.frame(capture), with_digest=True),
+            whatever_is_stated=True,
+        )
+
+    def once(self, key: Hashable, make: Callable[[], T], *, whatever_is_stated: bool = False) -> T:
+        """Return the summary of frames called `key`, made by `make` when it is first asked for. Where that raised
+        NotDetermined, it is raised again.
+
+        A summary is small beside its frames: it outlives them (`let_go`), and goes with the set to other processes.
+        `whatever_is_stated`: it holds for all sets of the same frames, as `key` holds all that it depends on, frames by
+        their paths; else for sets under the same manifest.
+        """
+        kept = self._summaries.of_frames if whatever_is_stated else self._summaries.of_manifest
+        if key not in kept:
+            try:
+                made: Any = make()
+            except NotDetermined as refused:
+                made = refused
+            with self._lock:
+                kept.setdefault(key, made)
+        found = kept[key]
+        if isinstance(found, NotDetermined):
+            raise NotDetermined(found.step, found.reason)
+        return cast(T, found)
+
+    @property
+    def summaries(self) -> Summaries:
+        """The summaries that were made so far, without those that couldn't be made."""
+        with self._lock:
+            return self._summaries.made
+
+    def keep(self, summaries: Summaries) -> None:
+        """Keep summaries that another process made of this set."""
+        with self._lock:
+            self._summaries.of_frames.update(summaries.of_frames)
+            self._summaries.of_manifest.update(summaries.of_manifest)
 
     def let_go(self) -> None:
         """Free the cached frames."""
         with self._lock:
             self._cache.clear()
             self._held = 0
-
-    def summarised(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Return `make()`, a summary of frames, computed once for `key` and for all sets of the same frames, whatever
-        their manifests state. Where it raised NotDetermined, that is raised again. `key` has to hold all that the
-        summary depends on, frames by their paths."""
-        if key not in self._summaries:
-            try:
-                self._summaries[key] = make()
-            except NotDetermined as refused:
-                self._summaries[key] = refused
-        found = self._summaries[key]
-        if isinstance(found, NotDetermined):
-            raise found
-        return cast(T, found)
 
     def spectrum(self, path: str) -> Spectrum:
         """Return the spectrum that the manifest calls `path`."""

@@ -15,23 +15,14 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from lab.errors import NotDetermined
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CrossValidation, DistortionModel, Skipped
-from lab.observables.boards.bundle_adjustment import (
-    BundleAdjustment,
-    CorrelatedErrors,
-    Observation,
-    RigParameters,
-    Solution,
-    board_key,
-    board_pose,
-    first_camera,
-    first_state,
-    rms_px,
-    splined,
-    with_boards,
-)
-from lab.observables.boards.detection import MIN_CORNERS, BoardView
+from lab.observables.boards.bundle_adjustment import BundleAdjustment, Observation, RigParameters, Solution, rms_px
+from lab.observables.boards.corners import board_corners
+from lab.observables.boards.correlated_errors import CorrelatedErrors
+from lab.observables.boards.first_state import board_pose, first_camera, first_state, splined, with_boards
 from lab.observables.boards.projection import CameraGeometry, Difference, difference, points_at, projection_std
+from lab.observables.boards.views import MIN_CORNERS, BoardView, board_key
 from sim.camera import ProjectionKind, Side
 from sim.scene.projection import CAMERA, COUNT, EQUIDISTANT, PINHOLE, Projection
 
@@ -59,7 +50,6 @@ LARGEST_RMS_SHARE = 0.005  # rms over the diagonal of the frame, above which no 
 LARGEST_FOCAL_STD = 0.1  # relative; above it the focal length isn't determined
 PARALLEL_DEG = 5.0
 MOST_LISTED = 3  # views named in a refusal
-
 DIFFERENCE_SIGMA = 2.6  # significance of 1 %, above which two halves of the views differ beyond their uncertainties
 
 
@@ -299,6 +289,28 @@ def with_model_error(
     or those that its residuals show.
     """
     return BundleAdjustment(observations_of(views), solution.free, shape).with_correlated_errors(solution, errors)
+
+
+def calibration_of(recordings: RecordingSet, side: Side) -> Calibration:
+    """Return the camera of `side`, calibrated once by the boards of its `charuco` captures.
+
+    Raises `NotDetermined` below 3 good views, where the board isn't what the captures say, or where all views are
+    parallel to each other: without perspective, focal length and distance can't be separated.
+    """
+
+    def made() -> Calibration:
+        boards, camera = board_corners(recordings, side), recordings.camera(side)
+        if not boards.views and not boards.missed:
+            raise NotDetermined("geometry", "no charuco captures")
+        if len(boards.views) < MIN_VIEWS:
+            raise NotDetermined(
+                "geometry",
+                f"{len(boards.views)} views of the board can be used, {MIN_VIEWS} are needed"
+                f"{list_reasons(boards.missed)}",
+            )
+        return calibrate_robustly(boards.views, (camera.rows, camera.cols), side)
+
+    return recordings.once(("calibration by boards", side), made)
 
 
 def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side: Side | None = None) -> Calibration:

@@ -12,9 +12,9 @@ import numpy as np
 
 from lab.capture_kinds.slanted_edge import EdgeCapture
 from lab.errors import NotDetermined
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import CodeCounts, FrameCodes, RecordingSet
 from lab.formats.results import NoiseFit
-from lab.observables.codes.step import count_codes, step_of
+from lab.observables.codes.step import step_of
 from lab.observables.edges.finding import Region, region_planes
 from lab.observables.edges.profile import EdgeSummary, summarise_edge
 from lab.observables.edges.region import FoundEdge, find_edges
@@ -43,7 +43,7 @@ def measure_edge(
     _refuse_clipped(recordings, captures[0], noise, region)
     cfa = recordings.camera(captures[0].side).cfa
     key = ("edge", tuple(c.frame for c in captures), region, tuple(sorted(phases(cfa)[channel])), step(cfa))
-    return recordings.summarised(key, lambda: _summarise(recordings, captures, cfa, channel, region))
+    return recordings.once(key, lambda: _summarise(recordings, captures, cfa, channel, region), whatever_is_stated=True)
 
 
 def _summarise(
@@ -52,7 +52,7 @@ def _summarise(
     """Summarise the edge in the mean of the captures' frames."""
     frames = [recordings.frame(c) for c in captures]
     mean = np.mean([f.astype(float) for f in frames], axis=0) if len(frames) > 1 else frames[0]
-    code = step_of(np.sum([count_codes(frame) for frame in frames], axis=0))
+    code = step_of(CodeCounts.total(FrameCodes.count(frame).every for frame in frames))
     return summarise_edge(region_planes(mean, region, cfa, channel), code=code, frames=len(frames))
 
 
@@ -85,4 +85,6 @@ def edges_of(recordings: RecordingSet, capture: EdgeCapture) -> tuple[FoundEdge,
     """Find the edges of the frame of a capture, those that can be used first; see `find_edges`."""
     camera = recordings.camera(capture.side)
     key = ("edges", capture.frame, camera.cfa, camera.saturation_dn)
-    return recordings.summarised(key, lambda: find_edges(recordings.frame(capture), camera.cfa, camera.saturation_dn))
+    return recordings.once(
+        key, lambda: find_edges(recordings.frame(capture), camera.cfa, camera.saturation_dn), whatever_is_stated=True
+    )

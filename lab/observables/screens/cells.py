@@ -15,12 +15,12 @@ from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
 from lab.errors import NotDetermined
-from lab.observables.charts.patches import Surroundings, halo_light, harmonics
 from lab.observables.dataset import Study, held_out_of, mean_frame
 from lab.observables.observable import Block, Label, Measurement, Prediction
 from lab.observables.plane_means import channel_pixels
 from lab.observables.reads import REFLECTIONS, SHOWN, acting
 from lab.observables.screens.pattern_fit import mean_rate
+from lab.observables.surroundings import Surroundings, halo_light, harmonics
 from sim.camera import CameraModel
 from sim.effects.base import Effects
 from sim.frame import screen_light, with_reflections

@@ -25,6 +25,7 @@ from scipy import ndimage, spatial
 from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
+from lab.observables.boards.corner_fits import fit_corners
 from lab.observables.boards.detection import fit_corners
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import phases, planes

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.charuco import CharucoCapture
-from lab.observables.boards.detection import BoardView, board_points
+from lab.observables.boards.views import BoardView, board_points
 
 SHAPE = (960, 1280)
 Array = NDArray[np.floating[Any]]

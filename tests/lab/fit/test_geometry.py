@@ -17,7 +17,8 @@ from lab.fit.geometry import _fit_shift, board_warps, channel_geometry, fit_geom
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import GeometryFit
 from lab.observables.boards.calibration import calibrate_robustly
-from lab.observables.boards.detection import CornerFits, find_board, fit_corners, luminance
+from lab.observables.boards.corner_fits import CornerFits, fit_corners
+from lab.observables.boards.detection import find_board, luminance
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 
@@ -62,7 +63,7 @@ def test_intrinsics_of_a_bayer_camera_are_recovered_within_their_uncertainty(cha
 def test_corners_on_the_mosaic_are_not_biased(charuco_boards, truth):
     """Against the projection of the board by the true camera: the mean error, in px, of all corners of a frame."""
     capture = charuco_boards.captures("charuco", "left")[0]
-    view = find_board(luminance(charuco_boards.frame(capture), "RGGB"), capture)
+    view = find_board(luminance(charuco_boards.frame(capture)), capture)
     half = np.array([8, 6, 0.0]) * 12.0
     turn = np.array([0.1, -0.08, 0.07])  # the first pose
     translation = np.array([30.0, 0, 420]) - cv2.Rodrigues(turn)[0] @ half

@@ -13,10 +13,11 @@ import pytest
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.fit.geometry import fit_geometry, geometry_result
-from lab.fit.stereo import StereoPair, fit_pairs, fit_stereo, rectification_maps
+from lab.fit.stereo import fit_pairs, fit_stereo, rectification_maps
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.observables.boards.calibration import calibrate_robustly
-from lab.observables.boards.detection import board_points
+from lab.observables.boards.pairs import StereoPair
+from lab.observables.boards.views import board_points
 from tests.lab.fit.projected import SHAPE, poses, seen
 
 PAIRS = Path(__file__).parents[3].parent / "shared" / "data" / "opencv_stereo"

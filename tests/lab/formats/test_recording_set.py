@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
-from lab.errors import InputError
+from lab.errors import InputError, NotDetermined
 from lab.formats.recording_set import Manifest, RecordingError, RecordingSet, read, write
 from sim.spectrum import Spectrum
 from tests.lab.formats.damaged_sets import edit, only, problems
@@ -406,3 +406,40 @@ def test_a_stated_value_that_no_camera_has_is_refused(folder: Path, key: str, va
     edit(folder, lambda manifest: manifest["cameras"]["left"].update({key: value}))
     found = problems(folder)
     assert any(f"{key} = {value:g}" in line and f"is below the limit of {limit}" in line for line in found)
+
+
+# --- summaries --------------------------------------------------------------------------------------------------------
+
+
+def test_a_summary_is_made_once_and_goes_with_frames_and_manifest(small_set: Callable[..., RecordingSet]) -> None:
+    one, made = small_set(), []
+
+    def summary() -> float:
+        made.append(1)
+        return float(one.frame(one.captures()[0]).mean())
+
+    assert one.once(("mean", "left"), summary) == one.once(("mean", "left"), summary)
+    one.let_go()
+    one.once(("mean", "left"), summary)
+    assert len(made) == 1
+    for same in (pickle.loads(pickle.dumps(one)), one.for_one_of(2)):
+        assert same.summaries == one.summaries
+    for other in (one.under(one.manifest), one.without(["none"]), one.with_frames({})):
+        assert other.summaries == {}
+    other.keep(one.summaries)
+    assert other.once(("mean", "left"), summary) == one.once(("mean", "left"), summary)
+    assert len(made) == 1
+
+
+def test_a_summary_that_frames_do_not_determine_is_refused_again(small_set: Callable[..., RecordingSet]) -> None:
+    one, tried = small_set(), []
+
+    def refused() -> None:
+        tried.append(1)
+        raise NotDetermined("boards", "no board in any frame")
+
+    for _ in range(2):
+        with pytest.raises(NotDetermined, match="boards: no board in any frame"):
+            one.once("boards", refused)
+    assert len(tried) == 1
+    assert pickle.loads(pickle.dumps(one)).summaries == {}

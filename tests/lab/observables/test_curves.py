@@ -9,7 +9,8 @@ import pytest
 from lab.diagnose.inference.refit import refit
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet
-from lab.observables.spectra.narrowband import BEYOND_STD, LEAK_STD, CurveJacobian, _last_place, narrowband_block
+from lab.observables.spectra.curves import BEYOND_STD, LEAK_STD, CurveJacobian, _last_place
+from lab.observables.spectra.narrowband import narrowband_block
 from mocks.former import Law
 from mocks.former.laws import StrayLightLaw
 from sim.effects.stray_light import StrayLight

@@ -24,14 +24,14 @@ from lab.observables.noise.figures import (
     repeated_levels,
     variance_between_pixels,
 )
-from lab.observables.spectra.narrowband import (
+from lab.observables.spectra.light_readings import (
     MOST_SAMPLE_STD,
     READING_SAMPLE_STD,
     READING_STD,
-    _reading_std,
-    _sample_std,
-    narrowband_block,
+    reading_std,
+    sample_std,
 )
+from lab.observables.spectra.narrowband import narrowband_block
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     AbsorptionBandLaw,
@@ -146,7 +146,7 @@ def test_standard_deviation_of_readings_is_measured_and_capped(std: float) -> No
     rng = np.random.default_rng(7)
     points = [(_Reading(f"c{i}", 400.0 + 5.0 * i), "Y") for i in range(62)]
     signal = 1e4 * (1.0 + std * rng.standard_normal(62))
-    found = _reading_std(points, signal, np.full(62, 1e-2), np.full(62, 1e4))
+    found = reading_std(points, signal, np.full(62, 1e-2), np.full(62, 1e4))
     assert found == pytest.approx(min(max(std, READING_STD), RADIOMETER_STD), rel=0.4)
 
 
@@ -169,8 +169,8 @@ def test_standard_deviation_within_readings_is_measured_and_capped(std: float) -
         [Spectrum.of(wavelength, level * line * (1.0 + std * rng.standard_normal(41))) for level in (1.0, 1.1)]
         for _ in range(24)
     ]
-    assert _sample_std(pairs) == pytest.approx(min(std, MOST_SAMPLE_STD), rel=0.15, abs=1e-12)
-    assert _sample_std(readings[:1] for readings in pairs) == READING_SAMPLE_STD
+    assert sample_std(pairs) == pytest.approx(min(std, MOST_SAMPLE_STD), rel=0.15, abs=1e-12)
+    assert sample_std(readings[:1] for readings in pairs) == READING_SAMPLE_STD
 
 
 def test_a_warmer_frame_s_dark_current_is_free() -> None:

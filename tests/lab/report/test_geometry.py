@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from lab.fit.geometry import geometry_result
-from lab.fit.stereo import StereoPair, fit_pairs
+from lab.fit.stereo import fit_pairs
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import ChannelGeometry, GeometryFit
 from lab.observables.boards.calibration import calibrate_robustly
+from lab.observables.boards.pairs import StereoPair
 from lab.report.geometry import (
     charts_by_side,
     coverage,

@@ -15,18 +15,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lab.fit.geometry import geometry_result
-from lab.fit.stereo import StereoPair, rig_observations, solve_rig
+from lab.fit.stereo import rig_observations, solve_rig
 from lab.formats.importers import read_checkerboard_pairs
-from lab.observables.boards.bundle_adjustment import (
-    BundleAdjustment,
-    Observation,
-    RigParameters,
-    Solution,
-    first_camera,
-    first_state,
-)
+from lab.observables.boards.bundle_adjustment import BundleAdjustment, Observation, RigParameters, Solution
 from lab.observables.boards.calibration import MODELS, calibrate, calibrate_robustly, free_intrinsics, with_model_error
-from lab.observables.boards.detection import find_boards
+from lab.observables.boards.corners import board_corners
+from lab.observables.boards.first_state import first_camera, first_state
+from lab.observables.boards.pairs import StereoPair
 from lab.observables.boards.projection import CameraGeometry
 from sim.scene.projection import PINHOLE
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
@@ -209,7 +204,7 @@ def test_a_ripple_that_both_cameras_see_is_found_common():
 def public_views():
     """The corners of the 13 public pairs, by side."""
     recordings = read_checkerboard_pairs(PAIRS, (6, 9), 25.0)
-    return {side: find_boards(recordings, side)[0] for side in ("left", "right")}
+    return {side: list(board_corners(recordings, side).views) for side in ("left", "right")}
 
 
 @pytest.mark.skipif(not PAIRS.is_dir(), reason="the public stereo pairs aren't here")

@@ -17,16 +17,14 @@ from scipy.spatial.transform import Rotation
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.fit.compare import compare
 from lab.fit.geometry import geometry_result
-from lab.fit.stereo import StereoPair, fit_pairs, rectification_maps
+from lab.fit.stereo import fit_pairs, rectification_maps
 from lab.formats.results import CameraFit, FitResult
 from lab.observables.boards.calibration import calibrate, calibrate_robustly, with_model_error
-from lab.observables.boards.detection import (
-    LEAST_BEND_PX,
-    BoardView,
-    bend_px,
-    board_points,
-    find_board,
-)
+from lab.observables.boards.corners import LEAST_BEND_PX
+from lab.observables.boards.detection import find_board
+from lab.observables.boards.pairs import StereoPair
+from lab.observables.boards.refinement import bend_px
+from lab.observables.boards.views import BoardView, board_points
 from sim.camera import Geometry
 from sim.scene.projection import EQUIDISTANT
 from sim.scene.warp import Warp

@@ -18,8 +18,11 @@ from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.importers import read_dot_grids
 from lab.formats.recording_set import RecordingSet
-from lab.observables.boards.corners import board_block, board_colour_block, calibration_of
-from lab.observables.boards.pairs import scene_gain_block, time_block
+from lab.observables.boards.calibration import calibration_of
+from lab.observables.boards.lateral_colour import board_colour_block
+from lab.observables.boards.pair_gain import scene_gain_block
+from lab.observables.boards.pair_time import time_block
+from lab.observables.boards.residuals import board_block
 from lab.observables.dataset import Study
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
@@ -45,7 +48,7 @@ def judged(study: Study, known: Geometry | None) -> Verdict:
 
 @cache
 def calibrated() -> Geometry:
-    found = calibration_of(study_of(recorded())).camera
+    found = calibration_of(recorded(), "left").camera
     a, b, c = (tuple(float(v) for v in row) for row in found.matrix)
     return Geometry(camera_matrix=(a, b, c), distortion=tuple(float(v) for v in found.distortion))  # type: ignore[arg-type]
 

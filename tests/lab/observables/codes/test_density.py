@@ -14,12 +14,12 @@ from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
+from lab.observables.charts.chart import chart_block
 from lab.observables.codes.density import code_block, widths
 from lab.observables.darks.level import dark_level_block
 from lab.observables.dataset import Study
 from lab.observables.flats.linearity import linearity_block
 from lab.observables.flats.noise import variance_block
-from lab.observables.spectra.narrowband import chart_block
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
 from sim.effects.adc_ripple import AdcRipple

@@ -21,15 +21,15 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.observables.boards.corners import colour_block
-from lab.observables.charts.patches import Surroundings, harmonics
+from lab.observables.charts.chart import chart_block
 from lab.observables.dataset import Study
 from lab.observables.edges.slanted_edge import edge_block
 from lab.observables.observable import Block, measurements
 from lab.observables.screens import pattern_fit
 from lab.observables.screens.cells import grid_block, screen_block
+from lab.observables.screens.lateral_colour import colour_block
 from lab.observables.screens.pattern_fit import cell_border_block, contrast_block, ghost_block, patterns
-from lab.observables.spectra.narrowband import chart_block
+from lab.observables.surroundings import Surroundings, harmonics
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
 from sim.effects.charge_diffusion import ChargeDiffusion
