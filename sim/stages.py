@@ -28,6 +28,7 @@ from sim.optics.filters import veil_otf
 from sim.optics.pupil import Wavefront, pupil_ratio
 from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
+from sim.sensor.electrons import NEIGHBOURS
 from sim.sensor.lines import LineNoise
 from sim.spectrum import FloatArray
 
@@ -337,8 +338,8 @@ class Charge(State):
     hold: their sum stays, and equal neighbours exchange none. `overflow`: mean electrons (rows, cols) -> the same after
     full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame, from none to all.
     `traps`: what fills in a frame and empties over the frames that follow. `variance_e2`: (mean electrons, shot noise's
-    variance) -> variance. `correlation`: mean electrons (...) -> correlation (2, ...) of the shot noise with each of
-    the two next pixels in the row, and of the two next in the column.
+    variance) -> variance. `correlation`: mean electrons (...) -> correlation (5, ...) of the shot noise with each
+    neighbour, by the kinds of `sim.sensor.electrons.NEIGHBOURS`.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
@@ -427,8 +428,8 @@ class Charge(State):
         return reduce(lambda value, law: law(electrons, value), self.variance_e2, electrons)
 
     def neighbour_correlation(self, electrons: FloatArray) -> FloatArray:
-        """Correlation (2, ...) of a pixel's shot noise with each of the two next in its row, and in its column."""
-        return sum((law(electrons) for law in self.correlation), np.zeros((2, *np.shape(electrons))))
+        """Correlation (5, ...) of a pixel's shot noise with each neighbour, by kind (`NEIGHBOURS`)."""
+        return sum((law(electrons) for law in self.correlation), np.zeros((len(NEIGHBOURS), *np.shape(electrons))))
 
 
 class Disturbance(Protocol):

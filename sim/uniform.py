@@ -358,8 +358,7 @@ class Uniform:
         return bool(self._charge.correlation)
 
     def neighbour_correlation(self, electrons: FloatArray) -> FloatArray:
-        """Correlation (2, ...) of a pixel's shot noise, at mean signals, with each of the two next in its row, and in
-        its column."""
+        """Correlation (5, ...) of a pixel's shot noise, at mean signals, with each neighbour, by `NEIGHBOURS`."""
         return self._charge.neighbour_correlation(electrons)
 
     # --- read-out ----------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from lab.measure.study import Study
 from sim.camera import Cfa
 from sim.effects.base import Effects
 from sim.sensor import mosaic
-from sim.sensor.electrons import solve_passed_share
+from sim.sensor.electrons import NEIGHBOURS, solve_passed_share
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -114,18 +114,18 @@ def correlations(
 ) -> FloatArray:
     """Predicted correlations by `PAIRS` in uniform light, (6,): means over the phases of the mosaic.
 
-    `shot_e2` (planes,): variance of the shot noise; `share` (2, planes): share of the departure from its mean of each
-    neighbour in the row, and of each in the column, that a pixel takes over. Read noise (`read_e2`) is independent, or
+    `shot_e2` (planes,): variance of the shot noise; `share` (5, planes): share of the departure from its mean of each
+    neighbour, by `NEIGHBOURS`, that a pixel takes over. Read noise (`read_e2`) is independent, or
     made of such noise by `read_kernel` (odd,) along the row. `kernel` filters both within a plane. Rounding
     (`rounding_e2`) is added last and is independent.
     """
     period = 1 if cfa == "MONO" else 2
     at = dict.fromkeys(planes, (0, 0)) if period == 1 else _phase_of(cfa)
-    variance, taken = np.zeros((period, period)), np.zeros((2, period, period))
+    variance, taken = np.zeros((period, period)), np.zeros((len(NEIGHBOURS), period, period))
     for name, v, g in zip(planes, shot_e2, share.T, strict=True):
         variance[at[name]], taken[:, *at[name]] = v, g
     taps = np.ones((1, 1)) if kernel is None else kernel
-    half = taps.shape[0] // 2 * period + 1
+    half = taps.shape[0] // 2 * period + 2
     reach = half + 2 + (0 if read_kernel is None else len(read_kernel) // 2)
     size = 2 * reach + 1
     offset = np.arange(size) - reach
@@ -134,14 +134,14 @@ def correlations(
     for phase in np.ndindex(period, period):
         row, col = (phase[0] + offset) % period, (phase[1] + offset) % period
         own, shares = variance[np.ix_(row, col)], [g[np.ix_(row, col)] for g in taken]
-        more = sum(np.square(g) * _neighbours(own, axis) for g, axis in zip(shares, (1, 0), strict=True))
+        more = sum(np.square(g) * _neighbours(own, places) for g, places in zip(shares, NEIGHBOURS, strict=True))
         norm = 1.0 / np.sqrt(1.0 + more / np.maximum(own, 1e-12))
         read = np.zeros((size, size))
         middle = taps.shape[0] // 2
         for (i, j), tap in np.ndenumerate(taps):
             read[reach + (i - middle) * period, reach + (j - middle) * period] = tap
         shot = read * norm
-        shot = shot + sum(_neighbours(read * norm * g, axis) for g, axis in zip(shares, (1, 0), strict=True))
+        shot = shot + sum(_neighbours(read * norm * g, places) for g, places in zip(shares, NEIGHBOURS, strict=True))
         if read_kernel is not None:
             read = convolve1d(read, read_kernel, axis=1, mode="constant")
         weights[phase] = np.stack([shot * np.sqrt(own), read * np.sqrt(read_e2)])
@@ -158,10 +158,11 @@ def correlations(
     return found
 
 
-def _neighbours(values: FloatArray, axis: int) -> FloatArray:
-    """Sum of each pixel's two neighbours along an axis, with zeros beyond the border."""
-    wide = np.pad(values, 1)[:, 1:-1] if axis == 0 else np.pad(values, 1)[1:-1]
-    return np.asarray(wide[:-2] + wide[2:] if axis == 0 else wide[:, :-2] + wide[:, 2:])
+def _neighbours(values: FloatArray, places: Sequence[tuple[int, int]]) -> FloatArray:
+    """Sum over each pixel's neighbours at `places`, (rows down, columns to the right), with zeros beyond the border."""
+    rows, cols = values.shape
+    wide = np.pad(values, 2)
+    return np.sum([wide[2 + down : 2 + down + rows, 2 + right : 2 + right + cols] for down, right in places], axis=0)
 
 
 def _phase_of(cfa: Cfa) -> dict[str, tuple[int, int]]:
