@@ -29,7 +29,7 @@ from sim.optics.pupil import Wavefront, pupil_ratio
 from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.electrons import NEIGHBOURS
-from sim.sensor.lines import LineNoise
+from sim.sensor.lines import LineGains, LineNoise
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
@@ -505,7 +505,8 @@ class Signal(State):
     """State of the electrons' read-out, up to the converter.
 
     `response`: electrons -> electrons, point by point; none stay none. `gains`: (row, col in px, which broadcast) ->
-    factor on what is read, noise alike, of mean 1 over the frame, as levels don't ask it. `offset_dn`: (elapsed_s,
+    factor on what is read, noise alike, of mean 1 over the frame, as levels don't ask it. `line_gains`: the same of
+    lines, at random. `offset_dn`: (elapsed_s,
     sensor temperature) -> DN added to the black level; `exposure_offset_dn`: exposure_s -> the same. `noise_e2`:
     elapsed_s -> variance of every pixel beside the read noise's. `lines`: noise that rows or columns share.
     `telegraph`: pixels that jump between two levels. `disturbances`: signals that are added at random. `filters`:
@@ -516,6 +517,7 @@ class Signal(State):
 
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     gains: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
+    line_gains: tuple[LineGains, ...] = ()
     offset_dn: tuple[Callable[[float, float | None], float], ...] = ()
     exposure_offset_dn: tuple[Callable[[float], float], ...] = ()
     noise_e2: tuple[Callable[[float], float], ...] = ()
@@ -531,10 +533,11 @@ class Signal(State):
 
     def gain_map(self, shape: tuple[int, int]) -> FloatArray | None:
         """Factor (rows, cols) on what is read of every pixel; None where no law says one."""
-        if not self.gains:
+        if not (self.gains or self.line_gains):
             return None
         row, col = np.arange(float(shape[0]))[:, None], np.arange(float(shape[1]))[None, :]
-        return reduce(lambda value, law: value * law(row, col), self.gains, np.ones(shape))
+        areas = reduce(lambda value, law: value * law(row, col), self.gains, np.ones(shape))
+        return reduce(lambda value, law: value * law.factors(shape), self.line_gains, areas)
 
     def shift_dn(self, elapsed_s: float, temperature_c: float | None, exposure_s: float) -> float:
         """DN added to the black level."""

@@ -16,7 +16,7 @@ from sim.detection import collection_m2_sr, detect_light
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
-from sim.sensor.lines import LineNoise
+from sim.sensor.lines import LineGains, LineNoise, Lines
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
 
@@ -373,8 +373,18 @@ class Uniform:
         return self._signal.read(electrons)
 
     def gain_map(self) -> FloatArray | None:
-        """Factor (rows, cols) on what is read of every pixel; None where it is the same for all."""
-        return self._signal.gain_map((self.camera.rows, self.camera.cols))
+        """Factor (rows, cols) on what is read of every pixel, without `line_gains`; None where it is the same for
+        all."""
+        return replace(self._signal, line_gains=()).gain_map((self.camera.rows, self.camera.cols))
+
+    @property
+    def line_gains(self) -> tuple[LineGains, ...]:
+        """Factors on what is read of rows or columns, at random."""
+        return self._signal.line_gains
+
+    def line_gain_std(self, lines: Lines) -> float:
+        """Relative standard deviation of the gains of rows or columns."""
+        return float(np.sqrt(sum(one.relative_std**2 for one in self.line_gains if one.lines == lines)))
 
     def offset_dn(self, elapsed_s: float, temperature_c: float | None, exposure_s: float) -> float:
         """DN added to the black level, beside the mean of `added_e`."""

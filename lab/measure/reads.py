@@ -19,6 +19,8 @@ CODES = frozenset({"codes.codes"})
 LEAK = frozenset({"charge.leak_s"})
 #: Factors on what is read, by place.
 GAINS = frozenset({"signal.gains"})
+#: Factors on what is read of rows and columns, at random.
+LINE_GAINS = frozenset({"signal.line_gains"})
 #: Row and column noise.
 LINES = frozenset({"signal.lines"})
 #: Spectrum of the read noise along a row.

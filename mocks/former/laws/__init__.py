@@ -70,6 +70,7 @@ from mocks.former.laws.readout import (
     DefectInterpolationLaw,
     DigitalGainLaw,
     JitteredRowsLaw,
+    LineGainLaw,
     LossyCodesLaw,
     NonlinearityLaw,
     OnChipSharpeningLaw,
@@ -151,6 +152,7 @@ LISTED: tuple[type[Law], ...] = (
     CoverGlassFringeLaw,
     ColouredReadNoiseLaw,
     MicrolensAngleLaw,
+    LineGainLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single

@@ -179,6 +179,31 @@ class TapOffsetLaw(Law):
         return {} if self.variant == 1 else {"offset_e": self.strength}
 
 
+class LineGainLaw(Law):
+    """Each line has an amplifier, or a slope of its converter, of its own. Variants: columns, normal; columns, uniform;
+    rows."""
+
+    name, effect = "line_gain", "column_gain"
+    variants, unit, nominal, limits = 3, "%", 0.6, (0.02, 6.0)
+
+    @property
+    def listed_effect(self) -> str | None:
+        return "row_gain" if self.variant == 2 else self.effect
+
+    def response(self, electrons: Array) -> Array:
+        rows, cols = electrons.shape
+        still = self.rng(21)
+        if self.variant == 1:
+            away = np.sqrt(3.0) * still.uniform(-1.0, 1.0, cols)
+        else:
+            away = still.standard_normal(rows if self.variant == 2 else cols)
+        away = 1.0 + self.strength / 100.0 * (away - away.mean())
+        return electrons * (away[:, None] if self.variant == 2 else away)
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"gain_percent": self.strength}
+
+
 class RowNoiseLaw(Law):
     """A temporal offset of each row. Variants: white; correlated between neighbouring rows."""
 

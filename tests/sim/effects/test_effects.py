@@ -209,9 +209,9 @@ def test_coloured_read_noise_keeps_its_variance(one: Effect) -> None:
     assert power.mean() == pytest.approx(1.0, rel=1e-6)
 
 
-@pytest.mark.parametrize("one", _acting("signal.gains"), ids=lambda e: e.name)
+@pytest.mark.parametrize("one", _acting("signal.gains") + _acting("signal.line_gains"), ids=lambda e: e.name)
 def test_gains_by_place_keep_the_mean_of_the_frame(one: Effect) -> None:
-    gains = Uniform(CAMERA, (one,)).gain_map()
+    gains = signal_of(CAMERA, (one,)).gain_map((CAMERA.rows, CAMERA.cols))
     assert gains is not None and np.ptp(gains) > 0.0
     assert gains.mean() == pytest.approx(1.0, rel=1e-12)
 
