@@ -30,6 +30,7 @@ from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.electrons import NEIGHBOURS
 from sim.sensor.lines import LineGains, LineNoise
+from sim.sensor.reading_order import ReadingOrderNoise
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
@@ -509,6 +510,7 @@ class Signal(State):
     lines, at random. `offset_dn`: (elapsed_s,
     sensor temperature) -> DN added to the black level; `exposure_offset_dn`: exposure_s -> the same. `noise_e2`:
     elapsed_s -> variance of every pixel beside the read noise's. `lines`: noise that rows or columns share.
+    `reading_order`: noise in the order in which pixels are read.
     `telegraph`: pixels that jump between two levels. `disturbances`: signals that are added at random. `filters`:
     kernels (odd, odd) of sum 1 that the chip runs over each colour's plane, signal and noise alike, before rounding.
     `read_spectrum`: frequency along the row in cycles per pixel, 0 to 0.5 -> factor on the read noise's power, of mean
@@ -522,6 +524,7 @@ class Signal(State):
     exposure_offset_dn: tuple[Callable[[float], float], ...] = ()
     noise_e2: tuple[Callable[[float], float], ...] = ()
     lines: tuple[LineNoise, ...] = ()
+    reading_order: tuple[ReadingOrderNoise, ...] = ()
     telegraph: tuple[Jumps, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     filters: tuple[FloatArray, ...] = ()
@@ -551,7 +554,8 @@ class Signal(State):
     @property
     def random(self) -> tuple[Disturbance, ...]:
         """Everything that is drawn anew in each frame, but for `noise_e2`."""
-        return (*self.lines, *(Telegraph(jumps) for jumps in self.telegraph), *self.disturbances)
+        jumps = (Telegraph(jumps) for jumps in self.telegraph)
+        return (*self.lines, *self.reading_order, *jumps, *self.disturbances)
 
     def random_at(self, elapsed_s: float) -> tuple[Disturbance, ...]:
         """Everything that is drawn anew in the frame taken at a time after the first capture."""

@@ -17,6 +17,7 @@ from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineGains, LineNoise, Lines
+from sim.sensor.reading_order import ReadingOrderNoise
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
 
@@ -405,6 +406,11 @@ class Uniform:
     def lines(self) -> tuple[LineNoise, ...]:
         """Noise that rows or columns share."""
         return self._signal.lines
+
+    @property
+    def reading_order(self) -> tuple[ReadingOrderNoise, ...]:
+        """Noise in the order in which pixels are read."""
+        return self._signal.reading_order
 
     @property
     def telegraph(self) -> tuple[Jumps, ...]:

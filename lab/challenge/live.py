@@ -215,6 +215,7 @@ SIZES: dict[str, str] = {
     "pixel_aperture": "left:side_change_um=-0.7",
     "radiometer_nonlinearity": "both:exponent_percent=4",
     "random_telegraph_noise": "left:amplitude_e=40,share_percent=0.5",
+    "reading_order_noise": "left:noise_e=4,alternating_e=2",
     "response_knee": "left:slope_percent=-3,knee_share=0.45",
     "row_gain": "left:gain_percent=0.7",
     "row_noise": "left:noise_e=3",

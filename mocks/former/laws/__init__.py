@@ -153,6 +153,7 @@ LISTED: tuple[type[Law], ...] = (
     ColouredReadNoiseLaw,
     MicrolensAngleLaw,
     LineGainLaw,
+    PinkNoiseLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
@@ -181,7 +182,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     TrefoilLaw,
     HaloLaw,
     InterPixelCapacitanceLaw,
-    PinkNoiseLaw,
     DustShadowLaw,
     LampJumpLaw,
     SmearLaw,
