@@ -28,7 +28,9 @@ from sim.optics.filters import veil_otf
 from sim.optics.pupil import Wavefront, pupil_ratio
 from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
-from sim.sensor.lines import LineNoise
+from sim.sensor.electrons import NEIGHBOURS
+from sim.sensor.lines import LineGains, LineNoise
+from sim.sensor.reading_order import ReadingOrderNoise
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
@@ -337,8 +339,8 @@ class Charge(State):
     hold: their sum stays, and equal neighbours exchange none. `overflow`: mean electrons (rows, cols) -> the same after
     full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame, from none to all.
     `traps`: what fills in a frame and empties over the frames that follow. `variance_e2`: (mean electrons, shot noise's
-    variance) -> variance. `correlation`: mean electrons (...) -> correlation (2, ...) of the shot noise with each of
-    the two next pixels in the row, and of the two next in the column.
+    variance) -> variance. `correlation`: mean electrons (...) -> correlation (5, ...) of the shot noise with each
+    neighbour, by the kinds of `sim.sensor.electrons.NEIGHBOURS`.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
@@ -427,8 +429,8 @@ class Charge(State):
         return reduce(lambda value, law: law(electrons, value), self.variance_e2, electrons)
 
     def neighbour_correlation(self, electrons: FloatArray) -> FloatArray:
-        """Correlation (2, ...) of a pixel's shot noise with each of the two next in its row, and in its column."""
-        return sum((law(electrons) for law in self.correlation), np.zeros((2, *np.shape(electrons))))
+        """Correlation (5, ...) of a pixel's shot noise with each neighbour, by kind (`NEIGHBOURS`)."""
+        return sum((law(electrons) for law in self.correlation), np.zeros((len(NEIGHBOURS), *np.shape(electrons))))
 
 
 class Disturbance(Protocol):
@@ -504,9 +506,11 @@ class Signal(State):
     """State of the electrons' read-out, up to the converter.
 
     `response`: electrons -> electrons, point by point; none stay none. `gains`: (row, col in px, which broadcast) ->
-    factor on what is read, noise alike, of mean 1 over the frame, as levels don't ask it. `offset_dn`: (elapsed_s,
+    factor on what is read, noise alike, of mean 1 over the frame, as levels don't ask it. `line_gains`: the same of
+    lines, at random. `offset_dn`: (elapsed_s,
     sensor temperature) -> DN added to the black level; `exposure_offset_dn`: exposure_s -> the same. `noise_e2`:
     elapsed_s -> variance of every pixel beside the read noise's. `lines`: noise that rows or columns share.
+    `reading_order`: noise in the order in which pixels are read.
     `telegraph`: pixels that jump between two levels. `disturbances`: signals that are added at random. `filters`:
     kernels (odd, odd) of sum 1 that the chip runs over each colour's plane, signal and noise alike, before rounding.
     `read_spectrum`: frequency along the row in cycles per pixel, 0 to 0.5 -> factor on the read noise's power, of mean
@@ -515,10 +519,12 @@ class Signal(State):
 
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     gains: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
+    line_gains: tuple[LineGains, ...] = ()
     offset_dn: tuple[Callable[[float, float | None], float], ...] = ()
     exposure_offset_dn: tuple[Callable[[float], float], ...] = ()
     noise_e2: tuple[Callable[[float], float], ...] = ()
     lines: tuple[LineNoise, ...] = ()
+    reading_order: tuple[ReadingOrderNoise, ...] = ()
     telegraph: tuple[Jumps, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     filters: tuple[FloatArray, ...] = ()
@@ -530,10 +536,11 @@ class Signal(State):
 
     def gain_map(self, shape: tuple[int, int]) -> FloatArray | None:
         """Factor (rows, cols) on what is read of every pixel; None where no law says one."""
-        if not self.gains:
+        if not (self.gains or self.line_gains):
             return None
         row, col = np.arange(float(shape[0]))[:, None], np.arange(float(shape[1]))[None, :]
-        return reduce(lambda value, law: value * law(row, col), self.gains, np.ones(shape))
+        areas = reduce(lambda value, law: value * law(row, col), self.gains, np.ones(shape))
+        return reduce(lambda value, law: value * law.factors(shape), self.line_gains, areas)
 
     def shift_dn(self, elapsed_s: float, temperature_c: float | None, exposure_s: float) -> float:
         """DN added to the black level."""
@@ -547,7 +554,8 @@ class Signal(State):
     @property
     def random(self) -> tuple[Disturbance, ...]:
         """Everything that is drawn anew in each frame, but for `noise_e2`."""
-        return (*self.lines, *(Telegraph(jumps) for jumps in self.telegraph), *self.disturbances)
+        jumps = (Telegraph(jumps) for jumps in self.telegraph)
+        return (*self.lines, *self.reading_order, *jumps, *self.disturbances)
 
     def random_at(self, elapsed_s: float) -> tuple[Disturbance, ...]:
         """Everything that is drawn anew in the frame taken at a time after the first capture."""

@@ -16,7 +16,8 @@ from sim.detection import collection_m2_sr, detect_light
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
-from sim.sensor.lines import LineNoise
+from sim.sensor.lines import LineGains, LineNoise, Lines
+from sim.sensor.reading_order import ReadingOrderNoise
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
 
@@ -358,8 +359,7 @@ class Uniform:
         return bool(self._charge.correlation)
 
     def neighbour_correlation(self, electrons: FloatArray) -> FloatArray:
-        """Correlation (2, ...) of a pixel's shot noise, at mean signals, with each of the two next in its row, and in
-        its column."""
+        """Correlation (5, ...) of a pixel's shot noise, at mean signals, with each neighbour, by `NEIGHBOURS`."""
         return self._charge.neighbour_correlation(electrons)
 
     # --- read-out ----------------------------------------------------------------------------------------------------
@@ -374,8 +374,18 @@ class Uniform:
         return self._signal.read(electrons)
 
     def gain_map(self) -> FloatArray | None:
-        """Factor (rows, cols) on what is read of every pixel; None where it is the same for all."""
-        return self._signal.gain_map((self.camera.rows, self.camera.cols))
+        """Factor (rows, cols) on what is read of every pixel, without `line_gains`; None where it is the same for
+        all."""
+        return replace(self._signal, line_gains=()).gain_map((self.camera.rows, self.camera.cols))
+
+    @property
+    def line_gains(self) -> tuple[LineGains, ...]:
+        """Factors on what is read of rows or columns, at random."""
+        return self._signal.line_gains
+
+    def line_gain_std(self, lines: Lines) -> float:
+        """Relative standard deviation of the gains of rows or columns."""
+        return float(np.sqrt(sum(one.relative_std**2 for one in self.line_gains if one.lines == lines)))
 
     def offset_dn(self, elapsed_s: float, temperature_c: float | None, exposure_s: float) -> float:
         """DN added to the black level, beside the mean of `added_e`."""
@@ -396,6 +406,11 @@ class Uniform:
     def lines(self) -> tuple[LineNoise, ...]:
         """Noise that rows or columns share."""
         return self._signal.lines
+
+    @property
+    def reading_order(self) -> tuple[ReadingOrderNoise, ...]:
+        """Noise in the order in which pixels are read."""
+        return self._signal.reading_order
 
     @property
     def telegraph(self) -> tuple[Jumps, ...]:

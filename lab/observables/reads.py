@@ -19,8 +19,10 @@ CODES = frozenset({"codes.codes"})
 LEAK = frozenset({"charge.leak_s"})
 #: Factors on what is read, by place.
 GAINS = frozenset({"signal.gains"})
-#: Row and column noise.
-LINES = frozenset({"signal.lines"})
+#: Factors on what is read of rows and columns, at random.
+LINE_GAINS = frozenset({"signal.line_gains"})
+#: Noise that pixels of a line share: of rows, of columns, and in the order in which pixels are read.
+LINES = frozenset({"signal.lines", "signal.reading_order"})
 #: Spectrum of the read noise along a row.
 READ_SPECTRUM = frozenset({"signal.read_spectrum"})
 #: The light of a screen for the picture that it is given.

@@ -116,6 +116,7 @@ _TOLD = {
     Family.READ_OUT_AREAS: _Told(
         "areas of the read-out",
         "Parts of the frame are read with another gain or another offset.",
+        "flat and dark frames with many repeats: areas differ from the line where they meet on, columns one by one",
     ),
     Family.DARK_SIGNAL: _Told(
         "dark signal and offset",

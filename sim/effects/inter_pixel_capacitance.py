@@ -8,13 +8,15 @@ import numpy as np
 
 from sim.effects.crosstalk import Crosstalk
 from sim.effects.families import Family
+from sim.sensor.electrons import NEIGHBOURS
 from sim.stages import Charge
 
 
 class InterPixelCapacitance(Crosstalk):
-    """The kernel of `Crosstalk` on what the pixels hold, noise and all: the image and its colours mix as by charge that
-    goes astray, and neighbours' shot noise is correlated, 2 c / (1 - 4 c) at all levels of light; read noise comes
-    after.
+    """The kernel of `Crosstalk` on what the pixels hold, noise and all, with unequal axes and a share across corners:
+    the image and its colours mix as by charge that goes astray. Shot noise has the kernel's autocorrelation at all
+    levels of light: 2 c / (1 - 4 c) of the next pixels to first order, and as much across corners as these couple.
+    Read noise comes after.
     """
 
     name: ClassVar[str] = "inter_pixel_capacitance"
@@ -34,9 +36,12 @@ class InterPixelCapacitance(Crosstalk):
         if self.share_percent == 0.0:
             return charge
         kernel = self.kernel()
-        along, down, own = kernel[1, 0], kernel[0, 1], kernel[1, 1]
-        shared = 2.0 * own * np.array([along, down]) / (own * own + 2.0 * along * along + 2.0 * down * down)
-        lost = 1.0 - float(np.sum(np.square(kernel)))
+        squares = float(np.sum(np.square(kernel)))
+        wide = np.pad(kernel, 2)
+        shared = np.array(
+            [np.sum(kernel * wide[2 + down : 5 + down, 2 + right : 5 + right]) for (down, right), *_ in NEIGHBOURS]
+        )
+        shared, lost = shared / squares, 1.0 - squares
         return charge.add_laws(
             kernels=kernel,
             correlation=lambda electrons: np.multiply.outer(shared, np.ones(np.shape(electrons))),

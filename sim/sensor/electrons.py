@@ -38,7 +38,7 @@ class ReadOut:
     shape, of mean `added_e`
                   and variance `added_e2`
     codes         DN before rounding -> DN
-    neighbours    mean electrons -> correlation (2, ...) of the shot noise with each neighbour in the row, in the column
+    neighbours    mean electrons -> correlation (5, ...) of the shot noise with each neighbour, by `NEIGHBOURS`
     processing    kernel of a filter of each colour's DN before rounding
     offset_dn     added to the black level
     gain          factor (rows, cols) on what is read of every pixel, its noise alike, before `added`
@@ -373,8 +373,8 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
         wanted = np.maximum(read_out.shot_e2(mean.astype(float)), 0.0)
         charge = (mean + (charge - mean) * np.sqrt(wanted / np.maximum(mean, 1e-12))).astype(np.float32)
     if read_out.neighbours is not None:
-        correlation = read_out.neighbours(mean.astype(float))
-        charge = (mean + shared_departures(charge - mean, mean, correlation)).astype(np.float32)
+        shares = passed_shares(read_out.neighbours, mean.astype(float))
+        charge = (mean + shared_departures(charge - mean, mean, shares)).astype(np.float32)
     np.minimum(charge, np.float32(camera.full_well_e), out=charge)
     if read_out.response is not None:
         charge = read_out.response(charge.astype(float)).astype(np.float32)
@@ -387,27 +387,80 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
     return charge
 
 
-#: A pixel's two neighbours in its row, and those in its column.
-NEXT = np.array([[1.0, 0.0, 1.0]]), np.array([[1.0], [0.0], [1.0]])
+#: The neighbours with which a pixel may share noise, (rows down, columns to the right), by kind: the next ones in its
+#: row and its column, those across corners, the second ones in its row and its column.
+NEIGHBOURS: tuple[tuple[tuple[int, int], ...], ...] = (
+    ((0, 1), (0, -1)),
+    ((1, 0), (-1, 0)),
+    ((1, 1), (1, -1), (-1, 1), (-1, -1)),
+    ((0, 2), (0, -2)),
+    ((2, 0), (-2, 0)),
+)
+#: Steps by which shares follow from correlations: each takes the error down by about a correlation's size.
+SHARE_STEPS = 12
+#: Levels at which shares are solved for a frame; between them they are interpolated.
+SHARE_LEVELS = 65
+
+
+def _products() -> tuple[tuple[tuple[int, int], ...], ...]:
+    """For each kind of neighbour, the pairs of kinds whose shares' product adds to its covariance, one pair for each
+    pair of places; the pixel itself isn't among them."""
+    places = [(kind, place) for kind, every in enumerate(NEIGHBOURS) for place in every]
+    found = []
+    for first, *_ in NEIGHBOURS:
+        found.append(
+            tuple(
+                (one, other)
+                for one, (down, right) in places
+                for other, (below, beside) in places
+                if (down - below, right - beside) == first
+            )
+        )
+    return tuple(found)
+
+
+_PRODUCTS = _products()
 
 
 def solve_passed_share(correlation: FloatArray) -> FloatArray:
-    """Shares g (2, ...) of each neighbour's deviation that a pixel takes over, in the row and in the column, given the
-    correlations r (2, ...) that result between two equal ones: r = 2 g / n with n = 1 + 2 sum g^2, so that
-    n = 1 + sum r^2 n^2 / 2."""
-    r = np.clip(np.asarray(correlation, float), 0.0, 0.49)
-    n = 2.0 / (1.0 + np.sqrt(1.0 - 2.0 * np.sum(np.square(r), axis=0)))
-    return np.asarray(0.5 * r * n)
+    """Shares g (5, ...) of each neighbour's deviation that a pixel takes over, by `NEIGHBOURS`, given the correlations
+    r (5, ...) that result between equal pixels: r = (2 g + sum g_a g_b) / n, where n = 1 + sum of all squares, and the
+    sum is over the neighbours a and b that lie as far apart as the two pixels. Solved by fixed-point steps.
+    """
+    r = np.clip(np.asarray(correlation, float), -0.49, 0.49)
+    counts = [len(places) for places in NEIGHBOURS]
+    g = 0.5 * r
+    for _ in range(SHARE_STEPS):
+        squares = sum((m * np.square(one) for m, one in zip(counts, g, strict=True)), np.ones(r.shape[1:]))
+        mixed = [sum((g[a] * g[b] for a, b in pairs), np.zeros(r.shape[1:])) for pairs in _PRODUCTS]
+        g = 0.5 * (r * squares - np.array(mixed))
+    return np.asarray(g)
 
 
-def shared_departures(departure: NDArray[F], mean: NDArray[F], correlation: FloatArray) -> FloatArray:
+def passed_shares(correlation: Callable[[FloatArray], FloatArray], mean: FloatArray) -> FloatArray:
+    """Return the shares (5, rows, cols) of `solve_passed_share` in a frame of `mean` electrons (rows, cols).
+
+    correlation : mean electrons (...) -> correlations (5, ...), linear between `SHARE_LEVELS` levels
+    """
+    levels = np.linspace(0.0, max(float(np.max(mean, initial=0.0)), 1.0), SHARE_LEVELS)
+    shares = solve_passed_share(correlation(levels))
+    return np.array([np.interp(mean, levels, of_kind) for of_kind in shares])
+
+
+def shared_departures(departure: NDArray[F], mean: NDArray[F], shares: FloatArray) -> FloatArray:
     """Deviations (rows, cols) of Poisson variables of given means after every pixel has taken over a share of its
-    neighbours', with unchanged variances: d_i + sum g_i d_j, over sqrt(1 + sum g_i^2 v_j / v_i). `correlation` (2,
-    rows, cols): with each neighbour in the row, in the column."""
+    neighbours', with unchanged variances: d_i + sum g_i d_j, over sqrt(1 + sum g_i^2 v_j / v_i). `shares` (5, rows,
+    cols): of each neighbour, by `NEIGHBOURS`."""
     taken, spread = np.asarray(departure, float), np.ones(departure.shape)
-    for share, neighbours in zip(solve_passed_share(correlation), NEXT, strict=True):
-        taken = taken + share * convolve(departure, neighbours, mode="mirror")
-        around = convolve(np.asarray(mean, float), neighbours, mode="mirror")
+    for share, places in zip(shares, NEIGHBOURS, strict=True):
+        if not np.any(share):
+            continue
+        reach = max(abs(step) for place in places for step in place)
+        kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
+        for down, right in places:
+            kernel[reach + down, reach + right] = 1.0
+        taken = taken + share * convolve(departure, kernel, mode="mirror")
+        around = convolve(np.asarray(mean, float), kernel, mode="mirror")
         spread = spread + np.square(share) * around / np.maximum(mean, 1e-12)
     return np.asarray(taken / np.sqrt(spread))
 

@@ -17,6 +17,8 @@ KNEE_CY_PER_LINE = 1e-3
 FOLDED = 4
 #: What makes the fixed offsets of rows and of columns different draws of one seed.
 _STREAM = {"columns": 3, "rows": 4}
+#: The same of their gains.
+_GAIN_STREAM = {"columns": 5, "rows": 6}
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,22 @@ class LineNoise:
         c = self.correlation
         turn = np.cos(2.0 * np.pi * np.asarray(frequency_cy_per_px))
         return np.asarray(self.temporal_e**2 * (1.0 - c * c) / (1.0 - 2.0 * c * turn + c * c))
+
+
+@dataclass(frozen=True)
+class LineGains:
+    """Factors on what is read of rows (or columns), drawn once by `seed`: normal, independent, of mean 1 over the
+    lines."""
+
+    lines: Lines
+    relative_std: float
+    seed: int = 0
+
+    def factors(self, shape: tuple[int, int]) -> FloatArray:
+        """Return the factors, (rows, 1) or (1, columns)."""
+        along = (shape[0], 1) if self.lines == "rows" else (1, shape[1])
+        drawn = np.random.default_rng([self.seed, _GAIN_STREAM[self.lines]]).standard_normal(along)
+        return np.asarray(1.0 + self.relative_std * (drawn - drawn.mean()))
 
 
 def _correlate(white: FloatArray, correlation: float) -> FloatArray:

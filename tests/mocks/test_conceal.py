@@ -82,6 +82,7 @@ CASES = (
     Case("left:charge_diffusion:length_um=2.5", (EDGE, SCREEN)),
     # 1/f noise of 96 rows has the power of some five free modes: its mean square scatters by half of itself
     Case("left:coloured_line_noise:noise_e=12,exponent=1", (DARK,), tolerance=0.6),
+    Case("left:column_gain:gain_percent=8", (FLAT,)),
     Case("left:column_noise:offset_e=6,odd_even_e=4", (DARK,)),
     Case("left:coma:w131_x_um=0.5", (EDGE, SCREEN)),
     Case("left:cover_glass:thickness_mm=20", (EDGE, SCREEN)),
@@ -114,6 +115,9 @@ CASES = (
     Case("left:pixel_aperture:side_change_um=1.5", (SCREEN,)),
     Case("both:radiometer_nonlinearity:exponent_percent=12,growth=0.5", (SWEPT,)),
     Case("left:random_telegraph_noise:amplitude_e=40,share_percent=10", (DARK,)),
+    # half of the power is in a frame's few slowest waves
+    Case("left:reading_order_noise:noise_e=6,alternating_e=6,exponent=0.7", (DARK,), tolerance=0.6),
+    Case("left:row_gain:gain_percent=8", (FLAT,)),
     Case("left:row_noise:noise_e=4,offset_e=4", (DARK,), tolerance=0.4),
     Case("both:screen_gamma:exponent=2.5", (SCREEN,)),
     Case("both:screen_pixel_structure:amplitude_percent=60", (replace(SCREEN, cell_px=8),)),

@@ -10,12 +10,14 @@ from lab.observables.darks.frames import CELL_FLOOR_DN, CELLS, cell_means, dark_
 from lab.observables.darks.level import dark_current_map
 from lab.observables.dataset import Study
 from lab.observables.observable import Block, Label, Measurement, Prediction
-from lab.observables.reads import ADDED, DARK_CURRENT
+from lab.observables.reads import ADDED, DARK_CURRENT, LINES
 from sim.effects.base import Effects
 from sim.sensor.lines import Lines
+from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
 CELL_PX = 4  # the least side of a cell
+SLOW_CYCLES = 6  # down a frame, of noise whose waves cells tell
 
 
 def dark_field_block(study: Study) -> Block:
@@ -75,6 +77,11 @@ def dark_field_block(study: Study) -> Block:
             column = np.zeros(len(value))
             column[i * count : (i + 1) * count] = 1.0
             jacobian[f"dark_field:{i}"] = column
+        for number, shape in enumerate(_slow_rows(study, model)):
+            for i, (*_, part) in enumerate(points):
+                column = np.zeros(len(value))
+                column[i * count : (i + 1) * count] = shape / np.sqrt(part.frames)
+                jacobian[f"dark_field:slow:{number}:{i}"] = column
         return Prediction(mean, jacobian)
 
     longest = max(float(exposures.max()), 1e-9)
@@ -82,8 +89,29 @@ def dark_field_block(study: Study) -> Block:
         measurement=DARK_FIELD, reach=0.5, value=value, covariance=np.asarray(covariance, float),
         labels=tuple(Label(float(radius[k]), "all", f.condition.name, part.captures, out) for f, out,
         part in points for k in range(count)),
-        reads=DARK_CURRENT | ADDED, predict=predict, scale=np.repeat(np.maximum(exposures / longest, 0.1), count),
+        reads=DARK_CURRENT | ADDED, scattered_by=LINES, predict=predict,
+        scale=np.repeat(np.maximum(exposures / longest, 0.1), count),
     )  # fmt: skip
+
+
+def _slow_rows(study: Study, model: Uniform) -> list[FloatArray]:
+    """Vectors (cells,) by which single frames' cells scatter with waves of `SLOW_CYCLES` cycles down the rows that
+    effects' noise has, DN: few of them, so that their scatter isn't that of independent cells."""
+    if not (model.lines or model.reading_order):
+        return []
+    shape = study.camera.rows, study.camera.cols
+    cycles = np.arange(1.0, SLOW_CYCLES + 1.0)
+    frequency = cycles / shape[0]
+    power_e2 = np.zeros(len(cycles))
+    for line in model.lines:
+        if line.lines == "rows":
+            power_e2 += line.spectrum_e2(frequency, fixed=False)
+    for ordered in model.reading_order:
+        power_e2 += ordered.plane_e2(shape, np.zeros(len(cycles)), frequency) / shape[1]
+    phase = 2.0 * np.pi * cycles[:, None] * np.arange(shape[0]) / shape[0]
+    size_dn = study.noise.gain * np.sqrt(2.0 * power_e2 / shape[0])
+    waves = np.concatenate([size_dn[:, None] * np.cos(phase), size_dn[:, None] * np.sin(phase)])
+    return [cell_means(np.tile(wave[:, None], (1, shape[1]))).ravel() for wave in waves]
 
 
 DARK_FIELD = Measurement(

@@ -13,6 +13,7 @@ from lab.observables.noise.figures import CLIP
 from lab.observables.observable import Block, Label, Measurement, Prediction
 from lab.observables.reads import DARK_CURRENT, LAG, LINES, acting
 from sim.effects.base import Effects
+from sim.sensor.reading_order import ReadingOrderNoise
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -65,6 +66,7 @@ def dark_noise_block(study: Study) -> Block:
         model = Uniform(study.camera, effects)
         more_at = added_dark_e_per_s(study, effects)
         lines = sum((one.variance_e2(()) for one in model.lines), 0.0)
+        lines += sum((one.variance_e2(()) for one in model.reading_order), 0.0)
         for i, (f, out, _) in enumerate(points):
             t, temperature = f.condition.exposure_s, f.condition.temperature_c
             carried[i] = noise.gain**2 * _carried_e(study, effects, f.condition, out)
@@ -75,6 +77,12 @@ def dark_noise_block(study: Study) -> Block:
             "dark_read": np.full(len(points), 0.5 * shortest + 0.1),
             "dark": noise.gain * exposures * noise.dark_std,
         }
+        slow_dn2 = noise.gain**2 * sum((_slow_scatter_e2(study, one) for one in model.reading_order), 0.0)
+        if slow_dn2 > 0.0:
+            for i, contrasts in enumerate(count):
+                jacobian[f"dark_noise:slow:{i}"] = np.where(
+                    np.arange(len(points)) == i, slow_dn2 / np.sqrt(contrasts), 0.0
+                )
         if np.any(carried):
             jacobian["dark_noise:carried"] = CARRIED_STD * carried
         jacobian["gain" if flats else "dark_gain"] = gain_std * shot
@@ -87,6 +95,14 @@ def dark_noise_block(study: Study) -> Block:
         _ in points),
         reads=DEFECTS | DARK_CURRENT | LAG | LINES, predict=predict, scale=value,
     )  # fmt: skip
+
+
+def _slow_scatter_e2(study: Study, one: ReadingOrderNoise) -> float:
+    """Standard deviation of a frame's variance by the rows' few slow waves: sqrt(2 sum P^2) / pixels, P their power."""
+    shape = study.camera.rows, study.camera.cols
+    down = np.arange(1, shape[0]) / shape[0]
+    power = one.plane_e2(shape, np.zeros(len(down)), down)
+    return float(np.sqrt(2.0 * np.sum(np.square(power)))) / (shape[0] * shape[1])
 
 
 def _carried_e(study: Study, effects: Effects, condition: DarkCondition, held_out: bool) -> float:

@@ -31,6 +31,7 @@ from lab.observables.reads import ADDED, LINES, READ_SPECTRUM
 from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.sensor.lines import Lines
+from sim.sensor.reading_order import ReadingOrderNoise
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -77,6 +78,7 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
         for one in model.lines:
             if one.lines == lines:
                 total += one.spectrum_e2(frequency, fixed=False)
+        total += _ordered_power(study, model, lines, frequency) / length
         shared = over * np.tile(study.noise.gain**2 * length * bands.mean(total), sets)
         # the means of rows hold the read noise's power at frequency 0, those of columns its spectrum
         along = frequency if lines == "columns" else np.zeros(len(frequency))
@@ -89,6 +91,22 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
         covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES | READ_SPECTRUM,
         predict=predict, scale=np.ones(n),
     )  # fmt: skip
+
+
+def _ordered_power(study: Study, model: Uniform, lines: Lines, frequency_cy_per_px: FloatArray) -> FloatArray:
+    """Return the power of lines' means by noise in reading order, times the pixels of a line, less its power in
+    `LEVEL_BAND`; e^2."""
+    shape, zero = (study.camera.rows, study.camera.cols), np.zeros(len(frequency_cy_per_px))
+    found = zero
+    for one in model.reading_order:
+        across, down = (zero, frequency_cy_per_px) if lines == "rows" else (frequency_cy_per_px, zero)
+        found = found + one.plane_e2(shape, across, down) - _ordered_level(one)
+    return found
+
+
+def _ordered_level(one: ReadingOrderNoise) -> float:
+    """Mean power of noise in reading order in `LEVEL_BAND`, e^2, where rows hardly depend on each other."""
+    return float(np.mean(one.spectrum_e2(np.linspace(*LEVEL_BAND, 33))))
 
 
 def _coloured_power(study: Study, model: Uniform, frequency_cy_per_px: FloatArray, white_dn2: float) -> FloatArray:
@@ -155,6 +173,7 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
                 still += one.spectrum_e2(frequency, fixed=True)
                 moving += one.spectrum_e2(frequency, fixed=False)
                 odd += one.odd_even_e
+        moving += _ordered_power(study, model, lines, frequency) / length
         parts = zip(factor, first.fixed.values(), strict=True)
         power = np.concatenate([np.log1p(f * bands.mean(still + moving / part.frames)) for f, part in parts])
         return Prediction(np.concatenate([power, np.full(pieces, study.noise.gain * odd)]), {})
@@ -193,7 +212,8 @@ def correlation_block(study: Study) -> Block:
     """
     fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN * study.step_dn)
     value, variance, labels = [], [], []
-    along: list[tuple[str, Bands, FloatArray, float]] = []  # lines, bands, frequencies, DN^2 of white noise
+    # lines, bands, frequencies, DN^2 of white noise, contrasts
+    along: list[tuple[str, Bands, FloatArray, float, float]] = []
     for out, part in by_part(fine).items():
         ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
         weight = np.array([min(c.contrasts, 6) for c in part], float)
@@ -210,7 +230,7 @@ def correlation_block(study: Study) -> Block:
             variance.append(1.0 / total + 1.0 / level + POWER_FLOOR**2)
             labels += [Label(float(x), "all", f"along {lines}", ids, out) for x in bands.middle]
             white_dn2 = 1.0 / float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))
-            along.append((lines, bands, frequency, white_dn2))
+            along.append((lines, bands, frequency, white_dn2, float(weight.sum())))
     if not labels:
         raise NotDetermined(
             "dark_correlation",
@@ -221,14 +241,28 @@ def correlation_block(study: Study) -> Block:
     def predict(effects: Effects) -> Prediction:
         # row and column noise has no spectrum along its lines; that of read noise along columns is its mean over rows
         model, means = Uniform(study.camera, effects), []
-        for lines, bands, frequency, white_dn2 in along:
+        shape = study.camera.rows, study.camera.cols
+        scatter = []
+        for lines, bands, frequency, white_dn2, contrasts in along:
             if lines == "rows":
                 power = bands.mean(_coloured_power(study, model, frequency, white_dn2))
             else:
                 every = _coloured_power(study, model, np.linspace(0.0, 0.5, 257), white_dn2)
                 power = np.full(len(bands.middle), every.mean())
+            for one in model.reading_order:
+                own = (one.along_rows_e2 if lines == "rows" else one.along_columns_e2)(shape, frequency)
+                power = power + study.noise.gain**2 / white_dn2 * bands.mean(own - _ordered_level(one))
             means.append(np.log1p(power))
-        return Prediction(np.concatenate(means), {})
+            waves = [one.plane_e2(shape, np.full(len(frequency), 0.5), frequency) for one in model.reading_order]
+            few = bands.mean(np.square(sum(waves, np.zeros(len(frequency))))) / bands.modes / contrasts
+            alone = 2.0 / shape[1] * study.noise.gain**2 / white_dn2 * np.sqrt(few)
+            scatter.append(alone / (1.0 + power) if lines == "columns" else np.zeros(len(alone)))
+        # of waves that alternate from column to column each band has few
+        each = np.diag(np.concatenate(scatter))
+        return Prediction(
+            np.concatenate(means),
+            {f"dark_correlation:few:{k}": column for k, column in enumerate(each) if column.any()},
+        )
 
     return Block(
         measurement=DARK_CORRELATION, reach=0.03, value=np.concatenate(value),

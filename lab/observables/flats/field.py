@@ -15,12 +15,13 @@ from lab.observables.darks.readout import OFFSETS_STD, DarkReadOut, dark_readout
 from lab.observables.dataset import Study, held_out_flats
 from lab.observables.flats.row_light import ROW_LIGHT, nuisances, row_light_scatter
 from lab.observables.observable import Block, Label, Measurement, Prediction
-from lab.observables.reads import ADDED, COLLECTED, GAINS, LEAK, acting
+from lab.observables.reads import ADDED, COLLECTED, GAINS, LEAK, LINE_GAINS, acting
 from sim.camera import CameraModel
 from sim.effects.base import Effects
 from sim.frame import collected_mosaic
 from sim.point import even_share
 from sim.sensor import mosaic
+from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 from sim.uniform import SHADING, STRAYS, FieldPoints, Uniform
 
@@ -192,7 +193,7 @@ def line_block(study: Study) -> Block:
         if not differing:
             return Prediction(np.zeros(len(values)), jacobian)
         found = []
-        for line in _lines(study.camera, differing):
+        for line in even_lines(study.camera, differing):
             found += [step for _, step, *_ in _steps(line, period, 0.0)] + [_stripes(line, period, 0.0)[0]]
         return Prediction(np.tile(found, len(images)), jacobian)
 
@@ -203,7 +204,7 @@ def line_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _lines(camera: CameraModel, effects: Effects) -> tuple[FloatArray, FloatArray]:
+def even_lines(camera: CameraModel, effects: Effects) -> tuple[FloatArray, FloatArray]:
     """Return the means of the columns and of the rows of even light, each over its mean, as effects leave it."""
     rows = collect_rows(camera, acting(effects, COLLECTED)).mean(axis=1)
     gains = Uniform(camera, effects).gain_map()
@@ -355,7 +356,9 @@ def shading_block(study: Study) -> Block:
         own = _own_factors(planes, place, effects, study)
         base = _shaded(planes, place, effects, study, own)
         axis = {name: _shaded(planes, off, effects, study, own) - base for name, off in moved.items()}
-        return Prediction(base, axis | _row_light(planes, base, Uniform(camera, effects), camera.rows))
+        model = Uniform(camera, effects)
+        scatter = _row_light(planes, base, model, camera.rows) | _line_gains(planes, base, model, camera)
+        return Prediction(base, axis | scatter)
 
     radius = np.hypot(x_mm, y_mm)
     return Block(
@@ -365,7 +368,7 @@ def shading_block(study: Study) -> Block:
         p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
         reads=SHADING | ADDED | COLLECTED | GAINS | LEAK | STRAYS | {"signal.response", "image.veils"},
-        scattered_by=ROW_LIGHT,
+        scattered_by=ROW_LIGHT | LINE_GAINS,
         predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
@@ -574,6 +577,27 @@ def _row_light(planes: Sequence[_ChannelCells], base: FloatArray, model: Uniform
             for one in row_light_scatter(model, rows, exposure_s, len(captures) ** 2 / frames, of):
                 vectors.append(base * np.kron(own, np.repeat(one, COLS)))
     return nuisances("flat_field", vectors)
+
+
+def _line_gains(
+    planes: Sequence[_ChannelCells], base: FloatArray, model: Uniform, camera: CameraModel
+) -> dict[str, FloatArray]:
+    """Jacobian of the cells `base` by gains of rows and columns, the same in all frames: a mean over n lines of one
+    parity, which a plane of the mosaic has alone or shares, scatters by 1 / sqrt(n) of a line's."""
+    step, found = mosaic.step(camera.cfa), {}
+    counts: dict[Lines, tuple[int, int]] = {"rows": (ROWS, camera.rows), "columns": (COLS, camera.cols)}
+    for axis, (lines, (cells, count)) in enumerate(counts.items()):
+        std = model.line_gain_std(lines) / np.sqrt(count / step / cells)
+        if std == 0.0:
+            continue
+        for parity in range(step):
+            own = [[phase[axis] % step == parity for phase in mosaic.phases(camera.cfa)[p.channel]] for p in planes]
+            share = np.array([np.mean(phases) for phases in own])
+            for k in range(cells):
+                at = (np.arange(cells) == k) - 1.0 / cells
+                frame = np.repeat(at, COLS) if lines == "rows" else np.tile(at, ROWS)
+                found[f"flat_field:gains of {lines}:{parity}:{k}"] = std * base * np.kron(share, frame)
+    return found
 
 
 def _cells(plane: FloatArray) -> FloatArray:

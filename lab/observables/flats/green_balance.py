@@ -14,10 +14,11 @@ from lab.observables.dataset import Study
 from lab.observables.flats.field import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
 from lab.observables.noise.figures import BLACK_FLOOR_DN
 from lab.observables.observable import Block, Label, Measurement, Prediction
-from lab.observables.reads import COLLECTED, acting
+from lab.observables.reads import COLLECTED, LINE_GAINS, acting
 from sim.effects.base import Effects
 from sim.frame import collected_mosaic
 from sim.sensor import mosaic
+from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 from sim.uniform import STRAYS, FieldPoints, Uniform
 
@@ -101,11 +102,11 @@ def green_block(study: Study) -> Block:
             flat = [r.x == 0.0 for r in ratios]  # none where only narrowband light is there, or every flat is noisy
             of_flats = parted[flat if any(flat) else slice(None)].mean(0)
             placed = np.tile(of_flats - of_flats.mean(), cells // number)
-        return Prediction(np.concatenate([found, placed]), {})
+        return Prediction(np.concatenate([found, placed]), _line_gains(model, len(ratios), cells // number))
 
     return Block(
         measurement=GREEN_BALANCE, reach=25.0, value=value, covariance=covariance, labels=tuple(labels),
-        reads=GREENS | STRAYS, predict=predict, scale=np.ones(len(value)),
+        reads=GREENS | STRAYS, scattered_by=LINE_GAINS, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -216,6 +217,26 @@ def _parted(ratio: _Ratio, study: Study, model: Uniform) -> FloatArray:
     place = FieldPoints.of(study.camera, 4 * rows, 4 * cols)
     more = model.part_greens({c: np.array(m) for c, m in ratio.mean.items()}, place) / max(ratio.mean["G"], 1e-9)
     return np.asarray(more.reshape(rows, 4, cols, 4).mean((1, 3)).ravel())
+
+
+def _line_gains(model: Uniform, ratios: int, parts: int) -> dict[str, FloatArray]:
+    """Jacobian of all numbers by gains of rows and columns: greens lie on even and on odd ones of both, and the means
+    of n lines differ by sqrt(4 / n) of a line's standard deviation. `ratios` are of whole frames; `parts` times the
+    cells' follow, less their mean."""
+    rows, cols = CELLS
+    found = {}
+    counts: dict[Lines, tuple[int, int]] = {"rows": (rows, model.camera.rows), "columns": (cols, model.camera.cols)}
+    for lines, (cells, count) in counts.items():
+        std = model.line_gain_std(lines)
+        if std == 0.0:
+            continue
+        for k in range(cells):
+            at = np.eye(cells)[k] - 1.0 / cells
+            placed = np.tile(np.repeat(at, cols) if lines == "rows" else np.tile(at, rows), parts)
+            whole = np.full(ratios, 1.0 / cells)
+            one = 2.0 * std / np.sqrt(count / cells)
+            found[f"green_balance:gains of {lines}:{k}"] = one * np.concatenate([whole, placed])
+    return found
 
 
 def _cell_means(plane: FloatArray) -> FloatArray:

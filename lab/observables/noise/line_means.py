@@ -1,4 +1,4 @@
-"""Scatter of the means of single frames by row and column noise of effects.
+"""Scatter of the means of single frames by effects' noise of rows and columns, and in reading order.
 
 The pixels of a line share its noise, so that the mean of a channel scatters by more than the noise of independent
 pixels. Of n lines whose noise has the power spectrum S(f) (e^2) across lines, the mean over all lines has the variance
@@ -44,13 +44,22 @@ class LineMeans:
             count = camera.rows if one.lines == "rows" else camera.cols
             for name, frequency in (("mean", 0.0), ("odd", 0.5)):
                 std_dn = gain * float(np.sqrt(one.spectrum_e2(np.array([frequency]), fixed=False)[0] / count))
-                key = one.lines, name, std_dn
-                if std_dn > 0.0 and key not in self._kept:
-                    if len(self._kept) > MOST_KEPT:
-                        self._kept.clear()
-                    self._kept[key] = dict(self._of_captures(*key))
-                columns |= self._kept.get(key, {})
+                columns |= self._columns(one.lines, name, std_dn)
+        shape = camera.rows, camera.cols
+        for ordered in Uniform(camera, effects).reading_order:
+            for name, frequency in (("mean", 0.0), ("odd", 0.5)):
+                power_e2 = float(ordered.plane_e2(shape, np.array(frequency), np.array(0.0)))
+                columns |= self._columns("columns", name, gain * float(np.sqrt(power_e2 / (shape[0] * shape[1]))))
         return columns
+
+    def _columns(self, lines: str, name: str, std_dn: float) -> dict[str, FloatArray]:
+        """Return the columns of one strength, which are kept."""
+        key = lines, name, std_dn
+        if std_dn > 0.0 and key not in self._kept:
+            if len(self._kept) > MOST_KEPT:
+                self._kept.clear()
+            self._kept[key] = dict(self._of_captures(*key))
+        return self._kept.get(key, {})
 
     def _of_captures(self, lines: str, name: str, std_dn: float) -> Iterator[tuple[str, FloatArray]]:
         """Yield the columns of one strength, one for each capture."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -10,13 +11,14 @@ from scipy.ndimage import convolve1d
 
 from lab.errors import NotDetermined
 from lab.observables.dataset import Study
-from lab.observables.noise.temporal import PAIRS, dark_repeats, flat_repeats
+from lab.observables.noise.temporal import OUTLIER, PAIRS, dark_repeats, flat_repeats
 from lab.observables.observable import LEVEL_REACH, Block, Label, Measurement, Prediction
 from lab.observables.reads import READ_SPECTRUM
-from sim.camera import Cfa
+from sim.camera import CameraModel, Cfa
 from sim.effects.base import Effects
 from sim.sensor import mosaic
-from sim.sensor.electrons import solve_passed_share
+from sim.sensor.electrons import NEIGHBOURS, solve_passed_share
+from sim.sensor.reading_order import ReadingOrderNoise
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -44,23 +46,26 @@ def neighbour_block(study: Study) -> Block:
     def predict(effects: Effects) -> Prediction:
         model = Uniform(camera, effects)
         kernel, read_kernel = model.filter_kernel(), model.read_kernel()
-        if kernel is None and read_kernel is None and not model.shares_shot_noise:
+        ordered = [OrderedCovariance.of(one, camera) for one in model.reading_order]
+        if kernel is None and read_kernel is None and not model.shares_shot_noise and not ordered:
             return Prediction(np.zeros(len(value)), {})
         parts = []
         for r in points:
             gain = noise.gain * r.gain
             electrons = np.array([max(s, 0.0) / gain for s in r.signal.values()])
             read = max(noise.read_dn**2 - noise.quantisation_dn2, 0.1 * noise.read_dn**2) / noise.gain**2
+            slow = sum(one.own_e2 for one in ordered)  # a part of what is measured as read noise
             parts.append(
                 correlations(
                     camera.cfa,
                     list(r.signal),
                     np.maximum(model.shot_e2(electrons), 0.0),
                     solve_passed_share(model.neighbour_correlation(electrons)),
-                    read,
+                    max(read - slow, 0.1 * read),
                     noise.quantisation_dn2 / gain**2,
                     kernel,
                     read_kernel,
+                    ordered,
                 )
             )
         return Prediction(np.concatenate(parts), {})
@@ -70,7 +75,8 @@ def neighbour_block(study: Study) -> Block:
         value=value, covariance=covariance + CORRELATION_FLOOR**2 * np.eye(len(value)),
         labels=tuple(Label(r.level if bright else 0.0, name, f"{r.exposure_s:.4g} s" if bright else f"dark, {r.exposure_s:.4g} s", r.captures, r.held_out)  # noqa: E501
                      for r, bright in zip(points, lit, strict=True) for name in names),
-        reads=frozenset({"signal.filters", "charge.correlation"}) | READ_SPECTRUM, predict=predict,
+        reads=frozenset({"signal.filters", "signal.reading_order", "charge.correlation"}) | READ_SPECTRUM,
+        predict=predict,
         scale=np.ones(len(value)),
     )  # fmt: skip
 
@@ -102,6 +108,45 @@ def tone_block(study: Study) -> Block:
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class OrderedCovariance:
+    """Noise in reading order after the means of rows were taken out of each plane of the mosaic: variance of a pixel,
+    and covariance by (phase of the column, rows down, columns to the right) of `PAIRS`, e^2; and the power of waves
+    that alternate from column to column, by cycles down the frame, which may stand out as tones do. A mosaic's planes
+    lose these with their rows' means."""
+
+    own_e2: float
+    shared_e2: Mapping[tuple[int, int, int], float]
+    alternating_e2: FloatArray  # (rows,); of a mosaic (0,)
+    pixels: int
+
+    @staticmethod
+    def of(noise: ReadingOrderNoise, camera: CameraModel) -> OrderedCovariance:
+        """Return the covariances in frames of a camera."""
+        shape, period = (camera.rows, camera.cols), mosaic.step(camera.cfa)
+        lags = [lag for every in PAIRS.values() for lag in every]
+        own = [noise.departures_e2(shape, period, phase, 0, 0) for phase in range(period)]
+        shared = {
+            (phase, down, right): noise.departures_e2(shape, period, phase, down, right)
+            for phase in range(period)
+            for down, right in lags
+        }
+        down_cy_per_px = np.arange(1, camera.rows if period == 1 else 1) / camera.rows  # 0: of the columns' means
+        alternating = noise.plane_e2(shape, np.full(len(down_cy_per_px), 0.5), down_cy_per_px)
+        return OrderedCovariance(float(np.mean(own)), shared, alternating, camera.rows * camera.cols)
+
+    def taken_out_e2(self, total_e2: float, down: int, right: int) -> float:
+        """Return the covariance of pixels so far apart that tones have which are taken out: powers that by chance, each
+        distributed exponentially, exceed `OUTLIER`^2 of the mean power, a pixel's variance."""
+        if not len(self.alternating_e2):
+            return 0.0
+        mean = self.alternating_e2 + total_e2 - self.own_e2
+        least = OUTLIER**2 * total_e2
+        taken = (least + mean) * np.exp(-least / mean)
+        turn = 2.0 * np.pi * down * np.arange(1, len(taken) + 1) / (len(taken) + 1)
+        return float(np.sum(taken * np.cos(turn)) * (-1.0) ** right / self.pixels)
+
+
 def correlations(
     cfa: Cfa,
     planes: Sequence[str],
@@ -111,21 +156,22 @@ def correlations(
     rounding_e2: float,
     kernel: FloatArray | None,
     read_kernel: FloatArray | None = None,
+    ordered: Sequence[OrderedCovariance] = (),
 ) -> FloatArray:
     """Predicted correlations by `PAIRS` in uniform light, (6,): means over the phases of the mosaic.
 
-    `shot_e2` (planes,): variance of the shot noise; `share` (2, planes): share of the departure from its mean of each
-    neighbour in the row, and of each in the column, that a pixel takes over. Read noise (`read_e2`) is independent, or
+    `shot_e2` (planes,): variance of the shot noise; `share` (5, planes): share of the departure from its mean of each
+    neighbour, by `NEIGHBOURS`, that a pixel takes over. Read noise (`read_e2`) is independent, or
     made of such noise by `read_kernel` (odd,) along the row. `kernel` filters both within a plane. Rounding
-    (`rounding_e2`) is added last and is independent.
+    (`rounding_e2`) is added last and is independent. `ordered`: noise in reading order beside, which no filter changes.
     """
     period = 1 if cfa == "MONO" else 2
     at = dict.fromkeys(planes, (0, 0)) if period == 1 else _phase_of(cfa)
-    variance, taken = np.zeros((period, period)), np.zeros((2, period, period))
+    variance, taken = np.zeros((period, period)), np.zeros((len(NEIGHBOURS), period, period))
     for name, v, g in zip(planes, shot_e2, share.T, strict=True):
         variance[at[name]], taken[:, *at[name]] = v, g
     taps = np.ones((1, 1)) if kernel is None else kernel
-    half = taps.shape[0] // 2 * period + 1
+    half = taps.shape[0] // 2 * period + 2
     reach = half + 2 + (0 if read_kernel is None else len(read_kernel) // 2)
     size = 2 * reach + 1
     offset = np.arange(size) - reach
@@ -134,18 +180,19 @@ def correlations(
     for phase in np.ndindex(period, period):
         row, col = (phase[0] + offset) % period, (phase[1] + offset) % period
         own, shares = variance[np.ix_(row, col)], [g[np.ix_(row, col)] for g in taken]
-        more = sum(np.square(g) * _neighbours(own, axis) for g, axis in zip(shares, (1, 0), strict=True))
+        more = sum(np.square(g) * _neighbours(own, places) for g, places in zip(shares, NEIGHBOURS, strict=True))
         norm = 1.0 / np.sqrt(1.0 + more / np.maximum(own, 1e-12))
         read = np.zeros((size, size))
         middle = taps.shape[0] // 2
         for (i, j), tap in np.ndenumerate(taps):
             read[reach + (i - middle) * period, reach + (j - middle) * period] = tap
         shot = read * norm
-        shot = shot + sum(_neighbours(read * norm * g, axis) for g, axis in zip(shares, (1, 0), strict=True))
+        shot = shot + sum(_neighbours(read * norm * g, places) for g, places in zip(shares, NEIGHBOURS, strict=True))
         if read_kernel is not None:
             read = convolve1d(read, read_kernel, axis=1, mode="constant")
         weights[phase] = np.stack([shot * np.sqrt(own), read * np.sqrt(read_e2)])
-    total = {p: float(np.vdot(w, w)) + rounding_e2 for p, w in weights.items()}
+    total = {p: float(np.vdot(w, w)) + rounding_e2 + sum(o.own_e2 for o in ordered) for p, w in weights.items()}
+    whole = float(np.mean(list(total.values())))
     for k, lags in enumerate(PAIRS.values()):
         parts = []
         for phase, here in weights.items():
@@ -153,15 +200,19 @@ def correlations(
                 other = (phase[0] + down) % period, (phase[1] + right) % period
                 mine = here[:, max(down, 0) : size + min(down, 0), max(right, 0) : size + min(right, 0)]
                 theirs = weights[other][:, max(-down, 0) : size - max(down, 0), max(-right, 0) : size - max(right, 0)]
-                parts.append(float(np.sum(mine * theirs)) / np.sqrt(total[phase] * total[other]))
+                shared = float(np.sum(mine * theirs))
+                for noise in ordered:
+                    shared += noise.shared_e2[phase[1], down, right] - noise.taken_out_e2(whole, down, right)
+                parts.append(shared / np.sqrt(total[phase] * total[other]))
         found[k] = np.mean(parts)
     return found
 
 
-def _neighbours(values: FloatArray, axis: int) -> FloatArray:
-    """Sum of each pixel's two neighbours along an axis, with zeros beyond the border."""
-    wide = np.pad(values, 1)[:, 1:-1] if axis == 0 else np.pad(values, 1)[1:-1]
-    return np.asarray(wide[:-2] + wide[2:] if axis == 0 else wide[:, :-2] + wide[:, 2:])
+def _neighbours(values: FloatArray, places: Sequence[tuple[int, int]]) -> FloatArray:
+    """Sum over each pixel's neighbours at `places`, (rows down, columns to the right), with zeros beyond the border."""
+    rows, cols = values.shape
+    wide = np.pad(values, 2)
+    return np.sum([wide[2 + down : 2 + down + rows, 2 + right : 2 + right + cols] for down, right in places], axis=0)
 
 
 def _phase_of(cfa: Cfa) -> dict[str, tuple[int, int]]:

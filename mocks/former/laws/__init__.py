@@ -70,6 +70,7 @@ from mocks.former.laws.readout import (
     DefectInterpolationLaw,
     DigitalGainLaw,
     JitteredRowsLaw,
+    LineGainLaw,
     LossyCodesLaw,
     NonlinearityLaw,
     OnChipSharpeningLaw,
@@ -152,6 +153,8 @@ LISTED: tuple[type[Law], ...] = (
     ColouredReadNoiseLaw,
     MicrolensAngleLaw,
     TrefoilLaw,
+    LineGainLaw,
+    PinkNoiseLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
@@ -179,7 +182,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     MotionLaw,
     HaloLaw,
     InterPixelCapacitanceLaw,
-    PinkNoiseLaw,
     DustShadowLaw,
     LampJumpLaw,
     SmearLaw,

@@ -54,24 +54,30 @@ class CrosstalkLaw(Law):
 
 
 class InterPixelCapacitanceLaw(Law):
-    """Neighbours are coupled after the charge was collected, so that noise is shared, too (related to crosstalk)."""
+    """Neighbours are coupled after the charge was collected, so that noise is shared, too (related to crosstalk).
+    Variants: the four next alike; those in the row twice as much as those in the column, and a fifth of their mean
+    across corners."""
 
-    name, unit, nominal, limits = "inter_pixel_capacitance", "%", 0.8, (0.02, 6.0)
+    name, variants, unit, nominal, limits = "inter_pixel_capacitance", 2, "%", 0.8, (0.02, 6.0)
     families = frozenset({"charge_between_neighbours"})
     accepts = frozenset({"crosstalk", "inter_pixel_capacitance"})
 
     def drawn_e(self, electrons: Array, mean_e: Array) -> Array:
         c = self.strength / 100
+        if self.variant == 1:
+            a, d, q = 4.0 * c / 3.0, 2.0 * c / 3.0, 0.2 * c
+            return convolve(electrons, np.array([[q, d, q], [a, 1 - 4.8 * c, a], [q, d, q]]), mode="mirror")
         return convolve(electrons, np.array([[0, c, 0], [c, 1 - 4 * c, c], [0, c, 0]]), mode="mirror")
 
 
 class BrighterFatterLaw(Law):
     """Charge repels charge. Variants: the variance falls with the signal; neighbours receive what is repelled
     (Antilogus 2014); every border between two pixels moves in proportion to the difference of their charges, so that
-    means of unequal neighbours move, too."""
+    means of unequal neighbours move, too; thick silicon, where neighbours across corners receive 0.35 and second ones
+    0.12 of what the next do."""
 
     name = effect = "brighter_fatter"
-    variants, unit, nominal, limits = 3, "%", 4.0, (0.1, 20.0)
+    variants, unit, nominal, limits = 4, "%", 4.0, (0.1, 20.0)
 
     def drawn_e(self, electrons: Array, mean_e: Array) -> Array:
         x = np.clip(mean_e / self.camera.full_well_e, 0, 1)
@@ -82,6 +88,16 @@ class BrighterFatterLaw(Law):
             return electrons + self.strength / 100.0 / (16.0 * self.camera.full_well_e) * four
         if self.variant == 0:
             return mean_e + away * np.sqrt(1 - self.strength / 100.0 * x)
+        if self.variant == 3:
+            q, s = 0.35, 0.12
+            far = np.array(
+                [[0, 0, s, 0, 0], [0, q, 1, q, 0], [s, 1, 0, 1, s], [0, q, 1, q, 0], [0, 0, s, 0, 0]], np.float64
+            )
+            return (
+                mean_e
+                + away
+                + 0.5 * self.strength / 100.0 * x * (convolve(away, far / far.sum(), mode="mirror") - away)
+            )
         around = convolve(away, np.array([[0, 0.25, 0], [0.25, 0, 0.25], [0, 0.25, 0]]), mode="mirror")
         return mean_e + away + 0.5 * self.strength / 100.0 * x * (around - away)
 

@@ -179,6 +179,31 @@ class TapOffsetLaw(Law):
         return {} if self.variant == 1 else {"offset_e": self.strength}
 
 
+class LineGainLaw(Law):
+    """Each line has an amplifier, or a slope of its converter, of its own. Variants: columns, normal; columns, uniform;
+    rows."""
+
+    name, effect = "line_gain", "column_gain"
+    variants, unit, nominal, limits = 3, "%", 0.6, (0.02, 6.0)
+
+    @property
+    def listed_effect(self) -> str | None:
+        return "row_gain" if self.variant == 2 else self.effect
+
+    def response(self, electrons: Array) -> Array:
+        rows, cols = electrons.shape
+        still = self.rng(21)
+        if self.variant == 1:
+            away = np.sqrt(3.0) * still.uniform(-1.0, 1.0, cols)
+        else:
+            away = still.standard_normal(rows if self.variant == 2 else cols)
+        away = 1.0 + self.strength / 100.0 * (away - away.mean())
+        return electrons * (away[:, None] if self.variant == 2 else away)
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"gain_percent": self.strength}
+
+
 class RowNoiseLaw(Law):
     """A temporal offset of each row. Variants: white; correlated between neighbouring rows."""
 
@@ -262,18 +287,38 @@ class PeriodicBandingLaw(Law):
 
 
 class PinkNoiseLaw(Law):
-    """1/f noise along the read-out (related to row noise)."""
+    """1/f noise along the read-out. Variants: of one amplifier; of two, for even and odd columns; of one, with the same
+    power an octave by eight filtered noises (Voss 1978), at rest between rows for a tenth of their time."""
 
-    name, unit, nominal, limits, power, shown_by = "pink_noise", "e", 3.0, (0.2, 40.0), 2.0, DARK
-    families = frozenset({"line_noise"})
-    accepts = frozenset({"row_noise"})
+    name, effect = "pink_noise", "reading_order_noise"
+    variants, unit, nominal, limits, power, shown_by = 3, "e", 3.0, (0.2, 40.0), 2.0, DARK
 
     def noise_e(self, shape: tuple[int, int], k: int) -> Array:
-        n = shape[0] * shape[1]
+        rows, cols = shape
+        rng = self.rng(12, k)
+        if self.variant == 1:
+            noise = np.empty(shape)
+            noise[:, ::2] = self._wave(rng, rows * ((cols + 1) // 2)).reshape(rows, -1)
+            noise[:, 1::2] = self._wave(rng, rows * (cols // 2)).reshape(rows, -1)
+        elif self.variant == 2:
+            wide = cols + cols // 10
+            noise = np.zeros(rows * wide)
+            for octave in range(0, 18):  # correlated over 0.5, 1, 2, ... 65536 pixels
+                keep = np.exp(-(2.0 ** (1 - octave)))
+                white = np.sqrt(1.0 - keep * keep) * rng.standard_normal(rows * wide)
+                noise += lfilter([1.0], [1.0, -keep], white, zi=[keep * rng.standard_normal()])[0]
+            noise = (noise.reshape(rows, wide)[:, :cols]) / np.sqrt(18.0)
+        else:
+            noise = self._wave(rng, rows * cols).reshape(shape)
+        return self.strength * noise
+
+    @staticmethod
+    def _wave(rng: np.random.Generator, n: int) -> Array:
+        """1/f noise of standard deviation 1."""
         f = np.fft.rfftfreq(n)
         f[0] = 1.0
-        wave = np.fft.irfft(np.fft.rfft(self.rng(12, k).standard_normal(n)) / np.sqrt(f), n)
-        return (self.strength * (wave - wave.mean()) / wave.std()).reshape(shape)
+        wave = np.fft.irfft(np.fft.rfft(rng.standard_normal(n)) / np.sqrt(f), n)
+        return (wave - wave.mean()) / wave.std()
 
 
 class ColumnNoiseLaw(Law):

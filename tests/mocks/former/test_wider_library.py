@@ -18,9 +18,11 @@ from mocks.former.laws import (
     CoverGlassFringeLaw,
     ImageLagLaw,
     LeakyShutterLaw,
+    LineGainLaw,
     MicrolensAngleLaw,
     PersistenceLaw,
     PhaseDetectionRowsLaw,
+    PinkNoiseLaw,
     ResponseKneeLaw,
     TapGainLaw,
     TapOffsetLaw,
@@ -46,6 +48,12 @@ STRONG: tuple[Law, ...] = (
     TapGainLaw(1.0, 2, 9),
     TapOffsetLaw(1.0, 0, 9),
     TapOffsetLaw(1.0, 1, 9),
+    PinkNoiseLaw(4.0, 0, 9),
+    PinkNoiseLaw(4.0, 1, 9),
+    PinkNoiseLaw(4.0, 2, 9),
+    LineGainLaw(0.6, 0, 9),
+    LineGainLaw(0.6, 1, 9),
+    LineGainLaw(0.6, 2, 9),
     LeakyShutterLaw(60.0, 0, 9),
     LeakyShutterLaw(60.0, 1, 9),
     LeakyShutterLaw(60.0, 2, 9),
@@ -63,7 +71,7 @@ STRONG: tuple[Law, ...] = (
 )
 #: Those that a mosaic shows.
 OF_COLOURS = {"microlens_angle", "vignetting"}
-NEW = {str(law.effect) for law in STRONG}
+NEW = {str(law.listed_effect) for law in STRONG}
 
 
 @cache
@@ -83,7 +91,7 @@ def _diagnosed(law: Law | None, cfa: str = "MONO", seed: int = 930) -> Diagnosis
 )
 def test_a_strong_one_is_named_and_sized(law: Law) -> None:
     (named,) = _diagnosed(law, "RGGB" if law.effect in OF_COLOURS else "MONO").effects
-    assert named.name == law.effect
+    assert named.name == law.listed_effect
     for name, truth in law.library_parameters().items():
         if truth != 0.0:
             found = named.parameters[name]

@@ -103,7 +103,7 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     levels = np.linspace(0.0, 4000.0, 41)
     electronics = [np.broadcast_to(more, frame.shape).ravel() for more in (*after, out.added_e, out.added_e2)]
     codes = levels if out.codes is None else out.codes(levels)
-    shared = np.zeros(82) if out.neighbours is None else out.neighbours(levels).ravel()
+    shared = np.zeros(5 * 41) if out.neighbours is None else out.neighbours(levels).ravel()
     asked = np.tile(np.linspace(0.0, 1.0, 5), (5, 1))
     shown = with_reflections(CAMERA, screen_light(CAMERA, asked, place[None, :], 0.5 * place[:, None], acting), acting)
     pair = [pair_gain_factor(CAMERA, acting), right_delay_s(CAMERA, acting)]
@@ -209,9 +209,9 @@ def test_coloured_read_noise_keeps_its_variance(one: Effect) -> None:
     assert power.mean() == pytest.approx(1.0, rel=1e-6)
 
 
-@pytest.mark.parametrize("one", _acting("signal.gains"), ids=lambda e: e.name)
+@pytest.mark.parametrize("one", _acting("signal.gains") + _acting("signal.line_gains"), ids=lambda e: e.name)
 def test_gains_by_place_keep_the_mean_of_the_frame(one: Effect) -> None:
-    gains = Uniform(CAMERA, (one,)).gain_map()
+    gains = signal_of(CAMERA, (one,)).gain_map((CAMERA.rows, CAMERA.cols))
     assert gains is not None and np.ptp(gains) > 0.0
     assert gains.mean() == pytest.approx(1.0, rel=1e-12)
 

@@ -114,12 +114,12 @@ def test_correlations_of_a_filter_are_its_autocorrelation() -> None:
     kernel = np.array([[0.0, 0.05, 0.0], [0.05, 0.8, 0.05], [0.0, 0.05, 0.0]])
     size = np.sum(kernel**2)
     own = {"1,0": 2 * 0.8 * 0.05 / size, "1,1": 2 * 0.05**2 / size, "2,0": 0.05**2 / size}
-    mono = correlations("MONO", ["Y"], np.array([100.0]), np.zeros((2, 1)), 4.0, 0.0, kernel)
+    mono = correlations("MONO", ["Y"], np.array([100.0]), np.zeros((5, 1)), 4.0, 0.0, kernel)
     np.testing.assert_allclose(mono[:5], [own["1,0"], own["1,0"], own["1,1"], own["2,0"], own["2,0"]], atol=1e-12)
-    bayer = correlations("RGGB", ["R", "G1", "G2", "B"], np.full(4, 100.0), np.zeros((2, 4)), 4.0, 0.0, kernel)
+    bayer = correlations("RGGB", ["R", "G1", "G2", "B"], np.full(4, 100.0), np.zeros((5, 4)), 4.0, 0.0, kernel)
     np.testing.assert_allclose(bayer, [0.0, 0.0, 0.0, own["1,0"], own["1,0"], own["1,1"]], atol=1e-12)
     # rounding is each pixel's own: half of the variance halves all
-    rounded = correlations("MONO", ["Y"], np.array([100.0]), np.zeros((2, 1)), 4.0, 104.0 * size, kernel)
+    rounded = correlations("MONO", ["Y"], np.array([100.0]), np.zeros((5, 1)), 4.0, 104.0 * size, kernel)
     np.testing.assert_allclose(rounded, 0.5 * mono, atol=1e-12)
 
 
@@ -163,6 +163,7 @@ def test_tones_of_the_read_out_are_told_and_leave_no_correlation() -> None:
     [
         effect("brighter_fatter")(loss_percent=12.0, shared_percent=10.0),
         effect("brighter_fatter")(loss_percent=12.0, shared_percent=10.0, row_excess=0.6),
+        effect("inter_pixel_capacitance")(share_percent=1.0, row_excess=0.4, corner_share=0.3),
         effect("on_chip_smoothing")(strength=0.06),
         effect("on_chip_sharpening")(strength=0.06),
         effect("coloured_read_noise")(correlation=-0.15),
@@ -192,6 +193,8 @@ def test_what_sim_renders_is_predicted_and_named(one: Effect, cfa: str) -> None:
         (OnChipSmoothingLaw(0.06, 1), "on_chip_smoothing"),
         (OnChipSharpeningLaw(0.06, 1), "on_chip_sharpening"),
         (InterPixelCapacitanceLaw(1.0), "inter_pixel_capacitance"),
+        (InterPixelCapacitanceLaw(1.5, 1), "inter_pixel_capacitance"),
+        (BrighterFatterLaw(12.0, 3), "brighter_fatter"),
         (ColouredReadNoiseLaw(3.0, 0), "coloured_read_noise"),
         (ColouredReadNoiseLaw(3.0, 1), "coloured_read_noise"),
         (ColouredReadNoiseLaw(3.0, 2), "coloured_read_noise"),

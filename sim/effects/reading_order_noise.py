@@ -1,0 +1,80 @@
+"""Noise in reading order: amplifiers have 1/f noise while they read pixel after pixel, of all columns, or of odd and
+even ones apart."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Self
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect
+from sim.effects.families import Family
+from sim.parameters import Quantity
+from sim.sensor.reading_order import ReadingOrderNoise as Law
+from sim.stages import Signal
+
+#: Exponents that are tried first.
+EXPONENTS = (0.7, 1.0, 1.4)
+
+
+class ReadingOrderNoise(Effect):
+    """Noise of power f^-b at f cycles a pixel in the order in which pixels are read, level below 1e-6. Neighbours in
+    the row have much of it in common, and rows its slow part, which shows as bands. Beside it the same of two
+    amplifiers that take turns, of even and odd columns: noise of alternating columns.
+    """
+
+    name: ClassVar[str] = "reading_order_noise"
+    title: ClassVar[str] = "1/f noise in reading order"
+    family: ClassVar[Family] = Family.READ_NOISE
+    reference: ClassVar[str] = "B. J. Rauscher, Teledyne H1RG, H2RG, and H4RG noise generator, PASP 127 (2015) 1144"
+    form_tolerance: ClassVar[float] = 0.1
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"exponent"})
+    sentence: ClassVar[str] = (
+        "The amplifier's noise is slow: pixels that are read one after the other share a part of it, so that frames "
+        "have bands and streaks that are others in every frame, dark or bright."
+    )
+
+    noise_e: Annotated[
+        float,
+        Quantity(
+            "e",
+            "standard deviation of the 1/f noise of a pixel",
+            lower=0.0,
+            upper=1e4,
+            prior=(0.0, 5.0),
+            absent=0.0,
+            linear_power=2,
+        ),
+    ] = 0.0
+    alternating_e: Annotated[
+        float,
+        Quantity(
+            "e",
+            "the same of the amplifiers of even and of odd columns, each for itself",
+            lower=0.0,
+            upper=1e4,
+            prior=(0.0, 5.0),
+            absent=0.0,
+            linear_power=2,
+        ),
+    ] = 0.0
+    exponent: Annotated[
+        float,
+        Quantity(
+            "1",
+            "power by which the noise falls with the frequency",
+            lower=0.3,
+            upper=2.0,
+            prior=(1.0, 0.3),
+            absent=1.0,
+        ),
+    ] = 1.0
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return tuple((cls(noise_e=0.5, exponent=b), cls(alternating_e=0.5, exponent=b)) for b in EXPONENTS)
+
+    def on_signal(self, signal: Signal) -> Signal:
+        if self.noise_e == 0.0 and self.alternating_e == 0.0:
+            return signal
+        return signal.add_laws(reading_order=Law(self.noise_e, self.alternating_e, self.exponent))

@@ -1,0 +1,215 @@
+"""Noise of the read-out in the order in which pixels are read: 1/f noise, and what alternates from column to column."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from sim.spectrum import FloatArray
+
+#: Below this frequency a power law is level, cycles a pixel: no read-out's noise grows without end.
+KNEE_CY_PER_PX = 1e-6
+#: Pixels that are drawn for each one that is read: the ends of a frame have nothing in common.
+FOLDED = 2
+#: Frequencies of the grid of covariances.
+GRID = 2**17
+
+
+@dataclass(frozen=True)
+class ReadingOrderNoise:
+    """A stationary normal disturbance in the order of the pixels, row after row, a `Disturbance`: of power f^-exponent
+    at f cycles a pixel, level below `KNEE_CY_PER_PX`, and standard deviation `noise_e`; and the same of `alternating_e`
+    by two amplifiers that take turns, of even and of odd columns (an even number in all), each at its own pixels.
+    """
+
+    noise_e: float
+    alternating_e: float = 0.0
+    exponent: float = 1.0
+
+    def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+        """Electrons (rows, cols) of one frame."""
+        total = self._wave((shape[0], shape[1]), rng, self.noise_e)
+        for first in (0, 1):
+            columns = total[:, first::2]
+            columns += self._wave((columns.shape[0], columns.shape[1]), rng, self.alternating_e)
+        return total
+
+    def _wave(self, shape: tuple[int, int], rng: np.random.Generator, std: float) -> FloatArray:
+        if std == 0.0:
+            return np.zeros(shape)
+        size = shape[0] * shape[1]
+        count = fft.next_fast_len(FOLDED * size, real=True)
+        power = _averaged(count, self.exponent)
+        wave = fft.irfft(fft.rfft(rng.standard_normal(count)) * np.sqrt(power), count)
+        return np.asarray(std * wave[:size].reshape(shape))
+
+    def mean_e(self, shape: tuple[int, ...]) -> float:
+        """None."""
+        return 0.0
+
+    def variance_e2(self, shape: tuple[int, ...]) -> float:
+        """Return the variance of a pixel."""
+        return self.noise_e**2 + self.alternating_e**2
+
+    def spectrum_e2(self, frequency_cy_per_px: FloatArray) -> FloatArray:
+        """Power at frequencies in reading order, e^2; its mean over -0.5..0.5 cy/px is the variance."""
+        f = _from_whole(np.asarray(frequency_cy_per_px, float))
+        common, apart = (_power_law(away, self.exponent) for away in (f, _from_whole(2.0 * f)))
+        return self.noise_e**2 * common + self.alternating_e**2 * apart
+
+    def plane_e2(self, shape: tuple[int, int], across_cy_per_px: FloatArray, down_cy_per_px: FloatArray) -> FloatArray:
+        """Expected periodogram |FFT|^2 / pixels of a frame (rows, cols) at frequencies across the columns and down the
+        rows, which broadcast.
+
+        A wave of f cycles a pixel has f cols cycles a row down the rows, of which whole ones aren't seen: at d cycles a
+        row it is one of (d + m) / cols, m = 0..cols - 1. Across, a row shows it through its Dirichlet kernel. Down the
+        rows the spectrum is smooth but at its poles, which leak (`_leaking`).
+        """
+        cols = shape[1]
+        across, down = np.broadcast_arrays(np.asarray(across_cy_per_px, float), np.asarray(down_cy_per_px, float))
+        waves = (down[..., None] + np.arange(cols)) / cols
+        kernel = _dirichlet2(across[..., None] - waves, cols)
+        return np.asarray(np.sum(kernel * self._shown(waves, shape), axis=-1))
+
+    def _shown(self, waves_cy_per_px: FloatArray, shape: tuple[int, int]) -> FloatArray:
+        """The spectrum as frames show it, which end: near a pole, with what leaks down the rows."""
+        rows, cols = shape
+        f = _from_whole(waves_cy_per_px)
+        own = []
+        for away, across in ((f, cols), (_from_whole(2.0 * f), cols // 2)):
+            near = _leaking((rows, across), self.exponent)
+            cycles = away * across * rows  # a frame, or its even or odd columns
+            smooth = _power_law(np.maximum(cycles, 0.5) / (rows * across), self.exponent)
+            own.append(np.where(cycles < 0.5 * rows, np.interp(cycles, np.arange(len(near)), near), smooth))
+        return np.asarray(self.noise_e**2 * own[0] + self.alternating_e**2 * own[1])
+
+    def along_rows_e2(self, shape: tuple[int, int], across_cy_per_px: FloatArray) -> FloatArray:
+        """Mean over all rows of their periodograms, at frequencies across the columns."""
+        rows, cols = shape
+        down = np.arange(min(rows, 64)) / min(rows, 64)
+        return np.asarray(self.plane_e2((min(rows, 64), cols), np.asarray(across_cy_per_px)[:, None], down).mean(-1))
+
+    def along_columns_e2(self, shape: tuple[int, int], down_cy_per_px: FloatArray) -> FloatArray:
+        """Mean over the waves across the columns, of 1 to cols / 2 cycles, of a frame's periodogram at frequencies down
+        the rows."""
+        cols = shape[1]
+        down = np.asarray(down_cy_per_px, float)
+        waves = (down[:, None] + np.arange(cols)) / cols
+        whole = self._shown(waves, shape).sum(axis=1)
+        # waves across and back are one but for those of no and of cols / 2 cycles
+        still, alternating = (self.plane_e2(shape, np.full(len(down), across), down) for across in (0.0, 0.5))
+        return np.asarray((whole - still + alternating) / cols)
+
+    @cached_property
+    def _covariances_e2(self) -> FloatArray:
+        own = fft.irfft(_averaged(GRID, self.exponent), GRID)[: GRID // 2]
+        apart = np.zeros(len(own))
+        apart[::2] = own[: len(own) // 2]
+        return np.asarray(self.noise_e**2 * own + self.alternating_e**2 * apart)
+
+    def covariance_e2(self, apart_px: NDArray[np.int_]) -> FloatArray:
+        """Covariance of two pixels that are read as many pixels apart, up to half of `GRID`."""
+        return np.asarray(self._covariances_e2[np.abs(apart_px)])
+
+    def departures_e2(self, shape: tuple[int, int], period: int, phase: int, down: int, right: int) -> float:
+        """Covariance of a pixel of a column of `phase` in the mosaic's `period` with the one `down` and `right` of it,
+        after the means of rows and columns were taken out of each plane of the mosaic.
+
+        What two rows' means have in common is the mean over pairs of their columns of both phases; on average over the
+        columns, a pixel has as much of the other's mean.
+        """
+        cols = shape[1]
+        first, second = (np.arange(cols) % period == (phase + more) % period for more in (0, right))
+        pairs = np.rint(np.correlate(second.astype(float), first.astype(float), mode="full"))
+        common = pairs @ self.covariance_e2(down * cols + np.arange(1 - cols, cols)) / pairs.sum()
+        apart = down * cols + right
+        own = float(self.covariance_e2(np.array(apart))) if abs(apart) < GRID // 2 else 0.0
+        return own - float(common) - self._column_means_e2(shape, period, down, right)
+
+    def _column_means_e2(self, shape: tuple[int, int], period: int, down: int, right: int) -> float:
+        """Covariance of the means of columns, without those of the rows, that two pixels lose: of means over all rows,
+        and, in a mosaic, of what rows of both phases differ by."""
+        rows, cols = shape
+        k = np.arange(cols)
+        use = (k * period) % cols != 0
+        turn = np.cos(2.0 * np.pi * k * right / cols)[use]
+        found = float(np.sum(self._shown(k / cols, shape)[use] * turn))
+        if period == 2:  # half a cycle a row lies between two waves
+            between = 0.5 * (self.spectrum_e2((k + 0.5) / cols) + self.spectrum_e2((k - 0.5) / cols))
+            found += (-1.0) ** down * float(np.sum(between[use] * turn))
+        return found / (rows * cols)
+
+
+def _from_whole(cycles: FloatArray) -> FloatArray:
+    """Distance from the nearest whole number."""
+    return np.asarray(np.abs(cycles - np.rint(cycles)))
+
+
+def _dirichlet2(frequency_cy_per_px: FloatArray, count: int) -> FloatArray:
+    """Square of the mean of `count` waves exp(2 pi i f n)."""
+    turn = np.pi * _from_whole(frequency_cy_per_px)
+    return np.square(np.sinc(count * turn / np.pi) / np.sinc(turn / np.pi))
+
+
+def _law(frequency_cy_per_px: FloatArray, exponent: float) -> FloatArray:
+    return np.asarray((np.square(frequency_cy_per_px) + KNEE_CY_PER_PX**2) ** (-0.5 * exponent))
+
+
+@lru_cache(maxsize=256)
+def _whole(exponent: float) -> float:
+    grid = np.geomspace(1e-3 * KNEE_CY_PER_PX, 0.5, 4001)
+    return float(2.0 * np.trapezoid(_law(grid, exponent), grid))
+
+
+def _power_law(frequency_cy_per_px: FloatArray, exponent: float) -> FloatArray:
+    """Power law of mean 1 over -0.5..0.5 cy/px."""
+    return _law(frequency_cy_per_px, exponent) / _whole(exponent)
+
+
+@lru_cache(maxsize=8)
+def _averaged(count: int, exponent: float) -> FloatArray:
+    """The power law at the frequencies of a line of `count` pixels, of mean 1 over all: that at 0 is the mean within
+    half a cycle."""
+    power = _power_law(np.asarray(fft.rfftfreq(count), float), exponent)
+    grid = np.geomspace(1e-3 * KNEE_CY_PER_PX, 0.5 / count, 2001)
+    power[0] = 2.0 * count * (np.trapezoid(_power_law(grid, exponent), grid) + grid[0] * power[0])
+    both = 2.0 * power.sum() - power[0] - (power[-1] if count % 2 == 0 else 0.0)
+    return np.asarray(power * (count / both))
+
+
+#: Cycles a frame up to which a slow wave's leakage is taken in full, waves from which it leaks, and points of a cycle.
+NEAR, SLOW, FINE = 32, 16, 32
+
+
+@lru_cache(maxsize=64)
+def _leaking(shape: tuple[int, int], exponent: float) -> FloatArray:
+    """The power law about its pole as the rows of a frame show it at 0, 1, ... rows / 2 cycles a frame: with what its
+    waves leak through the rows' Fejer kernel, F(x) = sin^2(pi rows x) / (rows sin^2(pi x))."""
+    rows, cols = shape
+    size = rows * cols
+    cycles = np.arange(rows // 2 + 1)
+    far = min(2 * NEAR, rows // 2)
+    fine = np.concatenate([np.geomspace(1e-4, 0.5 / FINE, 200), np.arange(1, FINE * far + 1) / FINE])
+    law = _power_law(fine / size, exponent)
+    below = fine[0] * _law(np.zeros(1), exponent)[0] / _whole(exponent) if fine[0] / size < KNEE_CY_PER_PX else 0.0
+
+    def leaked(at: FloatArray, upto: int) -> FloatArray:
+        use = fine <= upto
+        both = _fejer((at[:, None] - fine[use]) / rows, rows) + _fejer((at[:, None] + fine[use]) / rows, rows)
+        return np.asarray(np.trapezoid(law[use] * both, fine[use], axis=1) / rows)
+
+    shown = _power_law(np.maximum(cycles, 0.5) / size, exponent)
+    near = min(NEAR, len(cycles))
+    shown[:near] = leaked(cycles[:near].astype(float), far)
+    shown[0] += 2.0 * below
+    if near < len(cycles):
+        shown[near:] += leaked(cycles[near:].astype(float), SLOW)
+    return np.asarray(shown)
+
+
+def _fejer(frequency_cy_per_px: FloatArray, count: int) -> FloatArray:
+    return count * _dirichlet2(frequency_cy_per_px, count)
