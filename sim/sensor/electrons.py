@@ -43,6 +43,7 @@ class ReadOut:
     offset_dn     added to the black level
     gain          factor (rows, cols) on what is read of every pixel, its noise alike, before `added`
     read_kernel   kernel (odd,) along the row that makes read noise of white noise
+    excess        factor on the shot noise's variance, by which each electron is multiplied at random
     """
 
     response: Callable[[FloatArray], FloatArray] | None = None
@@ -56,6 +57,7 @@ class ReadOut:
     processing: FloatArray | None = None
     gain: FloatArray | None = None
     read_kernel: FloatArray | None = None
+    excess: float = 1.0
 
 
 LINEAR = ReadOut()
@@ -245,6 +247,8 @@ def dn_moments(
     full_dn = zero_dn + gain * float(full if read_out.response is None else read_out.response(full))
     by_charge = full_dn < camera.white_level_dn
     noise = electrons if read_out.shot_e2 is None else np.maximum(read_out.shot_e2(electrons), 0.0)
+    if read_out.excess != 1.0:
+        noise = noise * read_out.excess
     mean, variance = electrons, noise
     if by_charge:
         # to DN as it is, as the full well's own noise is none: what is clipped isn't clipped again
@@ -376,6 +380,8 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
         correlation = read_out.neighbours(mean.astype(float))
         charge = (mean + shared_departures(charge - mean, mean, correlation)).astype(np.float32)
     np.minimum(charge, np.float32(camera.full_well_e), out=charge)
+    if read_out.excess != 1.0:
+        charge = multiply_electrons(charge, read_out.excess, rng)
     if read_out.response is not None:
         charge = read_out.response(charge.astype(float)).astype(np.float32)
     if camera.read_noise_e > 0:
@@ -385,6 +391,13 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
             noise = convolve1d(noise, read_out.read_kernel, axis=-1, mode="wrap")
         charge += noise
     return charge
+
+
+def multiply_electrons(charge: Float32Array, excess: float, rng: np.random.Generator) -> Float32Array:
+    """Electrons after each was multiplied by a random number of mean 1 and variance `excess` - 1, gamma distributed:
+    exponentially at 2, as by a register of high gain (Basden, Haniff and Mackay, MNRAS 345, 985, 2003)."""
+    spread = excess - 1.0
+    return np.asarray(rng.gamma(np.maximum(charge, 0.0) / spread, spread), np.float32)
 
 
 #: A pixel's two neighbours in its row, and those in its column.
