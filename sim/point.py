@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import reduce
 from itertools import product
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -243,6 +243,20 @@ def mix_channels(
             out[i], total = transfers[i], 1.0
         out[i] /= total
     return out
+
+
+def trail_behind(camera: CameraModel, effects: Sequence[Acts], axis: Literal[0, 1], line: float, lag_px: int) -> float:
+    """Return by how much the pixel `lag_px` lines behind one that alone has charge exceeds that before it, over that
+    one's signal; `axis` 0 along a column, 1 along a row, `line` its place there."""
+    found = 0.0
+    charge = charge_of(camera, effects)
+    lines = (camera.rows, camera.cols)[axis]
+    for law in charge.trails:
+        if law.axis == axis:
+            kernel = np.ravel(law.kernel(float(law.transfers(np.asarray(line), lines))))
+            middle = len(kernel) // 2
+            found += float((kernel[middle + lag_px] - kernel[middle - lag_px]) / kernel[middle])
+    return found
 
 
 def even_share(camera: CameraModel, effects: Sequence[Acts]) -> float:

@@ -350,14 +350,19 @@ class Uniform:
                 held, end_s = traps.fill(left, electrons[k]), start_s + open_s
         return found
 
-    def shot_e2(self, electrons: FloatArray) -> FloatArray:
-        """Variance of the shot noise (e^2) at mean signals."""
-        return self._charge.shot_e2(electrons)
+    def shot_e2(self, electrons: FloatArray, gain_db: float = 0.0) -> FloatArray:
+        """Variance of the shot noise (e^2) at mean signals, at a gain setting."""
+        return self._charge.shot_e2(electrons) * self._charge.excess_factor(gain_db)
 
     def excess_factor(self, gain_db: float = 0.0) -> float:
         """Return the factor on the shot noise's variance by which electrons are multiplied at random, at a gain
         setting."""
         return self._charge.excess_factor(gain_db)
+
+    @property
+    def multiplies_electrons(self) -> bool:
+        """Return whether electrons are multiplied at random before read-out."""
+        return bool(self._charge.excess)
 
     @property
     def particles(self) -> tuple[Particles, ...]:

@@ -23,6 +23,8 @@ GAINS = frozenset({"signal.gains"})
 LINES = frozenset({"signal.lines"})
 #: Spectrum of the read noise along a row.
 READ_SPECTRUM = frozenset({"signal.read_spectrum"})
+#: Charge of single particles.
+PARTICLES = frozenset({"charge.particles"})
 #: The light of a screen for the picture that it is given.
 SHOWN = frozenset({"light.screen"})
 #: Displaced, scaled or rotated copies of the image.

@@ -17,7 +17,8 @@ class CosmicRays(Effect):
     particles, 80 e a um of silicon, at angles as muons have at sea level; and points, as X-rays of surrounding
     material or recoils make, of exponentially distributed charge.
 
-    A hit pixel is bright in one frame alone; hot pixels are in all, blinking ones in several.
+    Natural rates are some 0.02 at sea level; detectors in space, at altitude and near sources see up to 1e4. A hit
+    pixel is bright in one frame alone; hot pixels are in all, blinking ones in several.
     """
 
     name: ClassVar[str] = "cosmic_rays"
@@ -35,7 +36,7 @@ class CosmicRays(Effect):
 
     rate_per_cm2_s: Annotated[
         float,
-        Quantity("1/(cm2 s)", "events a second on a cm2 of the sensor", lower=0.0, upper=1e5, prior=(0.0, 1.0),
+        Quantity("1/(cm2 s)", "events a second on a cm2 of the sensor", lower=0.0, upper=1e5, prior=(0.0, 100.0),
                  absent=0.0),
     ] = 0.0  # fmt: skip
     depth_um: Annotated[

@@ -393,11 +393,30 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
     return charge
 
 
+#: Variance factor of a multiplication above which it is taken as continuous: the mean is then 50 and more.
+GEOMETRIC_BELOW = 1.98
+
+
+def multiplied_skewness(excess: float) -> float:
+    """Return E g^3 / (E g^2)^2 of the number g by which `multiply_electrons` multiplies one electron: 1 of none, 1.5 of
+    an exponential one."""
+    if excess > GEOMETRIC_BELOW:
+        return 2.0 - 1.0 / excess
+    return 1.0 + 2.0 / excess - 2.0 / excess**2
+
+
 def multiply_electrons(charge: Float32Array, excess: float, rng: np.random.Generator) -> Float32Array:
-    """Electrons after each was multiplied by a random number of mean 1 and variance `excess` - 1, gamma distributed:
-    exponentially at 2, as by a register of high gain (Basden, Haniff and Mackay, MNRAS 345, 985, 2003)."""
-    spread = excess - 1.0
-    return np.asarray(rng.gamma(np.maximum(charge, 0.0) / spread, spread), np.float32)
+    """Electrons after each was multiplied at random, over the mean multiplication; the variance of one is `excess` - 1.
+
+    Below 2 a geometric number of mean M = 1 / (2 - excess), as a chain of many stages makes of one electron. From there
+    on a gamma distribution: at 2 the exponential one of a register of high gain (Basden, Haniff and Mackay, MNRAS 345,
+    985, 2003)."""
+    if excess > GEOMETRIC_BELOW:
+        spread = excess - 1.0
+        return np.asarray(rng.gamma(np.maximum(charge, 0.0) / spread, spread), np.float32)
+    number, inverse_mean = np.rint(np.maximum(charge, 0.0)), 2.0 - excess
+    further = rng.negative_binomial(np.maximum(number, 1.0), inverse_mean)
+    return np.asarray(np.where(number > 0.0, (number + further) * inverse_mean, charge), np.float32)
 
 
 #: A pixel's two neighbours in its row, and those in its column.

@@ -21,6 +21,8 @@ LEAST_COSINE = 0.05
 STEPS_A_PIXEL = 4
 #: Events of the fixed sample from which moments and distributions are taken.
 SAMPLE = 2000
+#: Classes of the charge of hit pixels.
+CLASSES = 24
 
 
 @dataclass(frozen=True)
@@ -67,20 +69,30 @@ class Particles:
         """Electrons of the brightest pixel of each event of a fixed sample, ascending, (`SAMPLE`,)."""
         return _sample(self.depth_um, self.point_share, self.point_e, pitch_um)[0]
 
+    def pixels_e(self, pitch_um: float) -> tuple[FloatArray, FloatArray]:
+        """Return the distribution of the charge of hit pixels: their number an event in each of `CLASSES` classes of
+        equal number, and the mean charge of each, e."""
+        return _sample(self.depth_um, self.point_share, self.point_e, pitch_um)[3:]
+
     def moments_e(self, pitch_um: float) -> tuple[float, float]:
         """Means over events of the sum of their electrons, and of the sum of the squares of their pixels' (e, e^2)."""
-        return _sample(self.depth_um, self.point_share, self.point_e, pitch_um)[1:]
+        return _sample(self.depth_um, self.point_share, self.point_e, pitch_um)[1:3]
 
 
 @lru_cache(maxsize=256)
-def _sample(depth_um: float, point_share: float, point_e: float, pitch_um: float) -> tuple[FloatArray, float, float]:
+def _sample(
+    depth_um: float, point_share: float, point_e: float, pitch_um: float
+) -> tuple[FloatArray, float, float, FloatArray, FloatArray]:
     rng = np.random.default_rng(2001)
     law = Particles(1.0, depth_um, point_share, point_e)
     events = [law.draw_event(rng, pitch_um)[2] for _ in range(SAMPLE)]
+    classes = np.array_split(np.sort(np.concatenate(events)), CLASSES)
     return (
         np.sort([float(e.max()) for e in events]),
         float(np.mean([e.sum() for e in events])),
         float(np.mean([np.square(e).sum() for e in events])),
+        np.array([part.size for part in classes]) / SAMPLE,
+        np.array([float(part.mean()) for part in classes]),
     )
 
 

@@ -48,14 +48,14 @@ def neighbour_block(study: Study) -> Block:
             return Prediction(np.zeros(len(value)), {})
         parts = []
         for r in points:
-            gain = noise.gain * r.gain
+            gain, gain_db = noise.gain * r.gain, study.usual_gain_db + 20.0 * np.log10(r.gain)
             electrons = np.array([max(s, 0.0) / gain for s in r.signal.values()])
             read = max(noise.read_dn**2 - noise.quantisation_dn2, 0.1 * noise.read_dn**2) / noise.gain**2
             parts.append(
                 correlations(
                     camera.cfa,
                     list(r.signal),
-                    np.maximum(model.shot_e2(electrons), 0.0),
+                    np.maximum(model.shot_e2(electrons, gain_db), 0.0),
                     solve_passed_share(model.neighbour_correlation(electrons)),
                     read,
                     noise.quantisation_dn2 / gain**2,
