@@ -15,7 +15,7 @@ from sim.stages import Charge
 class CosmicRays(Effect):
     """A Poisson number of events a frame, in proportion to exposure and area: straight tracks of minimum ionising
     particles, 80 e a um of silicon, at angles as muons have at sea level; and points, as X-rays of surrounding
-    material or recoils make, of exponentially distributed charge.
+    material or recoils make, of charges between one and an exponential distribution.
 
     Natural rates are some 0.02 at sea level; detectors in space, at altitude and near sources see up to 1e4. A hit
     pixel is bright in one frame alone; hot pixels are in all, blinking ones in several.
@@ -28,7 +28,7 @@ class CosmicRays(Effect):
     )
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "time"})
-    shapes: ClassVar[frozenset[str]] = frozenset({"depth_um", "point_share", "point_e"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"depth_um", "point_share", "point_e", "point_spread"})
     sentence: ClassVar[str] = (
         "Single particles leave charge: pixels and short tracks are bright in one frame alone, more of them the longer "
         "the exposure."
@@ -55,12 +55,21 @@ class CosmicRays(Effect):
                  dispensable=True),
     ] = 2000.0  # fmt: skip
 
+    point_spread: Annotated[
+        float,
+        Quantity("1", "relative standard deviation of a point's charge; 1: exponential", lower=0.05, upper=1.5,
+                 absent=1.0, dispensable=True),
+    ] = 1.0  # fmt: skip
+
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         tracks = tuple((cls(rate_per_cm2_s=0.3, depth_um=depth_um),) for depth_um in (10.0, 3.0, 100.0))
-        return (*tracks, (cls(rate_per_cm2_s=0.3, point_share=1.0),))
+        points = tuple((cls(rate_per_cm2_s=0.3, point_share=1.0, point_spread=spread),) for spread in (1.0, 0.1))
+        return (*tracks, *points)
 
     def on_charge(self, charge: Charge) -> Charge:
         if self.rate_per_cm2_s == 0.0:
             return charge
-        return charge.add_laws(particles=Particles(self.rate_per_cm2_s, self.depth_um, self.point_share, self.point_e))
+        return charge.add_laws(particles=Particles(
+                self.rate_per_cm2_s, self.depth_um, self.point_share, self.point_e, self.point_spread
+            ))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -29,8 +29,8 @@ CLASSES = 24
 class Particles:
     """Events at random: a Poisson number a frame, `rate_per_cm2_s` a second and cm2.
 
-    A share `point_share` of them leaves its charge in one pixel, exponentially distributed with the mean `point_e`. The
-    others are straight tracks through the depth `depth_um` of the silicon, of directions whose cosine c with the normal
+    A share `point_share` of them leaves its charge in one pixel, gamma distributed with the mean `point_e` and the relative
+    standard deviation `point_spread` (1: exponentially). The others are straight tracks through the depth `depth_um` of the silicon, of directions whose cosine c with the normal
     has the density 4 c^3: a flux as cos^2 of the zenith's angle, through a level area.
     """
 
@@ -38,6 +38,7 @@ class Particles:
     depth_um: float
     point_share: float
     point_e: float
+    point_spread: float = 1.0
 
     def during(self, exposure_s: float, pitch_um: float) -> ParticlesOfFrame:
         """Return what a frame of that exposure gets, on pixels of that pitch."""
@@ -52,7 +53,7 @@ class Particles:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
         """Return rows and columns of one event's pixels, counted from that where it enters, and their electrons."""
         if rng.random() < self.point_share:
-            return np.zeros(1, np.intp), np.zeros(1, np.intp), np.array([rng.exponential(self.point_e)])
+            return np.zeros(1, np.intp), np.zeros(1, np.intp), np.array([rng.gamma(self.point_spread**-2, self.point_e * self.point_spread**2)])
         cosine = max(rng.random() ** 0.25, LEAST_COSINE)
         turn, enters = rng.uniform(0.0, 2.0 * np.pi), rng.random(2)
         long_px = self.depth_um * np.sqrt(1.0 - cosine**2) / cosine / pitch_um
@@ -67,24 +68,21 @@ class Particles:
 
     def brightest_e(self, pitch_um: float) -> FloatArray:
         """Electrons of the brightest pixel of each event of a fixed sample, ascending, (`SAMPLE`,)."""
-        return _sample(self.depth_um, self.point_share, self.point_e, pitch_um)[0]
+        return _sample(replace(self, rate_per_cm2_s=1.0), pitch_um)[0]
 
     def pixels_e(self, pitch_um: float) -> tuple[FloatArray, FloatArray]:
         """Return the distribution of the charge of hit pixels: their number an event in each of `CLASSES` classes of
         equal number, and the mean charge of each, e."""
-        return _sample(self.depth_um, self.point_share, self.point_e, pitch_um)[3:]
+        return _sample(replace(self, rate_per_cm2_s=1.0), pitch_um)[3:]
 
     def moments_e(self, pitch_um: float) -> tuple[float, float]:
         """Means over events of the sum of their electrons, and of the sum of the squares of their pixels' (e, e^2)."""
-        return _sample(self.depth_um, self.point_share, self.point_e, pitch_um)[1:3]
+        return _sample(replace(self, rate_per_cm2_s=1.0), pitch_um)[1:3]
 
 
 @lru_cache(maxsize=256)
-def _sample(
-    depth_um: float, point_share: float, point_e: float, pitch_um: float
-) -> tuple[FloatArray, float, float, FloatArray, FloatArray]:
+def _sample(law: Particles, pitch_um: float) -> tuple[FloatArray, float, float, FloatArray, FloatArray]:
     rng = np.random.default_rng(2001)
-    law = Particles(1.0, depth_um, point_share, point_e)
     events = [law.draw_event(rng, pitch_um)[2] for _ in range(SAMPLE)]
     classes = np.array_split(np.sort(np.concatenate(events)), CLASSES)
     return (
