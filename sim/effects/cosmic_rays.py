@@ -70,6 +70,6 @@ class CosmicRays(Effect):
     def on_charge(self, charge: Charge) -> Charge:
         if self.rate_per_cm2_s == 0.0:
             return charge
-        return charge.add_laws(particles=Particles(
-                self.rate_per_cm2_s, self.depth_um, self.point_share, self.point_e, self.point_spread
-            ))
+        return charge.add_laws(
+            particles=Particles(self.rate_per_cm2_s, self.depth_um, self.point_share, self.point_e, self.point_spread)
+        )

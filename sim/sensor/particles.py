@@ -53,7 +53,11 @@ class Particles:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
         """Return rows and columns of one event's pixels, counted from that where it enters, and their electrons."""
         if rng.random() < self.point_share:
-            return np.zeros(1, np.intp), np.zeros(1, np.intp), np.array([rng.gamma(self.point_spread**-2, self.point_e * self.point_spread**2)])
+            return (
+                np.zeros(1, np.intp),
+                np.zeros(1, np.intp),
+                np.array([rng.gamma(self.point_spread**-2, self.point_e * self.point_spread**2)]),
+            )
         cosine = max(rng.random() ** 0.25, LEAST_COSINE)
         turn, enters = rng.uniform(0.0, 2.0 * np.pi), rng.random(2)
         long_px = self.depth_um * np.sqrt(1.0 - cosine**2) / cosine / pitch_um
