@@ -281,9 +281,9 @@ class Traps:
         return held - left, left
 
     def fill(self, trapped_e: FloatArray, read_e: FloatArray) -> FloatArray:
-        """Return the electrons in the traps after a frame of `read_e` electrons: an electron is taken with a probability
-        in proportion to the traps that are empty, (c - t)(1 - exp(-q x / c)) of x with c the capacity and t in the
-        traps, q x without a limit.
+        """Return the electrons in the traps after a frame of `read_e` electrons: an electron is taken with a
+        probability in proportion to the traps that are empty, (c - t)(1 - exp(-q x / c)) of x with c the capacity and
+        t in the traps, q x without a limit.
         """
         if not np.isfinite(self.capacity_e):
             return trapped_e + self.share * read_e

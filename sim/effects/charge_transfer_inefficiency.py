@@ -36,8 +36,8 @@ class ChargeTransferInefficiency(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"release_px", "serial_release_px", "slow_share", "slow_release_px"})
     sentence: ClassVar[str] = (
-        "Charge is lost from pixel to pixel on its way to the output: hot pixels and edges trail away from it, the more "
-        "the farther they are from it."
+        "Charge is lost from pixel to pixel on its way to the output: hot pixels and edges trail away from it, the "
+        "more the farther they are from it."
     )
 
     parallel_ppm: Annotated[

@@ -29,9 +29,10 @@ CLASSES = 24
 class Particles:
     """Events at random: a Poisson number a frame, `rate_per_cm2_s` a second and cm2.
 
-    A share `point_share` of them leaves its charge in one pixel, gamma distributed with the mean `point_e` and the relative
-    standard deviation `point_spread` (1: exponentially). The others are straight tracks through the depth `depth_um` of the silicon, of directions whose cosine c with the normal
-    has the density 4 c^3: a flux as cos^2 of the zenith's angle, through a level area.
+    A share `point_share` of them leaves its charge in one pixel, gamma distributed with the mean `point_e` and the
+    relative standard deviation `point_spread` (1: exponentially). The others are straight tracks through the depth
+    `depth_um` of the silicon, of directions whose cosine c with the normal has the density 4 c^3: a flux as
+    cos^2 of the zenith's angle, through a level area.
     """
 
     rate_per_cm2_s: float

@@ -19,7 +19,8 @@ LEAST_TERM = 1e-12
 
 @dataclass(frozen=True)
 class Trails:
-    """Traps of a register, alike in all of its pixels, that take the share `loss` of a packet's charge in each transfer.
+    """Traps of a register, alike in all of its pixels, that take the share `loss` of a packet's charge in each
+    transfer.
 
     axis : 0 where rows are clocked (parallel), 1 where columns are (serial)
     releases : (share of the traps, time constant of their release in transfers) of each species; the shares' sum is 1

@@ -77,8 +77,8 @@ def _trails(away: Image, local: Image, below_dn: Image) -> list[_Trail]:
 
 
 def dark_trail_block(study: Study) -> Block:
-    """Signal behind hot pixels less that before them, over the hot pixels', by distance, along rows and columns, in both
-    halves of the frame, of the median of repeated dark frames of the condition of most dark signal.
+    """Signal behind hot pixels less that before them, over the hot pixels', by distance, along rows and columns, in
+    both halves of the frame, of the median of repeated dark frames of the condition of most dark signal.
 
     Raises NotDetermined where no half of the frame has `LEAST_HOT` hot pixels.
     """

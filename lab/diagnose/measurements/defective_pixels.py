@@ -50,7 +50,7 @@ def rooted_counts(counts: FloatArray) -> FloatArray:
 
 
 def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0) -> FloatArray:
-    """Covariance of `rooted_counts` counts: their exact variance for Poisson counts of mean `expected`, `COUNT_STD`, and
+    """Covariance of `rooted_counts`: their exact variance for Poisson counts of mean `expected`, `COUNT_STD`, and
     `uncertain`, the standard deviation of the expected counts."""
     number = np.arange(60.0)
     mean = np.minimum(expected, 20.0)[:, None]

@@ -62,7 +62,8 @@ def variance_block(study: Study) -> Block:
     return Block(
         measurement=NOISE, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
         labels=tuple(Label(p[2], p[1], f"{p[0].exposure_s:.4g} s", p[0].captures, p[0].held_out) for p in points),
-        reads=frozenset({"signal.response", "charge.variance_e2", "charge.excess", "codes.codes"}), predict=predict, scale=value,
+        reads=frozenset({"signal.response", "charge.variance_e2", "charge.excess", "codes.codes"}), predict=predict,
+        scale=value,
     )  # fmt: skip
 
 

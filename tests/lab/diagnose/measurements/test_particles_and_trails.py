@@ -70,9 +70,9 @@ def test_multiplied_electrons_have_skewed_noise() -> None:
 
 
 def test_figures_of_darks_and_flats_stay_right_where_particles_hit() -> None:
-    """Some 200 events in each of the long dark frames. Black level, read noise, dark current, gain and the median of the
-    pixels' noise are those of the camera within three of the standard deviations that they have without particles; the
-    stated ones may be wider, as dark frames of different exposures contradict each other."""
+    """Some 200 events in each of the long dark frames. Black level, read noise, dark current, gain and the median of
+    the pixels' noise are those of the camera within three of the standard deviations that they have without particles;
+    the stated ones may be wider, as dark frames of different exposures contradict each other."""
     quiet, hit = (fit_recording_set(_recorded(*acting)).cameras["left"].noise for acting in ((), (RAYS,)))
     assert quiet is not None and hit is not None
     assert quiet.read_noise_distribution is not None and hit.read_noise_distribution is not None
