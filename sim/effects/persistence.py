@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Self
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
+from pydantic import Field
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Charge, Traps
+
+
+#: Ratio by which time constants of real traps, of several energies, spread to either side.
+SPREAD = 3.0
 
 
 class Persistence(Effect):
@@ -33,6 +39,7 @@ class Persistence(Effect):
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "orientation"})
     shapes: ClassVar[frozenset[str]] = frozenset({"release_s", "fullness", "slow_release_s"})
+    forms: ClassVar[Mapping[str, object]] = {"release": "spread"}
     sentence: ClassVar[str] = (
         "Persistence: after bright frames dark ones have more signal, in proportion to their exposure, and it fades "
         "over the frames that follow."
@@ -70,12 +77,21 @@ class Persistence(Effect):
                  dispensable=True),
     ] = 300.0  # fmt: skip
 
+    release: Annotated[
+        Literal["exponential", "spread"],
+        Field(description="release by each kind's time constant, or half each by a third and by three times of it"),
+    ] = "exponential"
+
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         return tuple((cls(share_percent=0.3, release_s=release_s),) for release_s in (30.0, 1.0, 5.0, 150.0, 1000.0))
 
     def on_charge(self, charge: Charge) -> Charge:
-        kinds = ((self.share_percent, self.release_s), (self.slow_percent, self.slow_release_s))
+        kinds = [(self.share_percent, self.release_s), (self.slow_percent, self.slow_release_s)]
+        if self.release == "spread":
+            kinds = [
+                (0.5 * percent, release_s * factor) for percent, release_s in kinds for factor in (1.0 / SPREAD, SPREAD)
+            ]
         for percent, release_s in kinds:
             if percent != 0.0:
                 full_e = 0.01 * percent * charge.camera.full_well_e

@@ -301,8 +301,8 @@ class PersistenceLaw(Law):
 class ChargeTransferLaw(Law):
     """Packets of a CCD leave charge behind at every transfer, clocked one by one. Variants: rows, read from the top,
     and traps that release by exp(-t / 0.8); columns, read from the right, exp(-t / 3); rows, and faint packets lose
-    more, as (x / W)^0.6 in place of x. Strength: loss of a full packet by one transfer, in 1e-6. Traps take electrons one
-    by one, so that shot noise isn't shared: it is of what arrives."""
+    more, as (x / W)^0.6 in place of x. Strength: loss of a full packet by one transfer, in 1e-6. Traps take electrons
+    one by one, so that shot noise isn't shared: it is of what arrives."""
 
     name = effect = "charge_transfer_inefficiency"
     variants, unit, nominal, limits, shown_by = 3, "1e-6", 60.0, (2.0, 900.0), OPTICAL
