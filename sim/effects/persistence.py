@@ -14,7 +14,6 @@ from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Charge, Traps
 
-
 #: Ratio by which time constants of real traps, of several energies, spread to either side.
 SPREAD = 3.0
 

@@ -8,12 +8,15 @@ from functools import cache
 import numpy as np
 import pytest
 
+from lab.challenge.draw import recordings_of
 from lab.diagnose.measurements.dark_events import dark_event_block
 from lab.diagnose.measurements.dark_trails import dark_trail_block
 from lab.diagnose.measurements.noise_skewness import skewness_block
 from lab.errors import NotDetermined
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet
+from mocks.former import ConcealedCamera, Plan
+from mocks.former.laws import PersistenceLaw
 from sim.effects.base import Effect
 from sim.effects.charge_transfer_inefficiency import ChargeTransferInefficiency
 from sim.effects.cosmic_rays import CosmicRays
@@ -82,3 +85,19 @@ def test_figures_of_darks_and_flats_stay_right_where_particles_hit() -> None:
     # the median of 12,288 pixels' noise is known to about 0.6 %
     medians = quiet.read_noise_distribution.median_e, hit.read_noise_distribution.median_e
     assert medians[1] == pytest.approx(medians[0], rel=0.02)
+
+
+def test_a_decay_of_dark_frames_is_no_scatter_of_them() -> None:
+    """Frames that fade after light by some DN widen the scatter of all repeats by as much, but not what is about their
+    decay: that is the usual one of 0.02 DN and of the pixels' noise, 2 DN over the root of 12,288, at most twice. A
+    healthy camera has one scatter."""
+    plan = Plan(("dark", "flat"), dark_again=True)
+    fading, healthy = (
+        study(recordings_of(ConcealedCamera(930, laws, cfa="MONO", rows=96, cols=128), plan)).noise
+        for laws in ([PersistenceLaw(5.0, 0, 9)], [])
+    )
+    assert fading.jitter_dn > 0.3
+    assert fading.white_jitter_dn is not None
+    assert fading.dark_jitter_dn == fading.white_jitter_dn < 2.0 * np.hypot(0.02, 2.0 / np.sqrt(12_288.0))
+    assert healthy.white_jitter_dn is None
+    assert healthy.dark_jitter_dn == healthy.jitter_dn
