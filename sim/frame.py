@@ -154,7 +154,7 @@ def collected_electrons(
     down, across = np.linspace(0.0, 1.0, camera.rows)[:, None], np.linspace(0.0, 1.0, camera.cols)[None, :]
     mean *= charge.collected_s(exposure.exposure_s) + charge.leaked_s(down, across)
     np.add(charge.collect_light(charge.stray_pixels(mean)), dark_electrons(camera, exposure, effects), out=mean)
-    return charge.overflow_wells(charge.move_charge(mean))
+    return charge.clock_out(charge.overflow_wells(charge.move_charge(mean)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,9 +190,8 @@ def read_electrons(
         held.append(left_e)
     lag_e = charge.hold_lag(np.minimum(total, camera.full_well_e))
     read = total - lag_e
-    filled = (
-        e + traps.share * np.minimum(read, camera.full_well_e) for e, traps in zip(held, charge.traps, strict=True)
-    )
+    held_well = np.minimum(read, camera.full_well_e)
+    filled = (traps.fill(e, held_well) for e, traps in zip(held, charge.traps, strict=True))
     return read, Kept(lag_e, tuple(filled), exposure.elapsed_s + exposure.exposure_s)
 
 
@@ -232,10 +231,12 @@ def with_reflections(camera: CameraModel, image: FloatArray, effects: Sequence[E
 def collected_mosaic(
     camera: CameraModel, electrons: FloatArray, effects: Sequence[Effect], *, exposure_s: float, elapsed_s: float
 ) -> FloatArray:
-    """Mean electrons (rows, cols) of light, in frames of any size, as pixels collect and share them."""
+    """Mean electrons (rows, cols) of light, in frames of any size, as pixels collect and share them; what packets leave
+    behind on their way to the output is that of the camera's middle."""
     rows = light_of(camera, effects).row_factors(len(electrons), exposure_s, elapsed_s)
     charge = charge_of(camera, effects)
-    return charge.move_charge(charge.collect_light(electrons if rows is None else electrons * rows[:, None]))
+    moved = charge.move_charge(charge.collect_light(electrons if rows is None else electrons * rows[:, None]))
+    return charge.trail_tile(moved)
 
 
 def pair_gain_factor(camera: CameraModel, effects: Sequence[Effect]) -> float:
@@ -425,7 +426,9 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
     if not effects:
         return sensor.LINEAR
     charge, signal, codes = charge_of(camera, effects), signal_of(camera, effects), codes_of(camera, effects)
-    disturbances = signal.random_at(exposure.elapsed_s)
+    particles = (law.during(exposure.exposure_s, camera.pixel_pitch_um) for law in charge.particles)
+    disturbances = (*signal.random_at(exposure.elapsed_s), *particles)
+    excess = charge.excess_factor(exposure.gain_db)
 
     def draw_disturbances(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         return sum((one.draw(shape, rng) for one in disturbances), np.zeros((1, 1)))
@@ -445,6 +448,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         signal.filter_kernel(),
         signal.gain_map(shape),
         signal.read_kernel(),
+        excess,
     )
 
 

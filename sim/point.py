@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import reduce
 from itertools import product
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +33,7 @@ TRANSFER = frozenset(
         "image.veils",
         "charge.transfer",
         "charge.kernels",
+        "charge.trails",
         "signal.filters",
     }
 )
@@ -69,7 +70,8 @@ class Blur:
         self.image: Image = image.remove_veil() if collected else image
         self.charge: Charge = charge_of(camera, effects)
         self.signal = Signal(camera) if collected else signal_of(camera, effects)
-        self.kernels = self.charge.kernels if moving and not collected else ()
+        self.moving = moving and not collected
+        self.kernels = self.charge.kernels if self.moving else ()
 
     def at(
         self,
@@ -81,7 +83,7 @@ class Blur:
         """At frequencies in cy/px, which broadcast, and a place."""
         fx, fy = fx_cy_per_px / self.camera.pixel_pitch_um, fy_cy_per_px / self.camera.pixel_pitch_um
         lens = self.image.otf(fx, fy, wavelength_nm, place_um)
-        return times(lens, self._in_pixels(wavelength_nm, fx_cy_per_px, fy_cy_per_px))
+        return times(lens, self._in_pixels(wavelength_nm, fx_cy_per_px, fy_cy_per_px, place_um))
 
     def beside_lens(
         self,
@@ -93,7 +95,7 @@ class Blur:
         """Return the same over the transfer of the lens without effects."""
         fx, fy = fx_cy_per_px / self.camera.pixel_pitch_um, fy_cy_per_px / self.camera.pixel_pitch_um
         beside = self.image.otf_beside_lens(fx, fy, wavelength_nm, place_um)
-        return times(beside, self._in_pixels(wavelength_nm, fx_cy_per_px, fy_cy_per_px))
+        return times(beside, self._in_pixels(wavelength_nm, fx_cy_per_px, fy_cy_per_px, place_um))
 
     @property
     def is_lens_alone(self) -> bool:
@@ -102,7 +104,7 @@ class Blur:
         return not TRANSFER.intersection(states)
 
     def _in_pixels(
-        self, wavelength_nm: float, fx_cy_per_px: FloatArray, fy_cy_per_px: FloatArray
+        self, wavelength_nm: float, fx_cy_per_px: FloatArray, fy_cy_per_px: FloatArray, place_um: tuple[float, float]
     ) -> FloatArray | ComplexArray | float:
         pitch = self.camera.pixel_pitch_um
         value: FloatArray | ComplexArray | float = self.charge.otf(
@@ -110,6 +112,8 @@ class Blur:
         )
         for kernel in self.kernels:
             value = value * kernel_otf(kernel, fx_cy_per_px, fy_cy_per_px)
+        if self.moving and self.charge.trails:
+            value = value * self.charge.trail_otf(fx_cy_per_px, fy_cy_per_px, place_um)
         plane = mosaic.step(self.camera.cfa)  # filters on the chip run over each colour's plane
         for kernel in self.signal.filters:
             value = value * kernel_otf(kernel, plane * fx_cy_per_px, plane * fy_cy_per_px)
@@ -122,9 +126,10 @@ def times(transfer: FloatArray | ComplexArray, factor: FloatArray | ComplexArray
 
 
 def varies_over_field(camera: CameraModel, effects: Sequence[Acts]) -> bool:
-    """Return whether any effect's path error, or how far it lets wavelengths land apart, changes with the place."""
+    """Return whether any effect's path error, how far it lets wavelengths land apart, or the charge that is left behind
+    on its way to the output, changes with the place."""
     image = image_of(camera, effects)
-    return bool(image.pupil_at) or image.moves
+    return bool(image.pupil_at) or image.moves or bool(charge_of(camera, effects).trails)
 
 
 def displaced_um(
@@ -197,7 +202,8 @@ def detected_transfer(
 
 def mixes_colours(camera: CameraModel, effects: Sequence[Acts]) -> bool:
     """Return whether effects move charge between pixels of different colours."""
-    return camera.cfa != "MONO" and bool(charge_of(camera, effects).kernels)
+    charge = charge_of(camera, effects)
+    return camera.cfa != "MONO" and bool(charge.kernels or charge.trails)
 
 
 def mix_channels(
@@ -207,17 +213,19 @@ def mix_channels(
     fx_cy_per_px: FloatArray,
     fy_cy_per_px: FloatArray,
     effects: Sequence[Acts],
+    place_um: tuple[float, float] = (0.0, 0.0),
 ) -> ComplexArray:
     """Transfer functions of a mosaic's channels after charge has moved between pixels, (channels, *frequencies), from
     those before and each channel's mean signal before, (channels,), on any scale.
 
     T'_c(f) = sum_n k_n s_n T_n(f) exp(-2 pi i f n) / sum_n k_n s_n, over the offsets n of the kernel k of all moves
     together; s_n and T_n are of the channel from which charge moves by n to a pixel of channel c. Of a channel with
-    several phases in the mosaic, their mean.
+    several phases in the mosaic, their mean. `place_um` matters to charge that is left behind on its way to the output.
     """
     from scipy.signal import convolve2d  # here: the library takes a while to load
 
-    kernel = reduce(convolve2d, charge_of(camera, effects).kernels, np.ones((1, 1)))
+    charge = charge_of(camera, effects)
+    kernel = reduce(convolve2d, [*charge.kernels, *charge.trail_kernels(place_um)], np.ones((1, 1)))
     half, step, phases = np.array(kernel.shape) // 2, mosaic.step(camera.cfa), mosaic.phases(camera.cfa)
     channel_at = {place: i for i, name in enumerate(camera.channels) for place in phases[name]}
     out = np.zeros(transfers.shape, complex)
@@ -235,6 +243,20 @@ def mix_channels(
             out[i], total = transfers[i], 1.0
         out[i] /= total
     return out
+
+
+def trail_behind(camera: CameraModel, effects: Sequence[Acts], axis: Literal[0, 1], line: float, lag_px: int) -> float:
+    """Return by how much the pixel `lag_px` lines behind one that alone has charge exceeds that before it, over that
+    one's signal; `axis` 0 along a column, 1 along a row, `line` its place there."""
+    found = 0.0
+    charge = charge_of(camera, effects)
+    lines = (camera.rows, camera.cols)[axis]
+    for law in charge.trails:
+        if law.axis == axis:
+            kernel = np.ravel(law.kernel(float(law.transfers(np.asarray(line), lines))))
+            middle = len(kernel) // 2
+            found += float((kernel[middle + lag_px] - kernel[middle - lag_px]) / kernel[middle])
+    return found
 
 
 def even_share(camera: CameraModel, effects: Sequence[Acts]) -> float:
@@ -300,7 +322,9 @@ def optical_transfer(
         signals.append(float(np.sum(weight)))
     if not mixing:
         return transfers[0]
-    return mix_channels(camera, np.array(transfers), np.array(signals), fx, fy, effects)[camera.channels.index(channel)]
+    return mix_channels(camera, np.array(transfers), np.array(signals), fx, fy, effects, place_um)[
+        camera.channels.index(channel)
+    ]
 
 
 def common_wavelengths(

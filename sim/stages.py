@@ -30,7 +30,9 @@ from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.electrons import NEIGHBOURS
 from sim.sensor.lines import LineGains, LineNoise
+from sim.sensor.particles import Particles
 from sim.sensor.reading_order import ReadingOrderNoise
+from sim.sensor.trails import Trails
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
@@ -262,11 +264,13 @@ class Image(State):
 @dataclass(frozen=True)
 class Traps:
     """Traps that take the share `share` of the charge that a frame reads, and release it with the time constant
-    `release_s`. What is released before an exposure begins is reset with the pixels.
+    `release_s`. What is released before an exposure begins is reset with the pixels. `capacity_e`: electrons that a
+    pixel's traps hold when they are full.
     """
 
     share: float
     release_s: float
+    capacity_e: float = np.inf
 
     def release(self, trapped_e: FloatArray, since_s: float, exposure_s: float) -> tuple[FloatArray, FloatArray]:
         """Return the electrons that an exposure collects from the traps, and those that they hold at its end.
@@ -277,6 +281,16 @@ class Traps:
         held = trapped_e * np.exp(-max(since_s, 0.0) / self.release_s)
         left = held * np.exp(-exposure_s / self.release_s)
         return held - left, left
+
+    def fill(self, trapped_e: FloatArray, read_e: FloatArray) -> FloatArray:
+        """Return the electrons in the traps after a frame of `read_e` electrons: an electron is taken with a
+        probability in proportion to the traps that are empty, (c - t)(1 - exp(-q x / c)) of x with c the capacity and
+        t in the traps, q x without a limit.
+        """
+        if not np.isfinite(self.capacity_e):
+            return trapped_e + self.share * read_e
+        empty = np.maximum(self.capacity_e - trapped_e, 0.0)
+        return np.asarray(trapped_e - empty * np.expm1(-self.share * read_e / self.capacity_e))
 
 
 #: The colours of the four next pixels in the mosaic, half of them each where there are two.
@@ -338,9 +352,11 @@ class Charge(State):
     mosaic). `exchange`: mean electrons (rows, cols) -> the same after neighbours have exchanged charge by how much they
     hold: their sum stays, and equal neighbours exchange none. `overflow`: mean electrons (rows, cols) -> the same after
     full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame, from none to all.
-    `traps`: what fills in a frame and empties over the frames that follow. `variance_e2`: (mean electrons, shot noise's
-    variance) -> variance. `correlation`: mean electrons (...) -> correlation (5, ...) of the shot noise with each
-    neighbour, by the kinds of `sim.sensor.electrons.NEIGHBOURS`.
+    `traps`: what fills in a frame and empties over the frames that follow. `trails`: what packets leave behind on their
+    way to the output; in even light each finds what it loses. `particles`: charge of single particles. `variance_e2`:
+    (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons (...) -> correlation (5, ...) of
+    the shot noise with each neighbour, by the kinds of `sim.sensor.electrons.NEIGHBOURS`. `excess`: gain setting in dB
+    -> factor on the shot noise's variance by a random multiplication of each electron, 1 and more.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
@@ -355,8 +371,11 @@ class Charge(State):
     overflow: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     lag: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     traps: tuple[Traps, ...] = ()
+    trails: tuple[Trails, ...] = ()
+    particles: tuple[Particles, ...] = ()
     variance_e2: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     correlation: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    excess: tuple[Callable[[float], float], ...] = ()
 
     def collected_s(self, exposure_s: float) -> float:
         """Return the time in which light is collected, given the time that was asked for."""
@@ -410,7 +429,7 @@ class Charge(State):
     @property
     def mixes(self) -> bool:
         """Return whether charge moves between neighbouring pixels."""
-        return bool(self.kernels or self.exchange)
+        return bool(self.kernels or self.exchange or self.trails)
 
     def part_greens(self, electrons: Mapping[str, FloatArray], x_um: FloatArray, y_um: FloatArray) -> FloatArray:
         """By how much green pixels on red rows have more light than those on blue rows (..., places)."""
@@ -419,6 +438,47 @@ class Charge(State):
     def overflow_wells(self, electrons: FloatArray) -> FloatArray:
         """Mean electrons of a whole frame after what is above the full well has run over."""
         return reduce(lambda value, law: law(value), self.overflow, electrons)
+
+    def clock_out(self, electrons: FloatArray) -> FloatArray:
+        """Mean electrons of a whole frame (rows, cols) as they arrive at the output: rows first, then columns."""
+        return reduce(lambda value, law: law.clock(value), self.trails, electrons)
+
+    def _transfers(self, place_um: tuple[float, float]) -> list[float]:
+        """How often a packet of a place is transferred by each of `trails`."""
+        found = []
+        for law in self.trails:
+            lines, at_um = ((self.camera.rows, place_um[1]), (self.camera.cols, place_um[0]))[law.axis]
+            line = np.clip(at_um / self.camera.pixel_pitch_um + 0.5 * (lines - 1), 0.0, lines - 1.0)
+            found.append(float(law.transfers(np.asarray(line), lines)))
+        return found
+
+    def trail_otf(
+        self, fx_cy_per_px: FloatArray, fy_cy_per_px: FloatArray, place_um: tuple[float, float]
+    ) -> ComplexArray | float:
+        """Return the transfer function of `trails` at a place."""
+        value: ComplexArray | float = 1.0
+        for law, transfers in zip(self.trails, self._transfers(place_um), strict=True):
+            value = value * law.otf(fx_cy_per_px, fy_cy_per_px, transfers)
+        return value
+
+    def trail_kernels(self, place_um: tuple[float, float]) -> list[FloatArray]:
+        """Where the charge of a pixel at a place ends up by each of `trails`, (odd, odd)."""
+        return [law.kernel(n) for law, n in zip(self.trails, self._transfers(place_um), strict=True)]
+
+    def trail_tile(self, electrons: FloatArray) -> FloatArray:
+        """Mean electrons (rows, cols) of a small part in the middle of even light, which goes on periodically, after
+        `trails` with as many transfers as in the frame's middle."""
+        tile = electrons
+        for law, transfers in zip(self.trails, self._transfers((0.0, 0.0)), strict=True):
+            frequency = np.fft.fftfreq(tile.shape[law.axis])
+            along = law.otf(frequency, frequency, transfers)
+            shaped = along[:, None] if law.axis == 0 else along[None, :]
+            tile = np.real(np.fft.ifft(np.fft.fft(tile, axis=law.axis) * shaped, axis=law.axis))
+        return tile
+
+    def excess_factor(self, gain_db: float) -> float:
+        """Factor on the shot noise's variance at a gain setting."""
+        return reduce(lambda value, law: value * law(gain_db), self.excess, 1.0)
 
     def hold_lag(self, electrons: FloatArray) -> FloatArray | float:
         """Return how many of a frame's electrons aren't read but stay for the next frame: image lag."""

@@ -17,6 +17,7 @@ from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineGains, LineNoise, Lines
+from sim.sensor.particles import Particles
 from sim.sensor.reading_order import ReadingOrderNoise
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
@@ -39,6 +40,7 @@ LEVEL = (
         "light.ambient_e_per_s",
         "charge.kernels",
         "charge.exchange",
+        "charge.trails",
         "signal.response",
         "signal.offset_dn",
         "signal.exposure_offset_dn",
@@ -283,7 +285,7 @@ class Uniform:
             return {}
         cfa, size, inner = self.camera.cfa, 12, slice(4, 8)
         tile = mosaic.assemble({c: np.full((size, size), level) for c, level in electrons.items()}, cfa)
-        after = self._charge.move_charge(tile)
+        after = self._charge.trail_tile(self._charge.move_charge(tile))
         factors = {}
         for channel, level in electrons.items():
             where = np.zeros((size, size), bool)
@@ -346,12 +348,27 @@ class Uniform:
             for k, (start_s, open_s) in enumerate(zip(begin_s, exposure_s, strict=True)):
                 released, left = traps.release(held, start_s - end_s, open_s)
                 found[k] += released
-                held, end_s = left + traps.share * electrons[k], start_s + open_s
+                held, end_s = traps.fill(left, electrons[k]), start_s + open_s
         return found
 
-    def shot_e2(self, electrons: FloatArray) -> FloatArray:
-        """Variance of the shot noise (e^2) at mean signals."""
-        return self._charge.shot_e2(electrons)
+    def shot_e2(self, electrons: FloatArray, gain_db: float = 0.0) -> FloatArray:
+        """Variance of the shot noise (e^2) at mean signals, at a gain setting."""
+        return self._charge.shot_e2(electrons) * self._charge.excess_factor(gain_db)
+
+    def excess_factor(self, gain_db: float = 0.0) -> float:
+        """Return the factor on the shot noise's variance by which electrons are multiplied at random, at a gain
+        setting."""
+        return self._charge.excess_factor(gain_db)
+
+    @property
+    def multiplies_electrons(self) -> bool:
+        """Return whether electrons are multiplied at random before read-out."""
+        return bool(self._charge.excess)
+
+    @property
+    def particles(self) -> tuple[Particles, ...]:
+        """Return the single particles that leave charge in frames."""
+        return self._charge.particles
 
     @property
     def shares_shot_noise(self) -> bool:

@@ -188,7 +188,7 @@ class Study:
         return cast(T, found)
 
     @cached_property
-    def _order(self) -> list[Capture]:
+    def in_time_order(self) -> list[Capture]:
         """The side's captures as they were taken: by time where all have one, else in the manifest's order."""
         order: list[Capture] = list(self.recordings.captures(side=self.side))
         return sorted(order, key=self.elapsed_s) if all(c.time is not None for c in order) else order
@@ -197,7 +197,7 @@ class Study:
     def _before(self) -> dict[str, Capture]:
         """Id of a capture -> the capture whose frame was read before its own. After dummy frames that is a frame of the
         same capture."""
-        order = self._order
+        order = self.in_time_order
         return {c.id: before for before, c in pairwise(order)} | {c.id: c for c in order if c.dummy_frames}
 
     def settled(self, group: Sequence[C]) -> list[C]:
@@ -243,7 +243,7 @@ class Study:
         """Electrons that traps release by (id of a capture, channel), up to the last capture of even light or none, so
         that no frames are read for it besides. None where a capture has no time: how much is left by then isn't known.
         Dummy frames are taken as one directly after the other."""
-        order = self._order
+        order = self.in_time_order
         even = [k for k, c in enumerate(order) if isinstance(c, DarkCapture | FlatCapture | NarrowbandCapture)]
         taken = order[: even[-1] + 1] if even else []
         if any(c.time is None for c in taken):

@@ -25,6 +25,8 @@ LINE_GAINS = frozenset({"signal.line_gains"})
 LINES = frozenset({"signal.lines", "signal.reading_order"})
 #: Spectrum of the read noise along a row.
 READ_SPECTRUM = frozenset({"signal.read_spectrum"})
+#: Charge of single particles.
+PARTICLES = frozenset({"charge.particles"})
 #: The light of a screen for the picture that it is given.
 SHOWN = frozenset({"light.screen"})
 #: Displaced, scaled or rotated copies of the image.

@@ -21,8 +21,10 @@ class Family(StrEnum):
     DEFECTIVE_PIXELS = "defective_pixels"
     LINE_NOISE = "line_noise"
     READ_NOISE = "read_noise"
+    PHOTON_NOISE = "photon_noise"
     READ_OUT_AREAS = "areas_of_read_out"
     DARK_SIGNAL = "dark_signal"
+    RADIATION = "radiation"
     CHARGE_BETWEEN_NEIGHBOURS = "charge_between_neighbours"
     FRAME_MEMORY = "memory_of_the_last_frame"
     ON_CHIP_PROCESSING = "on_chip_processing"
@@ -113,6 +115,10 @@ _TOLD = {
         "The noise of the read-out isn't alike and independent from pixel to pixel.",
         "dark frames with many repeats, and flats: shot noise hides what read-out does the more, the brighter they are",
     ),
+    Family.PHOTON_NOISE: _Told(
+        "noise of photoelectrons",
+        "The noise of light isn't that of single electrons.",
+    ),
     Family.READ_OUT_AREAS: _Told(
         "areas of the read-out",
         "Parts of the frame are read with another gain or another offset.",
@@ -123,6 +129,10 @@ _TOLD = {
         "Dark frames aren't at their level: it moves with time or temperature, or is uneven over the frame.",
         "dark frames at two exposures and two temperatures, and again at the end: an offset doesn't grow with the "
         "exposure",
+    ),
+    Family.RADIATION: _Told(
+        "single particles",
+        "Pixels are bright in one frame alone.",
     ),
     Family.CHARGE_BETWEEN_NEIGHBOURS: _Told(
         "charge between neighbours",

@@ -43,6 +43,7 @@ class ReadOut:
     offset_dn     added to the black level
     gain          factor (rows, cols) on what is read of every pixel, its noise alike, before `added`
     read_kernel   kernel (odd,) along the row that makes read noise of white noise
+    excess        factor on the shot noise's variance, by which each electron is multiplied at random
     """
 
     response: Callable[[FloatArray], FloatArray] | None = None
@@ -56,6 +57,7 @@ class ReadOut:
     processing: FloatArray | None = None
     gain: FloatArray | None = None
     read_kernel: FloatArray | None = None
+    excess: float = 1.0
 
 
 LINEAR = ReadOut()
@@ -245,6 +247,8 @@ def dn_moments(
     full_dn = zero_dn + gain * float(full if read_out.response is None else read_out.response(full))
     by_charge = full_dn < camera.white_level_dn
     noise = electrons if read_out.shot_e2 is None else np.maximum(read_out.shot_e2(electrons), 0.0)
+    if read_out.excess != 1.0:
+        noise = noise * read_out.excess
     mean, variance = electrons, noise
     if by_charge:
         # to DN as it is, as the full well's own noise is none: what is clipped isn't clipped again
@@ -376,6 +380,8 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
         shares = passed_shares(read_out.neighbours, mean.astype(float))
         charge = (mean + shared_departures(charge - mean, mean, shares)).astype(np.float32)
     np.minimum(charge, np.float32(camera.full_well_e), out=charge)
+    if read_out.excess != 1.0:
+        charge = multiply_electrons(charge, read_out.excess, rng)
     if read_out.response is not None:
         charge = read_out.response(charge.astype(float)).astype(np.float32)
     if camera.read_noise_e > 0:
@@ -420,6 +426,30 @@ def _products() -> tuple[tuple[tuple[int, int], ...], ...]:
 
 
 _PRODUCTS = _products()
+#: Variance factor of a multiplication above which it is taken as continuous: the mean is then 50 and more.
+GEOMETRIC_BELOW = 1.98
+
+
+def multiplied_skewness(excess: float) -> float:
+    """Return E g^3 / (E g^2)^2 of the number g by which `multiply_electrons` multiplies one electron: 1 of none, 1.5 of
+    an exponential one."""
+    if excess > GEOMETRIC_BELOW:
+        return 2.0 - 1.0 / excess
+    return 1.0 + 2.0 / excess - 2.0 / excess**2
+
+
+def multiply_electrons(charge: Float32Array, excess: float, rng: np.random.Generator) -> Float32Array:
+    """Electrons after each was multiplied at random, over the mean multiplication; the variance of one is `excess` - 1.
+
+    Below 2 a geometric number of mean M = 1 / (2 - excess), as a chain of many stages makes of one electron. From there
+    on a gamma distribution: at 2 the exponential one of a register of high gain (Basden, Haniff and Mackay, MNRAS 345,
+    985, 2003)."""
+    if excess > GEOMETRIC_BELOW:
+        spread = excess - 1.0
+        return np.asarray(rng.gamma(np.maximum(charge, 0.0) / spread, spread), np.float32)
+    number, inverse_mean = np.rint(np.maximum(charge, 0.0)), 2.0 - excess
+    further = rng.negative_binomial(np.maximum(number, 1.0), inverse_mean)
+    return np.asarray(np.where(number > 0.0, (number + further) * inverse_mean, charge), np.float32)
 
 
 def solve_passed_share(correlation: FloatArray) -> FloatArray:

@@ -16,12 +16,15 @@ from lab.observables.darks.frames import (
     DarkStatistics,
     by_part,
     captures_of,
+    contrast_weights,
     dark_frames,
     fine_conditions,
 )
 from lab.observables.dataset import Study
 from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.reads import PARTICLES
 from sim.effects.base import Effects
+from sim.sensor.particles import Particles
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -40,20 +43,20 @@ COUNT_STD = 0.6
 FAR, PRESENCE = 20.0, 4.0
 
 
-def _rooted(counts: FloatArray) -> FloatArray:
+def rooted_counts(counts: FloatArray) -> FloatArray:
     """Anscombe transform 2 sqrt(n + 3/8) of Poisson counts: standard deviation 1 except for small ones (Anscombe
     1948)."""
     return np.asarray(2.0 * np.sqrt(counts + 0.375))
 
 
 def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0) -> FloatArray:
-    """Covariance of `_rooted` counts: their exact variance for Poisson counts of mean `expected`, `COUNT_STD`, and
+    """Covariance of `rooted_counts`: their exact variance for Poisson counts of mean `expected`, `COUNT_STD`, and
     `uncertain`, the standard deviation of the expected counts."""
     number = np.arange(60.0)
     mean = np.minimum(expected, 20.0)[:, None]
     share = np.exp(xlogy(number, mean) - mean - gammaln(number + 1.0))
-    chance = share @ np.square(_rooted(number)) - np.square(share @ _rooted(number))
-    return np.diag(chance + COUNT_STD**2 + np.square(_rooted(expected + uncertain) - _rooted(expected)))
+    chance = share @ np.square(rooted_counts(number)) - np.square(share @ rooted_counts(number))
+    return np.diag(chance + COUNT_STD**2 + np.square(rooted_counts(expected + uncertain) - rooted_counts(expected)))
 
 
 def defective_pixel_block(study: Study) -> Block:
@@ -71,7 +74,7 @@ def defective_pixel_block(study: Study) -> Block:
 
     def rooted(counts: FloatArray, present: Callable[[FloatArray], FloatArray]) -> FloatArray:
         """Roots of counts (points x bins,); in a point's first bin that is far off, whether any pixel is, too."""
-        found = _rooted(counts)
+        found = rooted_counts(counts)
         for number, is_far in enumerate(far):
             if is_far.any():
                 first = number * len(low)
@@ -209,13 +212,14 @@ def flickering_pixel_block(study: Study) -> Block:
         freedom = sum(f.changing[out].contrasts for _, f in part)
         edges = _flicker_edges(freedom)
         total = np.sum([f.changing[out].squares for _, f in part], axis=0)
-        value.append(_rooted(np.histogram(total, [*edges, np.inf])[0].astype(float)))
+        value.append(rooted_counts(np.histogram(total, [*edges, np.inf])[0].astype(float)))
         ids = tuple(i for _, f in part for i in captures_of(f, out))
         labels += [Label(float(x), "all", "all exposures", ids, out) for x in edges / freedom]
         sums.append((out, part, freedom, edges))
 
     def expected(effects: Effects) -> FloatArray:
         model, found = Uniform(study.camera, effects), []
+        particles = model.particles
         for out, part, freedom, edges in sums:
             shares = _chance_above(np.array([freedom], float), np.zeros(1), edges)[0]
             for hot in model.hot:
@@ -226,6 +230,8 @@ def flickering_pixel_block(study: Study) -> Block:
                 unit = np.sum([draws.sums[k, out] / f.changing[out].pixel_dn2 for k, f in part], axis=0)
                 above = _jump_above(study, unit, draws.weights(jumps.high_share), distance_e, edges, freedom)
                 shares = shares + weight @ (above - shares)
+            for law in particles:
+                shares = shares + _hit_above(study, law, [f for _, f in part], out, edges, freedom)
             found.append(size * (shares - np.append(shares[1:], 0.0)))
         return np.maximum(np.concatenate(found), 0.0)
 
@@ -234,7 +240,7 @@ def flickering_pixel_block(study: Study) -> Block:
     return Block(
         measurement=FLICKERING_PIXELS, reach=1.0,
         value=np.concatenate(value), covariance=_count_covariance(base, base), labels=tuple(labels),
-        reads=DEFECTS, predict=lambda effects: Prediction(_rooted(expected(effects)), {}),
+        reads=DEFECTS | PARTICLES, predict=lambda effects: Prediction(rooted_counts(expected(effects)), {}),
         scale=np.full(len(base), 10.0), along=np.log(position),
     )  # fmt: skip
 
@@ -268,6 +274,24 @@ def _hot_above(
     scale = variance / (2.0 * mean)
     freedom = mean / scale
     return np.asarray(chdtrc(freedom[:, None], edges[None, :] / scale[:, None]))
+
+
+def _hit_above(
+    study: Study, law: Particles, part: Sequence[DarkStatistics], out: bool, edges: FloatArray, freedom: int
+) -> FloatArray:
+    """Probability (edges,) that a particle's charge takes a pixel above the edges: over all frames in which it may be
+    hit."""
+    pitch_um = study.camera.pixel_pitch_um
+    number, charge_e = law.pixels_e(pitch_um)
+    found: FloatArray = np.zeros(len(edges))
+    for f in part:
+        hit = law.expected_number(1, pitch_um, f.condition.exposure_s)
+        for weight in np.sum(np.square(contrast_weights(f.condition, out)), axis=0):
+            away = np.square(study.noise.gain * charge_e) * weight / f.changing[out].pixel_dn2
+            found = found + hit * number @ _chance_above(
+                np.full(len(away), float(freedom)), np.maximum(away, 1e-9), edges
+            )
+    return found
 
 
 @dataclass(frozen=True)

@@ -112,6 +112,16 @@ class DarkStatistics:
     changing: dict[bool, DarkNoise]
 
 
+def contrast_weights(condition: DarkCondition, held_out: bool) -> FloatArray:
+    """Return the weights (contrasts, frames) of a condition's frames in the contrasts of its seen or held-out part."""
+    n, seen = len(condition.captures), len(condition.seen)
+    weights = np.zeros((max(n - 1, 0), n))
+    for k in range(1, n):
+        weights[k - 1, :k] = -np.sqrt(k / (k + 1.0)) / k
+        weights[k - 1, k] = np.sqrt(k / (k + 1.0))
+    return weights[max(seen - 1, 0) :] if held_out else weights[: max(seen - 1, 0)]
+
+
 def conditions(study: Study) -> list[DarkCondition]:
     """Dark captures by exposure and temperature, at the most frequent gain. The last third of the repeats is held out.
 

@@ -94,7 +94,7 @@ def dark_level_block(study: Study) -> Block:
     )
     return Block(
         measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
-        covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + floor_dn**2)) + same * np.outer(coarse, coarse),
+        covariance=(noise.dark_jitter_dn**2 + floor_dn**2) * np.eye(len(value)) + same * np.outer(coarse, coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
         reads=LAG | DARK_CURRENT | {"signal.offset_dn", "signal.exposure_offset_dn", "codes.codes"},
         scattered_by=LINES, predict=predict,

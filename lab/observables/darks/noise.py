@@ -6,12 +6,20 @@ import numpy as np
 from scipy.special import ndtr
 
 from lab.errors import NotDetermined
-from lab.observables.darks.frames import DEFECTS, DarkCondition, captures_of, dark_frames, too_coarse
+from lab.observables.darks.frames import (
+    DEFECTS,
+    DarkCondition,
+    captures_of,
+    contrast_weights,
+    dark_frames,
+    too_coarse,
+)
 from lab.observables.darks.level import added_dark_e_per_s
 from lab.observables.dataset import Study
+from lab.observables.flats.noise import GAIN_STD
 from lab.observables.noise.figures import CLIP
 from lab.observables.observable import Block, Label, Measurement, Prediction
-from lab.observables.reads import DARK_CURRENT, LAG, LINES, acting
+from lab.observables.reads import DARK_CURRENT, LAG, LINES, PARTICLES, acting
 from sim.effects.base import Effects
 from sim.sensor.reading_order import ReadingOrderNoise
 from sim.spectrum import FloatArray
@@ -58,7 +66,7 @@ def dark_noise_block(study: Study) -> Block:
     base = shortest + dark - float(dark.min())
     # relative prior standard deviation of the gain: measured by flats, stated, or unknown
     flats = len(study.flat_levels()) > 1
-    gain_std = 0.05 if flats else 0.3 if study.stated.conversion_gain_dn_per_e is not None else 10.0
+    gain_std = GAIN_STD if flats else 0.3 if study.stated.conversion_gain_dn_per_e is not None else 10.0
 
     def predict(effects: Effects) -> Prediction:
         mean = base.copy()
@@ -73,6 +81,10 @@ def dark_noise_block(study: Study) -> Block:
             shot[i] += noise.gain**2 * more_at(temperature) * t + carried[i]
             mean[i] += shot[i] - dark[i]
             mean[i] += _defect_variance(model, noise.gain, t, float(value[i])) + noise.gain**2 * lines
+            mean[i] += _particle_variance(study, model, f.condition, out, float(value[i]))
+        if model.multiplies_electrons:
+            more = model.excess_factor(study.usual_gain_db) - 1.0
+            mean, shot = mean + more * shot, (1.0 + more) * shot
         jacobian = {
             "dark_read": np.full(len(points), 0.5 * shortest + 0.1),
             "dark": noise.gain * exposures * noise.dark_std,
@@ -93,7 +105,7 @@ def dark_noise_block(study: Study) -> Block:
         covariance=covariance,
         labels=tuple(Label(f.condition.exposure_s, "all", f.condition.name, captures_of(f, out), out) for f, out,
         _ in points),
-        reads=DEFECTS | DARK_CURRENT | LAG | LINES, predict=predict, scale=value,
+        reads=DEFECTS | DARK_CURRENT | LAG | LINES | PARTICLES | {"charge.excess"}, predict=predict, scale=value,
     )  # fmt: skip
 
 
@@ -136,6 +148,21 @@ def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn
         apart_square = _cut_square(apart, still, cut)
         more += float(share @ (differ * (apart_square - variance_dn2)))
     return more
+
+
+def _particle_variance(
+    study: Study, model: Uniform, condition: DarkCondition, held_out: bool, variance_dn2: float
+) -> float:
+    """Return what particles add to the mean variance (DN^2) of a part's contrasts, which are clipped."""
+    pitch_um, more = study.camera.pixel_pitch_um, 0.0
+    for law in model.particles:
+        number, charge_e = law.pixels_e(pitch_um)
+        hit = law.expected_number(1, pitch_um, condition.exposure_s) * number
+        for weight in contrast_weights(condition, held_out):
+            apart = study.noise.gain * np.outer(weight, charge_e)
+            still = np.full_like(apart, variance_dn2)
+            more += float(np.sum(hit * (_cut_square(apart, still, CLIP * np.sqrt(variance_dn2)) - variance_dn2)))
+    return more / max(len(contrast_weights(condition, held_out)), 1)
 
 
 def _cut_square(mean: FloatArray, variance: FloatArray, cut: float) -> FloatArray:

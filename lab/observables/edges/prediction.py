@@ -62,7 +62,7 @@ MOST_MOVES, MOVED_TO_PX = 4, 1e-5  # of a profile to where the recorded edge lie
 KEPT = 64  # most entries of each cache
 #: Quantities of the stages that change an edge's profile otherwise than by the OTF.
 CHANGING = SHADING | STRAYS | {"signal.response", "image.veils", "charge.exchange"}
-KERNELS = frozenset({"charge.kernels"})
+KERNELS = frozenset({"charge.kernels", "charge.trails"})
 K = TypeVar("K")
 V = TypeVar("V")
 _Key = tuple[Effect, ...]
@@ -227,7 +227,7 @@ class PredictedEdges:
             return detected_transfer(self._camera, nodes, shares, whole, fx, fy, optical, [place_um]) + kink
 
         otf = _kept(self._blurred, (spectral, optical, place_um), blurred)
-        return self._mixed(otf, moving) if moving else otf
+        return self._mixed(otf, moving, place_um) if moving else otf
 
     @cached_property
     def _frequencies(self) -> tuple[FloatArray, FloatArray]:
@@ -272,12 +272,14 @@ class PredictedEdges:
         grid = np.linspace(low, high, 2 + int((high - low) / FINE_NM))
         return grid, np.array([transfer_at(self._camera, float(w), *self._frequencies) for w in grid])
 
-    def _mixed(self, otf: ComplexArray, moving: tuple[Effect, ...]) -> ComplexArray:
+    def _mixed(self, otf: ComplexArray, moving: tuple[Effect, ...], place_um: tuple[float, float]) -> ComplexArray:
         """OTFs (sights, directions, nodes) with charge that moves between pixels of different colours."""
         count = len(self._camera.channels)
         parts = [slice(first, first + count) for first in range(0, len(otf), count)]
         rates = np.array([max(self._rate(k), 0.0) for k in range(len(otf))])
-        return np.concatenate([mix_channels(self._camera, otf[p], rates[p], *self._frequencies, moving) for p in parts])
+        return np.concatenate(
+            [mix_channels(self._camera, otf[p], rates[p], *self._frequencies, moving, place_um) for p in parts]
+        )
 
     def _rate(self, sight: int) -> float:
         """Electrons a second of a sight; 1 where its light isn't stated."""

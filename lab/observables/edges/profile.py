@@ -68,17 +68,16 @@ GRID_PX = 0.05  # step of the grid of distances on which other profiles are give
 class EdgeSummary:
     """One edge in the pixels of one colour, in codes, with k spline coefficients and g gradients of the illumination.
 
-    `curve`: where it lies. `reach_px`: the largest distance of a sample from it. `samples`: their number. `spline`: basis of the
-    profile.
-    `gram` (k + g + 1, k + g + 1): A^T W A, where A holds the columns of the spline, the gradients and the values, which
-    are 0 on the dark and 1 on the light side, and W the inverse variances of the values. `inverse` (k + g, k + g): of
-    the normal matrix with the prior of the line spread; it takes A^T W values to the solution. `solution` (k + g,), its
-    first k numbers the profile, and `covariance` (k, k) of these about the truth. `right_side` (k + g, distances): the
-    operator A^T W C that takes another profile, given at `grid_px`, to the right side of the normal equations; C
-    interpolates to the samples by cubics. `rounding` (waves, k + g): A^T W e for the errors e that rounding to whole
-    codes may leave, one standard deviation each. `levels`, `noise_std`: of the dark and the light side, in codes.
-    `residual_chi2_per_sample`: near 1 where edge, spline and noise explain the region.
-    """
+    `curve`: where it lies. `reach_px`: the largest distance of a sample from it. `samples`: their number. `spline`:
+    basis of the profile. `gram` (k + g + 1, k + g + 1): A^T W A, where A holds the columns of the spline, the
+    gradients and the values, which are 0 on the dark and 1 on the light side, and W the inverse variances of the
+    values. `inverse` (k + g, k + g): of the normal matrix with the prior of the line spread; it takes A^T W values to
+    the solution. `solution` (k + g,), its first k numbers the profile, and `covariance` (k, k) of these about the
+    truth. `right_side` (k + g, distances): the operator A^T W C that takes another profile, given at `grid_px`, to the
+    right side of the normal equations; C interpolates to the samples by cubics. `rounding` (waves, k + g): A^T W e for
+    the errors e that rounding to whole codes may leave, one standard deviation each. `levels`, `noise_std`: of the
+    dark and the light side, in codes. `residual_chi2_per_sample`: near 1 where edge, spline and noise explain the
+    region. """
 
     curve: EdgeCurve
     angle_deg: float

@@ -197,7 +197,7 @@ def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
 
 #: Quantities of the stages by which neighbouring pixels differ in uniform light. A light that changes from row to row
 #: isn't among them: a green is held against the mean of the rows above and below.
-KERNELS = frozenset({"charge.kernels"})
+KERNELS = frozenset({"charge.kernels", "charge.trails"})
 GREENS = COLLECTED | KERNELS
 
 

@@ -62,7 +62,8 @@ def variance_block(study: Study) -> Block:
     return Block(
         measurement=NOISE, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
         labels=tuple(Label(p[2], p[1], f"{p[0].exposure_s:.4g} s", p[0].captures, p[0].held_out) for p in points),
-        reads=frozenset({"signal.response", "charge.variance_e2", "codes.codes"}), predict=predict, scale=value,
+        reads=frozenset({"signal.response", "charge.variance_e2", "charge.excess", "codes.codes"}), predict=predict,
+        scale=value,
     )  # fmt: skip
 
 
@@ -72,7 +73,9 @@ def shot_variance(study: Study, signal_dn: FloatArray, gain_dn_per_e: FloatArray
     noise, model = study.noise, Uniform(study.camera, effects)
     light = study.field.light / study.field.light.mean()
     electrons, slope = behind(signal_dn / gain_dn_per_e, light, effects, study)
-    shot = np.maximum(model.shot_e2(electrons), 0.0) * np.square(slope)
+    setting_db = study.usual_gain_db + 20.0 * np.log10(gain_dn_per_e / noise.gain)
+    noisy = [model.shot_e2(level, float(db)) for level, db in zip(electrons, setting_db, strict=True)]
+    shot = np.maximum(np.array(noisy), 0.0) * np.square(slope)
     dn2 = gain_dn_per_e[:, None] ** 2 * shot
     if not model.has_even_codes:
         dn = noise.black + gain_dn_per_e[:, None] * electrons

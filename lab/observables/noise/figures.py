@@ -21,6 +21,7 @@ from lab.observables.codes.rounding import (
     variance_before_rounding,
 )
 from lab.observables.flats.stated_light import most_frequent_gain_db
+from lab.observables.noise.repeats import RepeatedSetting, drifts_of
 from lab.observables.plane_means import channel_pixels
 from sim.sensor import mosaic
 from sim.sensor.lines import Lines
@@ -290,6 +291,13 @@ class NoiseFigures:
     black_std: float  # standard deviation of `black`
     dark_std: float  # standard deviation of `dark_dn_per_s`
     step_dn: float = 1.0  # of the codes
+    #: The same as `jitter_dn` about a trend, a decay or a step of the repeats in time; None where they have none.
+    white_jitter_dn: float | None = None
+
+    @property
+    def dark_jitter_dn(self) -> float:
+        """Standard deviation of a dark frame's mean by what the order of its repeats doesn't tell, DN."""
+        return self.jitter_dn if self.white_jitter_dn is None else self.white_jitter_dn
 
     def spread_dn2(self, signal_dn: FloatArray) -> FloatArray:
         """Variance (DN^2) of pixels at a signal before rounding: shot noise, read noise (0 where rounding hides it),
@@ -419,11 +427,13 @@ def _from_darks(study: Study, stated: NoiseFigures) -> NoiseFigures:
         read = float(np.sqrt(repeats.variance_dn2))
         own_dn2 = read**2 / recordings.frame(first[0]).size
     jitter, freedom = _jitter(study, darks, frames_mean, own_dn2)
+    white_dn = _white_jitter(study, darks, frames_mean, own_dn2)
     return replace(
         stated, black=black, dark_dn_per_s=dark, dark_c=dark_c, read_dn=read,
         jitter_dn=max(jitter, BLACK_FLOOR_DN * study.step_dn),
         jitter_freedom=freedom,
         black_std=black_std, dark_std=dark_std,
+        white_jitter_dn=None if white_dn is None else max(white_dn, BLACK_FLOOR_DN * study.step_dn),
     )  # fmt: skip
 
 
@@ -535,6 +545,48 @@ def _jitter(
     total = freedom + USUAL_JITTER_FREEDOM
     usual = USUAL_JITTER_FREEDOM * usual_dn2
     return float(np.sqrt((rest @ rest + usual) / total)), total
+
+
+def _white_jitter(
+    study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float
+) -> float | None:
+    """Standard deviation of the repeats' means (DN) about what their order in time shows
+    (`lab.observables.noise.repeats`): a trend, a decay or a step of a setting isn't scatter but a mismatch. None where
+    no setting has one.
+
+    It is pooled over all settings with `USUAL_JITTER_FREEDOM` degrees of freedom of the usual variance."""
+    place = {capture.id: number for number, capture in enumerate(study.in_time_order)}
+    settings: list[RepeatedSetting] = []
+    for group, mean in zip(groups, means, strict=True):
+        if len(group) < 2:
+            continue
+        order = sorted(range(len(group)), key=lambda k, group=group: place[group[k].id])  # type: ignore[misc]
+        captures = tuple(group[k] for k in order)
+        elapsed = np.array([study.elapsed_s(c) for c in captures])
+        is_timed = bool(np.all(np.diff(elapsed) > 0.0))
+        numbers = np.array([place[c.id] for c in captures])
+        settings.append(
+            RepeatedSetting(
+                captures=captures,
+                elapsed=elapsed - elapsed[0] if is_timed else np.arange(len(captures), dtype=float),
+                is_timed=is_timed,
+                run=np.concatenate([[0], np.cumsum(np.diff(numbers) > 1)]),
+                mean_dn=mean[order],
+                noise_dn=float(np.sqrt(own_dn2)),
+            )
+        )
+    drifts = {drift.captures: drift for drift in drifts_of(settings) if drift.is_of_one_setting}
+    if not drifts:
+        return None
+    usual_dn2 = (USUAL_JITTER_DN * study.step_dn) ** 2 + own_dn2
+    squares, freedom = USUAL_JITTER_FREEDOM * usual_dn2, USUAL_JITTER_FREEDOM
+    for setting in settings:
+        drift = drifts.get(tuple(c.id for c in setting.captures))
+        curve = setting.mean_dn.mean() if drift is None else np.array(drift.curve_dn)
+        taken = 1 if drift is None else 2 if drift.steady_dn is None else 3
+        squares += float(np.sum(np.square(setting.mean_dn - curve)))
+        freedom += max(len(setting.captures) - taken, 0)
+    return float(np.sqrt(squares / freedom))
 
 
 class TemporalVariance:

@@ -51,7 +51,7 @@ def neighbour_block(study: Study) -> Block:
             return Prediction(np.zeros(len(value)), {})
         parts = []
         for r in points:
-            gain = noise.gain * r.gain
+            gain, gain_db = noise.gain * r.gain, study.usual_gain_db + 20.0 * np.log10(r.gain)
             electrons = np.array([max(s, 0.0) / gain for s in r.signal.values()])
             read = max(noise.read_dn**2 - noise.quantisation_dn2, 0.1 * noise.read_dn**2) / noise.gain**2
             slow = sum(one.own_e2 for one in ordered)  # a part of what is measured as read noise
@@ -59,7 +59,7 @@ def neighbour_block(study: Study) -> Block:
                 correlations(
                     camera.cfa,
                     list(r.signal),
-                    np.maximum(model.shot_e2(electrons), 0.0),
+                    np.maximum(model.shot_e2(electrons, gain_db), 0.0),
                     solve_passed_share(model.neighbour_correlation(electrons)),
                     max(read - slow, 0.1 * read),
                     noise.quantisation_dn2 / gain**2,

@@ -9,8 +9,11 @@ from mocks.former.laws.charge import (
     AnisotropicBrighterFatterLaw,
     BrighterFatterLaw,
     ChargeDiffusionLaw,
+    ChargeTransferLaw,
+    CosmicRaysLaw,
     CrosstalkLaw,
     DarkCurrentTemperatureLaw,
+    ExcessNoiseLaw,
     ExposureOffsetLaw,
     GreenImbalanceLaw,
     HotPixelsLaw,
@@ -155,6 +158,9 @@ LISTED: tuple[type[Law], ...] = (
     TrefoilLaw,
     LineGainLaw,
     PinkNoiseLaw,
+    ChargeTransferLaw,
+    ExcessNoiseLaw,
+    CosmicRaysLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single

@@ -314,6 +314,97 @@ class PersistenceLaw(Law):
         return {"share_percent": self.strength, "release_s": 30.0} if self.variant == 0 else {}
 
 
+class ChargeTransferLaw(Law):
+    """Packets of a CCD leave charge behind at every transfer, clocked one by one. Variants: rows, read from the top,
+    and traps that release by exp(-t / 0.8); columns, read from the right, exp(-t / 3); rows, and faint packets lose
+    more, as (x / W)^0.6 in place of x. Strength: loss of a full packet by one transfer, in 1e-6. Traps take electrons
+    one by one, so that shot noise isn't shared: it is of what arrives."""
+
+    name = effect = "charge_transfer_inefficiency"
+    variants, unit, nominal, limits, shown_by = 3, "1e-6", 60.0, (2.0, 900.0), OPTICAL
+
+    def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
+        packets = np.array(electrons[:, ::-1].T if self.variant == 1 else electrons, float)
+        full = self.camera.full_well_e
+        kept = np.exp(-1.0 / (3.0 if self.variant == 1 else 0.8))
+        lines = len(packets)
+        # pixels in groups of eight, that share their traps' state: what each transfer takes is small
+        for first in range(lines - lines % 8, -1, -8):
+            many = 1e-6 * self.strength * np.minimum(np.arange(lines - first) + 1.0, 8.0)
+            held = np.zeros(packets.shape[1])
+            for number, row in enumerate(range(first, lines)):
+                packet = packets[row]
+                powered = full * (packet / full).clip(0.0, None) ** 0.6 if self.variant == 2 else packet
+                taken = np.minimum(many[number] * powered, packet)
+                released = (1.0 - kept) * held
+                packets[row] = packet - taken + released
+                held = held + taken - released
+        return packets.T[:, ::-1] if self.variant == 1 else packets
+
+    def library_parameters(self) -> dict[str, float]:
+        if self.variant == 1:
+            return {"serial_ppm": self.strength, "serial_release_px": 3.0}
+        return {"parallel_ppm": self.strength, "release_px": 0.8} if self.variant == 0 else {}
+
+
+class ExcessNoiseLaw(Law):
+    """Electrons are multiplied at random before read-out; codes are of the mean electron. Variants: a register of 24
+    stages, each of which adds an electron with the same small probability (Robbins and Hadwen 2003); a geometric
+    number of electrons for each. Strength: variance beyond that of single electrons."""
+
+    name = effect = "excess_noise"
+    variants, unit, nominal, limits = 2, "%", 60.0, (2.0, 85.0)
+
+    def drawn_e(self, electrons: Array, mean_e: Array) -> Array:
+        rng, more = self.rng(21, self.frame.draw), self.strength / 100.0
+        number = np.maximum(np.rint(electrons), 0.0)
+        if self.variant == 1:  # F^2 = 2 - 1 / M
+            chance = 1.0 - more
+            further = rng.negative_binomial(np.maximum(number, 1.0), chance)
+            return np.where(number > 0, (number + further) * chance, electrons)
+        stages, gains = 24, np.linspace(1.0001, 200.0, 400_000)
+        factor = 2.0 * (gains - 1.0) * gains ** (-(stages + 1.0) / stages) + 1.0 / gains
+        gain = float(gains[np.searchsorted(np.maximum.accumulate(factor), 1.0 + more)])
+        chance, packet = gain ** (1.0 / stages) - 1.0, number.astype(np.int64)
+        for _ in range(stages):
+            packet = packet + rng.binomial(packet, chance)
+        return packet / gain
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"excess_percent": self.strength}
+
+
+class CosmicRaysLaw(Law):
+    """Single particles in the silicon. Variants: muons through 10 um, at cos^2 of the zenith angle, with a long tail of
+    losses; points of 1620 electrons (iron-55); muons through 100 um."""
+
+    name = effect = "cosmic_rays"
+    variants, unit, nominal, limits, shown_by = 3, "1/(cm2 s)", 600.0, (10.0, 30000.0), DARK
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        rng, pitch = self.rng(22, k), self.camera.pitch_um
+        area_cm2 = shape[0] * shape[1] * pitch**2 * 1e-8
+        frame = np.zeros(shape)
+        for _ in range(rng.poisson(self.strength * area_cm2 * self.frame.exposure_s)):
+            row, col = rng.uniform(0, shape[0]), rng.uniform(0, shape[1])
+            if self.variant == 1:
+                frame[int(row), int(col)] += rng.normal(1620.0, 15.0)
+                continue
+            depth, angle = (100.0 if self.variant == 2 else 10.0), rng.uniform(0.0, 2.0 * np.pi)
+            slope = np.sqrt(max((1.0 - rng.random()) ** -0.5 - 1.0, 0.0))  # tan of an angle of density cos^3 sin
+            slope = min(slope, 20.0)
+            loss_e = 80.0 * depth * np.hypot(1.0, slope) * (1.0 + 0.3 * rng.exponential())
+            steps = max(int(2.0 * depth * slope / pitch), 1)
+            for part in (np.arange(steps) + 0.5) / steps * depth * slope / pitch:
+                r, c = int(np.floor(row + part * np.sin(angle))), int(np.floor(col + part * np.cos(angle)))
+                if 0 <= r < shape[0] and 0 <= c < shape[1]:
+                    frame[r, c] += loss_e / steps
+        return frame
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"rate_per_cm2_s": self.strength}
+
+
 class DarkCurrentTemperatureLaw(Law):
     """Dark current that rises with the temperature. Variants: exponential; Arrhenius. Strength: doublings in 10
     degrees."""

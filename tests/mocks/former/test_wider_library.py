@@ -14,8 +14,11 @@ from lab.formats.results import DiagnosisResult
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     BitWeightsLaw,
+    ChargeTransferLaw,
     ColouredLineNoiseLaw,
+    CosmicRaysLaw,
     CoverGlassFringeLaw,
+    ExcessNoiseLaw,
     ImageLagLaw,
     LeakyShutterLaw,
     LineGainLaw,
@@ -65,6 +68,12 @@ STRONG: tuple[Law, ...] = (
     MicrolensAngleLaw(6.0, 0, 9),
     MicrolensAngleLaw(6.0, 1, 9),
     MicrolensAngleLaw(6.0, 2, 9),
+    ChargeTransferLaw(400.0, 0, 9),
+    ChargeTransferLaw(400.0, 1, 9),
+    ExcessNoiseLaw(60.0, 0, 9),
+    ExcessNoiseLaw(60.0, 1, 9),
+    CosmicRaysLaw(600.0, 0, 9),
+    CosmicRaysLaw(600.0, 1, 9),
     # the likest laws of persistence and of microlenses
     ImageLagLaw(1.0, 0, 9),
     VignettingLaw(4.0, 0, 1),
@@ -78,7 +87,10 @@ NEW = {str(law.listed_effect) for law in STRONG}
 def _diagnosed(law: Law | None, cfa: str = "MONO", seed: int = 930) -> DiagnosisResult:
     camera = ConcealedCamera(seed, [] if law is None else [law], cfa=cfa, rows=192, cols=256)
     remembers = law is None or law.effect in {"persistence", "image_lag"}
-    plan = Plan(kinds=("dark", "flat", "narrowband"), dark_again=remembers)
+    edges = law is not None and law.effect == "charge_transfer_inefficiency"
+    kinds = ("dark", "flat", "slanted_edge" if edges else "narrowband")
+    repeats = 12 if law is not None and law.effect == "excess_noise" else 3  # a third moment needs many numbers
+    plan = Plan(kinds=kinds, repeats=repeats, dark_again=remembers)
     return diagnose(recordings_of(camera, plan), at_once=False)
 
 

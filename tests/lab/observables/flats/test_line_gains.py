@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lab.diagnose.measurements import line_gains
-from lab.diagnose.measurements.line_gains import line_gain_block
 
+from lab.observables.flats import line_gains
 from lab.errors import NotDetermined
 from lab.observables.flats.field import shading_block
 from lab.observables.flats.green_balance import green_block
+from lab.observables.flats.line_gains import line_gain_block
 from lab.observables.observable import Block
 from mocks.former import ConcealedCamera
 from mocks.former.laws import ColumnNoiseLaw, LineGainLaw, OnChipSmoothingLaw, PhaseDetectionRowsLaw, TapGainLaw

@@ -1,0 +1,132 @@
+"""Events in dark frames: groups of pixels that are bright in one of several repeats alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from lab.errors import NotDetermined
+from lab.observables.darks.defective_pixels import COUNT_STD, rooted_counts
+from lab.observables.darks.frames import DarkStatistics, captures_of, dark_frames
+from lab.observables.dataset import Study
+from lab.observables.observable import Block, Label, Measurement, Prediction
+from sim.effects.base import Effects
+from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+#: Least brightness of an event, in standard deviations of a pixel's temporal noise and in steps of the codes.
+BRIGHT, LEAST_STEPS = 12.0, 6.0
+#: Lower edges of the bins of brightness, over the least.
+EVENT_EDGES = 1.0, 3.0, 10.0, 30.0
+LEAST_FRAMES = 3  # repeats: of two, that without the event isn't known
+MOST_FRAMES = 12  # of a condition
+#: Eight neighbours make one event.
+TOUCHING = np.ones((3, 3), bool)
+
+
+@dataclass(frozen=True)
+class _Events:
+    """Events of one condition's frames, seen or held out: `counts` by bins of brightness."""
+
+    dark: DarkStatistics
+    held_out: bool
+    frames: int  # in which they were counted
+    repeats: int  # that each of these was compared with, itself included
+    edges_dn: FloatArray
+    counts: FloatArray
+
+
+def count_events(study: Study) -> list[_Events]:
+    """Return the events of all conditions of `LEAST_FRAMES` dark frames and more.
+
+    A pixel is hit in a frame where it exceeds its value in every other one by `BRIGHT` standard deviations of its
+    noise, shot noise of a hot pixel included, and by `LEAST_STEPS` steps of the codes. Neighbouring hit pixels are one
+    event, as bright as its brightest.
+    """
+    found: list[_Events] = []
+    for dark in study.once(dark_frames):
+        captures = dark.condition.captures[:MOST_FRAMES]
+        moving = next((part.pixel_dn2 for part in dark.changing.values()), None)
+        if len(captures) < LEAST_FRAMES or moving is None:
+            continue
+        frames = np.array([study.recordings.frame(c) for c in captures], np.float32)
+        frames -= np.median(frames, axis=(1, 2), keepdims=True)
+        top = np.sort(frames, axis=0)[-2:]
+        usual = np.median(frames, axis=0)
+        std = np.sqrt(moving + study.noise.gain * np.maximum(usual, 0.0))
+        least = np.maximum(BRIGHT * std, LEAST_STEPS * study.step_dn)
+        hit = top[1] - top[0] > least
+        edges = float(np.median(least)) * np.array(EVENT_EDGES)
+        counts = {True: np.zeros(len(edges)), False: np.zeros(len(edges))}
+        seen = len(dark.condition.seen)
+        for k, frame in enumerate(frames):
+            own = hit & (frame == top[1])
+            label, number = ndimage.label(own, TOUCHING)
+            if number:
+                bright = ndimage.maximum(frame - usual, label, np.arange(1, number + 1))
+                counts[k >= seen] += np.histogram(bright, [*edges, np.inf])[0]
+        numbers = {False: min(seen, len(captures)), True: max(len(captures) - seen, 0)}
+        found += [
+            _Events(dark, out, number, len(captures), edges, counts[out]) for out, number in numbers.items() if number
+        ]
+    return found
+
+
+def dark_event_block(study: Study) -> Block:
+    """Anscombe-transformed numbers of events by brightness, by exposure. None are expected of normal noise; of
+    telegraph noise those pixels that are at the higher level in one frame alone.
+
+    Raises NotDetermined without `LEAST_FRAMES` repeats of a dark frame.
+    """
+    points = study.once(count_events)
+    if not points:
+        raise NotDetermined(
+            "dark_events", f"fewer than {LEAST_FRAMES} dark frames of the same exposure and temperature"
+        )
+    pixels, pitch_um = study.camera.rows * study.camera.cols, study.camera.pixel_pitch_um
+    value = rooted_counts(np.concatenate([p.counts for p in points]))
+
+    def expected(effects: Effects) -> FloatArray:
+        model = Uniform(study.camera, effects)
+        found = []
+        for p in points:
+            number: FloatArray = np.zeros(len(p.edges_dn))
+            for law in model.particles:
+                events = law.expected_number(pixels, pitch_um, p.dark.condition.exposure_s) * p.frames
+                bright = study.noise.gain * law.brightest_e(pitch_um)
+                number = number + events * np.histogram(bright, [*p.edges_dn, np.inf])[0] / bright.size
+            for jumps in model.telegraph:
+                shares, distance_e = jumps.nodes()
+                high = jumps.high_share
+                alone = high * (1.0 - high) ** (p.repeats - 1)
+                bins = np.histogram(study.noise.gain * distance_e, [*p.edges_dn, np.inf], weights=shares)[0]
+                number = number + p.frames * pixels * alone * bins
+            found.append(number)
+        return np.concatenate(found)
+
+    labels = tuple(
+        Label(float(edge), "all", p.dark.condition.name, captures_of(p.dark, p.held_out), p.held_out)
+        for p in points
+        for edge in p.edges_dn
+    )
+    return Block(
+        measurement=DARK_EVENTS, reach=1.0, value=value,
+        covariance=np.eye(len(value)) * (1.0 + COUNT_STD**2), labels=labels,
+        reads=frozenset({"charge.particles", "signal.telegraph"}),
+        predict=lambda effects: Prediction(rooted_counts(expected(effects)), {}),
+        scale=np.full(len(value), 10.0), along=np.log([label.x for label in labels]),
+    )  # fmt: skip
+
+
+DARK_EVENTS = Measurement(
+    "dark_events",
+    title="events in single dark frames",
+    order=198,
+    axis="brightness",
+    unit="DN",
+    make=dark_event_block,
+    quantity="number of events, 2 sqrt(n + 3/8)",
+    conditions="exposure and temperature",
+)

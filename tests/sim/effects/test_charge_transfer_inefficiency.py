@@ -1,0 +1,119 @@
+"""Charge transfer inefficiency: the binomial law of deferred charge, the deposit of each transfer one by one, and that
+charge behind the last line is all that a frame lacks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim.effects.charge_transfer_inefficiency import ChargeTransferInefficiency
+from sim.frame import Exposure, expected_electrons
+from sim.point import edge_profile, mix_channels, optical_transfer
+from sim.scene.scenes import UniformField
+from sim.sensor.trails import TRAIL_PX, Trails
+from sim.spectrum import FloatArray
+from sim.stages import charge_of
+from tests.sim.effects.test_sensor_effects import CAMERA, LIGHT
+
+ROWS, COLS = 40, 30
+
+
+def clocked_one_by_one(frame: FloatArray, loss: float, releases: tuple[tuple[float, float], ...]) -> FloatArray:
+    """Rows are shifted by one towards row 0 at a time; each pixel's traps take and release charge of the packet there.
+
+    The pixels of row p meet the packets p, p + 1, ... one after the other: the farthest pixels act first.
+    """
+    packets = frame.copy()
+    for pixel in range(len(frame) - 1, -1, -1):
+        held = [np.zeros(frame.shape[1]) for _ in releases]
+        for row in range(pixel, len(frame)):
+            taken = loss * packets[row]
+            packets[row] -= taken
+            for k, (share, release) in enumerate(releases):
+                given = held[k] * (1.0 - np.exp(-1.0 / release))
+                packets[row] += given
+                held[k] += share * taken - given
+    return packets
+
+
+@pytest.mark.parametrize("releases", [((1.0, 0.7),), ((0.7, 1.5), (0.3, 12.0))])
+def test_packets_lose_what_every_transfer_takes(releases: tuple[tuple[float, float], ...]) -> None:
+    """The law is the limit of many small losses: of n transfers of loss e the square n e^2 / 2 is neglected, and a
+    pixel that has released within the transfer: 40 x (2e-4)^2 / 2 < 1e-6 of the charge."""
+    rng = np.random.default_rng(3)
+    frame = rng.uniform(0.0, 1000.0, (ROWS, COLS))
+    found = Trails(0, 2e-4, releases, "first").clock(frame)
+    np.testing.assert_allclose(found, clocked_one_by_one(frame, 2e-4, releases), atol=1e-6 * 1000.0)
+    assert np.abs(found - frame).max() > 3.0
+
+
+def test_deferred_charge_has_the_textbooks_transfer() -> None:
+    """Traps that release within the next transfer: exp(-n e (1 - exp(-2 pi i f))), of modulus
+    exp(-n e (1 - cos 2 pi f)) (Janesick 2001)."""
+    f = np.linspace(0.0, 0.5, 11)
+    found = Trails(1, 1e-5, ((1.0, 0.02),), "first").otf(f, 0.0 * f, 2000.0)
+    np.testing.assert_allclose(np.abs(found), np.exp(-0.02 * (1.0 - np.cos(2.0 * np.pi * f))), rtol=1e-12)
+
+
+@pytest.mark.parametrize("output", ["first", "last"])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_charge_is_conserved(axis: int, output: str) -> None:
+    """With 60 empty lines behind the last one, as overscan has, no electron is missing: exp(-60 / 3) of the slow traps'
+    charge, 1e-11 of all, is released beyond."""
+    law = Trails(axis, 3e-4, ((0.8, 0.8), (0.2, 3.0)), output)
+    padded = np.zeros((ROWS + 120, COLS + 120))
+    inside = (slice(60, 60 + ROWS), slice(60, 60 + COLS))
+    padded[inside] = np.random.default_rng(4).uniform(0.0, 1e4, (ROWS, COLS))
+    found = law.clock(padded)
+    assert found.sum() == pytest.approx(padded.sum(), rel=2e-11)
+    assert found[inside].sum() < padded.sum() - 10.0
+
+
+def test_a_hot_pixel_trails_away_from_the_output() -> None:
+    """In proportion to the transfers, and with the kernel of its place: the far half twice as much as the near."""
+    law = Trails(0, 1e-5, ((1.0, 1.3),), "last")
+    frame = np.zeros((200, 5))
+    frame[50, 2], frame[125, 2] = 1e4, 1e4
+    found = law.clock(frame)
+    for row, transfers in ((50, 150.0), (125, 75.0)):
+        seen = found[row - TRAIL_PX : row + TRAIL_PX + 1, 2]
+        np.testing.assert_allclose(seen, 1e4 * law.kernel(transfers)[:, 0], atol=1e-6)
+        share = 1.0 - np.exp(-1.0 / 1.3)
+        assert found[row - 1, 2] == pytest.approx(1e4 * 1e-5 * transfers * share, rel=2e-3)
+        assert found[row + 1, 2] < 1e-12  # rounding of the far trail of nothing
+
+
+def test_no_signal_of_even_light_changes_far_from_the_first_lines() -> None:
+    """What a packet loses it finds again, but for what lies in the trail: the loss times the mean delay."""
+    one = ChargeTransferInefficiency(parallel_ppm=100.0, release_px=1.0)
+    plain, lossy = (expected_electrons(CAMERA, Exposure(UniformField(LIGHT), 0.004), acting) for acting in ((), (one,)))
+    np.testing.assert_allclose(lossy, plain, rtol=1e-4 * 3.0)
+
+
+def test_an_edges_profile_is_that_of_a_frame() -> None:
+    """The transfer at a place is what the pixels' packets have gone through: an upright edge, read along rows."""
+    one = ChargeTransferInefficiency(serial_ppm=1000.0, serial_release_px=1.5)
+    distance = np.arange(-10.0, 11.0)
+    plain, lossy = (
+        edge_profile(CAMERA, "Y", LIGHT, 0.0, distance, acting, place_um=(0.0, 0.0)) for acting in ((), (one,))
+    )
+    law = charge_of(CAMERA, (one,)).trails[0]
+    wide = np.interp(np.arange(-60.0, 61.0), distance, plain)
+    kernel = law.kernel(0.5 * (CAMERA.cols + 1))[0]
+    wanted = np.convolve(wide, kernel, "same")[50:71]
+    # the trail beyond TRAIL_PX is left out of the kernel; the profile is interpolated where it is flat
+    np.testing.assert_allclose(lossy - plain, (wanted - wide[50:71])[: len(distance)], atol=2e-4)
+    assert np.abs(lossy - plain).max() > 5e-3
+
+
+def test_a_mosaic_of_one_colour_is_a_monochrome_sensor() -> None:
+    """Channels of equal transfer and signal: charge from the next pixel is of another colour and the same."""
+    f = np.linspace(0.0, 0.5, 6)
+    one = ChargeTransferInefficiency(parallel_ppm=500.0, release_px=1.0)
+    alike = np.ones((3, 6), complex)
+    curve = next(iter(CAMERA.quantum_efficiency.values()))
+    camera = CAMERA.model_copy(update={"cfa": "RGGB", "quantum_efficiency": dict.fromkeys("RGB", curve)})
+    found = mix_channels(camera, alike, np.ones(3), 0.0 * f, f, (one,))
+    law = charge_of(CAMERA, (one,)).trails[0]
+    np.testing.assert_allclose(found, np.tile(law.otf(0.0 * f, f, 0.5 * (CAMERA.rows + 1)), (3, 1)), atol=1e-9)
+    assert np.abs(optical_transfer(camera, "G", LIGHT, 0.0 * f, f, (one,))[-1]) > 0.0
