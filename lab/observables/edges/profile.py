@@ -77,7 +77,7 @@ class EdgeSummary:
     right side of the normal equations; C interpolates to the samples by cubics. `rounding` (waves, k + g): A^T W e for
     the errors e that rounding to whole codes may leave, one standard deviation each. `levels`, `noise_std`: of the
     dark and the light side, in codes. `residual_chi2_per_sample`: near 1 where edge, spline and noise explain the
-    region. """
+    region."""
 
     curve: EdgeCurve
     angle_deg: float

@@ -572,7 +572,7 @@ def _white_jitter(
                 is_timed=is_timed,
                 run=np.concatenate([[0], np.cumsum(np.diff(numbers) > 1)]),
                 mean_dn=mean[order],
-                noise_dn=float(np.sqrt(own_dn2)),
+                measure_noise_dn=lambda: float(np.sqrt(own_dn2)),
             )
         )
     drifts = {drift.captures: drift for drift in drifts_of(settings) if drift.is_of_one_setting}

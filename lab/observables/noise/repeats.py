@@ -27,7 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import groupby, pairwise
 from typing import Any
 
@@ -56,7 +56,7 @@ class RepeatedSetting:
     """The n repeats of one setting in order of capture.
 
     `elapsed` (n,): s since the first where `is_timed`, else numbers of frames; `run` (n,): number of the uninterrupted
-    run of this setting; `mean_dn` (n,); `frame_of`: frame (rows, cols) of a capture, DN.
+    run of this setting; `mean_dn` (n,); `measure_noise_dn`: returns `noise_dn`, and is called where a drift is found.
     """
 
     captures: tuple[Capture, ...]
@@ -64,20 +64,12 @@ class RepeatedSetting:
     is_timed: bool
     run: NDArray[np.integer[Any]]
     mean_dn: FloatArray
-    frame_of: Callable[[Capture], NDArray[Any]]
+    measure_noise_dn: Callable[[], float]
 
     @cached_property
     def noise_dn(self) -> float:
-        """Standard deviation of a mean by the noise of its pixels, DN, from differences of successive frames. Only this
-        reads frames."""
-        squares, pixels = [], 1
-        before: NDArray[np.float32] | None = None
-        for capture in self.captures:
-            frame = self.frame_of(capture).astype(np.float32)
-            if before is not None:
-                squares.append(0.5 * float(np.var(frame - before, dtype=np.float64)))
-            before, pixels = frame, frame.size
-        return math.sqrt(max(float(np.median(squares)), QUANTISATION_DN2) / pixels)
+        """Standard deviation of a mean by the noise of its pixels, DN."""
+        return self.measure_noise_dn()
 
     @property
     def text(self) -> str:
@@ -150,13 +142,14 @@ def _settings(
         seconds = np.array([_seconds(capture) for _, capture, _ in repeats])
         # equal time stamps are those of copying
         has_times = bool(np.all(np.diff(seconds) > 0))
+        captures = tuple(capture for _, capture, _ in repeats)
         yield RepeatedSetting(
-            captures=tuple(capture for _, capture, _ in repeats),
+            captures=captures,
             elapsed=seconds - seconds[0] if has_times else np.arange(len(repeats), dtype=float),
             is_timed=has_times,
             run=np.array([run for run, _, _ in repeats]),
             mean_dn=np.array([mean for _, _, mean in repeats]),
-            frame_of=recordings.frame,
+            measure_noise_dn=partial(_noise_of_means_dn, recordings, captures),
         )
 
 
@@ -192,6 +185,19 @@ def _means(recordings: RecordingSet, captures: Iterable[Capture]) -> list[float 
         means.append(None if codes.digest in known else codes.every.mean_dn)
         known.add(codes.digest)
     return means
+
+
+def _noise_of_means_dn(recordings: RecordingSet, captures: Sequence[Capture]) -> float:
+    """Return the standard deviation of a frame's mean by the noise of its pixels, DN, from differences of successive
+    frames, two in memory at a time."""
+    squares, pixels = [], 1
+    before: NDArray[np.float32] | None = None
+    for capture in captures:
+        frame = recordings.frame(capture).astype(np.float32)
+        if before is not None:
+            squares.append(0.5 * float(np.var(frame - before, dtype=np.float64)))
+        before, pixels = frame, frame.size
+    return math.sqrt(max(float(np.median(squares)), QUANTISATION_DN2) / pixels)
 
 
 # --- the test ------------------------------------------------------------------------------------------------------

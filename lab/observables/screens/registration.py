@@ -26,7 +26,6 @@ from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.observables.boards.corner_fits import fit_corners
-from lab.observables.boards.detection import fit_corners
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import phases, planes
 from sim.sensor.mosaic import step as period

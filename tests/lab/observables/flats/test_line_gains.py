@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.observables.flats import line_gains
 from lab.errors import NotDetermined
+from lab.observables.flats import line_gains
 from lab.observables.flats.field import shading_block
 from lab.observables.flats.green_balance import green_block
 from lab.observables.flats.line_gains import line_gain_block

@@ -39,7 +39,7 @@ def setting(mean_dn: FloatArray, elapsed: FloatArray | None = None, runs: Sequen
         is_timed=elapsed is not None,
         run=np.repeat(np.arange(len(runs) or 1), runs or [n]),
         mean_dn=mean_dn,
-        frame_of=lambda _: np.zeros((49, 17), np.uint16),  # rounding alone: (12 x 833)^(-1/2)
+        measure_noise_dn=lambda: 0.01,
     )
 
 
