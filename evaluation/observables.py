@@ -1,12 +1,14 @@
 """Calibration of the observables: does each scatter about its prediction as its covariance says?
 
-On healthy cameras the predictive distribution of an observable, nuisance parameters marginalised, gives
+On healthy cameras the residual r = y - m of an observable has the distribution N(0, S + J J'), J the Jacobian by the
+nuisance parameters per prior standard deviation. A parameter whose prior is wide beside the noise takes its direction
+out of r, whatever the truth is; these directions are projected out, and
 
-    chi2 = r' C^-1 r,    r = y - m,    chi2 ~ chi2_n
+    chi2 = r' C^-1 r ~ chi2_n
 
-with n numbers. Over many sets the mean of chi2 / n is 1 within its standard error, and the probability integral
-transform F(chi2; n) is uniform (Kolmogorov-Smirnov, Holm over the observables). Below 1, the covariance is too wide
-and hides departures; above 1, it is too narrow and makes departures of noise.
+remains with n directions. Over many sets the mean of chi2 / n is 1 within its standard error, and the probability
+integral transform F(chi2; n) is uniform (Kolmogorov-Smirnov, Holm over the observables). Below 1, the covariance is too
+wide and hides departures; above 1, it is too narrow and makes departures of noise.
 """
 
 from __future__ import annotations
@@ -32,6 +34,8 @@ from sim.spectrum import FloatArray
 SEED = 4711
 #: Eigenvalue of the correlation matrix below which a direction is rounding alone.
 LEAST_EIGENVALUE = 1e-6
+#: Width of a nuisance parameter's prior, over the noise in its direction, from which on the direction is projected out.
+FREE = 2.0
 #: Probability by chance, over all observables of a table, that one is marked.
 CHANCE = 0.01
 
@@ -86,19 +90,34 @@ def _of_set(source: str, number: int) -> Iterator[Calibrated]:
     model, _ = measurement_model(recordings, "left", fit_recording_set(recordings))
     if model is None:
         return
-    gaussian = model.gaussian()
-    away = model.value - gaussian.mean
-    for index, (block, at) in enumerate(zip(model.blocks, model.slices, strict=True)):
-        yield Calibrated(source, number, block.measurement.name, *_chi2(away[at], gaussian.block_covariance(index)))
-    yield Calibrated(source, number, "all", *_chi2(away, gaussian.covariance))
+    away = model.value - model.mean()
+    nuisances = np.reshape(list(model.nuisance_jacobian().values()), (-1, len(away))).T
+    white, own = [], []
+    for block, at in zip(model.blocks, model.slices, strict=True):
+        whiten = _whitening(block.covariance)
+        white.append(whiten @ away[at])
+        own.append(whiten @ nuisances[at])
+        yield Calibrated(source, number, block.measurement.name, *_chi2(white[-1], own[-1]))
+    yield Calibrated(source, number, "all", *_chi2(np.concatenate(white), np.concatenate(own)))
 
 
-def _chi2(away: FloatArray, covariance: FloatArray) -> tuple[float, int]:
-    """chi2 of residuals (n,), and the number of directions of their covariance (n, n) that aren't rounding alone."""
+def _whitening(covariance: FloatArray) -> FloatArray:
+    """Return W (k, n) with W S W' = 1, S the covariance (n, n), without the directions that are rounding alone."""
     std = np.sqrt(np.diag(covariance))
     size, direction = np.linalg.eigh(covariance / np.outer(std, std))
     use = size > LEAST_EIGENVALUE
-    return float(np.sum(np.square(direction.T[use] @ (away / std)) / size[use])), int(use.sum())
+    return np.asarray((direction[:, use] / np.sqrt(size[use])).T / std)
+
+
+def _chi2(white: FloatArray, nuisances: FloatArray) -> tuple[float, int]:
+    """Return chi2 and its number of directions: of whitened residuals (k,), with the whitened Jacobian (k, p) by
+    nuisance parameters."""
+    direction, size, _ = np.linalg.svd(nuisances, full_matrices=False)
+    along = direction.T @ white
+    free, held = size > FREE, size <= FREE
+    # of a narrow prior the variance along its direction is 1 + size^2
+    chi2 = white @ white - along @ along + float(np.sum(np.square(along[held]) / (1.0 + np.square(size[held]))))
+    return float(chi2), len(white) - int(free.sum())
 
 
 def table(found: Iterable[Calibrated]) -> str:
