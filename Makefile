@@ -61,7 +61,7 @@ run: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow and not extra" $(ARGS)
 
-# What CI runs beside `make test`: a browser, other programs, a database server, the wheel, whole sessions of the mock bench.
+# What CI runs beside `make test`: a browser, other programs, a database server, the wheel, whole sessions of the mock bench, whole diagnoses.
 ci-extra: $(STAMP)
 	$(BIN)/python -m pytest -n 3 --dist worksteal -m "extra and not slow" $(ARGS)
 

@@ -192,6 +192,7 @@ def desk(tmp_path: Path) -> dict[str, str]:
     return os.environ | {"PATH": path, "PYTHONPATH": str(ROOT), "CALIBENCH_DATA": str(tmp_path / "data")}
 
 
+@pytest.mark.extra  # commands in processes of their own
 @pytest.mark.parametrize(
     ("page", "block"),
     [

@@ -31,6 +31,7 @@ def _shared(name: str) -> DiagnosisResult:
     return diagnose(read(folder))
 
 
+@pytest.mark.extra  # a whole diagnosis
 def test_healthy_camera_of_another_image_former_is_believed() -> None:
     result = _shared("foreign_healthy")
     assert result.verdict == "no_mismatch"

@@ -34,6 +34,7 @@ def _names(law: Law) -> set[str]:
     return {e.name for e in diagnose(recordings_of(camera, Plan(kinds=kinds))).effects}
 
 
+@pytest.mark.extra  # whole diagnoses
 @pytest.mark.parametrize(
     "law",
     [*STRONG, *(pytest.param(law, marks=pytest.mark.slow) for law in MORE)],

@@ -338,7 +338,7 @@ class Search:
         likely = [(n, min(p, 1.0)) for n, p in inclusion.items() if p >= self.policy.least_rival_probability]
         return ModelSet(
             tuple(Model(self._in_order(sets[i]), float(probability[i]), sets[i] in self.fits) for i in kept),
-            tuple(sorted(likely, key=lambda one: -one[1])),
+            tuple(sorted(likely, key=lambda one: (-one[1], one[0]))),  # members of a set have no order of their own
             tuple(self.not_weighed.values()),
         )
 

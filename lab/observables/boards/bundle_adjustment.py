@@ -333,9 +333,8 @@ class BundleAdjustment:
                 rotation = _rotation(shared[at : at + 3]) @ rotation
                 translation = translation + shared[at + 3 : at + 6]
             warps = warps + shared[self.at_warp :].reshape(-1, 3)
-        rotations = np.array(
-            [_rotation(step[:3]) @ before for step, before in zip(poses, state.rotations, strict=True)]
-        )
+        turns = _rotation(poses[:, :3])
+        rotations = np.array([turn @ before for turn, before in zip(turns, state.rotations, strict=True)])
         return RigParameters(
             state.projections, intrinsics, rotation, translation, warps, rotations,
             state.translations_mm + poses[:, 3:],
@@ -491,5 +490,5 @@ def _step(parts: tuple[Array, ...], damping: float) -> tuple[Array, Array]:
 
 
 def _rotation(rotation_vector: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a rotation vector (3,), rad."""
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad."""
     return np.asarray(Rotation.from_rotvec(rotation_vector).as_matrix())

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 from sim.uniform import SHADING, STRAYS, FieldPoints, Uniform
 
+#: Read-outs whose effect on the cells is kept: a refit varies one effect's parameters beside the others' as they stand.
+CACHED_READ_OUTS = 64
 LEAST_SIGNAL = 10.0  # of a frame that is a part of the mean image, in standard deviations of the read noise
 
 
@@ -351,12 +354,17 @@ def shading_block(study: Study) -> Block:
     moved = {"axis:row": _cell_points(camera, off_px, 0.0), "axis:col": _cell_points(camera, 0.0, off_px)}
     x_mm, y_mm = (_cell_means(v) * 1e-3 for v in (place.x_um, place.y_um))
 
+    @lru_cache(maxsize=CACHED_READ_OUTS)
+    def of_pixels(acting: Effects) -> _ReadOut:
+        return _read_out(Uniform(camera, acting))
+
     def predict(effects: Effects) -> Prediction:
         # what pixels do stays where it is if the lens's axis moves
-        own = _own_factors(planes, place, effects, study)
-        base = _shaded(planes, place, effects, study, own)
-        axis = {name: _shaded(planes, off, effects, study, own) - base for name, off in moved.items()}
-        model = Uniform(camera, effects)
+        own, model = _own_factors(planes, place, effects, study), Uniform(camera, effects)
+        read_out = of_pixels(acting(effects, ADDED | GAINS))
+        even = even_share(camera, effects)
+        base = _shaded(planes, place, model, even, read_out, own)
+        axis = {name: _shaded(planes, off, model, even, read_out, own) - base for name, off in moved.items()}
         scatter = _row_light(planes, base, model, camera.rows) | _line_gains(planes, base, model, camera)
         return Prediction(base, axis | scatter)
 
@@ -501,30 +509,41 @@ def _cell_means(value: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("iajb,a,b->ij", parts, 0.5 * _SHARES, 0.5 * _SHARES).ravel())
 
 
+class _ReadOut(NamedTuple):
+    """What read-out does to the pixels of a cell: signal beside the light's, less its mean (cells,), in electrons, and
+    the factor on what is read (cells,)."""
+
+    added_e: FloatArray | float
+    gain: FloatArray | float
+
+
+def _read_out(model: Uniform) -> _ReadOut:
+    added_e = _cells(model.added_e - model.added_e.mean()).ravel() if model.adds_signal else 0.0
+    gains = model.gain_map()
+    return _ReadOut(added_e, 1.0 if gains is None else _cells(gains).ravel())
+
+
 def _shaded(
     planes: Sequence[_ChannelCells],
     place: FieldPoints,
-    effects: Effects,
-    study: Study,
+    model: Uniform,
+    even: float,
+    read_out: _ReadOut,
     factors: Sequence[FloatArray | float],
 ) -> FloatArray:
-    """Predicted cells of all planes, each relative to its mean, (planes x cells,); `factors` of `_own_factors`."""
-    model = Uniform(study.camera, effects)
+    """Predicted cells of all planes, each relative to its mean, (planes x cells,). `even`: share of the light that a
+    veil spreads; `factors` of `_own_factors`."""
     light = _cell_means(model.field(place).light)
     # a veil of scattered light reduces the contrast of the fall-off
-    even = even_share(study.camera, effects)
     light = (1.0 - even) * light + even * light.mean()
-    added = _cells(model.added_e - model.added_e.mean()).ravel() if model.adds_signal else 0.0
-    gains = model.gain_map()
     leaked_s = _cell_means(model.leaked_s(place))
-    gain = 1.0 if gains is None else _cells(gains).ravel()
     found = []
     for plane, factor in zip(planes, factors, strict=True):
         own = light * factor
         if model.leaks:
             own = own * (1.0 + leaked_s * float(np.mean([1.0 / c.exposure_s for c in plane.captures])))
-        electrons = model.response(own / own.mean() * plane.level_e) * gain
-        found.append(electrons / electrons.mean() + added * plane.inverse_per_e)
+        electrons = model.response(own / own.mean() * plane.level_e) * read_out.gain
+        found.append(electrons / electrons.mean() + read_out.added_e * plane.inverse_per_e)
     return np.concatenate(found)
 
 

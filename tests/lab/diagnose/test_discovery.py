@@ -267,6 +267,7 @@ def test_a_law_is_found_in_its_own_form(name: str, said: str, law: Callable[[Fra
     assert np.sqrt(np.mean(np.square(best.departure - best.departure.mean() - law(x) + law(x).mean()))) < 0.001
 
 
+@pytest.mark.extra  # a whole diagnosis
 @pytest.mark.parametrize(
     ("law", "place", "name", "words"),
     [
@@ -302,7 +303,7 @@ def test_a_mismatch_without_a_name_gets_a_law_along_its_coordinate(
 
 
 def test_a_mismatch_that_nothing_predicts_says_what_would_help() -> None:
-    camera = ConcealedCamera(772302, (TreeRingsLaw(3.0),), cfa="MONO", rows=96, cols=128)
+    camera = ConcealedCamera(772302, (TreeRingsLaw(3.0),), cfa="MONO", rows=128, cols=192)
     found = diagnose(recordings_of(camera, LIT_AND_DARK), None)
     (alone,) = [item for item in found.unexplained if item.shape.startswith("irregular")]
     assert alone.would_help.startswith("Nothing that was tried predicts it")
@@ -315,6 +316,7 @@ def _gain_by_code() -> RecordingSet:
     return recordings_of(ConcealedCamera(772302, (DigitalGainLaw(10.0),), rows=96, cols=128), LIT_AND_DARK)
 
 
+@pytest.mark.extra  # a whole diagnosis, twice decided
 def test_a_table_of_codes_stands_in_the_improved_model_in_the_place_of_a_family() -> None:
     """A gain after the converter is none of its listed laws: the family, named for the nearest one, gives way to a
     table by code, which is reported and stands in the improved model."""

@@ -121,6 +121,7 @@ class FiveWidths(Law):
         return whole + np.searchsorted(begins, dn + 0.5 - whole, side="right") - 1.0
 
 
+@pytest.mark.extra  # two whole diagnoses
 def test_a_law_of_a_set_is_drafted_concealed_and_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From a recording set, as a user does it. The draft in the former's converter is named, and whole.
 

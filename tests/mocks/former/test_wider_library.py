@@ -94,9 +94,10 @@ def _diagnosed(law: Law | None, cfa: str = "MONO", seed: int = 930) -> Diagnosis
     return diagnose(recordings_of(camera, plan), at_once=False)
 
 
+@pytest.mark.extra  # whole diagnoses
 @pytest.mark.parametrize(
     "law",
-    [  # of several variants of a law one is enough for every day
+    [  # of several variants of a law one is enough
         pytest.param(law, id=f"{law.name}-{law.variant}", marks=pytest.mark.slow if law.variant else ())
         for law in STRONG
     ],

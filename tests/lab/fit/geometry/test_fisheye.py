@@ -74,7 +74,13 @@ def views_through(
 
 @pytest.mark.parametrize(
     ("law", "focal_px"),
-    [("equidistant", 260.0), ("equisolid", 310.0), ("stereographic", 215.0), ("orthographic", 390.0)],
+    [  # make ci-extra calibrates the others
+        ("equidistant", 260.0),
+        *(
+            pytest.param(*one, marks=pytest.mark.extra)
+            for one in (("equisolid", 310.0), ("stereographic", 215.0), ("orthographic", 390.0))
+        ),
+    ],
 )
 def test_a_fisheye_is_chosen_and_its_interval_holds_the_focal_length(law, focal_px):
     """3.5 standard deviations: of eight focal lengths, one in 270 sets is beyond."""
@@ -126,6 +132,7 @@ def test_a_lens_that_sees_behind_itself_is_calibrated():
     assert abs(fit.camera_matrix[0][0] - focal) < 3.5 * fit.camera_matrix_std[0][0]
 
 
+@pytest.mark.extra  # two whole calibrations
 def test_a_rig_of_two_fisheyes_is_found_and_rectified():
     left, right = (
         views_through("equidistant", 260.0, 14, 6, aside_mm=aside) for aside in ((0.0,) * 3, (60.0, 0.0, 0.0))
