@@ -445,6 +445,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         signal.filter_kernel(),
         signal.gain_map(shape),
         signal.read_kernel(),
+        signal if signal.amplifiers else None,
     )
 
 

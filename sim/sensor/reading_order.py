@@ -130,6 +130,18 @@ class ReadingOrderNoise:
         own = float(self.covariance_e2(np.array(apart))) if abs(apart) < GRID // 2 else 0.0
         return own - float(common) - self._column_means_e2(shape, period, down, right)
 
+    def departures_apart_e2(self, shape: tuple[int, int], period: int, apart: int, turned: bool) -> float:
+        """Mean covariance of pixels in one row that are `apart` columns apart, or, `turned`, as far from a border on
+        either side, 1 to `apart` columns; after the means of rows and columns were taken out of each plane."""
+        if not turned:
+            each = [self.departures_e2(shape, period, phase, 0, apart) for phase in range(period)]
+            return float(np.mean(each))
+        right = 2 * np.arange(apart) + 1
+        lost = np.mean([self._column_means_e2(shape, period, 0, int(one)) for one in right[:: max(apart // 64, 1)]])
+        nearest = self.departures_e2(shape, period, 0, 0, 1) + self._column_means_e2(shape, period, 0, 1)
+        common = float(self.covariance_e2(np.array(1))) - nearest  # of rows' means in all columns an odd number apart
+        return float(np.mean(self.covariance_e2(right)) - common - lost)
+
     def _column_means_e2(self, shape: tuple[int, int], period: int, down: int, right: int) -> float:
         """Covariance of the means of columns, without those of the rows, that two pixels lose: of means over all rows,
         and, in a mosaic, of what rows of both phases differ by."""

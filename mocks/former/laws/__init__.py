@@ -61,6 +61,7 @@ from mocks.former.laws.imaging import (
 )
 from mocks.former.laws.readout import (
     AdcNonlinearityLaw,
+    AmplifierCrosstalkLaw,
     BitWeightsLaw,
     BlackLevelDriftLaw,
     BlackLevelTemperatureLaw,
@@ -154,6 +155,7 @@ LISTED: tuple[type[Law], ...] = (
     MicrolensAngleLaw,
     LineGainLaw,
     PinkNoiseLaw,
+    AmplifierCrosstalkLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
