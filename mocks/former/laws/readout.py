@@ -336,12 +336,12 @@ class PinkNoiseLaw(Law):
             noise[:, 1::2] = self._wave(rng, rows * (cols // 2)).reshape(rows, -1)
         elif self.variant == 2:
             wide = cols + cols // 10
-            noise = np.zeros(rows * wide)
-            for octave in range(0, 18):  # correlated over 0.5, 1, 2, ... 65536 pixels
+            line = np.zeros(rows * wide)
+            for octave in range(18):  # correlated over 0.5, 1, 2, ... 65536 pixels
                 keep = np.exp(-(2.0 ** (1 - octave)))
                 white = np.sqrt(1.0 - keep * keep) * rng.standard_normal(rows * wide)
-                noise += lfilter([1.0], [1.0, -keep], white, zi=[keep * rng.standard_normal()])[0]
-            noise = (noise.reshape(rows, wide)[:, :cols]) / np.sqrt(18.0)
+                line += lfilter([1.0], [1.0, -keep], white, zi=[keep * rng.standard_normal()])[0]
+            noise = line.reshape(rows, wide)[:, :cols] / np.sqrt(18.0)
         else:
             noise = self._wave(rng, rows * cols).reshape(shape)
         return self.strength * noise
