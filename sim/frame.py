@@ -449,6 +449,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         signal.gain_map(shape),
         signal.read_kernel(),
         excess,
+        signal if signal.amplifiers else None,
     )
 
 

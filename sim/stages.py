@@ -27,6 +27,7 @@ from sim.camera import CameraModel
 from sim.optics.filters import veil_otf
 from sim.optics.pupil import Wavefront, pupil_ratio
 from sim.sensor import mosaic
+from sim.sensor.amplifiers import AmplifierCrosstalk
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.electrons import NEIGHBOURS
 from sim.sensor.lines import LineGains, LineNoise
@@ -567,7 +568,7 @@ class Signal(State):
 
     `response`: electrons -> electrons, point by point; none stay none. `gains`: (row, col in px, which broadcast) ->
     factor on what is read, noise alike, of mean 1 over the frame, as levels don't ask it. `line_gains`: the same of
-    lines, at random. `offset_dn`: (elapsed_s,
+    lines, at random. `amplifiers`: how areas that are read at the same time couple. `offset_dn`: (elapsed_s,
     sensor temperature) -> DN added to the black level; `exposure_offset_dn`: exposure_s -> the same. `noise_e2`:
     elapsed_s -> variance of every pixel beside the read noise's. `lines`: noise that rows or columns share.
     `reading_order`: noise in the order in which pixels are read.
@@ -580,6 +581,7 @@ class Signal(State):
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     gains: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     line_gains: tuple[LineGains, ...] = ()
+    amplifiers: tuple[AmplifierCrosstalk, ...] = ()
     offset_dn: tuple[Callable[[float, float | None], float], ...] = ()
     exposure_offset_dn: tuple[Callable[[float], float], ...] = ()
     noise_e2: tuple[Callable[[float], float], ...] = ()
@@ -601,6 +603,18 @@ class Signal(State):
         row, col = np.arange(float(shape[0]))[:, None], np.arange(float(shape[1]))[None, :]
         areas = reduce(lambda value, law: value * law(row, col), self.gains, np.ones(shape))
         return reduce(lambda value, law: value * law.factors(shape), self.line_gains, areas)
+
+    def couple(self, electrons: FloatArray) -> FloatArray:
+        """Return what amplifiers read of the signals of a whole frame (rows, cols)."""
+        return reduce(lambda value, law: law.couple(value), self.amplifiers, electrons)
+
+    def couple_variances(self, variance_e2: FloatArray) -> FloatArray:
+        """Return the variances of what they read, of independent signals (rows, cols)."""
+        return reduce(lambda value, law: law.couple_variances(value), self.amplifiers, variance_e2)
+
+    def couple_noise(self, noise_e: FloatArray) -> FloatArray:
+        """Return the read noise (rows, cols) after it was coupled, where it is."""
+        return reduce(lambda value, law: law.couple(value) if law.of_noise else value, self.amplifiers, noise_e)
 
     def shift_dn(self, elapsed_s: float, temperature_c: float | None, exposure_s: float) -> float:
         """DN added to the black level."""

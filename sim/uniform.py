@@ -15,6 +15,7 @@ from sim.camera import CameraModel
 from sim.detection import collection_m2_sr, detect_light
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
+from sim.sensor.amplifiers import AmplifierCrosstalk
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineGains, LineNoise, Lines
 from sim.sensor.particles import Particles
@@ -391,9 +392,18 @@ class Uniform:
         return self._signal.read(electrons)
 
     def gain_map(self) -> FloatArray | None:
-        """Factor (rows, cols) on what is read of every pixel, without `line_gains`; None where it is the same for
-        all."""
-        return replace(self._signal, line_gains=()).gain_map((self.camera.rows, self.camera.cols))
+        """Factor (rows, cols) on what is read of every pixel in even light, without `line_gains`; None where it is the
+        same for all."""
+        shape = self.camera.rows, self.camera.cols
+        gains = replace(self._signal, line_gains=()).gain_map(shape)
+        if not self.amplifiers:
+            return gains
+        return self._signal.couple(np.ones(shape) if gains is None else gains)
+
+    @property
+    def amplifiers(self) -> tuple[AmplifierCrosstalk, ...]:
+        """How areas that are read at the same time couple."""
+        return self._signal.amplifiers
 
     @property
     def line_gains(self) -> tuple[LineGains, ...]:

@@ -17,8 +17,10 @@ ADDED = frozenset({"signal.disturbances"})
 CODES = frozenset({"codes.codes"})
 #: Light that is collected beside the exposure.
 LEAK = frozenset({"charge.leak_s"})
-#: Factors on what is read, by place.
-GAINS = frozenset({"signal.gains"})
+#: How amplifiers of areas couple.
+AMPLIFIERS = frozenset({"signal.amplifiers"})
+#: Factors on what is read of even light, by place.
+GAINS = frozenset({"signal.gains"}) | AMPLIFIERS
 #: Factors on what is read of rows and columns, at random.
 LINE_GAINS = frozenset({"signal.line_gains"})
 #: Noise that pixels of a line share: of rows, of columns, and in the order in which pixels are read.

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,19 @@ from sim.spectrum import FloatArray
 
 Float32Array = NDArray[np.float32]
 F = TypeVar("F", bound=np.floating[Any])
+
+
+class Amplifiers(Protocol):
+    """How amplifiers that read parts of a frame at the same time couple; all of whole frames (rows, cols)."""
+
+    def couple(self, electrons: FloatArray) -> FloatArray:
+        """Return what is read of signals."""
+
+    def couple_variances(self, variance_e2: FloatArray) -> FloatArray:
+        """Return the variances of what is read, of independent signals."""
+
+    def couple_noise(self, noise_e: FloatArray) -> FloatArray:
+        """Return the read noise, which is coupled or not."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +57,7 @@ class ReadOut:
     gain          factor (rows, cols) on what is read of every pixel, its noise alike, before `added`
     read_kernel   kernel (odd,) along the row that makes read noise of white noise
     excess        factor on the shot noise's variance, by which each electron is multiplied at random
+    amplifiers    what coupled amplifiers read of the signals of a whole frame in electrons
     """
 
     response: Callable[[FloatArray], FloatArray] | None = None
@@ -58,6 +72,7 @@ class ReadOut:
     gain: FloatArray | None = None
     read_kernel: FloatArray | None = None
     excess: float = 1.0
+    amplifiers: Amplifiers | None = None
 
 
 LINEAR = ReadOut()
@@ -259,6 +274,8 @@ def dn_moments(
         bent = read_out.response(mean)
         variance = variance * ((read_out.response(beyond) - bent) / (beyond - mean)) ** 2  # exactly 1 of a straight one
         mean = bent
+    if read_out.amplifiers is not None:
+        mean, variance = read_out.amplifiers.couple(mean), read_out.amplifiers.couple_variances(variance)
     if fixed_pattern is not None:
         mean = mean + fixed_pattern.dsnu_e
         if fixed_pattern.column_e is not None:
@@ -326,7 +343,7 @@ def sample_from(
     added = _added_electrons(electrons.shape, camera, rng, read_out)
     gain = np.float32(gain_dn_per_e(camera, gain_db))
     rows = max(1, 32_768 // max(1, electrons.shape[-1]))  # strips that stay in the processor's cache
-    if read_out.neighbours is not None or read_out.processing is not None:
+    if read_out.neighbours is not None or read_out.processing is not None or read_out.amplifiers is not None:
         rows = len(electrons)  # pixels act on one another
     for start in range(0, len(electrons), rows):
         strip = slice(start, start + rows)
@@ -384,11 +401,15 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
         charge = multiply_electrons(charge, read_out.excess, rng)
     if read_out.response is not None:
         charge = read_out.response(charge.astype(float)).astype(np.float32)
+    if read_out.amplifiers is not None:
+        charge = read_out.amplifiers.couple(charge.astype(float)).astype(np.float32)
     if camera.read_noise_e > 0:
         noise = rng.standard_normal(mean.shape, dtype=np.float32)
         noise *= np.float32(camera.read_noise_e)
         if read_out.read_kernel is not None:
             noise = convolve1d(noise, read_out.read_kernel, axis=-1, mode="wrap")
+        if read_out.amplifiers is not None:
+            noise = read_out.amplifiers.couple_noise(noise.astype(float)).astype(np.float32)
         charge += noise
     return charge
 

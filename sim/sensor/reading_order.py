@@ -11,8 +11,6 @@ from scipy import fft
 
 from sim.spectrum import FloatArray
 
-#: Below this frequency a power law is level, cycles a pixel: no read-out's noise grows without end.
-KNEE_CY_PER_PX = 1e-6
 #: Pixels that are drawn for each one that is read: the ends of a frame have nothing in common.
 FOLDED = 2
 #: Frequencies of the grid of covariances.
@@ -20,15 +18,40 @@ GRID = 2**17
 
 
 @dataclass(frozen=True)
+class Law:
+    """Power (f^2 + knee^2)^(-exponent / 2), of mean 1 over -0.5..0.5 cy/px."""
+
+    exponent: float
+    knee_cy_per_px: float
+
+    def _bare(self, frequency_cy_per_px: FloatArray) -> FloatArray:
+        return np.asarray((np.square(frequency_cy_per_px) + self.knee_cy_per_px**2) ** (-0.5 * self.exponent))
+
+    @cached_property
+    def _whole(self) -> float:
+        grid = np.geomspace(1e-3 * self.knee_cy_per_px, 0.5, 4001)
+        return float(2.0 * (np.trapezoid(self._bare(grid), grid) + grid[0] * self._bare(grid[:1])[0]))
+
+    def power(self, frequency_cy_per_px: FloatArray) -> FloatArray:
+        """Return the power at frequencies from 0 to 0.5."""
+        return self._bare(frequency_cy_per_px) / self._whole
+
+
+@dataclass(frozen=True)
 class ReadingOrderNoise:
     """A stationary normal disturbance in the order of the pixels, row after row, a `Disturbance`: of power f^-exponent
-    at f cycles a pixel, level below `KNEE_CY_PER_PX`, and standard deviation `noise_e`; and the same of `alternating_e`
+    at f cycles a pixel, level below `knee_cy_per_px`, and standard deviation `noise_e`; and the same of `alternating_e`
     by two amplifiers that take turns, of even and of odd columns (an even number in all), each at its own pixels.
     """
 
     noise_e: float
     alternating_e: float = 0.0
     exponent: float = 1.0
+    knee_cy_per_px: float = 1e-6
+
+    @property
+    def _shape(self) -> Law:
+        return Law(self.exponent, self.knee_cy_per_px)
 
     def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         """Electrons (rows, cols) of one frame."""
@@ -43,7 +66,7 @@ class ReadingOrderNoise:
             return np.zeros(shape)
         size = shape[0] * shape[1]
         count = fft.next_fast_len(FOLDED * size, real=True)
-        power = _averaged(count, self.exponent)
+        power = _averaged(count, self._shape)
         wave = fft.irfft(fft.rfft(rng.standard_normal(count)) * np.sqrt(power), count)
         return np.asarray(std * wave[:size].reshape(shape))
 
@@ -58,7 +81,7 @@ class ReadingOrderNoise:
     def spectrum_e2(self, frequency_cy_per_px: FloatArray) -> FloatArray:
         """Power at frequencies in reading order, e^2; its mean over -0.5..0.5 cy/px is the variance."""
         f = _from_whole(np.asarray(frequency_cy_per_px, float))
-        common, apart = (_power_law(away, self.exponent) for away in (f, _from_whole(2.0 * f)))
+        common, apart = (self._shape.power(away) for away in (f, _from_whole(2.0 * f)))
         return self.noise_e**2 * common + self.alternating_e**2 * apart
 
     def plane_e2(self, shape: tuple[int, int], across_cy_per_px: FloatArray, down_cy_per_px: FloatArray) -> FloatArray:
@@ -81,9 +104,9 @@ class ReadingOrderNoise:
         f = _from_whole(waves_cy_per_px)
         own = []
         for away, across in ((f, cols), (_from_whole(2.0 * f), cols // 2)):
-            near = _leaking((rows, across), self.exponent)
+            near = _leaking((rows, across), self._shape)
             cycles = away * across * rows  # a frame, or its even or odd columns
-            smooth = _power_law(np.maximum(cycles, 0.5) / (rows * across), self.exponent)
+            smooth = self._shape.power(np.maximum(cycles, 0.5) / (rows * across))
             own.append(np.where(cycles < 0.5 * rows, np.interp(cycles, np.arange(len(near)), near), smooth))
         return np.asarray(self.noise_e**2 * own[0] + self.alternating_e**2 * own[1])
 
@@ -106,7 +129,7 @@ class ReadingOrderNoise:
 
     @cached_property
     def _covariances_e2(self) -> FloatArray:
-        own = fft.irfft(_averaged(GRID, self.exponent), GRID)[: GRID // 2]
+        own = fft.irfft(_averaged(GRID, self._shape), GRID)[: GRID // 2]
         apart = np.zeros(len(own))
         apart[::2] = own[: len(own) // 2]
         return np.asarray(self.noise_e**2 * own + self.alternating_e**2 * apart)
@@ -129,6 +152,18 @@ class ReadingOrderNoise:
         apart = down * cols + right
         own = float(self.covariance_e2(np.array(apart))) if abs(apart) < GRID // 2 else 0.0
         return own - float(common) - self._column_means_e2(shape, period, down, right)
+
+    def departures_apart_e2(self, shape: tuple[int, int], period: int, apart: int, turned: bool) -> float:
+        """Mean covariance of pixels in one row that are `apart` columns apart, or, `turned`, as far from a border on
+        either side, 1 to `apart` columns; after the means of rows and columns were taken out of each plane."""
+        if not turned:
+            each = [self.departures_e2(shape, period, phase, 0, apart) for phase in range(period)]
+            return float(np.mean(each))
+        right = 2 * np.arange(apart) + 1
+        lost = np.mean([self._column_means_e2(shape, period, 0, int(one)) for one in right[:: max(apart // 64, 1)]])
+        nearest = self.departures_e2(shape, period, 0, 0, 1) + self._column_means_e2(shape, period, 0, 1)
+        common = float(self.covariance_e2(np.array(1))) - nearest  # of rows' means in all columns an odd number apart
+        return float(np.mean(self.covariance_e2(right)) - common - lost)
 
     def _column_means_e2(self, shape: tuple[int, int], period: int, down: int, right: int) -> float:
         """Covariance of the means of columns, without those of the rows, that two pixels lose: of means over all rows,
@@ -155,28 +190,13 @@ def _dirichlet2(frequency_cy_per_px: FloatArray, count: int) -> FloatArray:
     return np.square(np.sinc(count * turn / np.pi) / np.sinc(turn / np.pi))
 
 
-def _law(frequency_cy_per_px: FloatArray, exponent: float) -> FloatArray:
-    return np.asarray((np.square(frequency_cy_per_px) + KNEE_CY_PER_PX**2) ** (-0.5 * exponent))
-
-
-@lru_cache(maxsize=256)
-def _whole(exponent: float) -> float:
-    grid = np.geomspace(1e-3 * KNEE_CY_PER_PX, 0.5, 4001)
-    return float(2.0 * np.trapezoid(_law(grid, exponent), grid))
-
-
-def _power_law(frequency_cy_per_px: FloatArray, exponent: float) -> FloatArray:
-    """Power law of mean 1 over -0.5..0.5 cy/px."""
-    return _law(frequency_cy_per_px, exponent) / _whole(exponent)
-
-
 @lru_cache(maxsize=8)
-def _averaged(count: int, exponent: float) -> FloatArray:
+def _averaged(count: int, law: Law) -> FloatArray:
     """The power law at the frequencies of a line of `count` pixels, of mean 1 over all: that at 0 is the mean within
     half a cycle."""
-    power = _power_law(np.asarray(fft.rfftfreq(count), float), exponent)
-    grid = np.geomspace(1e-3 * KNEE_CY_PER_PX, 0.5 / count, 2001)
-    power[0] = 2.0 * count * (np.trapezoid(_power_law(grid, exponent), grid) + grid[0] * power[0])
+    power = law.power(np.asarray(fft.rfftfreq(count), float))
+    grid = np.geomspace(1e-6 * 0.5 / count, 0.5 / count, 2001)
+    power[0] = 2.0 * count * (np.trapezoid(law.power(grid), grid) + grid[0] * law.power(grid[:1])[0])
     both = 2.0 * power.sum() - power[0] - (power[-1] if count % 2 == 0 else 0.0)
     return np.asarray(power * (count / both))
 
@@ -186,7 +206,7 @@ NEAR, SLOW, FINE = 32, 16, 32
 
 
 @lru_cache(maxsize=64)
-def _leaking(shape: tuple[int, int], exponent: float) -> FloatArray:
+def _leaking(shape: tuple[int, int], law: Law) -> FloatArray:
     """The power law about its pole as the rows of a frame show it at 0, 1, ... rows / 2 cycles a frame: with what its
     waves leak through the rows' Fejer kernel, F(x) = sin^2(pi rows x) / (rows sin^2(pi x))."""
     rows, cols = shape
@@ -194,18 +214,17 @@ def _leaking(shape: tuple[int, int], exponent: float) -> FloatArray:
     cycles = np.arange(rows // 2 + 1)
     far = min(2 * NEAR, rows // 2)
     fine = np.concatenate([np.geomspace(1e-4, 0.5 / FINE, 200), np.arange(1, FINE * far + 1) / FINE])
-    law = _power_law(fine / size, exponent)
-    below = fine[0] * _law(np.zeros(1), exponent)[0] / _whole(exponent) if fine[0] / size < KNEE_CY_PER_PX else 0.0
+    power = law.power(fine / size)
 
     def leaked(at: FloatArray, upto: int) -> FloatArray:
         use = fine <= upto
         both = _fejer((at[:, None] - fine[use]) / rows, rows) + _fejer((at[:, None] + fine[use]) / rows, rows)
-        return np.asarray(np.trapezoid(law[use] * both, fine[use], axis=1) / rows)
+        return np.asarray(np.trapezoid(power[use] * both, fine[use], axis=1) / rows)
 
-    shown = _power_law(np.maximum(cycles, 0.5) / size, exponent)
+    shown = law.power(np.maximum(cycles, 0.5) / size)
     near = min(NEAR, len(cycles))
     shown[:near] = leaked(cycles[:near].astype(float), far)
-    shown[0] += 2.0 * below
+    shown[0] += 2.0 * fine[0] * power[0]
     if near < len(cycles):
         shown[near:] += leaked(cycles[near:].astype(float), SLOW)
     return np.asarray(shown)

@@ -104,6 +104,13 @@ def _ordered_power(study: Study, model: Uniform, lines: Lines, frequency_cy_per_
     return found
 
 
+def _alternating_e2(study: Study, one: ReadingOrderNoise, lines: Lines) -> float:
+    """Power of noise in reading order that alternates from line to line; the difference of a frame's odd and even lines
+    has 4 times that over its pixels, e^2."""
+    across, down = (0.0, 0.5) if lines == "rows" else (0.5, 0.0)
+    return float(one.plane_e2((study.camera.rows, study.camera.cols), np.array(across), np.array(down)))
+
+
 def _ordered_level(one: ReadingOrderNoise) -> float:
     """Mean power of noise in reading order in `LEVEL_BAND`, e^2, where rows hardly depend on each other."""
     return float(np.mean(one.spectrum_e2(np.linspace(*LEVEL_BAND, 33))))
@@ -176,7 +183,13 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
         moving += _ordered_power(study, model, lines, frequency) / length
         parts = zip(factor, first.fixed.values(), strict=True)
         power = np.concatenate([np.log1p(f * bands.mean(still + moving / part.frames)) for f, part in parts])
-        return Prediction(np.concatenate([power, np.full(pieces, study.noise.gain * odd)]), {})
+        apart = 4.0 / size * sum((_alternating_e2(study, one, lines) for one in model.reading_order), 0.0)
+        jacobian = {}
+        for k, part in enumerate(first.fixed.values() if apart > 0.0 else ()):
+            column = np.zeros(n + pieces)
+            column[n + k] = study.noise.gain * np.sqrt(apart / part.frames)
+            jacobian[f"dark_{name}:odd:{k}"] = column
+        return Prediction(np.concatenate([power, np.full(pieces, study.noise.gain * odd)]), jacobian)
 
     return Block(
         measurement=ROW_PATTERN if lines == "rows" else COLUMN_PATTERN, reach=0.1,

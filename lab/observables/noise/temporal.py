@@ -100,7 +100,7 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
         signal[name] = float(np.mean([p.mean(dtype=float) for p in planes])) - study.noise.black
     level = float(np.mean(list(signal.values())))
     dark_dn = abs(study.noise.dark_dn_per_s) * captures[0].exposure_s
-    _level_out(frames, cfa, study.noise.black if lit and level > 20.0 * max(dark_dn, 1.0) else None)
+    level_out(frames, cfa, study.noise.black if lit and level > 20.0 * max(dark_dn, 1.0) else None)
     freedom = len(frames) - 1
     sizes = {name: plane.shape for name, plane in mosaic.planes(first, cfa).items()}
     variance = {}
@@ -138,7 +138,7 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
     )
 
 
-def _level_out(frames: Sequence[Any], cfa: Cfa, black_dn: float | None) -> None:
+def level_out(frames: Sequence[Any], cfa: Cfa, black_dn: float | None) -> None:
     """Reduce frames, in place, to departures from their mean frame without row and column means. Levels are matched by
     factors above `black_dn`, or by subtraction where that is None."""
     for name in mosaic.planes(frames[0], cfa):

@@ -64,6 +64,7 @@ from mocks.former.laws.imaging import (
 )
 from mocks.former.laws.readout import (
     AdcNonlinearityLaw,
+    AmplifierCrosstalkLaw,
     BitWeightsLaw,
     BlackLevelDriftLaw,
     BlackLevelTemperatureLaw,
@@ -161,6 +162,7 @@ LISTED: tuple[type[Law], ...] = (
     ChargeTransferLaw,
     ExcessNoiseLaw,
     CosmicRaysLaw,
+    AmplifierCrosstalkLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single

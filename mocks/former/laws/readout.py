@@ -179,6 +179,40 @@ class TapOffsetLaw(Law):
         return {} if self.variant == 1 else {"offset_e": self.strength}
 
 
+class AmplifierCrosstalkLaw(Law):
+    """Ports that read parts of the frame at once disturb each other. Variants: two halves, read from the outer sides
+    inwards; four strips alike, where the next disturb and the others hardly do; the right half takes from the left one
+    alone."""
+
+    name = effect = "amplifier_crosstalk"
+    variants, unit, nominal, limits, needs = 3, "%", 1.0, (0.02, 15.0), "mono"
+
+    def response(self, electrons: Array) -> Array:
+        c, out, cols = self.strength / 100.0, np.array(electrons, np.float64), electrons.shape[1]
+        if self.variant == 1:
+            wide = cols // 4
+            strips = [electrons[:, k * wide : (k + 1) * wide] for k in range(4)]
+            for k in range(4):
+                for j in range(4):
+                    if j != k:
+                        out[:, k * wide : (k + 1) * wide] += c * (1.0 if abs(j - k) == 1 else 0.3) * strips[j]
+            return out
+        half = cols // 2
+        left, right = electrons[:, :half], electrons[:, half : 2 * half]
+        if self.variant == 2:
+            out[:, half : 2 * half] += 2.0 * c * left
+            return out
+        out[:, :half] += c * right[:, ::-1]
+        out[:, half : 2 * half] += c * left[:, ::-1]
+        return out
+
+    def library_parameters(self) -> dict[str, float]:
+        return {
+            0: {"share_percent": self.strength},
+            2: {"share_percent": self.strength, "excess_percent": self.strength},
+        }.get(self.variant, {})
+
+
 class LineGainLaw(Law):
     """Each line has an amplifier, or a slope of its converter, of its own. Variants: columns, normal; columns, uniform;
     rows."""
@@ -302,12 +336,12 @@ class PinkNoiseLaw(Law):
             noise[:, 1::2] = self._wave(rng, rows * (cols // 2)).reshape(rows, -1)
         elif self.variant == 2:
             wide = cols + cols // 10
-            noise = np.zeros(rows * wide)
-            for octave in range(0, 18):  # correlated over 0.5, 1, 2, ... 65536 pixels
+            line = np.zeros(rows * wide)
+            for octave in range(18):  # correlated over 0.5, 1, 2, ... 65536 pixels
                 keep = np.exp(-(2.0 ** (1 - octave)))
                 white = np.sqrt(1.0 - keep * keep) * rng.standard_normal(rows * wide)
-                noise += lfilter([1.0], [1.0, -keep], white, zi=[keep * rng.standard_normal()])[0]
-            noise = (noise.reshape(rows, wide)[:, :cols]) / np.sqrt(18.0)
+                line += lfilter([1.0], [1.0, -keep], white, zi=[keep * rng.standard_normal()])[0]
+            noise = line.reshape(rows, wide)[:, :cols] / np.sqrt(18.0)
         else:
             noise = self._wave(rng, rows * cols).reshape(shape)
         return self.strength * noise

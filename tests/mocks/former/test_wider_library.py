@@ -13,6 +13,7 @@ from lab.diagnose import diagnose
 from lab.formats.results import DiagnosisResult
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
+    AmplifierCrosstalkLaw,
     BitWeightsLaw,
     ChargeTransferLaw,
     ColouredLineNoiseLaw,
@@ -51,6 +52,9 @@ STRONG: tuple[Law, ...] = (
     TapGainLaw(1.0, 2, 9),
     TapOffsetLaw(1.0, 0, 9),
     TapOffsetLaw(1.0, 1, 9),
+    AmplifierCrosstalkLaw(1.0, 0, 9),
+    AmplifierCrosstalkLaw(1.0, 1, 9),
+    AmplifierCrosstalkLaw(1.0, 2, 9),
     PinkNoiseLaw(4.0, 0, 9),
     PinkNoiseLaw(4.0, 1, 9),
     PinkNoiseLaw(4.0, 2, 9),
