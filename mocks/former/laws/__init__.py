@@ -55,6 +55,7 @@ from mocks.former.laws.imaging import (
     MotionLaw,
     OpticalLowPassFilterLaw,
     PixelApertureLaw,
+    SeeingLaw,
     SphericalAberrationLaw,
     TrefoilLaw,
     VibrationBlurLaw,
@@ -152,6 +153,7 @@ LISTED: tuple[type[Law], ...] = (
     ColouredReadNoiseLaw,
     MicrolensAngleLaw,
     TrefoilLaw,
+    SeeingLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
