@@ -208,6 +208,7 @@ SIZES: dict[str, str] = {
     "light_flicker": "both:modulation_percent=8,frequency_hz=100,line_time_us=20",
     "microlens_angle": "left:crosstalk_percent=3,loss_percent=4",
     "model_discrepancy": "left:strength=1",
+    "moffat_blur": "left:radius_um=1.5,exponent=2.5",
     "non_uniform_illumination": "both:gradient_x_percent=4",
     "nonlinearity": "left:quadratic_percent=3",
     "on_chip_sharpening": "left:strength=0.3",

@@ -33,6 +33,8 @@ PARTICLES = frozenset({"charge.particles"})
 SHOWN = frozenset({"light.screen"})
 #: Displaced, scaled or rotated copies of the image.
 REFLECTIONS = frozenset({"image.copies"})
+#: Factors on the lens's transfer function.
+BLUR = frozenset({"image.transfer"})
 #: Displacement of the image by place and wavelength.
 SHIFT = frozenset({"image.shift"})
 

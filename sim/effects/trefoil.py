@@ -39,7 +39,8 @@ class Trefoil(Effect):
     ] = 0.0  # fmt: skip
     w333_y_um: Annotated[
         float,
-        Quantity("um", "path error at the pupil's rim along rows", lower=-5.0, upper=5.0, prior=(0.0, 0.08), absent=0.0),
+        Quantity("um", "path error at the pupil's rim along rows", lower=-5.0, upper=5.0, prior=(0.0, 0.08),
+                 absent=0.0),
     ] = 0.0  # fmt: skip
 
     stated_f_number: StatedFNumber = None

@@ -109,6 +109,7 @@ CASES = (
     Case("both:light_flicker:modulation_percent=20,frequency_hz=100,line_time_us=80", (FLAT, SCREEN)),
     Case("left:microlens_angle:crosstalk_percent=20,loss_percent=20,red_excess=0.3", (FLAT, SWEPT, CHART)),
     Case("left:model_discrepancy:strength=1", (SCREEN, EDGE)),
+    Case("left:moffat_blur:radius_um=2.5,exponent=2.5", (EDGE, SCREEN)),
     Case("both:non_uniform_illumination:gradient_x_percent=8,gradient_y_percent=4", (FLAT, SWEPT)),
     Case("left:nonlinearity:quadratic_percent=10", (FLAT, CHART)),
     Case("left:on_chip_sharpening:strength=0.5", (replace(EDGE, exposure_s=0.0006), DARK)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,11 @@ from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
 from lab.errors import NotDetermined
+from lab.observables.charts.patches import Surroundings, halo_light, harmonics
 from lab.observables.dataset import Study, held_out_of, mean_frame
 from lab.observables.observable import Block, Label, Measurement, Prediction
 from lab.observables.plane_means import channel_pixels
-from lab.observables.reads import REFLECTIONS, SHOWN, acting
+from lab.observables.reads import BLUR, REFLECTIONS, SHOWN, acting
 from lab.observables.screens.pattern_fit import mean_rate
 from lab.observables.surroundings import Surroundings, halo_light, harmonics
 from sim.camera import CameraModel
@@ -26,11 +28,13 @@ from sim.effects.base import Effects
 from sim.frame import screen_light, with_reflections
 from sim.point import even_share, optical_transfer, wide_contrast
 from sim.sensor import mosaic
-from sim.spectrum import FloatArray
+from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import Uniform
 
 # share of the lit screen's level: light of lit parts that the model doesn't follow, and of the screen's surroundings
 SCREEN_FLOOR = 6e-4
+RADII, ANGLES = 24, 4  # nodes of frequency and orientation between which a transfer function is interpolated
+FINE_CY_PER_PX = 0.01  # frequency below which the nodes are evenly spaced
 
 
 def screen_block(study: Study) -> Block:
@@ -99,6 +103,8 @@ def screen_block(study: Study) -> Block:
             low = np.maximum(tail, 0.0) / noise.gain
             base = np.array([p.black for p in points]) / noise.gain
             shift = (model.response(base + low) - model.response(base)) * noise.gain - tail
+        if blurring := acting(effects, BLUR):
+            shift = shift + np.array([p.reach.light(blurring) - p.reach.baseline for p in points])
         if acting(effects, REFLECTIONS):
             shift = shift + np.array([_copied(p, effects, camera) for p in points])
         return Prediction(wide_contrast(camera, effects) * tail + even_share(camera, effects) * lift + shift, {})
@@ -106,9 +112,54 @@ def screen_block(study: Study) -> Block:
     return Block(
         measurement=SCREEN, reach=1e9, value=value, covariance=covariance,
         labels=tuple(Label(float(i), p.channel, p.kind, p.captures, p.held_out) for i, p in enumerate(points)),
-        reads=REFLECTIONS | {"image.veils", "signal.response"}, predict=predict,
+        reads=REFLECTIONS | BLUR | {"image.veils", "signal.response"}, predict=predict,
         scale=np.array([p.white for p in points]),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Reach:
+    """Light that reaches dark squares from lit pixels, as a sum over frequencies of the transfer function.
+
+    The transfer function is interpolated linearly between `RADII` x `ANGLES` nodes in polar coordinates, the radii
+    `FINE_CY_PER_PX` sinh(t): wide wings change it near frequency 0. Changes of the light come out within 0.1 %."""
+
+    camera: CameraModel
+    channel: str
+    radiance: Spectrum | None
+    fx: FloatArray  # (n,), cy/px, of the nodes
+    fy: FloatArray  # (n,)
+    weight: FloatArray  # (n,), DN: what a transfer function of 1 about a node lets through
+
+    @staticmethod
+    def of(
+        camera: CameraModel, channel: str, radiance: Spectrum | None, fx: FloatArray, fy: FloatArray, weight: FloatArray
+    ) -> _Reach:
+        """Bring the `weight` (rows, cols), DN, of all frequencies `fx` (1, cols) and `fy` (rows, 1) to the nodes."""
+        radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
+        radii = FINE_CY_PER_PX * np.sinh(np.linspace(0.0, np.arcsinh(float(radius.max()) / FINE_CY_PER_PX), RADII))
+        ring = np.clip(np.searchsorted(radii, radius) - 1, 0, RADII - 2)
+        outwards = (radius - radii[ring]) / (radii[ring + 1] - radii[ring])
+        turn = (angle / np.pi + 0.5) * ANGLES
+        sector = np.floor(turn).astype(int)
+        around = turn - sector
+        total = np.zeros((RADII, ANGLES))
+        for i, radial in ((0, 1.0 - outwards), (1, outwards)):
+            for j, azimuthal in ((0, 1.0 - around), (1, around)):
+                np.add.at(total, (ring + i, (sector + j) % ANGLES), weight * radial * azimuthal)
+        middle = (np.arange(ANGLES) / ANGLES - 0.5) * np.pi
+        x, y = (np.multiply.outer(radii, part(middle)).ravel() for part in (np.cos, np.sin))
+        return _Reach(camera, channel, radiance, x, y, total.ravel())
+
+    def light(self, effects: Effects) -> float:
+        """Return the light that reaches the squares with effects on the lens's transfer function, DN."""
+        otf = optical_transfer(self.camera, self.channel, self.radiance, self.fx, self.fy, effects)
+        return float(self.weight @ np.real(otf))
+
+    @cached_property
+    def baseline(self) -> float:
+        """Return that light without effects, DN."""
+        return self.light(())
 
 
 @dataclass(frozen=True)
@@ -125,6 +176,7 @@ class _DarkSquares:
     picture: FloatArray  # pattern less dark screen, one plane of the mosaic
     use: NDArray[np.bool_]  # mask of the dark squares' pixels in it
     around: Surroundings  # of these pixels
+    reach: _Reach  # of the lit pixels' light, by the transfer function
     beyond: float  # standard deviation of `tail` by light from beyond the frame
     lift: float  # mean of the whole frame less that of the dark screen
     white: float  # mean of the lit screen less that of the dark screen
@@ -165,25 +217,31 @@ def _dark_squares(
         away = ndimage.distance_transform_edt(~lit) * step
         # what lies beyond the frame's border may be lit
         inside = ndimage.distance_transform_edt(np.pad(bright, 1))[1:-1, 1:-1] * step
-        for reach in (12.0, 9.0, 7.0):
-            use = (away >= reach) & (inside >= reach)
+        for clear in (12.0, 9.0, 7.0):
+            use = (away >= clear) & (inside >= clear)
             if use.sum() >= 60:
                 break
         else:
             continue
         pad = [(0, n) for n in share.shape]
         picture = np.where((share > 0.5) & bright, full, 0.0)
-        fy = np.fft.fftfreq(2 * share.shape[0], step)[:, None]
-        fx = np.fft.rfftfreq(2 * share.shape[1], step)[None, :]
+        fy: FloatArray = np.fft.fftfreq(2 * share.shape[0], step)[:, None].astype(float)
+        fx: FloatArray = np.fft.rfftfreq(2 * share.shape[1], step)[None, :].astype(float)
         radiance = study.spectrum(part[0].screen.radiance) if part[0].screen.radiance else None
         otf = np.real(optical_transfer(camera, channel, radiance, fx, fy))
-        # pixels above half the contrast are drawn as lit: the total is right, and far away the outline doesn't matter.
-        # How far a screen goes on beyond the frame's border isn't known: the tail is the mean of two cases, no light
-        # there, and the mirror image
-        ends, endless = (
-            np.fft.irfft2(np.fft.rfft2(whole) * otf, whole.shape)[: share.shape[0], : share.shape[1]][use].mean()
+        # The mean over the dark squares, by Parseval: columns of the half spectrum stand for two. Pixels above half the
+        # contrast are drawn as lit: the total is right, and far away the outline doesn't matter. How far a screen goes
+        # on beyond the frame's border isn't known: the tail is the mean of two cases, no light there, and the mirror
+        # image
+        squares = np.conj(np.fft.rfft2(np.pad(use / use.sum(), pad)))
+        twice = np.full(fx.shape, 2.0)
+        twice[:, [0, -1]] = 1.0
+        lit_by = [
+            np.asarray(np.real(np.fft.rfft2(whole) * squares) * twice / whole.size, float)
             for whole in (np.pad(picture, pad), np.pad(picture, pad, mode="symmetric"))
-        )
+        ]
+        ends, endless = (float(np.sum(weight * otf)) for weight in lit_by)
+        reach = _Reach.of(camera, channel, radiance, fx, fy, 0.5 * (lit_by[0] + lit_by[1]))
         added = (shown - black)[plane]
         difference = added[use]
         lights = np.maximum([float(frame[plane][use].mean()) - noise.black for frame in (shown, black)], 0.0)
@@ -192,7 +250,7 @@ def _dark_squares(
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
                          float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
-                         added, use, Surroundings.of(harmonics(added), use), 0.5 * float(endless - ends),
+                         added, use, Surroundings.of(harmonics(added), use), reach, 0.5 * float(endless - ends),
                          means[0] - means[1], float(full[bright].mean()),
                          float(black[plane][use].mean()) - noise.black,
                          float(np.linalg.norm(noise.rounding_std_dn(lights))))

@@ -58,6 +58,7 @@ from mocks.former.laws.imaging import (
     MotionLaw,
     OpticalLowPassFilterLaw,
     PixelApertureLaw,
+    SeeingLaw,
     SphericalAberrationLaw,
     TrefoilLaw,
     VibrationBlurLaw,
@@ -163,6 +164,7 @@ LISTED: tuple[type[Law], ...] = (
     ExcessNoiseLaw,
     CosmicRaysLaw,
     AmplifierCrosstalkLaw,
+    SeeingLaw,
 )
 
 #: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single

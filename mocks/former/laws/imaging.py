@@ -103,7 +103,7 @@ class TrefoilLaw(Law):
         return self.strength * np.real(z**3 + (0.2 * z**4 if self.variant == 1 else 0.0))
 
     def library_parameters(self) -> dict[str, float]:
-        return {"w333_x_um": self.strength} if self.variant == 0 else {}
+        return {"w333_x_um": -self.strength} if self.variant == 0 else {}  # phases have the other sign here
 
 
 class AxialColourLaw(Law):
@@ -241,6 +241,30 @@ class HaloLaw(Law):
     def spectral_transfer(self, frequency_cy_um: Array, wavelength_um: float) -> Array:
         r = (2.0 + 4.0 * self.uniform[0]) * self.camera.pitch_um
         return 1 - self.strength / 100 + self.strength / 100 / (1 + (2 * np.pi * r * frequency_cy_um) ** 2) ** 1.5
+
+
+class SeeingLaw(Law):
+    """Turbulent air blurs long exposures: of a full width at half maximum of `strength`. Variants: Moffat's profile of
+    exponent 2.5; of 3.5; Kolmogorov's spectrum, exp(-(f / f0)^(5/3))."""
+
+    name, effect = "seeing", "moffat_blur"
+    variants, unit, nominal, limits, power, shown_by = 3, "um", 1.5, (0.2, 12.0), 1.7, OPTICAL
+
+    def spectral_transfer(self, frequency_cy_um: Array, wavelength_um: float) -> Array:
+        f = np.asarray(frequency_cy_um, float)
+        if self.variant == 2:  # FWHM 0.976 wavelength / r0, exponent 3.44 (wavelength f / r0)^(5/3)
+            return np.exp(-3.44 * (self.strength / 0.976 * f) ** (5.0 / 3.0))
+        exponent = (2.5, 3.5)[self.variant]
+        core = self.strength / (2.0 * np.sqrt(2.0 ** (1.0 / exponent) - 1.0))
+        x = 2.0 * np.pi * core * np.maximum(f, 1e-9)
+        # the Bessel functions of order 3/2 and 5/2 are elementary
+        return (1.0 + x + (x * x / 3.0 if self.variant == 1 else 0.0)) * np.exp(-x)
+
+    def library_parameters(self) -> dict[str, float]:
+        if self.variant == 2:
+            return {}
+        exponent = (2.5, 3.5)[self.variant]
+        return {"radius_um": self.strength / (2.0 * np.sqrt(2.0 ** (1.0 / exponent) - 1.0)), "exponent": exponent}
 
 
 class PixelApertureLaw(Law):
