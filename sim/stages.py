@@ -351,8 +351,8 @@ class Charge(State):
     hold: their sum stays, and equal neighbours exchange none. `overflow`: mean electrons (rows, cols) -> the same after
     full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame, from none to all.
     `traps`: what fills in a frame and empties over the frames that follow. `trails`: what packets leave behind on their
-    way to the output; in even light each finds what it loses. `particles`: charge of single particles. `variance_e2`:
-    (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons (...) -> correlation (2, ...) of
+    way to the output; in even light each finds nearly all that it loses. `particles`: charge of single particles.
+    `variance_e2`: (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons (...) -> correlation (2, ...) of
     the shot noise with each of the two next pixels in the row, and of the two next in the column. `excess`: gain
     setting in dB -> factor on the shot noise's variance by a random multiplication of each electron, 1 and more.
     """
@@ -471,7 +471,7 @@ class Charge(State):
             frequency = np.fft.fftfreq(tile.shape[law.axis])
             along = law.otf(frequency, frequency, transfers)
             shaped = along[:, None] if law.axis == 0 else along[None, :]
-            tile = np.real(np.fft.ifft(np.fft.fft(tile, axis=law.axis) * shaped, axis=law.axis))
+            tile = law.steady_share * np.real(np.fft.ifft(np.fft.fft(tile, axis=law.axis) * shaped, axis=law.axis))
         return tile
 
     def excess_factor(self, gain_db: float) -> float:

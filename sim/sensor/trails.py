@@ -41,6 +41,12 @@ class Trails:
         """Return the number of transfers of lines 0 .. lines - 1, which may lie between two."""
         return np.asarray(line + 1.0 if self.output == "first" else lines - line)
 
+    @property
+    def steady_share(self) -> float:
+        """Share of even light that is read, far from the first lines: a packet finds what it loses, but for what
+        lies in the trail of the transfers that are still to come, the loss times the mean delay."""
+        return 1.0 - self.loss * sum(share / (1.0 - np.exp(-1.0 / release)) for share, release in self.releases)
+
     def clock(self, electrons: FloatArray) -> FloatArray:
         """Return the mean electrons (rows, cols) that are read, given those in the pixels.
 
