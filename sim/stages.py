@@ -352,9 +352,10 @@ class Charge(State):
     full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame, from none to all.
     `traps`: what fills in a frame and empties over the frames that follow. `trails`: what packets leave behind on their
     way to the output; in even light each finds nearly all that it loses. `particles`: charge of single particles.
-    `variance_e2`: (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons (...) -> correlation (2, ...) of
-    the shot noise with each of the two next pixels in the row, and of the two next in the column. `excess`: gain
-    setting in dB -> factor on the shot noise's variance by a random multiplication of each electron, 1 and more.
+    `variance_e2`: (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons
+    (...) -> correlation (2, ...) of the shot noise with each of the two next pixels in the row, and of the two next in
+    the column. `excess`: gain setting in dB -> factor on the shot noise's variance by a random multiplication of
+    each electron, 1 and more.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()
