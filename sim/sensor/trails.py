@@ -93,7 +93,7 @@ class Trails:
         """Return where a packet's charge ends up, (2 `TRAIL_PX` + 1, 1) of rows or (1, 2 `TRAIL_PX` + 1) of columns:
         what is released beyond is left out.
         """
-        frequency = np.fft.fftfreq(TRAIL_GRID)
+        frequency = np.asarray(np.fft.fftfreq(TRAIL_GRID), float)
         along = Trails(0, self.loss, self.releases, "first").otf(np.zeros(TRAIL_GRID), frequency, transfers)
         behind = np.real(np.fft.ifft(along))[: TRAIL_PX + 1]
         kernel = np.concatenate([np.zeros(TRAIL_PX), behind])
