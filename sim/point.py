@@ -113,7 +113,9 @@ class Blur:
         for kernel in self.kernels:
             value = value * kernel_otf(kernel, fx_cy_per_px, fy_cy_per_px)
         if self.moving and self.charge.trails:
-            value = value * self.charge.trail_otf(fx_cy_per_px, fy_cy_per_px, place_um)
+            value = cast(
+                "FloatArray | ComplexArray", value * self.charge.trail_otf(fx_cy_per_px, fy_cy_per_px, place_um)
+            )
         plane = mosaic.step(self.camera.cfa)  # filters on the chip run over each colour's plane
         for kernel in self.signal.filters:
             value = value * kernel_otf(kernel, plane * fx_cy_per_px, plane * fy_cy_per_px)

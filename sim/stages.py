@@ -471,10 +471,10 @@ class Charge(State):
         `trails` with as many transfers as in the frame's middle."""
         tile = electrons
         for law, transfers in zip(self.trails, self._transfers((0.0, 0.0)), strict=True):
-            frequency = np.fft.fftfreq(tile.shape[law.axis])
+            frequency = np.asarray(np.fft.fftfreq(tile.shape[law.axis]), float)
             along = law.otf(frequency, frequency, transfers)
             shaped = along[:, None] if law.axis == 0 else along[None, :]
-            tile = np.real(np.fft.ifft(np.fft.fft(tile, axis=law.axis) * shaped, axis=law.axis))
+            tile = law.steady_share * np.real(np.fft.ifft(np.fft.fft(tile, axis=law.axis) * shaped, axis=law.axis))
         return tile
 
     def excess_factor(self, gain_db: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal, Self
 
+import numpy as np
 from pydantic import Field
 
 from sim.camera import CameraModel
@@ -13,14 +14,17 @@ from sim.parameters import Quantity
 from sim.sensor.trails import Trails
 from sim.stages import Charge
 
-#: Release times that are tried first, in transfers.
-RELEASES_PX = (0.6, 4.0)
+#: Release time that is tried first, in transfers.
+RELEASE_PX = 1.5
 
 
 class ChargeTransferInefficiency(Effect):
     """Each transfer leaves the share `parallel_ppm` (of rows) or `serial_ppm` (of columns) of a packet behind, in
     proportion to it; traps release it by exp(-t / tau), t in transfers. Far from the output a pixel is transferred
     more often, so that its trail is longer in proportion. Traps of a second species take `slow_share` of it.
+
+    Traps take electrons one by one, so that the shot noise of what arrives is independent from pixel to pixel. Where
+    the same share of every packet lags behind, noise moves with it: neighbours share it (`noise`).
 
     The law of small packets, whose cloud grows with them: of traps that are always full, or of a cloud of constant
     volume, the loss isn't in proportion, and faint packets lose more.
@@ -70,6 +74,10 @@ class ChargeTransferInefficiency(Effect):
         Quantity("px", "time constant of that species' release, in transfers", lower=2.0, upper=1000.0, absent=20.0,
                  logarithmic=True, dispensable=True),
     ] = 20.0  # fmt: skip
+    noise: Annotated[
+        Literal["single electrons", "moves along"],
+        Field(description="shot noise of single electrons in traps, or of a share of every packet that lags behind"),
+    ] = "single electrons"
     first_row: Annotated[Literal["top", "bottom"], Field(description="end of the frame whose row is read first")] = (
         "top"
     )
@@ -84,11 +92,11 @@ class ChargeTransferInefficiency(Effect):
         ends = [(row, column) for row in ("top", "bottom") for column in ("left", "right")]
         return tuple(
             tuple(
-                cls.model_validate({"release_px": release, "serial_release_px": release, "first_row": row,
-                                    "first_column": column} | size)
+                cls.model_validate({"release_px": RELEASE_PX, "serial_release_px": RELEASE_PX, "first_row": row,
+                                    "first_column": column, "noise": noise} | size)
                 for size in ({"parallel_ppm": parallel_ppm}, {"serial_ppm": serial_ppm})
             )
-            for release in RELEASES_PX for row, column in ends
+            for noise in ("single electrons", "moves along") for row, column in ends
         )  # fmt: skip
 
     def _releases(self, release_px: float) -> tuple[tuple[float, float], ...]:
@@ -106,4 +114,27 @@ class ChargeTransferInefficiency(Effect):
             charge = charge.add_laws(
                 trails=Trails(1, 1e-6 * self.serial_ppm, self._releases(self.serial_release_px), output)
             )
+        if self.noise == "moves along":
+            charge = self._share_noise(charge)
         return charge
+
+    def _share_noise(self, charge: Charge) -> Charge:
+        """Return the charge's state with the frame's mean of what noise loses, and what the next pixels share of it.
+
+        A packet of which the share a lies in the next one has (1 - a)^2 + a^2 of the variance, and (1 - a) a of it in
+        common with either neighbour, to first order 1 - 2 a and a.
+        """
+        camera, shares = charge.camera, []
+        for ppm, release_px, lines in (
+            (self.serial_ppm, self.serial_release_px, camera.cols),
+            (self.parallel_ppm, self.release_px, camera.rows),
+        ):
+            lost = 1e-6 * ppm * 0.5 * (lines + 1.0)
+            beside = sum(share * (1.0 - np.exp(-1.0 / release)) for share, release in self._releases(release_px))
+            shares.append((min(lost, 0.4), min(lost, 0.4) * float(beside)))
+        lost_share = sum(lost for lost, _ in shares)
+        next_share = np.array([beside for _, beside in shares])
+        return charge.add_laws(
+            variance_e2=lambda electrons, variance_e2: variance_e2 * (1.0 - lost_share) ** 2,
+            correlation=lambda electrons: np.multiply.outer(next_share, np.ones(np.shape(electrons))),
+        )

@@ -41,6 +41,12 @@ class Trails:
         """Return the number of transfers of lines 0 .. lines - 1, which may lie between two."""
         return np.asarray(line + 1.0 if self.output == "first" else lines - line)
 
+    @property
+    def steady_share(self) -> float:
+        """Share of even light that is read, far from the first lines: a packet finds what it loses, but for what
+        lies in the trail of the transfers that are still to come, the loss times the mean delay."""
+        return 1.0 - self.loss * sum(share / (1.0 - np.exp(-1.0 / release)) for share, release in self.releases)
+
     def clock(self, electrons: FloatArray) -> FloatArray:
         """Return the mean electrons (rows, cols) that are read, given those in the pixels.
 
@@ -87,7 +93,7 @@ class Trails:
         """Return where a packet's charge ends up, (2 `TRAIL_PX` + 1, 1) of rows or (1, 2 `TRAIL_PX` + 1) of columns:
         what is released beyond is left out.
         """
-        frequency = np.fft.fftfreq(TRAIL_GRID)
+        frequency = np.asarray(np.fft.fftfreq(TRAIL_GRID), float)
         along = Trails(0, self.loss, self.releases, "first").otf(np.zeros(TRAIL_GRID), frequency, transfers)
         behind = np.real(np.fft.ifft(along))[: TRAIL_PX + 1]
         kernel = np.concatenate([np.zeros(TRAIL_PX), behind])
