@@ -169,9 +169,10 @@ class Quantisation:
 
     def std_of(self, residual: Array, fitted: int) -> float:
         """Return the standard deviation of the values about a profile, from their residuals (n,): the noise, and the
-        error of rounding. `fitted`: the number of parameters that were fitted to these values.
+        error of rounding. `fitted`: the number of parameters that were fitted to these values. Two more are allowed
+        for, so that 1 / variance, which weighs the samples, is unbiased.
         """
-        std = _robust_std(residual, self.size) * np.sqrt(len(residual) / max(len(residual) - fitted, 1))
+        std = _robust_std(residual, self.size) * np.sqrt(len(residual) / max(len(residual) - fitted - 2, 1))
         if not self.size:
             return float(std)
         return float(np.hypot(std, self.size * rounding_std_dn(self.frames * (std / self.size) ** 2)))
