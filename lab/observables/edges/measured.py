@@ -6,7 +6,7 @@ same one (`RecordingSet.summarised`). Statements on levels decide only whether a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 
@@ -42,8 +42,16 @@ def measure_edge(
     region = region or captures[0].region or edges_of(recordings, captures[0])[0].region
     _refuse_clipped(recordings, captures[0], noise, region)
     cfa = recordings.camera(captures[0].side).cfa
-    key = ("edge", tuple(c.frame for c in captures), region, tuple(sorted(phases(cfa)[channel])), step(cfa))
-    return recordings.once(key, lambda: _summarise(recordings, captures, cfa, channel, region), whatever_is_stated=True)
+    return recordings.once(
+        _key(captures, cfa, channel, region),
+        lambda: _summarise(recordings, captures, cfa, channel, region),
+        whatever_is_stated=True,
+    )
+
+
+def _key(captures: Sequence[EdgeCapture], cfa: Cfa, channel: str, region: Region) -> tuple[Hashable, ...]:
+    """Return all that a summary depends on."""
+    return "edge", tuple(c.frame for c in captures), region, tuple(sorted(phases(cfa)[channel])), step(cfa)
 
 
 def _summarise(
@@ -82,9 +90,17 @@ def _refuse_clipped(recordings: RecordingSet, capture: EdgeCapture, noise: Noise
 
 
 def edges_of(recordings: RecordingSet, capture: EdgeCapture) -> tuple[FoundEdge, ...]:
-    """Find the edges of the frame of a capture, those that can be used first; see `find_edges`."""
+    """Find the edges of the frame of a capture, those that can be used first; see `find_edges`. Their summaries are
+    those of `measure_edge`.
+    """
     camera = recordings.camera(capture.side)
-    key = ("edges", capture.frame, camera.cfa, camera.saturation_dn)
-    return recordings.once(
-        key, lambda: find_edges(recordings.frame(capture), camera.cfa, camera.saturation_dn), whatever_is_stated=True
-    )
+    frame, cfa, saturation_dn = capture.frame, camera.cfa, camera.saturation_dn
+
+    def find() -> tuple[FoundEdge, ...]:
+        found = find_edges(recordings.frame(capture), cfa, saturation_dn)
+        for edge in found:
+            key = _key([capture], cfa, "Y" if cfa == "MONO" else "G", edge.region)
+            recordings.once(key, lambda edge=edge: edge.summary, whatever_is_stated=True)
+        return found
+
+    return recordings.once(("edges", frame, cfa, saturation_dn), find, whatever_is_stated=True)

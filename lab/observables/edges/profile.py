@@ -68,16 +68,16 @@ GRID_PX = 0.05  # step of the grid of distances on which other profiles are give
 class EdgeSummary:
     """One edge in the pixels of one colour, in codes, with k spline coefficients and g gradients of the illumination.
 
-    `curve`: where it lies. `reach_px`: the largest distance of a sample from it. `samples`: their number. `spline`:
-    basis of the profile. `gram` (k + g + 1, k + g + 1): A^T W A, where A holds the columns of the spline, the
-    gradients and the values, which are 0 on the dark and 1 on the light side, and W the inverse variances of the
-    values. `inverse` (k + g, k + g): of the normal matrix with the prior of the line spread; it takes A^T W values to
-    the solution. `solution` (k + g,), its first k numbers the profile, and `covariance` (k, k) of these about the
-    truth. `right_side` (k + g, distances): the operator A^T W C that takes another profile, given at `grid_px`, to the
-    right side of the normal equations; C interpolates to the samples by cubics. `rounding` (waves, k + g): A^T W e for
-    the errors e that rounding to whole codes may leave, one standard deviation each. `levels`, `noise_std`: of the
-    dark and the light side, in codes. `residual_chi2_per_sample`: near 1 where edge, spline and noise explain the
-    region."""
+    `curve`: where it lies. `reach_px`: the largest distance of a sample from it; `samples`: their number. `spline`:
+    basis of the profile. `gram` (k + g + 1, k + g + 1): A^T W A, where A holds the columns of the spline, the gradients
+    and the values, which are 0 on the dark and 1 on the light side, and W the inverse variances of the values.
+    `inverse` (k + g, k + g): of the normal matrix with the prior of the line spread; it takes A^T W values to the
+    solution. `solution` (k + g,), its first k numbers the profile, and `covariance` (k, k) of these about the truth.
+    `right_side` (k + g, distances): the operator A^T W C that takes another profile, given at `grid_px`, to the right
+    side of the normal equations; C interpolates to the samples by cubics. `rounding` (waves, k + g): A^T W e for the
+    errors e that rounding to whole codes may leave, one standard deviation each. `levels`, `noise_std`: of the dark and
+    the light side, in codes. `residual_chi2_per_sample`: near 1 where edge, spline and noise explain the region.
+    """
 
     curve: EdgeCurve
     angle_deg: float
@@ -166,11 +166,13 @@ class Quantisation:
     size: float
     frames: int
 
-    def std_of(self, residual: Array, fitted: int) -> float:
+    def std_of(self, residual: Array, step: float, fitted: int) -> float:
         """Return the standard deviation of the values about a profile, from their residuals (n,): the noise, and the
-        error of rounding. `fitted`: the number of parameters that were fitted to these values.
+        error of rounding. `step`: the least difference of unequal values there. `fitted`: the number of parameters that
+        were fitted to these values. Two more are allowed for, so that 1 / variance, which weighs the samples, is
+        unbiased.
         """
-        std = _robust_std(residual, self.size) * np.sqrt(len(residual) / max(len(residual) - fitted, 1))
+        std = _robust_std(residual, max(step, self.size)) * np.sqrt(len(residual) / max(len(residual) - fitted - 2, 1))
         if not self.size:
             return float(std)
         return float(np.hypot(std, self.size * rounding_std_dn(self.frames * (std / self.size) ** 2)))
@@ -236,6 +238,7 @@ def _fit_profile(
     placed = SortedSamples.of(spline, distance)
     distance, foot, value = distance[placed.order], foot[placed.order], value[placed.order]
     dark_tail, light_tail = distance < -0.5 * inner, distance > 0.5 * inner
+    steps = [_step_of(samples.value[placed.order][tail]) for tail in (dark_tail, light_tail)]
     variance = np.ones_like(value)
     used = np.ones(len(value), dtype=bool)
     esf = np.clip(0.5 + distance, 0.0, 1.0)
@@ -259,8 +262,10 @@ def _fit_profile(
         esf = placed.values(solution[:size])
         residual = value - esf - solution[size:] @ gradients
         std_dark, std_light = (
-            noise_std / contrast if noise_std else quantisation.std_of(residual[tail] * contrast, fitted) / contrast
-            for tail in (dark_tail, light_tail)
+            noise_std / contrast
+            if noise_std
+            else quantisation.std_of(residual[tail] * contrast, step, fitted) / contrast
+            for tail, step in zip((dark_tail, light_tail), steps, strict=True)
         )
         variance = std_dark**2 + np.clip(esf, 0.0, 1.0) * (std_light**2 - std_dark**2) + STD_FLOOR**2
         used = np.abs(residual) < 6.0 * np.sqrt(variance) + 0.02
@@ -362,7 +367,14 @@ def _refuse_too_wide(spline: Spline, coefficients: Array, reach: float) -> None:
 
 def _refuse_clipped(light: Array, noise_std: float, contrast: float) -> None:
     """Raise `NotDetermined` where much of the light side is at its highest value although there is noise."""
-    values = np.unique(light)
-    step = float(np.diff(values).min()) if len(values) > 1 else 0.0
-    if noise_std > max(0.7 * step, 1e-4 * contrast) and float(np.mean(light == values[-1])) > 0.2:
-        raise NotDetermined("mtf", f"the edge's light side is clipped at {values[-1]:g}: expose it shorter")
+    highest = float(light.max())
+    if noise_std > max(0.7 * _step_of(light), 1e-4 * contrast) and float(np.mean(light == highest)) > 0.2:
+        raise NotDetermined("mtf", f"the edge's light side is clipped at {highest:g}: expose it shorter")
+
+
+def _step_of(values: Array) -> float:
+    """Return the least difference of unequal values, 0 where all are equal: pictures that were made linear have steps
+    that grow with the level.
+    """
+    different = np.unique(values)
+    return float(np.diff(different).min()) if len(different) > 1 else 0.0

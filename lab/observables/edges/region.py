@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from lab.errors import NotDetermined
+from lab.observables.codes.step import count_codes, step_of
 from lab.observables.edges.finding import Region, region_planes
-from lab.observables.edges.profile import summarise_edge
+from lab.observables.edges.profile import EdgeSummary, summarise_edge
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases
 from sim.sensor.mosaic import step as period
@@ -55,13 +56,15 @@ def check_phases(step: str, cfa: Cfa, channel: str, region: Region, angle_deg: f
 @dataclass(frozen=True)
 class FoundEdge:
     """An edge: a region (row0, col0, row1, col1) about its middle, its angle from the vertical, the length that is
-    used, and why it can't be used ("": it can), as it crosses less than a period of the samples.
+    used, why it can't be used ("": it can), as it crosses less than a period of the samples, and its summary in the
+    green (or only) channel.
     """
 
     region: Region
     angle_deg: float
     length_px: float
-    refused: str = ""
+    refused: str
+    summary: EdgeSummary
 
 
 def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None = None) -> tuple[FoundEdge, ...]:
@@ -73,7 +76,8 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
     the reason why they can't be used, after the others. Raises `NotDetermined` where none can be used, with the reason
     of the last one refused.
     """
-    values = np.asarray(frame, dtype=float)
+    recorded = np.asarray(frame)
+    values = recorded.astype(float)
     if values.ndim != 2 or not np.isfinite(values).all():
         raise NotDetermined("mtf", "the frame has to be two-dimensional and finite to find edges in it")
     step = period(cfa)
@@ -85,6 +89,7 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
     picture = ndimage.gaussian_filter(np.clip((binned - low) / (high - low), 0.0, 1.0), 1.0)
     lines = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(np.rint(255.0 * picture).astype(np.uint8))[0]
     channel = "Y" if cfa == "MONO" else "G"
+    code = step_of(count_codes(recorded)) if recorded.dtype == np.uint16 else 0.0
     found: list[FoundEdge] = []
     reason = "no straight line of 40 px or more stands out"
     segments = np.empty((0, 4)) if lines is None else lines.reshape(-1, 4) * step
@@ -116,7 +121,7 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
                 reason = f"the edge at row {middle[0]:.0f}, column {middle[1]:.0f} is saturated; expose it shorter"
                 continue
             try:
-                edge = summarise_edge(region_planes(values, region, cfa, channel))
+                edge = summarise_edge(region_planes(values, region, cfa, channel), code=code)
             except NotDetermined as refused:
                 reason = f"at row {middle[0]:.0f}, column {middle[1]:.0f}: {refused.reason}"
                 continue
@@ -127,7 +132,7 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
                 )
                 continue
             reason = _refusal(cfa, channel, region, edge.angle_deg)
-            found.append(FoundEdge(region, edge.angle_deg, float(share * lengths[index]), reason))
+            found.append(FoundEdge(region, edge.angle_deg, float(share * lengths[index]), reason, edge))
             break
     found.sort(key=lambda f: bool(f.refused))
     if not found or found[0].refused:
