@@ -88,6 +88,11 @@ class CaptureMeans:
     whole: Planes
     centre: Planes
 
+    @property
+    def mean_dn(self) -> float:
+        """Mean of the whole frame, DN."""
+        return ChannelMean(tuple(self.whole.values())).mean_dn
+
 
 def capture_means(recordings: RecordingSet, capture: Capture) -> CaptureMeans:
     """Return the means of a capture, taken once in a recording set."""

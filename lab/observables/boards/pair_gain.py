@@ -19,6 +19,7 @@ from lab.observables.boards.pairs import SIDES, StereoPair, board_pairs, needs_b
 from lab.observables.dataset import Study
 from lab.observables.flats.row_light import ROW_LIGHT, nuisances, row_light_variance
 from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.plane_means import capture_means
 from lab.observables.screens.cells import screen_block
 from sim.camera import Side
 from sim.effects.base import Effects
@@ -47,7 +48,7 @@ class _Darks:
     def __init__(self, study: Study, side: Side) -> None:
         frames = study.recordings.captures(DarkCapture, side)
         t = np.array([c.exposure_s for c in frames])
-        level = np.array([float(np.mean(study.recordings.frame(c))) for c in frames])
+        level = np.array([capture_means(study.recordings, c).mean_dn for c in frames])
         self._slope = 0.0
         if len(frames) and np.ptp(t) > 0:
             self._slope, self._black = (float(v) for v in np.polyfit(t, level, 1))
