@@ -354,10 +354,11 @@ class Charge(State):
     hold: their sum stays, and equal neighbours exchange none. `overflow`: mean electrons (rows, cols) -> the same after
     full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame, from none to all.
     `traps`: what fills in a frame and empties over the frames that follow. `trails`: what packets leave behind on their
-    way to the output; in even light each finds nearly all that it loses. `particles`: charge of single particles. `variance_e2`:
-    (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons (...) -> correlation (5, ...) of
-    the shot noise with each neighbour, by the kinds of `sim.sensor.electrons.NEIGHBOURS`. `excess`: gain setting in dB
-    -> factor on the shot noise's variance by a random multiplication of each electron, 1 and more.
+    way to the output; in even light each finds nearly all that it loses. `particles`: charge of single particles.
+    `variance_e2`: (mean electrons, shot noise's variance) -> variance. `correlation`: mean electrons (...) ->
+    correlation (5, ...) of the shot noise with each neighbour, by the kinds of `sim.sensor.electrons.NEIGHBOURS`.
+    `excess`: gain setting in dB -> factor on the shot noise's variance by a random multiplication of each electron, 1
+    and more.
     """
 
     exposure_s: tuple[Callable[[float], float], ...] = ()

@@ -51,15 +51,13 @@ from lab.observables.boards.calibration import (
 from lab.observables.boards.corner_fits import CornerFits
 from lab.observables.boards.corners import board_corners, channel_corners, plane_corners
 from lab.observables.boards.projection import CameraGeometry, grid, grid_points
+from lab.observables.boards.shift_fit import fit_shift
 from lab.observables.boards.views import MIN_CORNERS, BoardView
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 from sim.scene.projection import COUNT
 
 Array = NDArray[np.floating[Any]]
-HUBER_STD = 1.5  # standard deviations of a coordinate from which residuals lose weight
-MOST_ITERATIONS = 50
-
 LARGEST_WARP_STD = 0.5  # of the standard deviation of the prior; above it, the views don't determine a warp
 
 
@@ -84,19 +82,21 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
         trusted = np.concatenate([fits[channel].trusted & fits["G"].trusted for fits in corners])
         at = np.concatenate([fits[channel].points for fits in corners])
         green = np.concatenate([fits["G"].points for fits in corners])
-        own = _fit_shift(at - seen, jacobian, trusted)
-        beside = _fit_shift(at - green, jacobian, trusted) if channel != "G" else None
-        if own is None or (channel != "G" and beside is None):
+        if trusted.sum() < 4 * MIN_CORNERS:
             continue
-        theta = CameraGeometry(camera.projection, intrinsics + parameters @ own[0])
+        own = fit_shift((at - seen)[trusted], jacobian[trusted])
+        near = own.away_std < OUTLYING_CORNER_STD
+        theta = CameraGeometry(camera.projection, intrinsics + parameters @ own.values)
         result = ChannelGeometry(
             channel=channel,
             camera_matrix=theta.matrix.tolist(),
             distortion=theta.distortion.tolist(),
-            rms_px=own[2],
-            corners=int(own[3]),
+            rms_px=own.std_px * float(np.sqrt(np.mean(own.away_std[near] ** 2))),
+            corners=int(near.sum()),
         )
-        if beside is not None:
+        if channel != "G":
+            against_green = fit_shift((at - green)[trusted], jacobian[trusted])
+            values, covariance = against_green.values, against_green.covariance
             # Along the diagonal of the frame; the radial part hardly depends on the direction
             along = np.array([0.8, 0.6])
             line = camera.unproject(intrinsics[2:4] + radius[:, None] * along)
@@ -104,11 +104,13 @@ def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, Corne
             radial[:, 1:3] = 0.0  # a common shift of the frame isn't radial
             result = result.model_copy(
                 update={
-                    "centre_shift_px": tuple(beside[0][1:3].tolist()),
-                    "centre_shift_px_std": tuple(np.sqrt(np.diag(beside[1])[1:3]).tolist()),
+                    "centre_shift_px": tuple(values[1:3].tolist()),
+                    "centre_shift_px_std": tuple(np.sqrt(np.diag(covariance)[1:3]).tolist()),
                     "radius_px": tuple(radius.tolist()),
-                    "radial_shift_px": tuple((radial @ beside[0]).tolist()),
-                    "radial_shift_px_std": tuple(np.sqrt(np.einsum("ni,ij,nj->n", radial, beside[1], radial)).tolist()),
+                    "radial_shift_px": tuple((radial @ values).tolist()),
+                    "radial_shift_px_std": tuple(
+                        np.sqrt(np.einsum("ni,ij,nj->n", radial, covariance, radial)).tolist()
+                    ),
                 }
             )
         found.append(result)
@@ -122,42 +124,6 @@ def _colour_parameters(intrinsics: Array) -> Array:
     for column, row in ((1, 2), (2, 3), (3, 4), (4, 5)):
         parameters[row, column] = 1.0
     return parameters
-
-
-def _fit_shift(shift: Array, jacobian: Array, trusted: NDArray[np.bool_]) -> tuple[Array, Array, float, int] | None:
-    """Solve shift (n, 2) = jacobian (n, 2, p) values by robust least squares: Huber's, with the spread of the residuals
-    by their median.
-
-    Corners have errors by the demosaicing that aren't normal. Cut off at some residual, another set of them counts in
-    each session, and the values jump by more than their standard deviation; Huber's weights change smoothly. Returns
-    values (p,), covariance (p, p) by Huber's sandwich formula, rms (px) and number of corners, outliers left out; None
-    where too few corners are trusted.
-    """
-    if trusted.sum() < 4 * MIN_CORNERS:
-        return None
-    jacobian, shift = jacobian[trusted], shift[trusted]
-    scale = np.maximum(np.linalg.norm(jacobian, axis=(0, 1)), 1e-12)
-    design = jacobian / scale
-    weight = np.ones(len(shift))
-    values = np.zeros(len(scale))
-    for _ in range(MOST_ITERATIONS):
-        root, before = np.sqrt(weight)[:, None], values
-        weighted = (design * root[..., None]).reshape(-1, len(scale))
-        values = np.linalg.lstsq(weighted, (shift * root).ravel(), rcond=1e-12)[0]
-        rest = shift - design @ values
-        away = np.linalg.norm(rest, axis=1)
-        std = max(1.4826 * float(np.median(np.abs(rest))), 1e-6)
-        weight = np.minimum(1.0, HUBER_STD * std / np.maximum(away, 1e-12))
-        if np.max(np.abs(values - before)) < 1e-3 * std:  # the design's columns have norm 1: `std` is that of a value
-            break
-    # Beyond the bend, Huber's influence has no slope along the residual and that of its weight across
-    slope = np.where(weight < 1.0, 0.5 * weight, 1.0)
-    bread = np.linalg.pinv(np.einsum("n,nij,nik->jk", slope, design, design))
-    influence = np.einsum("n,nij,ni->nj", weight, design, rest)
-    freedom = len(shift) * 2 / max(len(shift) * 2 - len(values), 1)
-    covariance = freedom * bread @ (influence.T @ influence) @ bread / np.outer(scale, scale)
-    near = away < OUTLYING_CORNER_STD * std
-    return values / scale, covariance, float(np.sqrt(np.mean(away[near] ** 2))), int(near.sum())
 
 
 @one_blas_thread

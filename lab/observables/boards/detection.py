@@ -31,21 +31,35 @@ from lab.observables.boards.refinement import refine_corners
 from lab.observables.boards.views import MIN_CORNERS, BoardView, board_points, grid_steps
 
 Array = NDArray[np.floating[Any]]
+#: Largest difference of the planes' quantiles, of their contrast, at which a frame has no mosaic: a code or two of an
+#: 8-bit picture. Filters make planes differ by tens of per cent.
+EQUAL_LEVELS = 0.03
 
 
 def luminance(frame: NDArray[np.generic]) -> Array:
     """Level a frame (rows, cols), DN, of a black and white scene to one picture, 0 dark .. 1 light: each plane of the
-    2 x 2 cell between its 2 % and 98 % quantiles, whatever its colour is.
+    2 x 2 cell between its 2 % and 98 % quantiles, whatever its colour is. Where the planes' quantiles agree to
+    `EQUAL_LEVELS`, as of a sensor without a mosaic, it is levelled as a whole: their scatter would be a pattern.
     """
     picture = np.array(frame, dtype=float)
-    for row, col in CELLS:
-        picture[row::2, col::2] = levelled(picture[row::2, col::2])
+    planes = [picture[row::2, col::2] for row, col in CELLS]  # views of the picture
+    levels = np.array([quantiles(plane) for plane in planes])
+    if np.ptp(levels, axis=0).max() <= EQUAL_LEVELS * np.ptp(levels, axis=1).mean():
+        return levelled(picture)
+    for plane, between in zip(planes, levels, strict=True):
+        plane[:] = levelled(plane, between)
     return picture
 
 
-def levelled(plane: Array) -> Array:
-    """Level a plane (rows, cols), DN, of a black and white scene: its 2 % quantile to 0, its 98 % quantile to 1."""
-    low, high = np.quantile(plane, [0.02, 0.98])
+def quantiles(plane: Array) -> Array:
+    """Return the 2 % and 98 % quantiles of a plane (rows, cols), DN."""
+    return np.asarray(np.quantile(plane, [0.02, 0.98]))
+
+
+def levelled(plane: Array, between: Array | None = None) -> Array:
+    """Level a plane (rows, cols), DN: the first of the levels `between` (2,), DN, by default its `quantiles`, to 0, the
+    second to 1."""
+    low, high = quantiles(plane) if between is None else between
     return np.asarray((plane - low) / max(high - low, 1e-12))
 
 

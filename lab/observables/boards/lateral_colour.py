@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from lab.errors import NotDetermined
 from lab.observables.boards.corners import board_corners, channel_corners, plane_corners
 from lab.observables.boards.residuals import FEWEST_CORNERS
+from lab.observables.boards.shift_fit import fit_shift
 from lab.observables.boards.views import BoardView
 from lab.observables.colour_shift import COLOUR_FLOOR_PX, REFERENCE_NM, colour_shift_px, outward_shifts_px
 from lab.observables.dataset import Study
@@ -19,29 +19,63 @@ from lab.observables.observable import Block, Label, Measurement, Prediction
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 
-Array = NDArray[np.floating[Any]]
-
-COLOUR_VIEWS = 8  # of more views, evenly spaced ones are used, at least as many: every corner is fitted once a channel
+COLOUR_VIEWS = 8  # of more views, evenly spaced ones are used, at least as many: every corner is fitted once a plane
 COLOUR_RINGS = (0.3, 0.6, 1.0)  # outer radii of the rings, half diagonals; the last ring has no end
+LEAST_RADIUS = 0.05  # half diagonals: nearer to the middle, no direction is outwards
+
+
+@dataclass(frozen=True)
+class _Gaps:
+    """Displacements of n corners of one view, of one colour against another.
+
+    `radius` (n,), half diagonals; `unit` (n, 2): outwards; `gap` (n, 2), (x, y) px. `corner` (n,): of the view against
+    which they are displaced; gaps of different colours at one corner share the noise of that.
+    """
+
+    radius: FloatArray
+    unit: FloatArray
+    gap: FloatArray
+    corner: list[tuple[str, int]]
+
+    @staticmethod
+    def of(study: Study, view: BoardView, gap: FloatArray, use: NDArray[np.bool_]) -> _Gaps:
+        """Return those of the corners of `view` that `use` (n,) marks, without those near the middle."""
+        camera = study.camera
+        away = view.image_px - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
+        radius = np.hypot(*away.T) / camera.half_diagonal_px
+        use = use & (radius > LEAST_RADIUS)
+        unit = away[use] / (radius[use, None] * camera.half_diagonal_px)
+        corner = [(view.capture.id, int(number)) for number in view.index[use]]
+        return _Gaps(radius[use], unit, gap[use], corner)
 
 
 @dataclass(frozen=True)
 class _Shift:
-    """What is displaced from what: `table` of `_rings` of each view, and the captures of each.
+    """What is displaced from what: the gaps of each view, and the captures of each.
 
-    `pair`: wavelength (nm) and the one that it is held against, of pictures of one pose in light of one wavelength
+    `pair`: wavelength (nm) and the one that it is compared with, of pictures of one pose in light of one wavelength
     each; None: `channel` against green within pictures in white light.
     """
 
     channel: str
     pair: tuple[float, float] | None
-    tables: list[FloatArray]
+    gaps: list[_Gaps]
     captures: list[tuple[str, ...]]
 
     @property
     def condition(self) -> str:
         """The light in words."""
         return "white light" if self.pair is None else f"light of {self.pair[0]:g} nm against {self.pair[1]:g} nm"
+
+
+@dataclass(frozen=True)
+class _Ring:
+    """One ring: mean distance of its corners (half diagonals), their displacement outwards (px), and what each corner's
+    residual contributes to it (px), by corner."""
+
+    radius: float
+    outwards_px: float
+    influence: dict[tuple[str, int], float]
 
 
 def board_colour_block(study: Study) -> Block:
@@ -67,18 +101,19 @@ def board_colour_block(study: Study) -> Block:
             else "one channel or one wavelength: nothing to hold it against; take a pose in light of two wavelengths, "
             "under one `pose`",
         )
-    values, variances, labels, pairs = [], [], [], []
+    rings: list[_Ring] = []
+    labels: list[Label] = []
+    pairs: list[tuple[float, float] | None] = []
     for shift in shifts:
-        n = len(shift.tables)
+        n = len(shift.gaps)
         for held_out in (False, True):
             use = [i for i in range(n) if (i % 3 == 1 and n >= 3) == held_out]
             ids = tuple(name for i in use for name in shift.captures[i])
-            for r, value, variance in _rings(np.concatenate([shift.tables[i] for i in use] or [np.zeros((0, 6))])):
-                values.append(value)
-                variances.append(variance + COLOUR_FLOOR_PX**2)
-                labels.append(Label(r, shift.channel, shift.condition, ids, held_out))
+            for ring in _rings([shift.gaps[i] for i in use]):
+                rings.append(ring)
+                labels.append(Label(ring.radius, shift.channel, shift.condition, ids, held_out))
                 pairs.append(shift.pair)
-    if not values:
+    if not rings:
         raise NotDetermined("board_colour", "too few corners are clear in every colour")
 
     def predict(effects: Effects) -> Prediction:
@@ -92,9 +127,9 @@ def board_colour_block(study: Study) -> Block:
         return Prediction(mean, {})
 
     return Block(
-        measurement=BOARD_COLOUR, reach=0.5, value=np.array(values),
-        covariance=np.diag(variances), labels=tuple(labels), reads=frozenset({"image.shift"}), predict=predict,
-        scale=np.ones(len(values)),
+        measurement=BOARD_COLOUR, reach=0.5, value=np.array([ring.outwards_px for ring in rings]),
+        covariance=_covariance(rings) + np.diag(np.full(len(rings), COLOUR_FLOOR_PX**2)), labels=tuple(labels),
+        reads=frozenset({"image.shift"}), predict=predict, scale=np.ones(len(rings)),
     )  # fmt: skip
 
 
@@ -102,11 +137,11 @@ def _within_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
     """Of each channel but green, in pictures in white light."""
     views = views[:: max(1, len(views) // COLOUR_VIEWS)]
     found = {c: _Shift(c, None, [], []) for c in study.channels if c != "G"} if views else {}
-    for k, view in enumerate(views):
+    for view in views:
         fits = channel_corners(plane_corners(study.recordings, view), study.camera.cfa)
         for channel, shift in found.items():
             use = fits[channel].trusted & fits["G"].trusted
-            shift.tables.append(_table(study, view.image_px[use], (fits[channel].points - fits["G"].points)[use], k))
+            shift.gaps.append(_Gaps.of(study, view, fits[channel].points - fits["G"].points, use))
             shift.captures.append((view.capture.id,))
     return [*found.values()]
 
@@ -127,67 +162,54 @@ def _between_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
             pair = (wavelength_nm, reference_nm)
             shift = found.setdefault(pair, _Shift("Y", pair, [], []))
             _, own, of_other = np.intersect1d(view.index, other.index, return_indices=True)
-            gap = view.image_px[own] - other.image_px[of_other]
-            shift.tables.append(_table(study, other.image_px[of_other], gap, len(shift.tables)))
+            gap, seen = np.zeros(other.image_px.shape), np.zeros(len(other.index), bool)
+            gap[of_other], seen[of_other] = view.image_px[own] - other.image_px[of_other], True
+            shift.gaps.append(_Gaps.of(study, other, gap, seen))
             shift.captures.append((view.capture.id, other.capture.id))
     return [*found.values()]
 
 
-def _table(study: Study, place: Array, gap: Array, number: int) -> FloatArray:
-    """Return the `table` of `_rings` of one view, from places and displacements (n, 2), (x, y) px, without those near
-    the middle."""
-    camera = study.camera
-    half = camera.half_diagonal_px
-    away = place - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
-    radius = np.hypot(*away.T)
-    use = radius > 0.05 * half
-    unit = away[use] / radius[use, None]
-    return np.column_stack([radius[use] / half, unit, gap[use], np.full(int(use.sum()), number)])
+def _rings(gaps: Sequence[_Gaps]) -> list[_Ring]:
+    """Return the rings with corners enough.
 
-
-def _rings(table: FloatArray) -> list[tuple[float, float, float]]:
-    """Of each ring with corners enough: mean distance (half diagonals), outward displacement (px) and its variance
-    (px^2).
-
-    `table` (corners, 6): distance, outward unit vector (x, y), displacement (x, y) in px, number of the view. Least
-    squares of displacement = common shift + outward unit vector x displacement of the ring. The common shift, as of a
-    prism, is no lateral colour and isn't returned. Outliers beyond 6 robust standard deviations are left out. The
-    variance is the larger of that of independent corners and of the sandwich estimate clustered by view.
+    Robust least squares (`fit_shift`) of displacement = shift of the view + outward unit vector x displacement of the
+    ring. The shift of a view is no lateral colour and isn't returned: a prism shifts all views, and where a board is
+    aligned with the pixels, a plane's samples meet all its edges at one phase, which shifts the view by tenths of a px.
     """
-    if len(table) < 4 * FEWEST_CORNERS:
+    if sum(len(one.radius) for one in gaps) < 4 * FEWEST_CORNERS:
         return []
-    radius, unit, gap, view = table[:, 0], table[:, 1:3], table[:, 3:5], table[:, 5]
-
-    edges = (0.0, *COLOUR_RINGS[:-1], np.inf)
-    which = np.digitize(radius, edges[1:-1])
+    radius, unit, gap = (np.concatenate([getattr(one, name) for one in gaps]) for name in ("radius", "unit", "gap"))
+    corner = [key for one in gaps for key in one.corner]
+    which = np.digitize(radius, COLOUR_RINGS[:-1])
     used = [k for k in range(len(COLOUR_RINGS)) if (which == k).sum() >= FEWEST_CORNERS]
-    keep = np.isin(which, used)
-    columns = [
-        np.column_stack([np.ones(len(table)), np.zeros(len(table))]),
-        np.column_stack([np.zeros(len(table)), np.ones(len(table))]),
-    ]
-    columns += [np.where((which == k)[:, None], unit, 0.0) for k in used]
-    design = np.array([c[keep].ravel() for c in columns]).T
-    seen = gap[keep].ravel()
-    solution, *_ = np.linalg.lstsq(design, seen, rcond=None)
-    rest = seen - design @ solution
-    inside = np.abs(rest) < 6.0 * 1.4826 * float(np.median(np.abs(rest))) + 1e-9
-    solution, *_ = np.linalg.lstsq(design[inside], seen[inside], rcond=None)
-    rest = np.where(inside, seen - design @ solution, 0.0)
-    inverse = np.linalg.pinv(design[inside].T @ design[inside])
-    # corners of one view share errors
-    groups = np.repeat(view[keep], 2)
-    meat = np.zeros_like(inverse)
-    for k in np.unique(groups):
-        score = design[groups == k].T @ rest[groups == k]
-        meat += np.outer(score, score)
-    plain = float(np.mean(rest[inside] ** 2)) * inverse
-    spread = inverse @ meat @ inverse
-    found = []
+    keep = np.flatnonzero(np.isin(which, used))
+    jacobian = np.zeros((len(keep), 2, len(used) + 2 * len(gaps)))
     for i, k in enumerate(used):
-        at = 2 + i
-        found.append((float(radius[which == k].mean()), float(solution[at]), float(max(spread[at, at], plain[at, at]))))
-    return found
+        jacobian[:, :, i] = np.where((which == k)[:, None], unit, 0.0)[keep]
+    view = np.concatenate([np.full(len(one.radius), n) for n, one in enumerate(gaps)])[keep]
+    for way in (0, 1):
+        jacobian[np.arange(len(keep)), way, len(used) + 2 * view + way] = 1.0
+    fit = fit_shift(gap[keep], jacobian)
+    return [
+        _Ring(
+            float(radius[which == k].mean()),
+            float(fit.values[i]),
+            {corner[n]: float(fit.influence[m, i]) for m, n in enumerate(keep)},
+        )
+        for i, k in enumerate(used)
+    ]
+
+
+def _covariance(rings: Sequence[_Ring]) -> FloatArray:
+    """Covariance (n, n), px^2, of the rings' displacements: of independent corners, some of which several colours
+    share, enlarged where the corners of a view have errors in common, which a sandwich clustered by view shows."""
+    corners = list(dict.fromkeys(key for ring in rings for key in ring.influence))
+    influence = np.array([[ring.influence.get(key, 0.0) for key in corners] for ring in rings])
+    covariance = influence @ influence.T
+    views = np.array([name for name, _ in corners])
+    by_view = np.stack([influence[:, views == name].sum(axis=1) for name in dict.fromkeys(views)], axis=1)
+    larger = np.sqrt(np.maximum(np.sum(by_view**2, axis=1) / np.maximum(np.diag(covariance), 1e-300), 1.0))
+    return np.asarray(covariance * np.outer(larger, larger))
 
 
 BOARD_COLOUR = Measurement(

@@ -47,7 +47,7 @@ class _Darks:
     def __init__(self, study: Study, side: Side) -> None:
         frames = study.recordings.captures(DarkCapture, side)
         t = np.array([c.exposure_s for c in frames])
-        level = np.array([float(np.mean(study.recordings.frame(c))) for c in frames])
+        level = np.array([study.recordings.codes(c).every.mean_dn for c in frames])
         self._slope = 0.0
         if len(frames) and np.ptp(t) > 0:
             self._slope, self._black = (float(v) for v in np.polyfit(t, level, 1))

@@ -16,7 +16,6 @@ from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
 from lab.errors import NotDetermined
-from lab.observables.charts.patches import Surroundings, halo_light, harmonics
 from lab.observables.dataset import Study, held_out_of, mean_frame
 from lab.observables.observable import Block, Label, Measurement, Prediction
 from lab.observables.plane_means import channel_pixels

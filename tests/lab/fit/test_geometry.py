@@ -13,12 +13,13 @@ import pytest
 from scipy.special import erf
 
 from lab.errors import NotDetermined
-from lab.fit.geometry import _fit_shift, board_warps, channel_geometry, fit_geometry, geometry_result
+from lab.fit.geometry import board_warps, channel_geometry, fit_geometry, geometry_result
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import GeometryFit
 from lab.observables.boards.calibration import calibrate_robustly
 from lab.observables.boards.corner_fits import CornerFits, fit_corners
 from lab.observables.boards.detection import find_board, luminance
+from lab.observables.boards.shift_fit import fit_shift
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 
@@ -225,6 +226,6 @@ def test_corners_with_large_errors_move_the_shift_by_no_more_than_its_uncertaint
     jacobian[:, 0, 0], jacobian[:, 1, 0], jacobian[:, 0, 1], jacobian[:, 1, 2] = x, y, 1.0, 1.0
     same = np.zeros((300, 2))
     same[:75, 0] = rng.normal(0.05, 0.02, 75)
-    fits = [_fit_shift(same + rng.normal(0, 0.007, (300, 2)), jacobian, np.ones(300, bool)) for _ in range(60)]
-    spread = np.std([fit[0] for fit in fits], axis=0, ddof=1)
-    assert np.all(spread < 1.28 * np.mean([np.sqrt(np.diag(fit[1])) for fit in fits], axis=0))
+    fits = [fit_shift(same + rng.normal(0, 0.007, (300, 2)), jacobian) for _ in range(60)]
+    spread = np.std([fit.values for fit in fits], axis=0, ddof=1)
+    assert np.all(spread < 1.28 * np.mean([np.sqrt(np.diag(fit.covariance)) for fit in fits], axis=0))
