@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from lab.errors import NotDetermined
-from lab.observables.codes.step import count_codes, step_of
+from lab.formats.recording_set import FrameCodes
+from lab.observables.codes.step import step_of
 from lab.observables.edges.finding import Region, region_planes
 from lab.observables.edges.profile import EdgeSummary, summarise_edge
 from sim.camera import Cfa
@@ -89,7 +90,7 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
     picture = ndimage.gaussian_filter(np.clip((binned - low) / (high - low), 0.0, 1.0), 1.0)
     lines = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(np.rint(255.0 * picture).astype(np.uint8))[0]
     channel = "Y" if cfa == "MONO" else "G"
-    code = step_of(count_codes(recorded)) if recorded.dtype == np.uint16 else 0.0
+    code = step_of(FrameCodes.count(recorded).every) if recorded.dtype == np.uint16 else 0.0
     found: list[FoundEdge] = []
     reason = "no straight line of 40 px or more stands out"
     segments = np.empty((0, 4)) if lines is None else lines.reshape(-1, 4) * step
