@@ -11,6 +11,7 @@ from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.parameters import Quantity
+from sim.sensor.electrons import NEIGHBOURS
 from sim.sensor.trails import Trails
 from sim.stages import Charge
 
@@ -133,7 +134,8 @@ class ChargeTransferInefficiency(Effect):
             beside = sum(share * (1.0 - np.exp(-1.0 / release)) for share, release in self._releases(release_px))
             shares.append((min(lost, 0.4), min(lost, 0.4) * float(beside)))
         lost_share = sum(lost for lost, _ in shares)
-        next_share = np.array([beside for _, beside in shares])
+        next_share = np.zeros(len(NEIGHBOURS))  # of further ones to first order none
+        next_share[:2] = [beside for _, beside in shares]
         return charge.add_laws(
             variance_e2=lambda electrons, variance_e2: variance_e2 * (1.0 - lost_share) ** 2,
             correlation=lambda electrons: np.multiply.outer(next_share, np.ones(np.shape(electrons))),
