@@ -6,8 +6,8 @@ normal equations of this fit, the sums over the samples that predict their right
 profile itself. Two readings are made of it: the MTF under the prior of the line spread (`mtf.py`), and the transfer
 function at a few frequencies with the covariance of its noise (`transfer.py`).
 
-A summary is in codes of the frames. No black level, exposure or f-number enters it: the levels of both sides and a
-gradient of the illumination on each side are free.
+A summary is in codes of the frames. No black level, exposure or f-number enters it: the levels of both sides are free,
+and so are gradients of the illumination.
 """
 
 from __future__ import annotations
@@ -239,6 +239,7 @@ def _fit_profile(
     distance, foot, value = distance[placed.order], foot[placed.order], value[placed.order]
     dark_tail, light_tail = distance < -0.5 * inner, distance > 0.5 * inner
     steps = [_step_of(samples.value[placed.order][tail]) for tail in (dark_tail, light_tail)]
+    tied = _one_gradient(size, room, max(dark_level, 0.0) / contrast)
     variance = np.ones_like(value)
     used = np.ones(len(value), dtype=bool)
     esf = np.clip(0.5 + distance, 0.0, 1.0)
@@ -251,12 +252,12 @@ def _fit_profile(
         if pass_number == 0:
             bridged = matrix.copy()
             bridged[:size, :size] += spline.roughness(ROUGHNESS_SHARE * np.trace(matrix[:size, :size]) / size)
-            inverse = np.linalg.inv(bridged)
+            inverse = tied @ np.linalg.inv(tied.T @ bridged @ tied) @ tied.T
         else:
             priors = LineSpreadPriors.of(spline, solution[:size], width, outer)
-            inverse, covariance, start = posterior(
-                priors, matrix, right, start, LOG_LIKELIHOOD_RANGE if pass_number == PASSES - 1 else 0.0
-            )
+            log_range = LOG_LIKELIHOOD_RANGE if pass_number == PASSES - 1 else 0.0
+            inverse, covariance, start = posterior(priors, tied.T @ matrix @ tied, tied.T @ right, start, log_range)
+            inverse, covariance = tied @ inverse @ tied.T, tied @ covariance @ tied.T
         solution = inverse @ right
         fitted = 1 + len(gradients) // 2  # of a side: its level, and gradients
         esf = placed.values(solution[:size])
@@ -295,6 +296,22 @@ def _fit_profile(
         noise_std=(std_dark * contrast, std_light * contrast),
         residual_chi2_per_sample=float((weight * residual**2).sum() / freedom),
     )
+
+
+def _one_gradient(size: int, room: bool, dark_share: float) -> Array:
+    """Return the matrix (k + g, k + g / 2) that ties the gradients of the light that the edge adds and of that which
+    both sides have, `dark_share` of the contrast, as all light has one gradient. `size`: k; `room`: whether there is
+    one across the edge.
+
+    All codes of the dark side count as light: a black level of a tenth of the contrast makes its gradient wrong by a
+    tenth of the light side's.
+    """
+    directions = 2 if room else 1
+    tied = np.zeros((size + 2 * directions, size + directions))
+    tied[:size, :size] = np.eye(size)
+    for k in range(directions):
+        tied[size + 2 * k : size + 2 * k + 2, size + k] = 1.0, dark_share
+    return tied
 
 
 def _knots_px(width: float, reach: float, step: int) -> Array:
