@@ -89,8 +89,8 @@ class Drawn:
     "cfa", ["MONO", "GBRG", *(pytest.param(c, marks=pytest.mark.slow) for c in ("RGGB", "GRBG", "BGGR"))]
 )
 def test_the_numbers_of_the_least_region_are_unbiased_and_their_covariance_is_true(cfa: str, bits: int) -> None:
-    """chi2 of n numbers is n within three standard deviations: sqrt(2 n) of normal numbers, and those of the variance of
-    each edge's noise, sqrt(2 / 120) of some 120 samples beside it. The means of m whitened edges are normal with a
+    """chi2 of n numbers is n within three standard deviations: sqrt(2 n) of normal numbers, and those of the variance
+    of each edge's noise, sqrt(2 / 120) of some 120 samples beside it. The means of m whitened edges are normal with a
     variance of 1 / m: of 17 numbers, chi2 is 17 + 3 sqrt(34) at most."""
     block = edge_block(Drawn(cfa, bits, LEAST_PX[cfa]).study())
     n = len(block.value)
