@@ -166,13 +166,12 @@ class Quantisation:
     size: float
     frames: int
 
-    def std_of(self, residual: Array, step: float, fitted: int) -> float:
-        """Return the standard deviation of the values about a profile, from their residuals (n,): the noise, and the
-        error of rounding. `step`: the least difference of unequal values there. `fitted`: the number of parameters that
-        were fitted to these values. Two more are allowed for, so that 1 / variance, which weighs the samples, is
-        unbiased.
+    def std_of(self, residual: Array, step: float) -> float:
+        """Return the standard deviation of the values about a profile, from their residuals (n,) on one side: the
+        noise, and the error of rounding. `step`: the least difference of unequal values there. The level and two
+        gradients are fitted; two more are allowed for, so that 1 / variance, which weighs the samples, is unbiased.
         """
-        std = _robust_std(residual, max(step, self.size)) * np.sqrt(len(residual) / max(len(residual) - fitted - 2, 1))
+        std = _robust_std(residual, max(step, self.size)) * np.sqrt(len(residual) / max(len(residual) - 5, 1))
         if not self.size:
             return float(std)
         return float(np.hypot(std, self.size * rounding_std_dn(self.frames * (std / self.size) ** 2)))
@@ -240,8 +239,7 @@ def _fit_profile(
     dark_tail, light_tail = distance < -0.5 * inner, distance > 0.5 * inner
     steps = [_step_of(samples.value[placed.order][tail]) for tail in (dark_tail, light_tail)]
     tied = _one_gradient(size, room, max(dark_level, 0.0) / contrast)
-    variance = np.ones_like(value)
-    used = np.ones(len(value), dtype=bool)
+    variance, used = np.ones_like(value), np.ones(len(value), dtype=bool)
     esf = np.clip(0.5 + distance, 0.0, 1.0)
     start, solution = (1, 1, 3, 0), np.zeros(size)
     for pass_number in range(PASSES):
@@ -259,13 +257,10 @@ def _fit_profile(
             inverse, covariance, start = posterior(priors, tied.T @ matrix @ tied, tied.T @ right, start, log_range)
             inverse, covariance = tied @ inverse @ tied.T, tied @ covariance @ tied.T
         solution = inverse @ right
-        fitted = 1 + len(gradients) // 2  # of a side: its level, and gradients
         esf = placed.values(solution[:size])
         residual = value - esf - solution[size:] @ gradients
         std_dark, std_light = (
-            noise_std / contrast
-            if noise_std
-            else quantisation.std_of(residual[tail] * contrast, step, fitted) / contrast
+            noise_std / contrast if noise_std else quantisation.std_of(residual[tail] * contrast, step) / contrast
             for tail, step in zip((dark_tail, light_tail), steps, strict=True)
         )
         variance = std_dark**2 + np.clip(esf, 0.0, 1.0) * (std_light**2 - std_dark**2) + STD_FLOOR**2
@@ -278,7 +273,6 @@ def _fit_profile(
     weighted = np.array(waves).reshape(-1, len(value)) * (weight / contrast)
     rounding = np.concatenate([weighted @ spline.design(distance), weighted @ gradients.T], axis=1)
     moved = rounding @ inverse[:size].T
-    freedom = max(np.count_nonzero(used) - len(solution) - len(edge.poly), 1)
     return EdgeSummary(
         curve=edge,
         angle_deg=angle_from_vertical_deg(edge.tilt, edge.transposed),
@@ -294,7 +288,8 @@ def _fit_profile(
         rounding=rounding,
         levels=(dark_level, light_level),
         noise_std=(std_dark * contrast, std_light * contrast),
-        residual_chi2_per_sample=float((weight * residual**2).sum() / freedom),
+        residual_chi2_per_sample=float((weight * residual**2).sum())
+        / max(np.count_nonzero(used) - len(solution) - len(edge.poly), 1),
     )
 
 
