@@ -7,6 +7,8 @@ same one (`RecordingSet.summarised`). Statements on levels decide only whether a
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from functools import partial
+from operator import attrgetter
 
 import numpy as np
 
@@ -98,7 +100,7 @@ def edges_of(recordings: RecordingSet, capture: EdgeCapture) -> tuple[FoundEdge,
         found = find_edges(recordings.frame(capture), cfa, saturation_dn)
         for edge in found:
             key = _key([capture], cfa, "Y" if cfa == "MONO" else "G", edge.region)
-            recordings.summarised(key, lambda edge=edge: edge.summary)
+            recordings.summarised(key, partial(attrgetter("summary"), edge))
         return found
 
     return recordings.summarised(("edges", frame, cfa, saturation_dn), find)

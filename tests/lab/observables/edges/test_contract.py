@@ -116,8 +116,9 @@ def test_a_prediction_is_what_the_estimator_reports_of_the_mean_frame(cfa: str, 
     for capture, mean in zip(study.recordings.captures(SlantedEdgeCapture), drawn.means, strict=True):
         for channel in study.channels:
             # weights as of a noisy frame
-            summary = summarise_edge(region_planes(mean, capture.region, cfa, channel), noise_std=2.0)
-            edges.append(SideEdge((capture,), channel, summary, False, capture.region, 0.0))
+            region = (0, 0, size, size)
+            summary = summarise_edge(region_planes(mean, region, drawn.camera.cfa, channel), noise_std=2.0)
+            edges.append(SideEdge((capture,), channel, summary, False, region, 0.0))
     predicted = PredictedEdges(study, edges, drawn.camera)
     np.testing.assert_allclose(predicted.value, predicted.predict(()), atol=3.0 * EDGE_FLOOR)
 
@@ -161,7 +162,7 @@ def test_no_statement_enters_the_numbers(of_camera: dict[str, Any], of_edges: di
         recordings = drawn.recordings(document)
         camera = camera_model(recordings, "left", None, maker_curves=True)
         values.append(edge_block(Study(recordings, "left", camera)).value)
-    np.testing.assert_array_equal(*values)
+    np.testing.assert_array_equal(values[0], values[1])
 
 
 @pytest.mark.parametrize(("cfa", "other"), [("GRBG", "GBRG"), ("RGGB", "BGGR")])
