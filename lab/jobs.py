@@ -410,7 +410,7 @@ class JobRunner:
         return self.job(job_id)
 
     def wait(self, job_id: str, timeout_s: float | None = None) -> JobInfo:
-        """Block until a job is over, or for so long at most."""
+        """Observable until a job is over, or for so long at most."""
         until = None if timeout_s is None else time.monotonic() + timeout_s
         while not (info := self.job(job_id)).is_over:
             if until is not None and time.monotonic() > until:

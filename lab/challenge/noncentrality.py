@@ -22,7 +22,7 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.observable import measurements
 from sim.effects.library import candidates
 from sim.spectrum import FloatArray
@@ -165,14 +165,14 @@ TwoDraws = Sequence[MeasurementModel | None]
 
 def summaries(recordings: RecordingSet) -> MeasurementModel | None:
     """Return the summaries of a single camera's recordings; None where no measurement is determined."""
-    study = Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+    dataset = Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
     blocks = []
     for measurement in measurements():
         try:
-            blocks.append(measurement.make(study))
+            blocks.append(measurement.make(dataset))
         except NotDetermined:
             continue
-    return MeasurementModel(tuple(blocks), study.camera) if blocks else None
+    return MeasurementModel(tuple(blocks), dataset.camera) if blocks else None
 
 
 def _keys(found: MeasurementModel) -> list[Hashable]:

@@ -16,7 +16,7 @@ from lab.diagnose.discovery import Superseded, discover, law_of, superseded, tol
 from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.side_model import measurement_model, study_of
+from lab.diagnose.inference.side_model import dataset_of, measurement_model
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.outcome.goodness_of_fit import (
@@ -50,7 +50,7 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisLists, FitResult, HeldOut, Mismatch, Skipped
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.flats.linearity import PHOTON_TRANSFER
 from lab.workers import Workers
 from sim.camera import Side
@@ -100,16 +100,16 @@ class SideFindings:
 
 def _measure(
     recordings: RecordingSet, side: Side, fit: FitResult | None, baseline: CameraFile | None
-) -> tuple[Study, MeasurementModel | None, tuple[Skipped, ...]]:
-    """Measure a side and free the frames, as the search looks at none. Returns the study, the measurement model (None
+) -> tuple[Dataset, MeasurementModel | None, tuple[Skipped, ...]]:
+    """Measure a side and free the frames, as the search looks at none. Returns the dataset, the measurement model (None
     where nothing can be measured), and the measurements that the recordings don't determine."""
-    study = study_of(recordings, side, fit, baseline)
-    model, skipped = measurement_model(recordings, side, fit, baseline, study)
+    dataset = dataset_of(recordings, side, fit, baseline)
+    model, skipped = measurement_model(recordings, side, fit, baseline, dataset)
     skipped = (*skipped, *unchecked(recordings, side))
-    for one in (recordings, study.recordings):
+    for one in (recordings, dataset.recordings):
         one.let_go()
     return_freed_memory()
-    return study, model, skipped
+    return dataset, model, skipped
 
 
 def diagnose_side(
@@ -137,7 +137,7 @@ def diagnose_side(
     report("summarising the recordings")
     if recordings is not given:
         given.let_go()
-    study, model, skipped = _measure(recordings, side, fit, baseline)
+    dataset, model, skipped = _measure(recordings, side, fit, baseline)
     if model is None:
         return SideFindings(side, DiagnosisLists(skipped=skipped, unexplained=wrong))
     rng = np.random.default_rng(SEED)
@@ -154,17 +154,17 @@ def diagnose_side(
     verdict = decide(model, rng, policy, report, least_threshold=least)
     withdrawn: dict[str, Superseded] = {}
     report("looking for laws that no effect has")
-    discovered = discover(study, (*model.always, *verdict.effects), policy, verdict)
+    discovered = discover(dataset, (*model.always, *verdict.effects), policy, verdict)
     for _ in range(MOST_WITHDRAWN):
-        lost = superseded(study, verdict, discovered, policy)
+        lost = superseded(dataset, verdict, discovered, policy)
         if not lost:
             break
         withdrawn |= lost
         names = tuple(name for one in withdrawn.values() for name in one.names)
         verdict = decide(model, rng, policy, report, least_threshold=least, without=names)
-        discovered = discover(study, (*model.always, *verdict.effects), policy, verdict)
+        discovered = discover(dataset, (*model.always, *verdict.effects), policy, verdict)
     report("looking for the next capture")
-    laws = tuple(law_of(one, study) for one in discovered)
+    laws = tuple(law_of(one, dataset) for one in discovered)
     by_laws = described(verdict, discovered, laws, policy)
     smooth = left_to_smooth(verdict, by_laws)
     improved, corrections = improved_model(recordings, side, fit, baseline, model, verdict.effects, smooth)
@@ -200,7 +200,7 @@ def diagnose_side(
             mismatches=tuple(found),
             unexplained=left,
             vetoed=(*vetoed_names(side, verdict), *(one.told(side, model) for one in withdrawn.values())),
-            discovered=told(side, study, discovered),
+            discovered=told(side, dataset, discovered),
             models=() if models is None else (models,),
             places=tuple(places(side, verdict, policy)),
             measurements=tuple(measurement_fits(side, verdict)),

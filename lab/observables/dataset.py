@@ -1,4 +1,4 @@
-"""The study of one side of a recording set: frames summarised once, and what several measurements need of them."""
+"""A dataset: one side of a recording set, its frames summarised once, with what several observables share."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class Levels:
     whole: dict[str, float]  # DN, clipped or not
 
 
-class Study:
-    """One side of a recording set, from which measurements are made. What they share is computed once.
+class Dataset:
+    """One side of a recording set, from which observables are measured. What they share is computed once.
 
     `camera`: the baseline; its gain, black level, dark current, read noise and full well are those of the noise fit, or
     first estimates where there is none (`noise_figures`). `saturation_dn`: code from which on pixels clip (None:
@@ -175,7 +175,7 @@ class Study:
 
     # --- what several measurements share ---
 
-    def once(self, make: Callable[[Study], T]) -> T:
+    def once(self, make: Callable[[Dataset], T]) -> T:
         """`make(self)`, computed once. Where it raised NotDetermined, that is raised again."""
         if make not in self._made:
             try:
@@ -289,22 +289,22 @@ def mean_frame(recordings: RecordingSet, captures: Sequence[Capture]) -> FloatAr
     return total / len(captures)
 
 
-def clipping_level_dn(study: Study) -> float:
+def clipping_level_dn(dataset: Dataset) -> float:
     """Code (DN) from which on a pixel counts as clipped: the converter's highest, or less where the full well is
     reached before it.
 
     Pixels at full well have no shot noise. A plane is taken to be there where its 97, 99 and 99.9 % quantiles lie
     closer together than a third of their distance by shot noise.
     """
-    white = study.camera.white_level_dn
-    gain = study.stated.conversion_gain_dn_per_e
-    black = study.stated.black_level_dn or 0.0
+    white = dataset.camera.white_level_dn
+    gain = dataset.stated.conversion_gain_dn_per_e
+    black = dataset.stated.black_level_dn or 0.0
     piles = []
     for kind in ("flat", "narrowband", "white"):
-        for capture in study.recordings.captures(kind, study.side):
-            codes = study.recordings.codes(capture)
-            for channel in study.channels:
-                counts = codes.of_channel(study.camera.cfa, channel)[0]
+        for capture in dataset.recordings.captures(kind, dataset.side):
+            codes = dataset.recordings.codes(capture)
+            for channel in dataset.channels:
+                counts = codes.of_channel(dataset.camera.cfa, channel)[0]
                 if counts.highest_dn < 0.25 * white:
                     continue
                 middle, high, top = counts.quantiles([0.97, 0.99, 0.999])
@@ -333,11 +333,11 @@ def held_out_of(group: Sequence[Capture], index: int, groups: int) -> set[str]:
     return {group[0].id} if groups >= 3 and index % 3 == 1 else set()
 
 
-def held_out_flats(study: Study) -> frozenset[str]:
+def held_out_flats(dataset: Dataset) -> frozenset[str]:
     """Ids of held-out flats: the last third of a level's repeats where it has six or more, as temporal noise needs
     pairs. Of other levels, every third from the darkest on, never the brightest."""
-    groups = study.flat_levels()
-    size = {id(g): float(np.mean(list(study.levels(g[0]).whole.values()))) for g in groups}
+    groups = dataset.flat_levels()
+    size = {id(g): float(np.mean(list(dataset.levels(g[0]).whole.values()))) for g in groups}
     out: set[str] = set()
     for rank, group in enumerate(sorted(groups, key=lambda g: size[id(g)])):
         if len(group) >= 6:

@@ -21,11 +21,11 @@ from sim.effects.library import may_change
 from sim.spectrum import FloatArray
 
 if TYPE_CHECKING:
-    from lab.observables.dataset import Study
+    from lab.observables.dataset import Dataset
 
 
-#: `Block.reach` of measurements by ln(level): a departure from linearity may change over a factor of exp(0.8) = 2.2 in
-#: level.
+#: `Observable.reach` of measurements by ln(level): a departure from linearity may change over a factor of exp(0.8) =
+#: 2.2 in level.
 LEVEL_REACH = 0.8
 
 
@@ -33,7 +33,7 @@ LEVEL_REACH = 0.8
 class Measurement:
     """The declaration of a measurement in its module, where `lab.observables.observable` finds it.
 
-    `make` takes the `Study` of a side and returns the measured numbers. It raises NotDetermined where the recordings
+    `make` takes the `Dataset` of a side and returns the measured numbers. It raises NotDetermined where the recordings
     don't determine them.
     """
 
@@ -44,7 +44,7 @@ class Measurement:
     order: int
     axis: str  # quantity of `Label.x`
     unit: str  # of the axis
-    make: Callable[[Study], Block]
+    make: Callable[[Dataset], Observable]
     quantity: str  # what the numbers are, with their unit: the ordinate of the report's curves
     #: Whether the numbers are levels of frames, which lie between 0 and the white level.
     is_level: bool = False
@@ -88,7 +88,7 @@ class Label:
 
 
 @dataclass(frozen=True)
-class Block:
+class Observable:
     """The n numbers of one measurement: values, covariance of their noise, labels, and the prediction for given
     effects."""
 

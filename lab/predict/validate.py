@@ -32,7 +32,7 @@ from lab.formats.results import (
 )
 from lab.observables.charts.patches import Patch as PatchLevel
 from lab.observables.charts.patches import patch_covariance, patch_levels
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.edges.measured import measure_edge
 from lab.observables.edges.mtf import EdgeMtf, read_mtf
 from lab.observables.gaussian import chi2
@@ -128,8 +128,8 @@ def _charts(
         raise NotDetermined("colorchecker", "the sensitivities weren't fitted: capture narrowband light")
     if fit.noise is None or fit.noise.conversion_gain_dn_per_e is None:
         raise NotDetermined("colorchecker", "the conversion gain wasn't fitted: capture flats in repeats")
-    study = Study(recordings, side, model, fitted=fit.noise)
-    points = patch_levels(study)
+    dataset = Dataset(recordings, side, model, fitted=fit.noise)
+    points = patch_levels(dataset)
     if not points:
         raise NotDetermined("colorchecker", "no unclipped patches of a ColorChecker24")
     by_capture: dict[tuple[str, ...], list[PatchLevel]] = {}
@@ -138,12 +138,12 @@ def _charts(
     checks = []
     for captures, members in by_capture.items():
         tell(captures[0])
-        checks.append(_chart(study, side, model, effects, captures, members))
+        checks.append(_chart(dataset, side, model, effects, captures, members))
     return checks
 
 
 def _chart(
-    study: Study,
+    dataset: Dataset,
     side: Side,
     model: CameraModel,
     effects: Sequence[Effect],
@@ -152,7 +152,7 @@ def _chart(
 ) -> Check:
     known = reflectances(points[0].captures[0].chart)
     exposure = points[0].captures[0].exposure_s
-    light = study.spectrum(points[0].captures[0].radiance)
+    light = dataset.spectrum(points[0].captures[0].radiance)
     gain, black = model.conversion_gain_dn_per_e, model.black_level_dn
     dark = model.dark_current_e_per_s * exposure
     predicted, spread = np.empty(len(points)), np.empty(len(points))
@@ -163,7 +163,7 @@ def _chart(
         predicted[i] = float(Uniform(model, effects).response(electrons)) * gain
         spread[i] = _curve_std(model, p.channel, light.arrays[0]) * rate * exposure * fall_off * gain
     measured = np.array([p.level for p in points]) - black
-    covariance = patch_covariance(study, points, np.maximum(measured - dark * gain, 0.1))
+    covariance = patch_covariance(dataset, points, np.maximum(measured - dark * gain, 0.1))
     channel = np.array([p.channel for p in points])
     # the error of a fitted curve is common to all patches of a channel, that of the light to all patches
     covariance += (channel[:, None] == channel) * np.outer(spread, spread) + LIGHT_STD**2 * np.outer(
@@ -173,7 +173,7 @@ def _chart(
     noise = np.sqrt(
         np.array(
             [
-                (gain * max(m, 0.0) + study.noise.read_dn**2) / p.pixels / len(p.captures)
+                (gain * max(m, 0.0) + dataset.noise.read_dn**2) / p.pixels / len(p.captures)
                 for m, p in zip(measured, points, strict=True)
             ]
         )

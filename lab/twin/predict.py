@@ -28,12 +28,12 @@ from lab.observables.charts.chart import CHART
 from lab.observables.charts.patches import reflectance_covariance
 from lab.observables.codes.rounding import QUANTISATION_DN2
 from lab.observables.darks.level import DARK, added_dark_e_per_s
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.edges.slanted_edge import ASIDE, SLANTED_EDGE
 from lab.observables.flats.linearity import PHOTON_TRANSFER, misstated_levels
 from lab.observables.flats.noise import GAIN_STD, NOISE, READ_STD, shot_variance
 from lab.observables.noise.figures import BLACK_FLOOR_DN, USUAL_LAMP, NoiseFigures
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.one_blas_thread import one_blas_thread
 from lab.twin.changes import Changes, carried, doubling_std_c, reference_temperature_c
 from lab.twin.relative_light import RelativeLight, rates_per_dose, relative_light
@@ -127,20 +127,20 @@ def posterior_of(content: CameraFile) -> ModelPosterior:
 
 
 def measured_blocks(
-    study: Study, quantities: tuple[Measurement, ...] = QUANTITIES
-) -> tuple[list[Block], list[Skipped]]:
+    dataset: Dataset, quantities: tuple[Measurement, ...] = QUANTITIES
+) -> tuple[list[Observable], list[Skipped]]:
     """Return the blocks that the recordings determine, with the numbers that a twin predicts, and why others are
     missing."""
     blocks, skipped = [], []
     for measurement in quantities:
         try:
-            blocks.append(measurement.make(study))
+            blocks.append(measurement.make(dataset))
         except NotDetermined as refused:
-            skipped.append(Skipped(step=f"twin {refused.step}", reason=refused.reason, side=study.side))
+            skipped.append(Skipped(step=f"twin {refused.step}", reason=refused.reason, side=dataset.side))
     return blocks, skipped
 
 
-def is_predicted(block: Block, label: Label) -> bool:
+def is_predicted(block: Observable, label: Label) -> bool:
     """Return whether a twin predicts a block's number: transfer functions by their real parts up to Nyquist, all else
     wholly."""
     return block.measurement is not SLANTED_EDGE or (
@@ -163,35 +163,35 @@ def _side(
         check_sensor(content, fitted.camera(side), fitted.source)
         noise_fit = fit_recording_set(fitted, steps=NOISE_STEP).cameras.get(side)
         misstated = frozenset(id for level in misstated_levels(noise_fit) for id in level.captures)
-        light = relative_light(_study(content, posterior, fitted, side, misstated)[0], content.effects, posterior)
+        light = relative_light(_dataset(content, posterior, fitted, side, misstated)[0], content.effects, posterior)
     session = future_session(content, plan, side, changes, dn_per_photon=None if light is None else light.dn_per_dose())
     captures = session.captures(side=side)
-    study, growth_std = _study(content, posterior, session, side)
-    blocks, skipped = measured_blocks(study, QUANTITIES if light is None else (*QUANTITIES, PHOTON_TRANSFER))
+    dataset, growth_std = _dataset(content, posterior, session, side)
+    blocks, skipped = measured_blocks(dataset, QUANTITIES if light is None else (*QUANTITIES, PHOTON_TRANSFER))
     if not blocks:
         raise InputError(
             f"{plan.source}: nothing can be predicted ({skipped[0].reason}); plan other captures or changes"
         )
-    model = MeasurementModel(tuple(blocks), study.camera, gain_is_known=True, noise=study.noise)
+    model = MeasurementModel(tuple(blocks), dataset.camera, gain_is_known=True, noise=dataset.noise)
     effects = content.effects
     for block in blocks:
         if light is not None and block.measurement is PHOTON_TRANSFER:
-            light = light.about(rates_per_dose(study, block))
+            light = light.about(rates_per_dose(dataset, block))
     unnamed = effects_at_f_number(with_unnamed(effects, posterior), fitted_f_number, content.camera.lens.f_number)
-    mean, covariance = _distribution(model, study, effects, unnamed, posterior, growth_std, light_std, light)
+    mean, covariance = _distribution(model, dataset, effects, unnamed, posterior, growth_std, light_std, light)
     use = np.array([is_predicted(b, label) for b in blocks for label in b.labels])
     is_level = np.array([b.measurement.is_level for b in blocks for _ in b.labels])
-    full = is_level & (mean > HIGHEST_SHARE * study.saturation_dn)
+    full = is_level & (mean > HIGHEST_SHARE * dataset.saturation_dn)
     if full.any():
         reason = (
-            f"{full.sum()} levels are above {100 * HIGHEST_SHARE:g} % of saturation, {study.saturation_dn:.4g} DN: "
+            f"{full.sum()} levels are above {100 * HIGHEST_SHARE:g} % of saturation, {dataset.saturation_dn:.4g} DN: "
             "plan shorter exposures"
         )
         skipped.append(Skipped(step="twin saturation", reason=reason, side=side))
         use &= ~full
     names = _names(model, content, posterior, fitted_f_number, mean, use)
     kept = covariance[np.ix_(use, use)]
-    numbers = [n for n, used in zip(_numbers(study, model, effects, mean, covariance), use, strict=True) if used]
+    numbers = [n for n, used in zip(_numbers(dataset, model, effects, mean, covariance), use, strict=True) if used]
     lens = content.camera.lens
     return SidePrediction(
         camera=session.camera(side),
@@ -254,14 +254,14 @@ def _names(
     return tuple(found)
 
 
-def _study(
+def _dataset(
     content: CameraFile,
     posterior: ModelPosterior,
     session: RecordingSet,
     side: Side,
     misstated: frozenset[str] = frozenset(),
-) -> tuple[Study, float]:
-    """Return the study of the session to come, whose figures are the model's; and the relative standard deviation of
+) -> tuple[Dataset, float]:
+    """Return the dataset of the session to come, whose figures are the model's; and the relative standard deviation of
     its dark current by the camera's own doubling temperature."""
     camera, first = content.camera, posterior.first
     captures: list[Capture] = session.captures(side=side)
@@ -295,12 +295,12 @@ def _study(
         }
     )
     clipped = camera.black_level_dn + NEAR_FULL * camera.full_well_e * gain
-    return Study(session, side, seen, clipped, misstated, noise=noise), growth_std
+    return Dataset(session, side, seen, clipped, misstated, noise=noise), growth_std
 
 
 def _distribution(
     model: MeasurementModel,
-    study: Study,
+    dataset: Dataset,
     effects: Effects,
     acting: Effects,
     posterior: ModelPosterior,
@@ -327,7 +327,7 @@ def _distribution(
             variance = (model.noise.gain * charge_dn + model.noise.read_dn**2) / (camera.rows * camera.cols)
             covariance[at, at] += np.diag(variance)
         if block.measurement is NOISE:
-            _hold_what_is_corrected(columns, at, block, model, study, acting, len(effects))
+            _hold_what_is_corrected(columns, at, block, model, dataset, acting, len(effects))
             variance = model.mean(effects)[at]
             signal_e = np.array([label.x for label in block.labels]) / model.camera.conversion_gain_dn_per_e
             for correction in _corrections(effects):
@@ -368,22 +368,27 @@ def _corrections(effects: Effects) -> list[ModelDiscrepancy]:
 
 
 def _hold_what_is_corrected(
-    columns: dict[str, FloatArray], at: slice, block: Block, model: MeasurementModel, study: Study, acting: Effects,
+    columns: dict[str, FloatArray],
+    at: slice,
+    block: Observable,
+    model: MeasurementModel,
+    dataset: Dataset,
+    acting: Effects,
     named: int,
-) -> None:  # fmt: skip
+) -> None:
     """Take from `columns`, the derivatives by the laws beyond the first `named` of `acting`, what a correction of the
     variances holds of them already: it was read from variances in which they acted. What is left is their change from
     the nearest level that it knows."""
-    gain = study.noise.gain
+    gain = dataset.noise.gain
     signal_dn = np.array([label.x for label in block.labels])
     for correction in _corrections(acting):
         nearest_dn = np.clip(signal_dn, gain * correction.at[0], gain * correction.at[-1])
 
         def there(effects: Effects, dn: FloatArray = nearest_dn) -> Prediction:
-            shot_dn2 = shot_variance(study, dn, np.full(len(dn), gain), effects)
-            return Prediction(shot_dn2 + study.noise.read_dn**2, {})
+            shot_dn2 = shot_variance(dataset, dn, np.full(len(dn), gain), effects)
+            return Prediction(shot_dn2 + dataset.noise.read_dn**2, {})
 
-        held = MeasurementModel((replace(block, predict=there),), study.camera)
+        held = MeasurementModel((replace(block, predict=there),), dataset.camera)
         coords = [c for c in coordinates(acting, model.camera) if c.index >= named]
         share = model.mean(acting)[at] / held.mean(acting)
         for c, column in zip(coords, effect_jacobian(held, acting, coords).T, strict=True):
@@ -424,14 +429,14 @@ def _forms(model: MeasurementModel, effects: Effects) -> FloatArray:
     return np.asarray(sum((np.outer(c, c) for c in columns), np.zeros((len(model.value),) * 2)))
 
 
-def _without_nuisances(block: Block) -> Block:
+def _without_nuisances(block: Observable) -> Observable:
     def bare(effects: Effects) -> Prediction:
         return Prediction(block.predict(effects).mean, {})
 
     return replace(block, predict=bare)
 
 
-def _patch_columns(block: Block, at: slice, size: int) -> dict[str, FloatArray]:
+def _patch_columns(block: Observable, at: slice, size: int) -> dict[str, FloatArray]:
     """Derivatives (size,) of all numbers by the patches' relative reflectances, by name."""
     found: dict[str, FloatArray] = {}
     for row, label in enumerate(block.labels):
@@ -441,10 +446,10 @@ def _patch_columns(block: Block, at: slice, size: int) -> dict[str, FloatArray]:
 
 
 def _numbers(
-    study: Study, model: MeasurementModel, effects: Effects, mean: FloatArray, covariance: FloatArray
+    dataset: Dataset, model: MeasurementModel, effects: Effects, mean: FloatArray, covariance: FloatArray
 ) -> list[PredictedNumber]:
     """Every number, with how it follows exposure, temperature and level."""
-    noise, more, offset = study.noise, added_dark_e_per_s(study, effects), study.offset(effects)
+    noise, more, offset = dataset.noise, added_dark_e_per_s(dataset, effects), dataset.offset(effects)
     found = []
     for block, at in zip(model.blocks, model.slices, strict=True):
         name = block.measurement.name
@@ -452,11 +457,11 @@ def _numbers(
         slope = np.zeros(len(levels))
         if block.measurement is NOISE:
             gains, step = np.full(len(levels), noise.gain), 0.01 * levels
-            ends = [shot_variance(study, levels + sign * step, gains, effects) for sign in (1.0, -1.0)]
+            ends = [shot_variance(dataset, levels + sign * step, gains, effects) for sign in (1.0, -1.0)]
             slope = (ends[0] - ends[1]) / (2.0 * step)
         for k, label in enumerate(block.labels):
             value, std = float(mean[at][k]), float(np.sqrt(covariance[at.start + k, at.start + k]))
-            capture = study.recordings.capture(label.captures[0])
+            capture = dataset.recordings.capture(label.captures[0])
             update: dict[str, float | None] = {"fixed": value}
             if block.measurement is NOISE:
                 update |= {"level_dn": float(levels[k]), "level_slope": float(slope[k])}

@@ -21,9 +21,9 @@ from lab.diagnose.inference.refit import coordinates
 from lab.diagnose.outcome.model_posterior import coordinate_name, effect_jacobian, with_unnamed
 from lab.errors import InputError, NotDetermined
 from lab.formats.model_posterior import ModelPosterior
-from lab.observables.dataset import Study
-from lab.observables.flats.linearity import linearity_block, reading
-from lab.observables.observable import Block
+from lab.observables.dataset import Dataset
+from lab.observables.flats.linearity import measure_photon_transfer, reading
+from lab.observables.observable import Observable
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import electron_rate
@@ -64,19 +64,19 @@ class RelativeLight:
         return RelativeLight(dict(per_dose), value, self.parameters, self.by[at] * ratio[:, None], covariance)
 
 
-def relative_light(study: Study, effects: Effects, posterior: ModelPosterior) -> RelativeLight:
-    """Return the light of the flats of `study`, the recordings that the model was fitted to, about whose figures it is
-    linear.
+def relative_light(dataset: Dataset, effects: Effects, posterior: ModelPosterior) -> RelativeLight:
+    """Return the light of the flats of `dataset`, the recordings that the model was fitted to, about whose figures it
+    is linear.
 
     Raises InputError where their levels can't be compared.
     """
     try:
-        block = linearity_block(study)
+        block = measure_photon_transfer(dataset)
     except NotDetermined as refused:
         raise InputError(
-            f"--fitted {study.recordings.source}: {refused.reason}; give the fitted recordings"
+            f"--fitted {dataset.recordings.source}: {refused.reason}; give the fitted recordings"
         ) from refused
-    model = MeasurementModel((block,), study.camera, gain_is_known=True, noise=study.noise)
+    model = MeasurementModel((block,), dataset.camera, gain_is_known=True, noise=dataset.noise)
     columns = dict(model.nuisance_jacobian(effects))
     rates = {name: columns.pop(name) for name in [*columns] if name.startswith(RATE)}
     acting = with_unnamed(effects, posterior)
@@ -96,13 +96,13 @@ def relative_light(study: Study, effects: Effects, posterior: ModelPosterior) ->
     covariance = np.asarray(np.linalg.inv(weighted @ of_rates), float)
     value = covariance @ weighted @ (block.value - model.mean(effects) - jacobian @ mean)
     return RelativeLight(
-        rates_per_dose(study, block), value, tuple(known), -covariance @ weighted @ jacobian, covariance
+        rates_per_dose(dataset, block), value, tuple(known), -covariance @ weighted @ jacobian, covariance
     )
 
 
-def rates_per_dose(study: Study, block: Block) -> dict[str, float]:
+def rates_per_dose(dataset: Dataset, block: Observable) -> dict[str, float]:
     """DN for a unit of dose, in the baseline's linear response, by the name of each rate."""
-    dose = doses(study, block)
+    dose = doses(dataset, block)
     found = {}
     for name, column in block.predict(()).jacobian.items():
         if name.startswith(RATE) and column.any():
@@ -111,15 +111,15 @@ def rates_per_dose(study: Study, block: Block) -> dict[str, float]:
     return found
 
 
-def doses(study: Study, block: Block) -> FloatArray:
+def doses(dataset: Dataset, block: Observable) -> FloatArray:
     """Dose (n,) of the flats' means: photons a pixel, or electrons by the stated radiance and curves."""
     found = []
     for label in block.labels:
-        capture = study.recordings.capture(label.captures[0])
-        light = reading(study, capture)  # type: ignore[arg-type]
+        capture = dataset.recordings.capture(label.captures[0])
+        light = reading(dataset, capture)  # type: ignore[arg-type]
         assert light is not None  # the block leaves out flats without it
         rate = light.photons_per_s
         if light.path is not None:
-            rate = electron_rate(study.camera, label.channel, study.spectrum(light.path))
+            rate = electron_rate(dataset.camera, label.channel, dataset.spectrum(light.path))
         found.append(rate * capture.exposure_s)
     return np.array(found)

@@ -14,7 +14,7 @@ from lab.errors import InputError
 from lab.formats.camera_file import lens_cache, traced_table
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.flats.linearity import PHOTON_TRANSFER
 from lab.observables.gaussian import chi2
 from lab.observables.observable import Label, measurement_title
@@ -167,9 +167,9 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
     parts: dict[str, float] = {}
     for side, prediction in sealed.sides.items():
         camera = _camera(sealed, side)
-        study = Study(_with_curves(recordings, prediction, camera, side), side, camera)
+        dataset = Dataset(_with_curves(recordings, prediction, camera, side), side, camera)
         wanted = {number.quantity for number in prediction.numbers}
-        blocks, left_out = measured_blocks(study, tuple(m for m in SCORED if m.name in wanted))
+        blocks, left_out = measured_blocks(dataset, tuple(m for m in SCORED if m.name in wanted))
         skipped += left_out
         measured = {
             _key(b.measurement.name, label): (float(v), label.x)

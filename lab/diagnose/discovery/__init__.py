@@ -59,7 +59,7 @@ from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import DiscoveredLaw, VetoedName
 from lab.observables.codes.density import WIDEST
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from sim.camera import Side
 from sim.effects.base import Effects
 from sim.effects.empirical_law import PLACES, EmpiricalLaw
@@ -90,7 +90,7 @@ EQUAL_LENGTH = 6.0
 
 
 def discover(
-    study: Study, effects: Effects, policy: DecisionPolicy, left: Verdict | None = None
+    dataset: Dataset, effects: Effects, policy: DecisionPolicy, left: Verdict | None = None
 ) -> tuple[PredictiveTable, ...]:
     """Find laws that hold in what they weren't taken from, the most significant first; see the package.
 
@@ -101,35 +101,35 @@ def discover(
     every: list[float] = []
     named = frozenset().union(*(list_changes(effect) for effect in effects))
     while len(found) < MOST_LAWS:
-        acting = (*effects, *(law_of(one, study) for one in found))
-        looks = [look for look in index_looks(study, acting) if not any(_is_at(look, one.look) for one in found)]
+        acting = (*effects, *(law_of(one, dataset) for one in found))
+        looks = [look for look in index_looks(dataset, acting) if not any(_is_at(look, one.look) for one in found)]
         tables = [_fitted(look, _index_forms(look)) for look in looks]
         every = [_likeliest(own) for own in tables]
         limit = _limit(every, policy)
         beside = _of_each_place(
             one
             for one in _told(looks, tables, limit, policy)
-            if not named & list_changes(law_of(one, study)) or _exceeds_tolerance(one, policy)
+            if not named & list_changes(law_of(one, dataset)) or _exceeds_tolerance(one, policy)
         )
         if not beside:
             break
         found.append(min(beside, key=lambda one: one.log_probability))
     if left is not None:
-        found = [_with_parity(study, left.model, left.effects, one) for one in found]
-        found += _curves(study, left, found, every, policy)
+        found = [_with_parity(dataset, left.model, left.effects, one) for one in found]
+        found += _curves(dataset, left, found, every, policy)
     return tuple(sorted(found, key=lambda one: one.log_probability))
 
 
-def _with_parity(study: Study, model: MeasurementModel, effects: Effects, one: PredictiveTable) -> PredictiveTable:
+def _with_parity(dataset: Dataset, model: MeasurementModel, effects: Effects, one: PredictiveTable) -> PredictiveTable:
     """Return a table of sensitivities by lines of a mosaic with the difference of even and odd lines that the two
     greens tell, where they do. Within a plane of the mosaic it can't be seen, as all its pixels have one parity."""
     look = one.look
     count = look.columns or one.period
-    if look.stage != "charge" or mosaic.step(study.camera.cfa) == 1 or not one.period or count % 2 or one.form.first:
+    if look.stage != "charge" or mosaic.step(dataset.camera.cfa) == 1 or not one.period or count % 2 or one.form.first:
         return one
     parity = np.resize([1.0, -1.0], one.period)
     even, odd = (
-        model.gaussian((*effects, law_of(replace(one, departure=one.departure + size * parity), study)))
+        model.gaussian((*effects, law_of(replace(one, departure=one.departure + size * parity), dataset)))
         for size in (0.0, PARITY)
     )
     seen = model.seen
@@ -367,7 +367,7 @@ def _of_each_place(found: Iterable[PredictiveTable]) -> list[PredictiveTable]:
 
 
 def _curves(
-    study: Study,
+    dataset: Dataset,
     left: Verdict,
     found: Sequence[PredictiveTable],
     tried: Sequence[float],
@@ -377,9 +377,9 @@ def _curves(
     """Find laws along coordinates of what is mismatched, the one that describes most first, and others beside it."""
     laws: list[PredictiveTable] = []
     while len(laws) < most:
-        acting = (*left.effects, *(law_of(one, study) for one in (*found, *laws)))
+        acting = (*left.effects, *(law_of(one, dataset) for one in (*found, *laws)))
         located = _located(left.model, acting, policy)
-        looks = list(curve_looks(left.model, study, acting, located, every=not located))
+        looks = list(curve_looks(left.model, dataset, acting, located, every=not located))
         tables = [_fitted(look, _curve_forms(look)) for look in looks]
         every = [*tried, *(_likeliest(own) for own in tables)]
         limit = _limit(every, policy)
@@ -471,7 +471,7 @@ class Superseded:
 
 
 def superseded(
-    study: Study, verdict: Verdict, found: Sequence[PredictiveTable], policy: DecisionPolicy
+    dataset: Dataset, verdict: Verdict, found: Sequence[PredictiveTable], policy: DecisionPolicy
 ) -> dict[str, Superseded]:
     """Return the named effects in whose place a discovered law predicts more, by name.
 
@@ -486,23 +486,23 @@ def superseded(
     for candidate in verdict.named:
         name, others = candidate.effect.name, tuple(e for e in effects if e is not candidate.effect)
         changed = list_changes(candidate.effect)
-        rivals = [one for one in found if changed & list_changes(law_of(one, study))]
+        rivals = [one for one in found if changed & list_changes(law_of(one, dataset))]
         if candidate.members:
             rivals = [one for one in rivals if one.look.stage == "codes" and one.period]
         if not rivals and (candidate.members or candidate.probability > policy.unrivalled_probability):
             continue
         left = replace(verdict, named=tuple(c for c in verdict.named if c is not candidate), after=(), held_out=())
-        again = discover(study, (*model.always, *others), policy)
+        again = discover(dataset, (*model.always, *others), policy)
         beside = [one for one in again if any(_is_at(one.look, rival.look) for rival in rivals)]
-        elsewhere = [] if rivals else [*again, *_curves(study, left, (), (), policy, most=1)]
+        elsewhere = [] if rivals else [*again, *_curves(dataset, left, (), (), policy, most=1)]
         elsewhere = [
             one
             for one in elsewhere
             if not any(_is_at(one.look, other.look) for other in found)
-            and (one.look.stage == "codes" or not changed & list_changes(law_of(one, study)))
+            and (one.look.stage == "codes" or not changed & list_changes(law_of(one, dataset)))
         ]
-        for law in (*(_with_parity(study, model, others, one) for one in beside), *elsewhere):
-            with_law = (*others, law_of(law, study))
+        for law in (*(_with_parity(dataset, model, others, one) for one in beside), *elsewhere):
+            with_law = (*others, law_of(law, dataset))
             # a law that is there anyway: the name has to earn its own number
             allowed = policy.parameter_log_odds if rivals and not candidate.members else 0.0
             least = -allowed if allowed else policy.superseding_chi2 + 2.0 * law.form.numbers
@@ -523,11 +523,11 @@ def _chi2_of(model: MeasurementModel, effects: Effects) -> tuple[float, float]:
 # --- as a result, and as an effect ---
 
 
-def told(side: Side, study: Study, found: Sequence[PredictiveTable]) -> tuple[DiscoveredLaw, ...]:
+def told(side: Side, dataset: Dataset, found: Sequence[PredictiveTable]) -> tuple[DiscoveredLaw, ...]:
     """Put discovered laws into results: the law as it stands in a camera file, its chi2, and sentences."""
     laws = []
     for one in found:
-        shortest, law = (*one.shorter, one)[0], law_of(one, study)
+        shortest, law = (*one.shorter, one)[0], law_of(one, dataset)
         # of a table by code, the codes that were counted
         shown = slice(law.first, law.first + len(law.table)) if shortest.form.name == "by index" else slice(None)
         laws.append(
@@ -559,15 +559,15 @@ def told(side: Side, study: Study, found: Sequence[PredictiveTable]) -> tuple[Di
     return tuple(laws)
 
 
-def law_of(found: PredictiveTable, study: Study) -> EmpiricalLaw:
+def law_of(found: PredictiveTable, dataset: Dataset) -> EmpiricalLaw:
     """Return the law as an effect that acts on its stage, in its units."""
     look, none = found.look, PLACES[found.look.stage, found.look.along, found.look.of][1]
     first, at, table = found.form.first, np.array(look.at), np.array(found.departure)
     if look.of != "mean" and none == 0.0:  # added to the read noise, of which the least entry has none
-        scale = 1.0 / study.noise.gain**2 if look.along == "time" else study.camera.read_noise_e**2
+        scale = 1.0 / dataset.noise.gain**2 if look.along == "time" else dataset.camera.read_noise_e**2
         table = (table - table.min()) * scale
     elif none == 0.0 and not look.along.endswith("level") and (not look.at or entry_unit(look).startswith("DN")):
-        table = table / study.noise.gain
+        table = table / dataset.noise.gain
     elif none == 1.0:
         table = np.maximum(1.0 + table, LEAST_WIDTH)
         if not look.at:

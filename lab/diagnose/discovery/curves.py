@@ -13,9 +13,9 @@ from scipy.linalg import cholesky, solve_triangular
 
 from lab.diagnose.discovery.profile import Look, Profile
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.gaussian import ROUNDING
-from lab.observables.observable import Block
+from lab.observables.observable import Observable
 from sim.effects.base import Effects
 from sim.effects.empirical_law import PLACES, Along, EmpiricalLaw, Of, Stage
 from sim.effects.library import list_changes
@@ -48,7 +48,7 @@ AXES: dict[Along, str] = {"level": "level", "wavelength": "wavelength", "frequen
 
 
 def curve_looks(
-    model: MeasurementModel, study: Study, effects: Effects, located: Sequence[int], *, every: bool = False
+    model: MeasurementModel, dataset: Dataset, effects: Effects, located: Sequence[int], *, every: bool = False
 ) -> Iterator[Look]:
     """Yield a look for every coordinate along which a law could change the `located` blocks, beside `effects`. `every`:
     look at all blocks, but not for narrow bands of transmittance.
@@ -57,7 +57,7 @@ def curve_looks(
     """
     places = tuple(place for place in CURVES if not (every and place == BANDS))
     at = range(len(model.blocks)) if every else located
-    points_of = {place: _points(model, study, place, at) for place in places}
+    points_of = {place: _points(model, dataset, place, at) for place in places}
     points = {place: found for place, found in points_of.items() if len(found[1]) >= LEAST_POINTS}
     if not points or model.seen.all() or not model.seen.any():
         return
@@ -98,7 +98,7 @@ def _profile(white: FloatArray) -> Profile:
 
 
 def _points(
-    model: MeasurementModel, study: Study, place: tuple[Stage, Along, Of], located: Sequence[int]
+    model: MeasurementModel, dataset: Dataset, place: tuple[Stage, Along, Of], located: Sequence[int]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the points of a curve, and those of them that seen numbers lie at: places of the numbers of the located
     blocks that a law there could change.
@@ -110,7 +110,7 @@ def _points(
         block = model.blocks[i]
         if not block.reads & changed:
             continue
-        x = _coordinate(block, study, along)
+        x = _coordinate(block, dataset, along)
         there = np.isfinite(x)
         every.append(x[there])
         seen.append(x[there & model.seen[model.slices[i]]])
@@ -126,7 +126,7 @@ def _points(
     return points, known
 
 
-def _coordinate(block: Block, study: Study, along: Along) -> FloatArray:
+def _coordinate(block: Observable, dataset: Dataset, along: Along) -> FloatArray:
     """Return where a block's numbers lie along a coordinate (n,); NaN where it isn't one of theirs."""
     none = np.full(len(block.labels), np.nan)
     axis = block.measurement.axis
@@ -135,16 +135,16 @@ def _coordinate(block: Block, study: Study, along: Along) -> FloatArray:
         if axis != AXES[along] or block.measurement.places:
             return none
         if along == "level":  # variances are stated by signals above black
-            x = (x if block.measurement.of_variances else x - study.noise.black) / study.noise.gain
-        return x / study.camera.pixel_pitch_um if along == "frequency" else x
+            x = (x if block.measurement.of_variances else x - dataset.noise.black) / dataset.noise.gain
+        return x / dataset.camera.pixel_pitch_um if along == "frequency" else x
     if along == "radius":
         place = block.position
         return 1e3 * np.hypot(*place.T) if axis == "field" and place.ndim == 2 else none
-    captures = {c.id: c for c in study.recordings.captures(side=study.side)}
+    captures = {c.id: c for c in dataset.recordings.captures(side=dataset.side)}
     for k, label in enumerate(block.labels):
         if len(label.captures) == 1:
             capture = captures[label.captures[0]]
-            none[k] = capture.exposure_s if along == "exposure" else study.elapsed_s(capture)
+            none[k] = capture.exposure_s if along == "exposure" else dataset.elapsed_s(capture)
     return none
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lab.errors import NotDetermined
 from lab.observables.darks.frames import DarkCondition, conditions, usual_conditions
 from lab.observables.darks.readout import MOST_FRAMES, dark_readout
-from lab.observables.dataset import Study, held_out_flats, held_out_of
+from lab.observables.dataset import Dataset, held_out_flats, held_out_of
 from lab.observables.flats.field import LEAST_SIGNAL, dark_level_dn, flats
 from lab.observables.noise.figures import CLIP, robust_std
 from sim.sensor import mosaic
@@ -85,44 +85,44 @@ def _pixels_alone(away: Image, step_dn: float = 1.0) -> Image:
     return clipped
 
 
-def dark_images(study: Study) -> dict[bool, DarkImages]:
+def dark_images(dataset: Dataset) -> dict[bool, DarkImages]:
     """Return the images of dark frames at the usual temperature; none without dark captures."""
     try:
-        every = conditions(study)
+        every = conditions(dataset)
     except NotDetermined:
         return {}
-    sums = [(one.exposure_s, _summed(study, one)) for one in usual_conditions(study, every)]
+    sums = [(one.exposure_s, _summed(dataset, one)) for one in usual_conditions(dataset, every)]
     found = {}
     for out in (False, True):
         mine = [(exposure_s, own[out]) for exposure_s, own in sums if own[out].frames]
         if mine:
-            found[out] = _joined(study, mine)
+            found[out] = _joined(dataset, mine)
     return found
 
 
-def _summed(study: Study, condition: DarkCondition) -> dict[bool, _Sums]:
+def _summed(dataset: Dataset, condition: DarkCondition) -> dict[bool, _Sums]:
     """Return the sums over a condition's frames. Contrasts are Helmert's: frame k less the mean of those before, times
     sqrt(k / (k + 1)); pixels beyond `CLIP` standard deviations count as such."""
-    shape = study.camera.rows, study.camera.cols
+    shape = dataset.camera.rows, dataset.camera.cols
     mean, own = np.zeros(shape, np.float32), {out: _Sums.empty(shape) for out in (False, True)}
     seen, held_out = condition.seen[:MOST_FRAMES], condition.held_out[: MOST_FRAMES // 2]
     for k, capture in enumerate((*seen, *held_out)):
-        frame = study.recordings.frame(capture).astype(np.float32)
+        frame = dataset.recordings.frame(capture).astype(np.float32)
         frame -= np.float32(frame.mean(dtype=float))
         sums, away = own[k >= len(seen)], frame - mean
         mean += away / np.float32(k + 1)
         sums.frames += 1
         sums.mean += (frame - sums.mean) / np.float32(sums.frames)
         if k:
-            sums.add_contrast(away * np.float32(np.sqrt(k / (k + 1.0))), study.step_dn)
+            sums.add_contrast(away * np.float32(np.sqrt(k / (k + 1.0))), dataset.step_dn)
     return own
 
 
-def _joined(study: Study, sums: Sequence[tuple[float, _Sums]]) -> DarkImages:
+def _joined(dataset: Dataset, sums: Sequence[tuple[float, _Sums]]) -> DarkImages:
     """Return the images of all exposures, weighted by their noise."""
     exposure_s = np.array([t for t, _ in sums])
-    read_dn2 = max(study.noise.read_dn**2, study.noise.quantisation_dn2)
-    shot_dn2 = study.noise.gain * max(study.noise.dark_dn_per_s, 0.0) * exposure_s
+    read_dn2 = max(dataset.noise.read_dn**2, dataset.noise.quantisation_dn2)
+    shot_dn2 = dataset.noise.gain * max(dataset.noise.dark_dn_per_s, 0.0) * exposure_s
     weight = np.array([one.frames for _, one in sums]) / (read_dn2 + shot_dn2)
     weight /= weight.sum()
     middle = float(weight @ exposure_s)
@@ -134,7 +134,7 @@ def _joined(study: Study, sums: Sequence[tuple[float, _Sums]]) -> DarkImages:
         by_time = weight * (exposure_s - middle) / spread
         slope = _clipped(np.tensordot(by_time.astype(np.float32), means, 1))
         offset = mean - np.float32(middle) * slope
-    images = DarkImages(_clipped(mean, study.step_dn), _clipped(offset, study.step_dn), slope)
+    images = DarkImages(_clipped(mean, dataset.step_dn), _clipped(offset, dataset.step_dn), slope)
     paired = [one for _, one in sums if one.contrasts and one.squares.any()]
     if not paired:
         return images
@@ -168,54 +168,54 @@ class FlatImages:
     greatest_dn_per_s: float
 
 
-def flat_images(study: Study) -> dict[bool, FlatImages]:
+def flat_images(dataset: Dataset) -> dict[bool, FlatImages]:
     """Return the images of unclipped flats of the most frequent lamp; none where they don't determine them."""
     try:
-        levels, _ = study.once(flats)
+        levels, _ = dataset.once(flats)
     except NotDetermined:
         return {}
 
     def lamp_of(capture: Any) -> tuple[int, bool]:
-        return study.lamps.get(capture.radiance, -1), (capture.gain_db or 0.0) == study.usual_gain_db
+        return dataset.lamps.get(capture.radiance, -1), (capture.gain_db or 0.0) == dataset.usual_gain_db
 
     lamps = [lamp_of(c) for u in levels for c in u.captures]
     if not lamps:
         return {}
     usual = max(dict.fromkeys(lamps), key=lamps.count)
-    dark = study.once(dark_readout)
-    full_dn = study.saturation_dn - study.noise.black
+    dark = dataset.once(dark_readout)
+    full_dn = dataset.saturation_dn - dataset.noise.black
     found = {}
     for held_out in (False, True):
         captures = [
             (float(np.mean(list(u.mean.values()))) / full_dn, c)
             for u in levels
-            if u.held_out == held_out and min(u.mean.values()) > LEAST_SIGNAL * study.noise.read_dn
+            if u.held_out == held_out and min(u.mean.values()) > LEAST_SIGNAL * dataset.noise.read_dn
             for c in u.captures[:MOST_FRAMES]
             if lamp_of(c) == usual
         ]
         if len({s for s, _ in captures}) >= LEAST_LEVELS:
-            found[held_out] = _regressed(study, captures, full_dn, None if dark is None else dark.offsets_dn)
+            found[held_out] = _regressed(dataset, captures, full_dn, None if dark is None else dark.offsets_dn)
     return found
 
 
 def _regressed(
-    study: Study, captures: Sequence[tuple[float, Any]], full_dn: float, offsets_dn: Image | None
+    dataset: Dataset, captures: Sequence[tuple[float, Any]], full_dn: float, offsets_dn: Image | None
 ) -> FlatImages:
     """Return the terms by least squares, weighted by shot and read noise, pixel by pixel."""
     signal = np.array([s for s, _ in captures])
     inverse = np.array([1.0 / max(float(c.exposure_s), 1e-9) for _, c in captures])
-    noise = (study.noise.gain * signal * full_dn + study.noise.read_dn**2) / np.square(signal * full_dn)
+    noise = (dataset.noise.gain * signal * full_dn + dataset.noise.read_dn**2) / np.square(signal * full_dn)
     weights = [_slope(x, 1.0 / noise) for x in (signal, inverse)]
-    total = np.zeros((2, study.camera.rows, study.camera.cols), np.float32)
+    total = np.zeros((2, dataset.camera.rows, dataset.camera.cols), np.float32)
     for k, (_, capture) in enumerate(captures):
-        frame = np.asarray(study.recordings.frame(capture), np.float32) - np.float32(dark_level_dn(study, capture))
+        frame = np.asarray(dataset.recordings.frame(capture), np.float32) - np.float32(dark_level_dn(dataset, capture))
         if offsets_dn is not None:
             frame -= offsets_dn
-        for plane in mosaic.planes(frame, study.camera.cfa).values():
+        for plane in mosaic.planes(frame, dataset.camera.cfa).values():
             np.divide(plane, np.float32(plane.mean(dtype=float)), out=plane)
         total += np.array([weight[k] for weight in weights], np.float32)[:, None, None] * frame
     for term in total:
-        for plane in mosaic.planes(term, study.camera.cfa).values():
+        for plane in mosaic.planes(term, dataset.camera.cfa).values():
             plane[...] = _clipped(plane)
     fixed_s = total[1] if np.ptp(inverse) > 0.0 else None
     return FlatImages(total[0], fixed_s, float(np.max(signal * full_dn * inverse)))
@@ -256,13 +256,13 @@ class NoiseByTime:
     held_out: NDArray[np.bool_]
 
 
-def noise_by_time(study: Study) -> NoiseByTime | None:
+def noise_by_time(dataset: Dataset) -> NoiseByTime | None:
     """Return the variance of repeats by time; None where no time is stated, or nothing is repeated."""
-    captures = study.recordings.captures(side=study.side)
+    captures = dataset.recordings.captures(side=dataset.side)
     if not captures or any(c.time is None for c in captures):
         return None
     by_setting: dict[str, list[Any]] = {}
-    for c in sorted(captures, key=study.elapsed_s):
+    for c in sorted(captures, key=dataset.elapsed_s):
         by_setting.setdefault(c.model_dump_json(exclude=NO_SETTING), []).append(c)
     groups = [group[:MOST_FRAMES] for group in by_setting.values() if len(group) > 1]
     every = [c for group in groups for c in group]
@@ -270,35 +270,35 @@ def noise_by_time(study: Study) -> NoiseByTime | None:
     shortest_s = min((c.exposure_s for c in every if c.kind == "dark"), default=0.0)
     rows: list[tuple[float, FloatArray, float, float, float, bool]] = []
     for number, group in enumerate(groups):
-        out = _held_out(study, group, number, len(groups))
-        mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
+        out = _held_out(dataset, group, number, len(groups))
+        mean = np.zeros((dataset.camera.rows, dataset.camera.cols), np.float32)
         for k, capture in enumerate(group):
-            frame = study.recordings.frame(capture).astype(np.float32)
+            frame = dataset.recordings.frame(capture).astype(np.float32)
             if k == 0:
-                signal = frame - np.float32(study.noise.black)
+                signal = frame - np.float32(dataset.noise.black)
                 level, square = float(signal.mean(dtype=float)), float(np.mean(np.square(signal), dtype=float))
             away = frame - mean
             mean += away / np.float32(k + 1)
-            if k == 0 or any(v is None for v in study.levels(capture).mean.values()):
+            if k == 0 or any(v is None for v in dataset.levels(capture).mean.values()):
                 continue
             share = np.zeros(len(every))
             share[[place[c.id] for c in group[:k]]] = 1.0 / (k * (k + 1.0))
             share[place[capture.id]] = k / (k + 1.0)
             away *= np.float32(np.sqrt(k / (k + 1.0)))
-            for plane in mosaic.planes(away, study.camera.cfa).values():
+            for plane in mosaic.planes(away, dataset.camera.cfa).values():
                 plane[...] = _pixels_alone(plane)
             own = capture.exposure_s if capture.kind == "dark" and capture.exposure_s > shortest_s else 0.0
             rows.append((float(np.mean(np.square(away), dtype=float)), share, level, square, own, capture.id in out))
     if not rows:
         return None
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    elapsed_s = np.array([study.elapsed_s(c) for c in every])
-    pixels = float((study.camera.rows - 2) * (study.camera.cols - 2))
+    elapsed_s = np.array([dataset.elapsed_s(c) for c in every])
+    pixels = float((dataset.camera.rows - 2) * (dataset.camera.cols - 2))
     return NoiseByTime(columns[0], pixels, columns[1], elapsed_s, *columns[2:])
 
 
-def _held_out(study: Study, group: Sequence[Any], number: int, groups: int) -> set[str]:
+def _held_out(dataset: Dataset, group: Sequence[Any], number: int, groups: int) -> set[str]:
     """Return the ids of a setting's held-out captures."""
     if group[0].kind == "dark":
-        return {c.id for condition in conditions(study) for c in condition.held_out}
-    return set(study.once(held_out_flats)) if group[0].kind == "flat" else held_out_of(group, number, groups)
+        return {c.id for condition in conditions(dataset) for c in condition.held_out}
+    return set(dataset.once(held_out_flats)) if group[0].kind == "flat" else held_out_of(group, number, groups)

@@ -17,7 +17,7 @@ from lab.errors import NotDetermined
 from lab.observables.codes.density import CodeCounts, counted, counted_in_all, prepared, widths
 from lab.observables.darks.frames import cell_means
 from lab.observables.darks.readout import dark_readout
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.flats.field import FlatLevel, flats, without_dark
 from lab.observables.reads import CODES, COLLECTED, GAINS, acting
 from sim.camera import Cfa
@@ -51,32 +51,32 @@ SHOWN_IN = {
 }
 
 
-def index_looks(study: Study, effects: Effects) -> Iterator[Look]:
+def index_looks(dataset: Dataset, effects: Effects) -> Iterator[Look]:
     """Yield what the effects leave along codes, rows, columns and places of the sensor."""
-    yield from _codes(study, effects)
-    step, even = mosaic.step(study.camera.cfa), _lit_images(study, effects)
-    yield from _lines_of(study, "charge", "mean", even, step)
-    yield from _cells_of(study, "charge", even)
-    yield from _places_of(study, "image", "angle", even, field=True)
-    dark, mean = study.once(dark_images), _offsets(study, effects, "mean")
-    yield from _lines_of(study, "signal", "mean", mean, 1)
-    yield from _cells_of(study, "signal", mean)
-    yield from _places_of(study, "signal", "radius", _offsets(study, effects, "offset"))
-    yield from _places_of(study, "charge", "radius", _per_second(study, dark, effects))
-    yield from _lines_of(study, "signal", "variance", _part(dark, "variance"), 1)
-    yield from _lines_of(study, "signal", "covariance", _part(dark, "below"), 1, lines=("row",))
-    yield from _lines_of(study, "signal", "covariance", _part(dark, "right"), 1, lines=("column",))
-    yield from _noise_times(study)
-    lit = study.once(flat_images)
+    yield from _codes(dataset, effects)
+    step, even = mosaic.step(dataset.camera.cfa), _lit_images(dataset, effects)
+    yield from _lines_of(dataset, "charge", "mean", even, step)
+    yield from _cells_of(dataset, "charge", even)
+    yield from _places_of(dataset, "image", "angle", even, field=True)
+    dark, mean = dataset.once(dark_images), _offsets(dataset, effects, "mean")
+    yield from _lines_of(dataset, "signal", "mean", mean, 1)
+    yield from _cells_of(dataset, "signal", mean)
+    yield from _places_of(dataset, "signal", "radius", _offsets(dataset, effects, "offset"))
+    yield from _places_of(dataset, "charge", "radius", _per_second(dataset, dark, effects))
+    yield from _lines_of(dataset, "signal", "variance", _part(dark, "variance"), 1)
+    yield from _lines_of(dataset, "signal", "covariance", _part(dark, "below"), 1, lines=("row",))
+    yield from _lines_of(dataset, "signal", "covariance", _part(dark, "right"), 1, lines=("column",))
+    yield from _noise_times(dataset)
+    lit = dataset.once(flat_images)
     bend = {out: one.bend for out, one in lit.items()}
-    yield from _lines_of(study, "signal", "mean", bend, step, times=" x level")
+    yield from _lines_of(dataset, "signal", "mean", bend, step, times=" x level")
     fixed_s = {out: one.fixed_s for out, one in lit.items() if one.fixed_s is not None}
     # a pattern of offsets that is another in light is one of time where the signal goes by the exposure
     least_s = LEAST_OFFSET_DN / lit[False].greatest_dn_per_s if False in lit else 0.0
-    yield from _places_of(study, "charge", "radius x exposure", fixed_s, least=least_s)
+    yield from _places_of(dataset, "charge", "radius x exposure", fixed_s, least=least_s)
 
 
-def _codes(study: Study, effects: Effects) -> Iterator[Look]:
+def _codes(dataset: Dataset, effects: Effects) -> Iterator[Look]:
     """Yield the counts of codes in light, seen and held out, less those that the effects' converter gives.
 
     Even light has to show codes by itself. Beside a converter's effect it is all that counts: there its counts are
@@ -84,26 +84,26 @@ def _codes(study: Study, effects: Effects) -> Iterator[Look]:
     """
     even_only = bool(acting(effects, CODES))
     try:
-        if prepared(study, study.once(counted)[False]) is None:
+        if prepared(dataset, dataset.once(counted)[False]) is None:
             return
-        counts = study.once(counted if even_only else counted_in_all)
+        counts = dataset.once(counted if even_only else counted_in_all)
     except NotDetermined:
         return
     found = {}
     for held_out in (False, True):
-        codes = prepared(study, counts[held_out]) if counts[held_out].captures else None
+        codes = prepared(dataset, counts[held_out]) if counts[held_out].captures else None
         if codes is not None:
-            found[held_out] = _code_profile(codes, effects, study)
+            found[held_out] = _code_profile(codes, effects, dataset)
     if False in found:
         yield Look("codes", "code", found[False], found.get(True), shown_in=SHOWN_IN["codes"])
 
 
-def _code_profile(codes: CodeCounts, effects: Effects, study: Study) -> Profile:
+def _code_profile(codes: CodeCounts, effects: Effects, dataset: Dataset) -> Profile:
     used, rough = np.flatnonzero(codes.used), codes.rough
-    known = rough @ (codes.expected * (widths(codes, effects, study) - 1.0)) if acting(effects, CODES) else 0.0
+    known = rough @ (codes.expected * (widths(codes, effects, dataset) - 1.0)) if acting(effects, CODES) else 0.0
     of_widths = sparse.coo_array((rough @ sparse.diags_array(codes.smooth))[used])
     at = of_widths.coords[0], of_widths.coords[1] + codes.first
-    matrix = sparse.csr_array((of_widths.data, at), shape=(len(used), int(study.camera.white_level_dn) + 1))
+    matrix = sparse.csr_array((of_widths.data, at), shape=(len(used), int(dataset.camera.white_level_dn) + 1))
     variance = rough.power(2) @ np.maximum(codes.smooth, 1.0)
     return Profile(used + codes.first, (rough @ codes.count - known)[used], variance[used], matrix)
 
@@ -111,30 +111,30 @@ def _code_profile(codes: CodeCounts, effects: Effects, study: Study) -> Profile:
 # --- images ----------------------------------------------------------------------------------------------------------
 
 
-def _lit_images(study: Study, effects: Effects) -> dict[bool, FloatArray]:
+def _lit_images(dataset: Dataset, effects: Effects) -> dict[bool, FloatArray]:
     """Return the mean flat, each plane over its mean, less the dark offsets and over the pattern that effects give even
     light: of seen (False) and of held-out captures.
     """
     try:
-        levels, images = study.once(flats)
+        levels, images = dataset.once(flats)
     except NotDetermined:
         return {}
-    dark, pattern = study.once(dark_readout), _pattern(study, levels, effects)
+    dark, pattern = dataset.once(dark_readout), _pattern(dataset, levels, effects)
     found = {}
     for held_out, (image, _) in images.items():
         part = [u for u in levels if u.held_out == held_out]
-        level = image if dark is None else without_dark(study, dark, part, image)[0]
+        level = image if dark is None else without_dark(dataset, dark, part, image)[0]
         found[held_out] = np.asarray(level / pattern, float)
     return found
 
 
-def _pattern(study: Study, levels: Sequence[FlatLevel], effects: Effects) -> FloatArray | float:
+def _pattern(dataset: Dataset, levels: Sequence[FlatLevel], effects: Effects) -> FloatArray | float:
     """Return what effects make of even light (rows, cols): collected, shaded, amplified by place; 1 where none do."""
     here = acting(effects, COLLECTED | GAINS | SHADING)
     if not here:
         return 1.0
-    camera, model = study.camera, Uniform(study.camera, here)
-    level_e = float(np.mean([np.mean(list(u.mean.values())) for u in levels])) / study.noise.gain
+    camera, model = dataset.camera, Uniform(dataset.camera, here)
+    level_e = float(np.mean([np.mean(list(u.mean.values())) for u in levels])) / dataset.noise.gain
     even = np.full((camera.rows, camera.cols), level_e)
     row, col = np.indices(even.shape)
     points = FieldPoints.at(camera, row.ravel().astype(float), col.ravel().astype(float))
@@ -144,23 +144,23 @@ def _pattern(study: Study, levels: Sequence[FlatLevel], effects: Effects) -> Flo
     return pattern if gains is None else pattern * gains
 
 
-def _offsets(study: Study, effects: Effects, name: Literal["mean", "offset"]) -> dict[bool, FloatArray]:
+def _offsets(dataset: Dataset, effects: Effects, name: Literal["mean", "offset"]) -> dict[bool, FloatArray]:
     """Return the mean dark frame, of all exposures or at none, DN, less the offsets that the effects add."""
-    added, found = Uniform(study.camera, effects), {}
-    for out, dark in study.once(dark_images).items():
+    added, found = Uniform(dataset.camera, effects), {}
+    for out, dark in dataset.once(dark_images).items():
         image = np.array(getattr(dark, name), float)
         if added.adds_signal:
-            image -= study.noise.gain * added.added_e
+            image -= dataset.noise.gain * added.added_e
         for one in added.lines:  # of fixed offsets only their spread is known, but for the step from even to odd lines
-            image -= study.noise.gain * replace(one, fixed_e=0.0).mean_e(image.shape)
+            image -= dataset.noise.gain * replace(one, fixed_e=0.0).mean_e(image.shape)
         found[out] = image
     return found
 
 
-def _per_second(study: Study, dark: dict[bool, DarkImages], effects: Effects) -> dict[bool, FloatArray]:
+def _per_second(dataset: Dataset, dark: dict[bool, DarkImages], effects: Effects) -> dict[bool, FloatArray]:
     """Return the dark current by pixel, DN/s, less that of the effects."""
-    model = Uniform(study.camera, effects)
-    own = study.noise.gain * model.dark_e_per_s(study.temperature_c) if model.changes_dark_current else 0.0
+    model = Uniform(dataset.camera, effects)
+    own = dataset.noise.gain * model.dark_e_per_s(dataset.temperature_c) if model.changes_dark_current else 0.0
     return {out: np.asarray(one.per_second - own, float) for out, one in dark.items() if one.per_second is not None}
 
 
@@ -175,7 +175,7 @@ def _part(dark: dict[bool, DarkImages], name: Literal["variance", "below", "righ
 
 
 def _lines_of(
-    study: Study,
+    dataset: Dataset,
     stage: Stage,
     of: Of,
     images: Mapping[bool, Image],
@@ -193,7 +193,7 @@ def _lines_of(
         return
     least = LEAST_PATTERN_DN if stage == "signal" and of == "mean" and not times else 0.0
     shown = frozenset({"dark_noise"}) if of != "mean" else frozenset() if times else SHOWN_IN[stage]
-    cfa: Cfa = study.camera.cfa if step > 1 else "MONO"
+    cfa: Cfa = dataset.camera.cfa if step > 1 else "MONO"
     for line in lines:
         along = cast(Along, f"{line}{times}")
         rough = {out: _rough_lines(image, line, cfa) for out, image in images.items()}
@@ -209,13 +209,13 @@ def _lines_of(
                 )
 
 
-def _cells_of(study: Study, stage: Stage, images: Mapping[bool, Image]) -> Iterator[Look]:
+def _cells_of(dataset: Dataset, stage: Stage, images: Mapping[bool, Image]) -> Iterator[Look]:
     """Yield the looks within cells of rows and columns."""
-    step = mosaic.step(study.camera.cfa)
+    step = mosaic.step(dataset.camera.cfa)
     for cell in CELLS if False in images else ():
         if min(cell) * step < 2:
             continue
-        within = {out: _within_cells(study, image, cell) for out, image in images.items()}
+        within = {out: _within_cells(dataset, image, cell) for out, image in images.items()}
         seen = within[False]
         if seen is not None:
             yield Look(
@@ -225,7 +225,7 @@ def _cells_of(study: Study, stage: Stage, images: Mapping[bool, Image]) -> Itera
 
 
 def _places_of(
-    study: Study,
+    dataset: Dataset,
     stage: Stage,
     along: Along,
     images: Mapping[bool, Image],
@@ -238,10 +238,10 @@ def _places_of(
     field : whether light and lens may change the image: beside it may stand x, y, r^2 and r^4
     least : range of departures below which nothing is told
     """
-    rows, cols = study.camera.rows, study.camera.cols
+    rows, cols = dataset.camera.rows, dataset.camera.cols
     if False not in images or min(rows, cols) < 4 * PLACES_A_SIDE:
         return
-    pitch_um, middle = study.camera.pixel_pitch_um, (np.arange(PLACES_A_SIDE) + 0.5) / PLACES_A_SIDE - 0.5
+    pitch_um, middle = dataset.camera.pixel_pitch_um, (np.arange(PLACES_A_SIDE) + 0.5) / PLACES_A_SIDE - 0.5
     y, x = (one.ravel() for one in np.meshgrid(rows * middle * pitch_um, cols * middle * pitch_um, indexing="ij"))
     radius, most = np.hypot(x, y), 0.5 * pitch_um * float(np.hypot(rows, cols))
     beside = [np.ones(x.size), x / most, y / most]
@@ -269,11 +269,11 @@ def _places_of(
     yield Look(stage, along, found[False], found.get(True), at=points, known=points, least=least, is_whole=True)
 
 
-def _noise_times(study: Study) -> Iterator[Look]:
+def _noise_times(dataset: Dataset) -> Iterator[Look]:
     """Yield the look at the variance of repeats by time, DN^2. Beside it may stand variance in proportion to the
     signal and to its square, and of each longer dark exposure.
     """
-    noise = study.once(noise_by_time)
+    noise = dataset.once(noise_by_time)
     if noise is None or len(np.unique(noise.elapsed_s)) < LEAST_TIMES:
         return
     at = np.unique(noise.elapsed_s)
@@ -371,16 +371,16 @@ def _polynomial_filter(count: int) -> sparse.csr_array | None:
     return sparse.csr_array(sparse.eye_array(count) - smooth)
 
 
-def _within_cells(study: Study, image: Image, cell: tuple[int, int]) -> Profile | None:
+def _within_cells(dataset: Dataset, image: Image, cell: tuple[int, int]) -> Profile | None:
     """Return how pixels differ by their place in a cell (rows, columns) of a plane of the mosaic.
 
     The means of the cell's pixels over each of `STRIPS` strips of the frame, in Helmert's contrasts, which are
     independent of each other.
     """
-    (rows, cols), step = cell, mosaic.step(study.camera.cfa)
+    (rows, cols), step = cell, mosaic.step(dataset.camera.cfa)
     contrasts = helmert(rows * cols)
     residual, matrix, spread = [], [], []
-    for phases in mosaic.phases(study.camera.cfa).values():
+    for phases in mosaic.phases(dataset.camera.cfa).values():
         for phase in phases:
             plane = image[phase[0] :: step, phase[1] :: step]
             down, across = plane.shape[0] // rows, plane.shape[1] // cols

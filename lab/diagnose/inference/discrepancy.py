@@ -17,7 +17,7 @@ from scipy.linalg import cholesky, eigh, solve_triangular
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
 from lab.observables.gaussian import ROUNDING, Gaussian, chi2, conditional
-from lab.observables.observable import Block
+from lab.observables.observable import Observable
 from sim.spectrum import FloatArray
 
 #: Amplitudes, relative to the block's scale, and lengths, relative to the block's `reach`, that are tried.
@@ -86,7 +86,7 @@ def predictive_discrepancy(
     return best if left_out_chi2(best) < left_out_chi2(none) - 2.0 * policy.discrepancy_log_odds else none
 
 
-def _left_out(block: Block, seen: np.ndarray, most_parts: int) -> list[np.ndarray]:
+def _left_out(block: Observable, seen: np.ndarray, most_parts: int) -> list[np.ndarray]:
     """Masks over the seen numbers that are left out together: those of the same captures, in at most `most_parts`
     parts."""
     captures = [label.captures for label, s in zip(block.labels, seen, strict=True) if s]
@@ -95,7 +95,7 @@ def _left_out(block: Block, seen: np.ndarray, most_parts: int) -> list[np.ndarra
     return [part == k for k in range(min(len(number), most_parts))]
 
 
-def _repeated_share(block: Block, seen: np.ndarray, distance: float) -> float:
+def _repeated_share(block: Observable, seen: np.ndarray, distance: float) -> float:
     """Share of the held-out numbers that have a seen one of the same channel and condition within `distance`
     correlation lengths."""
     x = block.position.reshape(len(seen), -1) / block.reach
@@ -152,7 +152,7 @@ def _fitted(
         yield likeliest(_by_group(block.scale[:, None], where), 0.0, "each point by itself")
 
 
-def _groupings(block: Block) -> dict[str, NDArray[np.intp]]:
+def _groupings(block: Observable) -> dict[str, NDArray[np.intp]]:
     """Return the ways in which numbers share a draw: in words, and each number's group (m,)."""
     channel = np.unique([label.channel for label in block.labels], return_inverse=True)[1]
     condition = np.unique([label.condition for label in block.labels], return_inverse=True)[1]
@@ -168,7 +168,7 @@ def _groupings(block: Block) -> dict[str, NDArray[np.intp]]:
     return found
 
 
-def no_discrepancy(block: Block, index: int) -> Discrepancy:
+def no_discrepancy(block: Observable, index: int) -> Discrepancy:
     """None, with log odds of 0."""
     n = len(block.value)
     return Discrepancy(index, 0.0, 0.0, block.reach, "none", np.zeros((n, n)))

@@ -11,7 +11,7 @@ from scipy import special
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
 from lab.observables.gaussian import ROUNDING, Gaussian, chi2, conditional
-from lab.observables.observable import Block
+from lab.observables.observable import Observable
 from sim.spectrum import FloatArray
 
 #: Distinct places on an axis from which on its quarters are slices, too: two a quarter.
@@ -25,7 +25,7 @@ class Slice:
     """A part of one measurement: a range of its axis, a channel or a condition. `log_probability`: of a chi2 as large
     by chance, corrected for the number of slices (Bonferroni)."""
 
-    block: Block
+    block: Observable
     axis: str
     where: str
     members: np.ndarray  # indices into the model's vector
@@ -45,7 +45,7 @@ class Slice:
 def chi2_by_slice(model: MeasurementModel, gaussian: Gaussian, policy: DecisionPolicy) -> list[Slice]:
     """Every slice of the seen numbers under a distribution of all numbers, most significant first."""
     residual = model.value - gaussian.mean
-    candidates: list[tuple[Block, str, str, np.ndarray]] = []
+    candidates: list[tuple[Observable, str, str, np.ndarray]] = []
     for block, at in zip(model.blocks, model.slices, strict=True):
         candidates += _slices(block, at, model.seen)
     found = []
@@ -72,7 +72,7 @@ def log_tail(value: float, n: int) -> float:
     return float(-0.5 * value + (0.5 * n - 1.0) * np.log(0.5 * value) - special.gammaln(0.5 * n))
 
 
-def _slices(block: Block, at: slice, seen: np.ndarray) -> list[tuple[Block, str, str, np.ndarray]]:
+def _slices(block: Observable, at: slice, seen: np.ndarray) -> list[tuple[Observable, str, str, np.ndarray]]:
     """Return the block as a whole, its channels, its conditions, and the quarters of its axis: (block, axis, words,
     indices)."""
     index = np.arange(at.start, at.stop)
@@ -104,7 +104,7 @@ def _slices(block: Block, at: slice, seen: np.ndarray) -> list[tuple[Block, str,
     return found
 
 
-def _range(block: Block, x: FloatArray) -> str:
+def _range(block: Observable, x: FloatArray) -> str:
     if block.measurement.places or len(x) == 0:
         return block.measurement.places
     low, high = float(np.min(x)), float(np.max(x))

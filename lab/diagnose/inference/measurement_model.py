@@ -22,7 +22,7 @@ import numpy as np
 
 from lab.observables.gaussian import ROUNDING, BlockCovariance, Gaussian
 from lab.observables.noise.figures import NoiseFigures
-from lab.observables.observable import Block, Prediction
+from lab.observables.observable import Observable, Prediction
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Effects
 from sim.spectrum import FloatArray
@@ -58,7 +58,7 @@ class MeasurementModel:
     `noise`: the first estimates about which the predictions are linear. Predictions are cached by block, as most
     effects act on few blocks."""
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[Observable, ...]
     camera: CameraModel
     always: tuple[Effect, ...] = ()
     unstated_jacobian: Mapping[str, FloatArray] = field(default_factory=dict)

@@ -11,7 +11,7 @@ from scipy.special import chdtrc, chdtri
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
-from lab.observables.observable import Block
+from lab.observables.observable import Observable
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 from sim.uniform import LEVEL
@@ -103,7 +103,7 @@ def _agrees(
 
 
 def _by_setting(
-    block: Block, captures: list[tuple[str, ...]], factor: FloatArray, std: FloatArray, alike_sigma: float
+    block: Observable, captures: list[tuple[str, ...]], factor: FloatArray, std: FloatArray, alike_sigma: float
 ) -> tuple[OutlyingLevel, ...]:
     """Return captures of one setting whose factors agree within `alike_sigma`, together, with their weighted mean."""
     setting = {label.captures: label.condition for label in block.labels}

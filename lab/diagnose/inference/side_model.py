@@ -13,7 +13,7 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.camera_model import assumptions, camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, FitResult, Skipped
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.flats.linearity import misstated_levels
 from lab.observables.noise.levels import LEAST_REACH
 from lab.observables.observable import measurements
@@ -37,15 +37,15 @@ NO_GAIN = (
 _NEAR_FULL = 0.985
 
 
-def study_of(
+def dataset_of(
     recordings: RecordingSet, side: Side, fit: FitResult | None = None, baseline: CameraFile | None = None
-) -> Study:
-    """Return the study of one side, with the baseline camera that `measurement_model` describes."""
+) -> Dataset:
+    """Return the dataset of one side, with the baseline camera that `measurement_model` describes."""
     camera_fit = fit.cameras.get(side) if fit is not None else None
     camera = baseline.camera if baseline else camera_model(recordings, side, camera_fit, maker_curves=True)
     misstated = frozenset(name for level in misstated_levels(camera_fit) for name in level.captures)
     noise = camera_fit.noise if camera_fit else None
-    return Study(recordings, side, camera, _saturation_dn(camera_fit), misstated, noise)
+    return Dataset(recordings, side, camera, _saturation_dn(camera_fit), misstated, noise)
 
 
 def measurement_model(
@@ -53,13 +53,13 @@ def measurement_model(
     side: Side,
     fit: FitResult | None = None,
     baseline: CameraFile | None = None,
-    study: Study | None = None,
+    dataset: Dataset | None = None,
 ) -> tuple[MeasurementModel | None, tuple[Skipped, ...]]:
     """Return the measurement model of one side (None where no measurement is determined), and what was skipped or
     assumed.
 
     The baseline camera is made of the data sheet and of the side's `fit`. `baseline` stands in place of both: a camera
-    file, whose effects are then part of the baseline. `study`: that of `study_of`, where it is there already."""
+    file, whose effects are then part of the baseline. `dataset`: that of `dataset_of`, where it is there already."""
     camera_fit = fit.cameras.get(side) if fit is not None else None
     skipped = [
         Skipped(
@@ -69,44 +69,44 @@ def measurement_model(
         )
         for a in assumptions(recordings.camera(side), camera_fit)
     ]
-    study = study or study_of(recordings, side, fit, baseline)
-    skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for reason in study.copies.told]
-    if not study.noise.gain_is_known:
+    dataset = dataset or dataset_of(recordings, side, fit, baseline)
+    skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for reason in dataset.copies.told]
+    if not dataset.noise.gain_is_known:
         skipped.append(Skipped(step="diagnose conversion_gain_dn_per_e", reason=NO_GAIN, side=side))
-    skipped += _far_from_full(study)
+    skipped += _far_from_full(dataset)
     blocks = []
     for measurement in measurements():
         try:
-            blocks.append(measurement.make(study))
+            blocks.append(measurement.make(dataset))
         except NotDetermined as refused:
             skipped.append(Skipped(step=f"diagnose {refused.step}", reason=refused.reason, side=side))
     blocks = [b for b in blocks if any(not label.held_out for label in b.labels)]
     always = baseline.effects if baseline is not None else ()
     if not blocks:
         return None, tuple(skipped)
-    known = study.noise.gain_is_known
-    model = MeasurementModel(tuple(blocks), study.camera, always, gain_is_known=known, noise=study.noise)
-    if study.stated.fill_factor is None and baseline is None:
+    known = dataset.noise.gain_is_known
+    model = MeasurementModel(tuple(blocks), dataset.camera, always, gain_is_known=known, noise=dataset.noise)
+    if dataset.stated.fill_factor is None and baseline is None:
         model = replace(model, unstated_jacobian=_any_aperture(model))
     return model, tuple(skipped)
 
 
-def _far_from_full(study: Study) -> list[Skipped]:
+def _far_from_full(dataset: Dataset) -> list[Skipped]:
     """Return a remark where no flat reaches `LEAST_REACH` of the full well, to which parameters of the response
     refer."""
-    flats = study.recordings.captures(FlatCapture, study.side)
-    highest = max((level for flat in flats for level in study.levels(flat).whole.values()), default=np.inf)
-    reach = (highest - study.noise.black) / (study.saturation_dn - study.noise.black)
+    flats = dataset.recordings.captures(FlatCapture, dataset.side)
+    highest = max((level for flat in flats for level in dataset.levels(flat).whole.values()), default=np.inf)
+    reach = (highest - dataset.noise.black) / (dataset.saturation_dn - dataset.noise.black)
     if reach >= LEAST_REACH:
         return []
     reason = (
         f"the brightest flat reaches {100 * reach:.2g} % of it, {100 * LEAST_REACH:.0f} % are needed: parameters that "
         "refer to full well (nonlinearity's, "
         "brighter-fatter's) are extrapolated from there, and hold for signals up to "
-        f"{highest - study.noise.black:.4g} DN; expose longer, or correct "
+        f"{highest - dataset.noise.black:.4g} DN; expose longer, or correct "
         "bit_depth or white_level_dn"
     )
-    return [Skipped(step="diagnose full_well_e", reason=reason, side=study.side)]
+    return [Skipped(step="diagnose full_well_e", reason=reason, side=dataset.side)]
 
 
 def _any_aperture(model: MeasurementModel) -> dict[str, FloatArray]:

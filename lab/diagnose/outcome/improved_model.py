@@ -25,7 +25,7 @@ from lab.formats.results import FitResult, ResidualPicture
 from lab.formats.results.diagnosis import IN_CURVES
 from lab.observables.charts.patches import PATCH_COLOUR_STD, PATCH_STD, patch_boxes
 from lab.observables.flats.stated_light import most_frequent_gain_db
-from lab.observables.observable import Block
+from lab.observables.observable import Observable
 from lab.observables.spectra.curves import freed_curve
 from lab.predict.replay import Replay
 from sim.camera import CameraModel, Side
@@ -155,7 +155,7 @@ def _applied(
     return found, kernels
 
 
-def _place_for(block: Block) -> Applied | None:
+def _place_for(block: Observable) -> Applied | None:
     """Return the stage that a smooth factor along the measurement's axis can act on."""
     if block.measurement.places:
         return None
@@ -165,7 +165,7 @@ def _place_for(block: Block) -> Applied | None:
 
 
 def _factor(
-    block: Block, mean: FloatArray, predicted: FloatArray
+    block: Observable, mean: FloatArray, predicted: FloatArray
 ) -> tuple[FloatArray, FloatArray, dict[str, tuple[FloatArray, FloatArray]]]:
     """x and the factor on the prediction there, averaged over channels and conditions; and the same by channel. `mean`:
     the posterior mean of the discrepancy (m,). The factor is relative to the block's scale where that varies, else to
@@ -186,7 +186,7 @@ def _factor(
 
 
 def _correction(
-    kind: Applied, block: Block, x: FloatArray, factor: FloatArray, camera: CameraModel
+    kind: Applied, block: Observable, x: FloatArray, factor: FloatArray, camera: CameraModel
 ) -> ModelDiscrepancy:
     """Return the factor on its stage, in that stage's unit."""
     gain = camera.conversion_gain_dn_per_e

@@ -38,7 +38,7 @@ from lab.observables.boards.residuals import BOARDS
 from lab.observables.boards.views import MIN_CORNERS
 from lab.observables.flats.linearity import PHOTON_TRANSFER, RADIOMETER_STD, misstated_levels
 from lab.observables.gaussian import Gaussian, chi2
-from lab.observables.observable import Block
+from lab.observables.observable import Observable
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.empirical_law import EmpiricalLaw
@@ -142,7 +142,7 @@ def shown_in(verdict: Verdict, candidate: Candidate, policy: DecisionPolicy) -> 
     return tuple(m for m in strongest if changes[m] > least) or (strongest[0],)
 
 
-def _change_chi2(verdict: Verdict, effect: Effect, block: Block) -> float:
+def _change_chi2(verdict: Verdict, effect: Effect, block: Observable) -> float:
     others = tuple(e for e in verdict.effects if e.name != effect.name)
     return verdict.model.change_chi2(effect, others, verdict.model.blocks.index(block))
 

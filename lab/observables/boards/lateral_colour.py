@@ -14,8 +14,8 @@ from lab.observables.boards.residuals import FEWEST_CORNERS
 from lab.observables.boards.shift_fit import fit_shift
 from lab.observables.boards.views import BoardView
 from lab.observables.colour_shift import COLOUR_FLOOR_PX, REFERENCE_NM, colour_shift_px, outward_shifts_px
-from lab.observables.dataset import Study
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.dataset import Dataset
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 
@@ -38,9 +38,9 @@ class _Gaps:
     corner: list[tuple[str, int]]
 
     @staticmethod
-    def of(study: Study, view: BoardView, gap: FloatArray, use: NDArray[np.bool_]) -> _Gaps:
+    def of(dataset: Dataset, view: BoardView, gap: FloatArray, use: NDArray[np.bool_]) -> _Gaps:
         """Return those of the corners of `view` that `use` (n,) marks, without those near the middle."""
-        camera = study.camera
+        camera = dataset.camera
         away = view.image_px - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
         radius = np.hypot(*away.T) / camera.half_diagonal_px
         use = use & (radius > LEAST_RADIUS)
@@ -78,19 +78,19 @@ class _Ring:
     influence: dict[tuple[str, int], float]
 
 
-def board_colour_block(study: Study) -> Block:
+def measure_board_colour(dataset: Dataset) -> Observable:
     """Radial displacement (px) of corners or dots, by rings about the frame's middle: in red and blue from those in
     green, and of pictures of one pose in light of single wavelengths from the one nearest `REFERENCE_NM`.
 
     Raises NotDetermined without boards, where there is neither a green channel nor a pose in light of two wavelengths,
     and with too few corners.
     """
-    boards = board_corners(study.recordings, study.side)
+    boards = board_corners(dataset.recordings, dataset.side)
     views = boards.views
     if not views:
         raise NotDetermined("board_colour", "no board is found" if boards.missed else "no charuco captures")
-    white = [view for view in views if view.capture.wavelength_nm is None] if "G" in study.channels else []
-    shifts = _within_pictures(study, white) + _between_pictures(study, views)
+    white = [view for view in views if view.capture.wavelength_nm is None] if "G" in dataset.channels else []
+    shifts = _within_pictures(dataset, white) + _between_pictures(dataset, views)
     if not shifts:
         lit = len({view.capture.wavelength_nm for view in views} - {None})
         raise NotDetermined(
@@ -120,33 +120,33 @@ def board_colour_block(study: Study) -> Block:
         mean = np.zeros(len(labels))
         for k, (label, pair) in enumerate(zip(labels, pairs, strict=True) if effects else ()):
             if pair is None:
-                mean[k] = colour_shift_px(study, label.channel, label.x, None, effects, "charuco")
+                mean[k] = colour_shift_px(dataset, label.channel, label.x, None, effects, "charuco")
             else:
-                own, other = outward_shifts_px(study, label.x, np.array(pair), effects)
+                own, other = outward_shifts_px(dataset, label.x, np.array(pair), effects)
                 mean[k] = own - other
         return Prediction(mean, {})
 
-    return Block(
+    return Observable(
         measurement=BOARD_COLOUR, reach=0.5, value=np.array([ring.outwards_px for ring in rings]),
         covariance=_covariance(rings) + np.diag(np.full(len(rings), COLOUR_FLOOR_PX**2)), labels=tuple(labels),
         reads=frozenset({"image.shift"}), predict=predict, scale=np.ones(len(rings)),
     )  # fmt: skip
 
 
-def _within_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
+def _within_pictures(dataset: Dataset, views: Sequence[BoardView]) -> list[_Shift]:
     """Of each channel but green, in pictures in white light."""
     views = views[:: max(1, len(views) // COLOUR_VIEWS)]
-    found = {c: _Shift(c, None, [], []) for c in study.channels if c != "G"} if views else {}
+    found = {c: _Shift(c, None, [], []) for c in dataset.channels if c != "G"} if views else {}
     for view in views:
-        fits = channel_corners(plane_corners(study.recordings, view), study.camera.cfa)
+        fits = channel_corners(plane_corners(dataset.recordings, view), dataset.camera.cfa)
         for channel, shift in found.items():
             use = fits[channel].trusted & fits["G"].trusted
-            shift.gaps.append(_Gaps.of(study, view, fits[channel].points - fits["G"].points, use))
+            shift.gaps.append(_Gaps.of(dataset, view, fits[channel].points - fits["G"].points, use))
             shift.captures.append((view.capture.id,))
     return [*found.values()]
 
 
-def _between_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
+def _between_pictures(dataset: Dataset, views: Sequence[BoardView]) -> list[_Shift]:
     """Of each wavelength but the reference, in pictures of one pose: the first of each wavelength."""
     poses: dict[str, dict[float, BoardView]] = {}
     for view in views:
@@ -164,7 +164,7 @@ def _between_pictures(study: Study, views: Sequence[BoardView]) -> list[_Shift]:
             _, own, of_other = np.intersect1d(view.index, other.index, return_indices=True)
             gap, seen = np.zeros(other.image_px.shape), np.zeros(len(other.index), bool)
             gap[of_other], seen[of_other] = view.image_px[own] - other.image_px[of_other], True
-            shift.gaps.append(_Gaps.of(study, other, gap, seen))
+            shift.gaps.append(_Gaps.of(dataset, other, gap, seen))
             shift.captures.append((view.capture.id, other.capture.id))
     return [*found.values()]
 
@@ -218,7 +218,7 @@ BOARD_COLOUR = Measurement(
     order=510,
     axis="field",
     unit="half diagonals",
-    make=board_colour_block,
+    make=measure_board_colour,
     quantity="displacement from green, or from the reference wavelength, px",
     conditions="light",
     conditions_words="in",

@@ -16,10 +16,10 @@ from lab.capture_kinds.white import WhiteCapture
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.observables.boards.pairs import SIDES, StereoPair, board_pairs, needs_both_sides
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.flats.row_light import ROW_LIGHT, nuisances, row_light_variance
-from lab.observables.observable import Block, Label, Measurement, Prediction
-from lab.observables.screens.cells import screen_block
+from lab.observables.observable import Label, Measurement, Observable, Prediction
+from lab.observables.screens.cells import measure_screen
 from sim.camera import Side
 from sim.effects.base import Effects
 from sim.effects.veiling_glare import VeilingGlare
@@ -44,24 +44,24 @@ FEWEST_PIXELS = 200  # of a channel in the region that is compared
 class _Darks:
     """A side's mean signal without light by exposure: a line through its dark frames, else the stated black level."""
 
-    def __init__(self, study: Study, side: Side) -> None:
-        frames = study.recordings.captures(DarkCapture, side)
+    def __init__(self, dataset: Dataset, side: Side) -> None:
+        frames = dataset.recordings.captures(DarkCapture, side)
         t = np.array([c.exposure_s for c in frames])
-        level = np.array([study.recordings.codes(c).every.mean_dn for c in frames])
+        level = np.array([dataset.recordings.codes(c).every.mean_dn for c in frames])
         self._slope = 0.0
         if len(frames) and np.ptp(t) > 0:
             self._slope, self._black = (float(v) for v in np.polyfit(t, level, 1))
         elif len(frames):
             self._black = float(level.mean())
         else:
-            self._black = study.recordings.camera(side).black_level_dn or 0.0
+            self._black = dataset.recordings.camera(side).black_level_dn or 0.0
 
     def at(self, exposure_s: float) -> float:
         """Return the mean signal without light, DN."""
         return self._black + self._slope * exposure_s
 
 
-def scene_gain_block(study: Study) -> Block:
+def measure_stereo_gain(dataset: Dataset) -> Observable:
     """ln(right / left) of the signals in every scene that both cameras see, less that in uniform light, by channel.
 
     Veiling glare, which scatters a share g of a camera's light evenly over the frame, changes a region's signal by the
@@ -69,9 +69,9 @@ def scene_gain_block(study: Study) -> Block:
     camera's g is estimated from the dark squares of its screens and corrected for; its uncertainty is a nuisance
     parameter. Raises NotDetermined without unclipped flats of one lamp on both sides, and without a scene that both saw
     in that lamp's light."""
-    needs_both_sides(study.recordings, study.side, "stereo_gain")
-    darks = {side: _Darks(study, side) for side in SIDES}
-    uniform = [_uniform(study, side, darks[side]) for side in SIDES]
+    needs_both_sides(dataset.recordings, dataset.side, "stereo_gain")
+    darks = {side: _Darks(dataset, side) for side in SIDES}
+    uniform = [_uniform(dataset, side, darks[side]) for side in SIDES]
     if not all(uniform):
         missing = " and ".join(side for side, found in zip(SIDES, uniform, strict=True) if not found)
         raise NotDetermined(
@@ -81,16 +81,16 @@ def scene_gain_block(study: Study) -> Block:
     if not lamps:
         raise NotDetermined("stereo_gain", "the two sides' flats are of different lamps")
     values, labels, lifts, exposures = [], [], [], []
-    for scene_name, regions in _scenes(study).items():
+    for scene_name, regions in _scenes(dataset).items():
         rates = [
-            _rates(study, side, darks[side], captures, mask)
+            _rates(dataset, side, darks[side], captures, mask)
             for side, (captures, mask) in zip(SIDES, regions, strict=True)
         ]
         alike = [
             pair for pair in lamps if all(_same_colour(rate, lamp) for rate, lamp in zip(rates, pair, strict=True))
         ]
         captures = tuple(c.id for part, _ in regions for c in part)
-        for channel in study.channels if alike else ():
+        for channel in dataset.channels if alike else ():
             of_light = np.mean([np.log(right.level[channel] / left.level[channel]) for left, right in alike])
             values.append(float(np.log(rates[1][channel].rate / rates[0][channel].rate) - of_light))
             of_lamp = np.mean([[side.lift[channel] for side in pair] for pair in alike], axis=0)
@@ -110,16 +110,16 @@ def scene_gain_block(study: Study) -> Block:
     covariance = covariance + np.diag(np.full(len(values), OWN_STD**2))
 
     left_lift, right_lift = np.array(lifts).T
-    glare, glare_std = _glare(study, "left")
+    glare, glare_std = _glare(dataset, "left")
 
     def predict(effects: Effects) -> Prediction:
-        gain = np.log(max(pair_gain_factor(study.camera, effects), 1e-6))
-        scattered = even_share(study.camera, effects) * right_lift
+        gain = np.log(max(pair_gain_factor(dataset.camera, effects), 1e-6))
+        scattered = even_share(dataset.camera, effects) * right_lift
         jacobian = {"stereo_gain:glare of the left camera": -glare_std * left_lift}
-        jacobian |= _row_light(Uniform(study.camera, effects), study.camera.rows, scenes, exposures)
+        jacobian |= _row_light(Uniform(dataset.camera, effects), dataset.camera.rows, scenes, exposures)
         return Prediction(gain + scattered - glare * left_lift, jacobian)
 
-    return Block(
+    return Observable(
         measurement=STEREO_GAIN, reach=1e9, value=np.array(values), covariance=covariance,
         labels=tuple(labels), reads=frozenset({"light.pair_gain", "image.veils"}), scattered_by=ROW_LIGHT,
         predict=predict, scale=np.ones(len(values)),
@@ -167,22 +167,22 @@ class _UniformLight:
         return bool(np.abs(there / max(there.sum(), 1e-300) - self.shape).sum() < SAME_LAMP)
 
 
-def _uniform(study: Study, side: Side, dark: _Darks) -> list[_UniformLight]:
+def _uniform(dataset: Dataset, side: Side, dark: _Darks) -> list[_UniformLight]:
     """Return the uniform lights of a side's flats, by radiance file, in which every channel has an unclipped signal."""
-    recordings = study.recordings
+    recordings = dataset.recordings
     white = recordings.camera(side).saturation_dn
     gathered: dict[str, dict[str, list[_Seen]]] = {}
     for capture in recordings.captures(FlatCapture, side):
         if capture.gain_db or capture.radiance is None:
             continue
         total = float(recordings.spectrum(capture.radiance).arrays[1].sum())
-        for channel, seen in _signals(study, capture, side, dark, None).items():
+        for channel, seen in _signals(dataset, capture, side, dark, None).items():
             if seen.rate * capture.exposure_s > 0.02 * white:
                 levels = gathered.setdefault(capture.radiance, {}).setdefault(channel, [])
                 levels.append(_Seen(seen.rate / total, seen.lift))
     found = []
     for path, by_channel in gathered.items():
-        if set(by_channel) >= set(study.channels):
+        if set(by_channel) >= set(dataset.channels):
             wavelength, radiance = recordings.spectrum(path).arrays
             middle = {c: float(np.median([seen.rate for seen in v])) for c, v in by_channel.items()}
             lift = {c: float(np.mean([seen.lift for seen in v])) for c, v in by_channel.items()}
@@ -190,9 +190,9 @@ def _uniform(study: Study, side: Side, dark: _Darks) -> list[_UniformLight]:
     return found
 
 
-def _signals(study: Study, capture: Any, side: Side, dark: _Darks, mask: np.ndarray | None) -> dict[str, _Seen]:
+def _signals(dataset: Dataset, capture: Any, side: Side, dark: _Darks, mask: np.ndarray | None) -> dict[str, _Seen]:
     """Return the unclipped channels of a capture in the pixels of `mask`, or in the middle half of the frame."""
-    camera, frame = study.recordings.camera(side), study.recordings.frame(capture)
+    camera, frame = dataset.recordings.camera(side), dataset.recordings.frame(capture)
     rows, cols = frame.shape
     row, col = np.arange(rows)[:, None], np.arange(cols)[None, :]
     if mask is None:
@@ -207,7 +207,7 @@ def _signals(study: Study, capture: Any, side: Side, dark: _Darks, mask: np.ndar
         if use.sum() < FEWEST_PIXELS or np.mean(frame[use] >= camera.saturation_dn) > 1e-3:
             continue
         signal, whole = float(frame[use].mean()) - black, float(frame[own].mean()) - black
-        fall_off = relative_illumination(study.camera, *(a.astype(float) for a in np.nonzero(use))).mean()
+        fall_off = relative_illumination(dataset.camera, *(a.astype(float) for a in np.nonzero(use))).mean()
         found[channel] = _Seen(
             rate=signal / float(fall_off) / capture.exposure_s, lift=whole / signal - 1.0 if signal > 0.0 else 0.0
         )
@@ -215,13 +215,13 @@ def _signals(study: Study, capture: Any, side: Side, dark: _Darks, mask: np.ndar
 
 
 def _rates(
-    study: Study, side: Side, dark: _Darks, captures: Sequence[Capture], mask: np.ndarray | None
+    dataset: Dataset, side: Side, dark: _Darks, captures: Sequence[Capture], mask: np.ndarray | None
 ) -> dict[str, _Seen]:
     """Return the channels in a region, means over captures."""
-    white = study.recordings.camera(side).saturation_dn
+    white = dataset.recordings.camera(side).saturation_dn
     found: dict[str, list[_Seen]] = {}
     for capture in captures:
-        for channel, seen in _signals(study, capture, side, dark, mask).items():
+        for channel, seen in _signals(dataset, capture, side, dark, mask).items():
             if seen.rate * capture.exposure_s > 0.01 * white:
                 found.setdefault(channel, []).append(seen)
     return {
@@ -229,39 +229,39 @@ def _rates(
     }
 
 
-def _scenes(study: Study) -> dict[str, list[tuple[list[Any], np.ndarray | None]]]:
+def _scenes(dataset: Dataset) -> dict[str, list[tuple[list[Any], np.ndarray | None]]]:
     """Scenes that both sides saw, by name: for each side its captures, and the mask of the pixels that show the same
     part of the scene (None: the middle of the frame)."""
     found: dict[str, list[tuple[list[Any], np.ndarray | None]]] = {}
-    for pair in board_pairs(study.recordings):
-        masks = _board_masks(study, pair)
+    for pair in board_pairs(dataset.recordings):
+        masks = _board_masks(dataset, pair)
         if masks is not None:
             captures = (pair.left.capture, pair.right.capture)
             found[f"board {pair.pose}"] = [([c], m) for c, m in zip(captures, masks, strict=True)]
-    screens = [_screen_captures(study, side) for side in SIDES]
+    screens = [_screen_captures(dataset, side) for side in SIDES]
     for pose in screens[0]:
         if pose in screens[1]:
             found[f"screen {pose}"] = [(part[pose], None) for part in screens]
     return found
 
 
-def _screen_captures(study: Study, side: Side) -> dict[str, list[Any]]:
+def _screen_captures(dataset: Dataset, side: Side) -> dict[str, list[Any]]:
     """Return the captures of the lit screen without gain in dB, by pose."""
     found: dict[str, list[Any]] = {}
-    for capture in study.recordings.captures(WhiteCapture, side):
+    for capture in dataset.recordings.captures(WhiteCapture, side):
         if not capture.gain_db:
             found.setdefault(capture.screen.pose, []).append(capture)
     return found
 
 
-def _glare(study: Study, side: Side) -> tuple[float, float]:
+def _glare(dataset: Dataset, side: Side) -> tuple[float, float]:
     """Share of a camera's light that is scattered evenly over its frame, and its standard deviation.
 
     Weighted least squares of the light in the dark squares of its screens, with the prior 0 +- `GLARE_STD`; at least 0.
     """
-    camera = camera_model(study.recordings, side, None, maker_curves=True)
+    camera = camera_model(dataset.recordings, side, None, maker_curves=True)
     try:
-        squares = screen_block(Study(study.recordings, side, camera))
+        squares = measure_screen(Dataset(dataset.recordings, side, camera))
     except NotDetermined:
         return 0.0, GLARE_STD
     seen = np.array([not label.held_out for label in squares.labels])
@@ -283,14 +283,14 @@ def _same_colour(rates: dict[str, _Seen], lamp: _UniformLight) -> bool:
     return bool(np.ptp(gap) < SAME_COLOUR)
 
 
-def _board_masks(study: Study, pair: StereoPair) -> list[np.ndarray] | None:
+def _board_masks(dataset: Dataset, pair: StereoPair) -> list[np.ndarray] | None:
     """Masks of the convex hull of the corners that both cameras saw, in each frame; None for fewer than six corners."""
     at_left, at_right = pair.common
     if len(at_left) < 6:
         return None
     masks = []
     for side, points in zip(SIDES, (pair.left.image_px[at_left], pair.right.image_px[at_right]), strict=True):
-        camera = study.recordings.camera(side)
+        camera = dataset.recordings.camera(side)
         mask = np.zeros((camera.rows, camera.cols), np.uint8)
         cv2.fillConvexPoly(mask, cv2.convexHull(np.round(points).astype(np.int32)), 1)
         masks.append(mask.astype(bool))
@@ -303,7 +303,7 @@ STEREO_GAIN = Measurement(
     order=600,
     axis="level",
     unit="1",
-    make=scene_gain_block,
+    make=measure_stereo_gain,
     quantity="right over left, ln",
     conditions="scene",
     places="scenes",

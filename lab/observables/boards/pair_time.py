@@ -11,8 +11,8 @@ from lab.observables.boards.calibration import calibration_of
 from lab.observables.boards.corners import board_corners
 from lab.observables.boards.pairs import SIDES, StereoPair, board_pairs, needs_both_sides, rig_poses
 from lab.observables.boards.projection import CameraGeometry
-from lab.observables.dataset import Study
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.dataset import Dataset
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.frame import right_delay_s
 from sim.spectrum import FloatArray
@@ -24,27 +24,27 @@ SHIFT_STD_PX = 0.05  # standard deviation of a pair's displacement beside noise,
 POINTING_STD_PX = 2.0  # prior standard deviation of the displacement by the rig's rotation and the optical axes
 
 
-def time_block(study: Study) -> Block:
+def measure_stereo_time(dataset: Dataset) -> Observable:
     """Displacement (px) of a moving board in the right image from where the left camera's pose puts it, perpendicular
     to the rig's baseline.
 
     A delay t of the right camera displaces it by speed x t. Nuisance parameters: a common displacement, and its
     gradients over the frame. Raises NotDetermined where the cameras can't be calibrated, and for fewer than
     `FEWEST_PAIRS` pairs of a moving board."""
-    needs_both_sides(study.recordings, study.side, "stereo_time")
-    moving = _moving(study)
+    needs_both_sides(dataset.recordings, dataset.side, "stereo_time")
+    moving = _moving(dataset)
     try:
-        left, right = (calibration_of(study.recordings, side) for side in SIDES)
+        left, right = (calibration_of(dataset.recordings, side) for side in SIDES)
     except NotDetermined as refused:
         raise NotDetermined("stereo_time", refused.reason) from refused
-    of_pose = {pair.pose: pair for pair in board_pairs(study.recordings)}
+    of_pose = {pair.pose: pair for pair in board_pairs(dataset.recordings)}
     pairs = [of_pose[pose] for pose in moving if pose in of_pose]
     if len(pairs) < FEWEST_PAIRS:
         raise NotDetermined("stereo_time", f"{len(pairs)} pairs of a moving board, {FEWEST_PAIRS} needed")
     gaps, across = _gaps(pairs, left.camera, right.camera)
     speed = np.array([across @ moving[pair.pose] for pair in pairs])
     place = np.array([pair.right.image_px.mean(axis=0) for pair in pairs])
-    place = (place - place.mean(axis=0)) / (0.5 * float(np.hypot(study.camera.rows, study.camera.cols)))
+    place = (place - place.mean(axis=0)) / (0.5 * float(np.hypot(dataset.camera.rows, dataset.camera.cols)))
     noise = np.array([right.solution.noise_px**2 * 2.0 / len(pair.right.index) for pair in pairs])
     pointing = {
         "stereo:turn": np.full(len(pairs), POINTING_STD_PX),
@@ -53,9 +53,9 @@ def time_block(study: Study) -> Block:
     }
 
     def predict(effects: Effects) -> Prediction:
-        return Prediction(right_delay_s(study.camera, effects) * speed, pointing)
+        return Prediction(right_delay_s(dataset.camera, effects) * speed, pointing)
 
-    return Block(
+    return Observable(
         measurement=STEREO_TIME, reach=1e9, value=gaps, covariance=np.diag(noise + SHIFT_STD_PX**2),
         labels=tuple(
             Label(float(v), "Y", pair.pose, (pair.left.capture.id, pair.right.capture.id), i % 3 == 1)
@@ -65,13 +65,13 @@ def time_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _moving(study: Study) -> dict[str, FloatArray]:
+def _moving(dataset: Dataset) -> dict[str, FloatArray]:
     """Pose -> speed (x, y) of the board in the right image, px/s, from the captures just before and after it.
 
     Raises NotDetermined where no board moves.
     """
-    views = board_corners(study.recordings, "right").views
-    timed = [(study.elapsed_s(v.capture), v) for v in views if v.capture.time is not None]
+    views = board_corners(dataset.recordings, "right").views
+    timed = [(dataset.elapsed_s(v.capture), v) for v in views if v.capture.time is not None]
     timed.sort(key=lambda one: one[0])
     found = {}
     for (start, before), (_, here), (end, after) in zip(timed, timed[1:], timed[2:], strict=False):
@@ -112,6 +112,6 @@ STEREO_TIME = Measurement(
     order=610,
     axis="time",
     unit="px/s",
-    make=time_block,
+    make=measure_stereo_time,
     quantity="displacement, px",
 )

@@ -20,8 +20,8 @@ from lab.observables.boards.calibration import (
 )
 from lab.observables.boards.projection import CameraGeometry
 from lab.observables.colour_shift import REFERENCE_NM
-from lab.observables.dataset import Study
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.dataset import Dataset
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.point import displaced_um
 from sim.scene.projection import Projection
@@ -120,26 +120,26 @@ def _propagated(operator: FloatArray, calibration: Calibration) -> FloatArray:
     return found
 
 
-def board_block(study: Study) -> Block:
+def measure_boards(dataset: Dataset) -> Observable:
     """Mean residual of the corners (px), along and across the radius, by cell of the frame.
 
     Raises NotDetermined without charuco captures, where they don't determine the camera, and where no cell holds
     `FEWEST_CORNERS` corners.
     """
     try:
-        calibration = calibration_of(study.recordings, study.side)
+        calibration = calibration_of(dataset.recordings, dataset.side)
     except NotDetermined as refused:
         raise NotDetermined("boards", refused.reason) from refused
-    known = study.camera.geometry
+    known = dataset.camera.geometry
     earlier = None if known is None else CameraGeometry.of(known.camera_matrix, known.distortion, Projection.of(known))
     found = cell_residuals(calibration, earlier)
     count = len(found.value)
     jacobian = {} if known is None else _calibrated(found, calibration.shape)
 
     def predict(effects: Effects) -> Prediction:
-        return Prediction(found.operator @ shifts_px(study, found.place, effects).ravel(), jacobian)
+        return Prediction(found.operator @ shifts_px(dataset, found.place, effects).ravel(), jacobian)
 
-    return Block(
+    return Observable(
         measurement=BOARDS, reach=0.4, value=found.value,
         covariance=found.covariance + np.diag(np.full(count, CELL_FLOOR_PX**2)),
         labels=tuple(Label(radius, "Y", way, captures, out) for radius, way, captures, out in found.labels),
@@ -147,9 +147,9 @@ def board_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def shifts_px(study: Study, place: FloatArray, effects: Effects) -> FloatArray:
+def shifts_px(dataset: Dataset, place: FloatArray, effects: Effects) -> FloatArray:
     """Displacement (n, 2) of the image by the effects, px, at `place` (n, 2), (x, y) px, at `REFERENCE_NM`."""
-    camera = study.camera
+    camera = dataset.camera
     pitch = camera.pixel_pitch_um
     x, y = ((place[:, k] - 0.5 * (n - 1)) * pitch for k, n in ((0, camera.cols), (1, camera.rows)))
     shift = displaced_um(camera, x, y, REFERENCE_NM, effects)
@@ -219,7 +219,7 @@ BOARDS = Measurement(
     order=500,
     axis="field",
     unit="half diagonals",
-    make=board_block,
+    make=measure_boards,
     quantity="shift of corners, px",
     conditions="direction",
     conditions_words="corners",

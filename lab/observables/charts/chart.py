@@ -11,9 +11,9 @@ from lab.capture_kinds.chart import ChartCapture
 from lab.errors import NotDetermined
 from lab.observables.charts.patches import Patch, patch_covariance, patch_levels
 from lab.observables.darks.level import added_dark_dn
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.flats.row_light import ROW_LIGHT, nuisances, row_light_scatter
-from lab.observables.observable import LEVEL_REACH, Block, Label, Measurement, Prediction
+from lab.observables.observable import LEVEL_REACH, Label, Measurement, Observable, Prediction
 from lab.observables.reads import DARK_CURRENT
 from lab.observables.spectra.curves import CurveJacobian
 from lab.observables.surroundings import halo_light
@@ -28,21 +28,21 @@ from sim.uniform import LEVEL, SPECTRAL, FieldPoints, Uniform
 CHART_SCALE_STD, CHART_GRADIENT_STD = 0.05, 0.005
 
 
-def chart_block(study: Study) -> Block:
+def measure_chart(dataset: Dataset) -> Observable:
     """Mean level (DN) of every patch of a ColorChecker24 by channel.
 
     Nuisance parameters: level and gradient of the light, the maker's sensitivity curves, black level and dark current.
     Tolerances of the reflectances are in the covariance. Raises NotDetermined where the sensitivity curves aren't
     stated, and with fewer than twelve unclipped patches.
     """
-    if not study.stated.quantum_efficiency:
+    if not dataset.stated.quantum_efficiency:
         raise NotDetermined(
             "chart", "the maker's sensitivity curves aren't stated: nothing to hold the recordings against"
         )
-    points = patch_levels(study)
+    points = patch_levels(dataset)
     if len(points) < 12:
         raise NotDetermined("chart", "fewer than twelve unclipped patches of a ColorChecker24")
-    noise, camera = study.noise, study.camera
+    noise, camera = dataset.noise, dataset.camera
     value = np.array([p.level for p in points])
     exposures = np.array([p.captures[0].exposure_s for p in points])
     row, col = np.array([p.row for p in points]), np.array([p.col for p in points])
@@ -53,13 +53,13 @@ def chart_block(study: Study) -> Block:
     place = FieldPoints.at(camera, row, col)
     known = reflectances(points[0].captures[0].chart)
     curves = CurveJacobian(
-        study,
+        dataset,
         [(p.captures[0].radiance, p.channel, p.captures[0].exposure_s, "chart", known[p.name]) for p in points],
         signal / noise.gain / exposures,
     )
     names = {n: i for i, n in enumerate(known)}
 
-    of_channel = {name: np.array([p.channel == name for p in points]) for name in study.channels}
+    of_channel = {name: np.array([p.channel == name for p in points]) for name in dataset.channels}
 
     def predict(effects: Effects) -> Prediction:
         rates = curves.rates(effects)
@@ -69,20 +69,20 @@ def chart_block(study: Study) -> Block:
         electrons = rates * model.field(place).light * (time + model.leaked_s(place))
         if model.strays:
             electrons = _strayed(points, electrons, place, model)
-        electrons = electrons * _mixing(study, points, electrons, model)
+        electrons = electrons * _mixing(dataset, points, electrons, model)
         veil = even_share(camera, effects) * surround + halo_light([p.around for p in points], effects, camera)
         electrons = wide_contrast(camera, effects) * electrons + (veil + tail) / noise.gain + ambient
-        more = added_dark_dn(study, effects)
+        more = added_dark_dn(dataset, effects)
         dark = noise.dark_dn_per_s * exposures + np.array([more(p.captures[0]) for p in points])
         read_dn = np.empty(len(points))
         for name, mine in of_channel.items():
             read_dn[mine] = model.mean_dn({name: (electrons + dark / noise.gain)[mine, None]})[name]
         lit = read_dn - dark
-        offset = study.offset(effects)
+        offset = dataset.offset(effects)
         shift = np.array([offset(p.captures[0]) for p in points])
 
         def jacobian() -> dict[str, FloatArray]:
-            found = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
+            found = dataset.free_offsets(exposures) | dataset.free_warmth([p.captures[0] for p in points])
             found |= {k: v * lit / np.maximum(rates, 1e-30) for k, v in curves.jacobian(effects).items()}
             found["chart:scale"] = CHART_SCALE_STD * lit
             found["chart:x"] = CHART_GRADIENT_STD * lit * (col / camera.cols - 0.5) * 2
@@ -92,12 +92,12 @@ def chart_block(study: Study) -> Block:
 
         return Prediction(noise.black + read_dn + shift, jacobian)
 
-    return Block(
+    return Observable(
         measurement=CHART,
         reach=LEVEL_REACH,
         along=np.log(np.maximum(signal, 1.0)),
         value=value,
-        covariance=patch_covariance(study, points, signal),
+        covariance=patch_covariance(dataset, points, signal),
         labels=tuple(
             Label(float(names[p.name]), p.channel, p.name, tuple(c.id for c in p.captures), p.held_out) for p in points
         ),
@@ -145,12 +145,12 @@ def _by_patch(points: list[Patch]) -> list[dict[str, int]]:
     return [*found.values()]
 
 
-def _mixing(study: Study, points: list[Patch], electrons: FloatArray, model: Uniform) -> FloatArray:
+def _mixing(dataset: Dataset, points: list[Patch], electrons: FloatArray, model: Uniform) -> FloatArray:
     """Factors (n,) on the patches' electrons by effects that move charge between neighbouring pixels of different
     channels."""
     factor = np.ones(len(points))
     for members in _by_patch(points):
-        if len(members) == len(study.channels):
+        if len(members) == len(dataset.channels):
             mixed = model.mixing_factors({c: float(electrons[i]) for c, i in members.items()})
             for c, i in members.items():
                 factor[i] = mixed.get(c, 1.0)
@@ -163,7 +163,7 @@ CHART = Measurement(
     order=300,
     axis="level",
     unit="DN",
-    make=chart_block,
+    make=measure_chart,
     quantity="mean level, DN",
     is_level=True,
     places="patches",

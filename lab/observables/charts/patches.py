@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.capture_kinds.chart import ChartCapture
-from lab.observables.dataset import CLIPPED_SHARE, Study, held_out_of, mean_frame
+from lab.observables.dataset import CLIPPED_SHARE, Dataset, held_out_of, mean_frame
 from lab.observables.plane_means import channel_pixels
 from lab.observables.surroundings import Surroundings, harmonics
 from sim.point import optical_transfer
@@ -41,26 +41,26 @@ class Patch:
     held_out: bool
 
 
-def patch_levels(study: Study) -> list[Patch]:
+def patch_levels(dataset: Dataset) -> list[Patch]:
     """Return the unclipped patches of all ColorChecker24 captures, by channel, seen and held-out repeats apart."""
-    groups = study.groups(ChartCapture, lambda c: (c.chart, c.exposure_s, c.radiance, c.corners))
+    groups = dataset.groups(ChartCapture, lambda c: (c.chart, c.exposure_s, c.radiance, c.corners))
     groups = [g for g in groups if g[0].chart == "ColorChecker24"]
-    step = mosaic.step(study.camera.cfa)
+    step = mosaic.step(dataset.camera.cfa)
     points = []
     for i, group in enumerate(groups):
         out = held_out_of(group, i, len(groups))
         for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
             if not part:
                 continue
-            frame = mean_frame(study.recordings, part)
-            clipped = study.recordings.frame(part[0]) >= study.saturation_dn
-            for channel in study.channels:
-                first_row, first_col = mosaic.phases(study.camera.cfa)[channel][0]
+            frame = mean_frame(dataset.recordings, part)
+            clipped = dataset.recordings.frame(part[0]) >= dataset.saturation_dn
+            for channel in dataset.channels:
+                first_row, first_col = mosaic.phases(dataset.camera.cfa)[channel][0]
                 plane = frame[first_row::step, first_col::step]
-                spread = _spread(study, plane, channel, part[0].radiance)
-                mean = float(channel_pixels(frame, study.camera.cfa, channel).mean())
-                low = harmonics(plane - study.noise.black - study.noise.dark_dn_per_s * part[0].exposure_s)
-                mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))
+                spread = _spread(dataset, plane, channel, part[0].radiance)
+                mean = float(channel_pixels(frame, dataset.camera.cfa, channel).mean())
+                low = harmonics(plane - dataset.noise.black - dataset.noise.dark_dn_per_s * part[0].exposure_s)
+                mask = dataset.plane_mask(channel, (dataset.camera.rows, dataset.camera.cols))
                 for name, rows, cols, row, col in patch_boxes(part[0]):
                     box = (slice(*rows), slice(*cols))
                     values = frame[box][mask[box]]
@@ -75,13 +75,13 @@ def patch_levels(study: Study) -> list[Patch]:
     return points
 
 
-def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> FloatArray:
+def patch_covariance(dataset: Dataset, points: list[Patch], signal: FloatArray) -> FloatArray:
     """Covariance (n, n), DN^2, of the levels of n patches.
 
     It is the sum of shot and read noise and PRNU, tolerances of the reflectance (one common to repeats and channels,
     one for each channel), of the point spread function's tail, rounding, and the lamp's repeatability, common to all
     patches of a capture."""
-    noise = study.noise
+    noise = dataset.noise
     pixels = np.array([p.pixels for p in points])
     repeats = np.array([len(p.captures) for p in points])
     tail = np.array([p.tail for p in points])
@@ -92,7 +92,7 @@ def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> F
     fixed = np.sqrt((noise.prnu * signal) ** 2 / pixels + digits**2)
     same = names[:, None] == names
     covariance = np.diag(temporal + noise.jitter_dn**2) + same * (channel[:, None] == channel) * np.outer(fixed, fixed)
-    covariance += same * np.outer(tail, tail) * study.tail_std**2
+    covariance += same * np.outer(tail, tail) * dataset.tail_std**2
     covariance += reflectance_covariance(names, channel, signal)
     taken = np.array([p.captures[0].id for p in points])
     lamp = signal * noise.jitter_lamp / np.sqrt(repeats)
@@ -110,17 +110,17 @@ def reflectance_covariance(names: StrArray, channel: StrArray, signal: FloatArra
     return np.asarray(same * (common + own))
 
 
-def _spread(study: Study, plane: FloatArray, channel: str, light: str) -> FloatArray:
+def _spread(dataset: Dataset, plane: FloatArray, channel: str, light: str) -> FloatArray:
     """Change (DN) of a plane of the mosaic by the baseline's point spread function: plane convolved with it, less the
     plane.
 
     The recording stands for the scene, as well inside a patch blur changes it by a fraction of a per cent.
     """
-    step = mosaic.step(study.camera.cfa)
+    step = mosaic.step(dataset.camera.cfa)
     picture = np.pad(plane, [(0, n) for n in plane.shape], mode="symmetric")
     fy = np.fft.fftfreq(picture.shape[0], step)[:, None]
     fx = np.fft.rfftfreq(picture.shape[1], step)[None, :]
-    otf = np.real(optical_transfer(study.camera, channel, study.spectrum(light), fx, fy))
+    otf = np.real(optical_transfer(dataset.camera, channel, dataset.spectrum(light), fx, fy))
     blurred = np.fft.irfft2(np.fft.rfft2(picture) * otf, picture.shape)
     return np.asarray(blurred[: plane.shape[0], : plane.shape[1]] - plane)
 

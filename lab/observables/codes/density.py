@@ -19,8 +19,8 @@ from scipy.special import ndtr
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
-from lab.observables.dataset import Study, held_out_flats, held_out_of
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.dataset import Dataset, held_out_flats, held_out_of
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -68,19 +68,19 @@ class CodeCounts:
     used: np.ndarray  # mask: counted often enough, and all neighbours of the filter present
 
 
-def code_block(study: Study) -> Block:
+def measure_code_density(dataset: Dataset) -> Observable:
     """Code-density test of all uniform light: steps (DN) by the code, combs of a few codes' period, and the variance of
     the counts about a smooth curve."""
-    counts = study.once(counted)
+    counts = dataset.once(counted)
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
     sets: dict[bool, tuple[CodeCounts, sparse.csr_array, list[_Part]]] = {}
     values, covariances, scales = [], [], []
     for held_out in (False, True):
-        codes = prepared(study, counts[held_out])
+        codes = prepared(dataset, counts[held_out])
         if codes is None:
             continue
-        (steps, boundaries), parts = _steps(study, codes), _parts(codes)
+        (steps, boundaries), parts = _steps(dataset, codes), _parts(codes)
         combs, names = _combs(codes)
         residual = codes.rough @ codes.count
         values += [
@@ -91,7 +91,7 @@ def code_block(study: Study) -> Block:
         # unequal codes show in proportion to the number of pixels counted: seen and held-out frames have different ones
         scales += [np.ones(len(steps) + len(combs)), np.array([p.ofwidths for p in parts])]
         linear = np.vstack([steps, combs])
-        floor = np.concatenate([np.full(len(steps), STEP_FLOOR * _spacing(study)), np.full(len(combs), COMB_FLOOR)])
+        floor = np.concatenate([np.full(len(steps), STEP_FLOOR * _spacing(dataset)), np.full(len(combs), COMB_FLOOR)])
         covariances += [
             _covariance(linear, codes, counts[held_out]) + np.diag(np.square(floor)),
             np.diag([1.0 + (VARIANCE_FLOOR * p.number / p.chi2_std) ** 2 for p in parts]),
@@ -105,7 +105,7 @@ def code_block(study: Study) -> Block:
             low, high = codes.first + p.at.start, codes.first + p.at.stop - 1
             labels.append(Label(0.5 * (low + high), "variance", f"codes {low} to {high}", members, held_out))
         # discrepancies of combs: independent between periods and phases, the same for seen and held-out frames
-        far = 10.0 * study.camera.white_level_dn
+        far = 10.0 * dataset.camera.white_level_dn
         places += [(float(codes.first + b), 0.0) for b in boundaries]
         places += [(0.0, far * k) for k in range(len(names))]
         places += [(label.x, 0.0) for label in labels[len(places) :]]
@@ -119,7 +119,7 @@ def code_block(study: Study) -> Block:
         found: list[FloatArray] = []
         scatter: dict[str, tuple[int, float]] = {}
         for held_out, (codes, linear, parts) in sets.items():
-            change = codes.expected * (widths(codes, effects, study) - 1.0)
+            change = codes.expected * (widths(codes, effects, dataset) - 1.0)
             moved = codes.rough @ change
             excess = np.array([p.excess(moved) for p in parts])
             at = sum(map(len, found)) + int(linear.shape[0])
@@ -129,8 +129,8 @@ def code_block(study: Study) -> Block:
         mean = np.concatenate(found)
         return Prediction(mean, {name: std * (np.arange(len(mean)) == i) for name, (i, std) in scatter.items()})
 
-    return Block(
-        measurement=CODE_DENSITY, reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
+    return Observable(
+        measurement=CODE_DENSITY, reach=0.1 * dataset.camera.white_level_dn, value=np.concatenate(values),
         covariance=block_diag(*covariances), labels=tuple(labels), reads=frozenset({"codes.codes"}), predict=predict,
         scale=np.concatenate(scales),
         along=np.array(places),
@@ -148,19 +148,19 @@ class _Counts:
     captures: list[str]
     groups: list[tuple[int, int, FloatArray]]
 
-    def take(self, study: Study, capture: Any) -> None:
+    def take(self, dataset: Dataset, capture: Any) -> None:
         """Add a capture's frame."""
-        frame = study.recordings.frame(capture)
+        frame = dataset.recordings.frame(capture)
         self.count[:] += np.bincount(frame.ravel(), minlength=len(self.count))[: len(self.count)]
-        for plane in mosaic.planes(frame, study.camera.cfa).values():
-            for first, number, probability in _levels(np.asarray(plane, np.float32), study):
+        for plane in mosaic.planes(frame, dataset.camera.cfa).values():
+            for first, number, probability in _levels(np.asarray(plane, np.float32), dataset):
                 last = min(first + len(probability), len(self.expected))
                 self.expected[first:last] += number * probability[: last - first]
                 self.groups.append((first, number, probability))
         self.captures.append(capture.id)
 
 
-def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
+def _levels(plane: Any, dataset: Dataset) -> Iterator[tuple[int, int, FloatArray]]:
     """Yield a plane's pixels by level, as `_Counts.groups`.
 
     Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels, and by as much beside it as its row is on
@@ -170,7 +170,7 @@ def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
     surface = ndimage.uniform_filter(plane, AROUND, mode="reflect")
     surface = surface + (plane - surface).mean(axis=1, keepdims=True)
     own = AROUND**2 / (AROUND**2 - 1.0) / (1.0 - 1.0 / plane.shape[1])
-    signal = max(float(surface.mean()) - study.noise.black, 1.0)
+    signal = max(float(surface.mean()) - dataset.noise.black, 1.0)
     variance = own * float(np.mean(np.square(plane - surface), dtype=float))
     # pixels are binned by level, in steps narrow beside the noise; the variance of the levels within a bin is added
     step = max(STEP_OF_LEVELS * np.sqrt(variance), 1.0)
@@ -183,58 +183,58 @@ def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
     for n, middle, added in zip(number, mean + float(surface.min()), within, strict=True):
         if n == 0:
             continue
-        sigma = np.sqrt(max(variance * max(middle - study.noise.black, 1.0) / signal + added, 1e-2))
+        sigma = np.sqrt(max(variance * max(middle - dataset.noise.black, 1.0) / signal + added, 1e-2))
         low = max(int(middle - 6.0 * sigma), 0)
         edges = (np.arange(low, int(middle + 6.0 * sigma) + 3) - 0.5 - middle) / sigma
         yield low, int(n), np.diff(ndtr(edges))
 
 
-def counted(study: Study) -> dict[bool, _Counts]:
+def counted(dataset: Dataset) -> dict[bool, _Counts]:
     """Counts of all flat and narrowband frames without gain in dB: seen (False) and held out (True). Raises
     NotDetermined where codes lie `SHIFTED_FROM` or more apart."""
-    if study.step_dn >= SHIFTED_FROM:
+    if dataset.step_dn >= SHIFTED_FROM:
         raise NotDetermined(
             "code_density",
-            f"codes lie {study.step_dn:.5g} DN apart, as those of fewer bits that were shifted or scaled: their steps "
-            "aren't judged; write the frames as they left the converter",
+            f"codes lie {dataset.step_dn:.5g} DN apart, as those of fewer bits that were shifted or scaled: their "
+            "steps aren't judged; write the frames as they left the converter",
         )
-    size = int(study.camera.white_level_dn) + 1
+    size = int(dataset.camera.white_level_dn) + 1
     counts = {out: _Counts(np.zeros(size), np.zeros(size), [], []) for out in (False, True)}
-    out = set(study.once(held_out_flats))
-    groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    out = set(dataset.once(held_out_flats))
+    groups = dataset.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
     out |= set().union(*(held_out_of(g, i, len(groups)) for i, g in enumerate(groups))) if groups else set()
     for kind in (FlatCapture, NarrowbandCapture):
-        for capture in study.recordings.captures(kind, study.side):
+        for capture in dataset.recordings.captures(kind, dataset.side):
             if not capture.gain_db:
-                counts[capture.id in out].take(study, capture)
+                counts[capture.id in out].take(dataset, capture)
     return counts
 
 
-def counted_in_all(study: Study) -> dict[bool, _Counts]:
+def counted_in_all(dataset: Dataset) -> dict[bool, _Counts]:
     """Counts of `counted`, and of all other frames with light, without what their light gives an ideal converter.
 
     Their histogram is as smooth by the noise of the light as that of even light. Of each kind every third capture is
     held out.
     """
     found = {}
-    for out, even in study.once(counted).items():
+    for out, even in dataset.once(counted).items():
         found[out] = _Counts(even.count.copy(), np.zeros(len(even.count)), list(even.captures), [])
     number: dict[str, int] = {}
-    for capture in study.recordings.captures(side=study.side):
+    for capture in dataset.recordings.captures(side=dataset.side):
         if capture.kind in {"dark", "flat", "narrowband"} or getattr(capture, "gain_db", None):
             continue
         number[capture.kind] = number.get(capture.kind, -1) + 1
-        own, frame = found[number[capture.kind] % 3 == 1], study.recordings.frame(capture)
+        own, frame = found[number[capture.kind] % 3 == 1], dataset.recordings.frame(capture)
         own.count[:] += np.bincount(frame.ravel(), minlength=len(own.count))[: len(own.count)]
         own.captures.append(capture.id)
     return found
 
 
-def prepared(study: Study, counts: _Counts) -> CodeCounts | None:
+def prepared(dataset: Dataset, counts: _Counts) -> CodeCounts | None:
     """Return the histogram over the usable codes, None where they are too few."""
     level = np.arange(len(counts.count), dtype=float)
-    noise = np.sqrt(np.maximum(study.noise.gain * (level - study.noise.black), 0.0) + study.noise.read_dn**2)
-    high = min(float(study.saturation_dn), float(len(level) - 1))
+    noise = np.sqrt(np.maximum(dataset.noise.gain * (level - dataset.noise.black), 0.0) + dataset.noise.read_dn**2)
+    high = min(float(dataset.saturation_dn), float(len(level) - 1))
     usable = (noise >= LEAST_NOISE) & (level < high - 6.0 * noise)
     if usable.sum() < LEAST_CODES:
         return None
@@ -304,21 +304,21 @@ def _combs(codes: CodeCounts) -> tuple[FloatArray, list[tuple[float, str]]]:
     return np.array(table).reshape(len(table), len(index)), names
 
 
-def _spacing(study: Study) -> int:
+def _spacing(dataset: Dataset) -> int:
     """Codes from one place to the next."""
-    return max(round(2.0**study.camera.bit_depth / PLACES), LEAST_SPACING)
+    return max(round(2.0**dataset.camera.bit_depth / PLACES), LEAST_SPACING)
 
 
-def _steps(study: Study, codes: CodeCounts) -> tuple[FloatArray, list[int]]:
+def _steps(dataset: Dataset, codes: CodeCounts) -> tuple[FloatArray, list[int]]:
     """Weights of the counts that give how many codes' worth is missing about each of `PLACES` parts of the converter's
     range, and these codes.
 
     Codes count the less, the further they are from the place, and not at all from the next place on: what is missing
     anywhere is shared by the two places beside it. It is missing against `expected` and the parabola that it lacks on
     either side of both neighbours."""
-    spacing = _spacing(study)
+    spacing = _spacing(dataset)
     table, at = [], []
-    for k in range(1, int(2.0**study.camera.bit_depth / spacing)):
+    for k in range(1, int(2.0**dataset.camera.bit_depth / spacing)):
         place = k * spacing - codes.first
         if not 0 <= place < len(codes.count):
             continue
@@ -383,14 +383,14 @@ def _parts(codes: CodeCounts) -> list[_Part]:
     return found
 
 
-def widths(codes: CodeCounts, effects: Effects, study: Study) -> FloatArray:
+def widths(codes: CodeCounts, effects: Effects, dataset: Dataset) -> FloatArray:
     """Width (codes,) of each code: the interval of the converter's input that gives it, 1 for an ideal converter.
 
     The input is cut at the edges of the ideal converter's codes. Where the converter's law is straight over several of
     these intervals, what lands on each code is exact; other intervals are sampled `FINE` times, and samples in which it
     bends as often again.
     """
-    size, law = len(codes.count), Uniform(study.camera, effects).codes
+    size, law = len(codes.count), Uniform(dataset.camera, effects).codes
     edge = np.asarray(np.arange(size + 2 * MARGIN + 1) - 0.5 - MARGIN, float)  # from the first counted code on
     lands = law(edge + codes.first) - codes.first
     bend = np.abs(np.diff(lands, 2)) > STRAIGHT
@@ -432,6 +432,6 @@ CODE_DENSITY = Measurement(
     order=240,
     axis="level",
     unit="DN",
-    make=code_block,
+    make=measure_code_density,
     quantity="step, DN, or excess variance of counts",
 )

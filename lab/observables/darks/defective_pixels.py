@@ -20,8 +20,8 @@ from lab.observables.darks.frames import (
     dark_frames,
     fine_conditions,
 )
-from lab.observables.dataset import Study
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.dataset import Dataset
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import PARTICLES
 from sim.effects.base import Effects
 from sim.sensor.particles import Particles
@@ -59,7 +59,7 @@ def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0)
     return np.diag(chance + COUNT_STD**2 + np.square(rooted_counts(expected + uncertain) - rooted_counts(expected)))
 
 
-def defective_pixel_block(study: Study) -> Block:
+def measure_defective_pixels(dataset: Dataset) -> Observable:
     """Anscombe-transformed numbers of pixels by their deviation from their surroundings in the median of repeats, by
     exposure.
 
@@ -67,7 +67,7 @@ def defective_pixel_block(study: Study) -> Block:
     bright as the exposure is long. Telegraph noise is predicted where the temporal noise exceeds `LEAST_COUNTED_DN`:
     with less, all repeats of a pixel have one code. That any pixel is far off in several frames, where none is
     expected, counts as `PRESENCE` more. Raises NotDetermined without dark captures."""
-    frames = [f for f in study.once(dark_frames) if f.fixed]
+    frames = [f for f in dataset.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
     low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]])
     far = [(low >= FAR) & (part.of_median > 1) for *_, part in points]
@@ -83,19 +83,19 @@ def defective_pixel_block(study: Study) -> Block:
         return found
 
     value = rooted(np.concatenate([part.counts for *_, part in points]), np.sign)
-    size = study.camera.rows * study.camera.cols
+    size = dataset.camera.rows * dataset.camera.cols
     bins = len(points[0][2].counts)
-    own = [_pixel_noise(study, f, part) for f, _, part in points]
+    own = [_pixel_noise(dataset, f, part) for f, _, part in points]
 
     def expected(effects: Effects, times: float = 1.0) -> FloatArray:
         found = []
         for (f, _, part), (moving, fixed) in zip(points, own, strict=True):
-            classes = _defect_classes(Uniform(study.camera, effects), study.noise.gain, f.condition.exposure_s)
-            if moving < LEAST_COUNTED_DN * study.step_dn:
+            classes = _defect_classes(Uniform(dataset.camera, effects), dataset.noise.gain, f.condition.exposure_s)
+            if moving < LEAST_COUNTED_DN * dataset.step_dn:
                 classes = [c for c in classes if c.jump_dn == 0.0]
             skew = times * part.skewness * (part.spread_dn / moving) ** 3
             found.append(
-                size * _tail_shares(classes, moving, fixed, part.of_median, part.spread_dn, study.noise.gain, skew)
+                size * _tail_shares(classes, moving, fixed, part.of_median, part.spread_dn, dataset.noise.gain, skew)
             )
         return np.concatenate(found)
 
@@ -111,7 +111,7 @@ def defective_pixel_block(study: Study) -> Block:
     base = expected(())
     # the skewness of most pixels doesn't determine the far tail
     uncertain = np.abs(expected((), 2.0) - expected((), 0.0)) + 0.2 * base
-    return Block(
+    return Observable(
         measurement=DEFECTIVE_PIXELS, reach=1.0, value=value,
         covariance=_count_covariance(base, uncertain), labels=labels, reads=DEFECTS,
         predict=predict, scale=np.full(len(value), 10.0),
@@ -119,11 +119,11 @@ def defective_pixel_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _pixel_noise(study: Study, frames: DarkStatistics, part: DarkPattern) -> tuple[float, float]:
+def _pixel_noise(dataset: Dataset, frames: DarkStatistics, part: DarkPattern) -> tuple[float, float]:
     """(temporal, fixed) standard deviation of single pixels, DN. fixed^2 = spread^2 of the median frame - its temporal
     variance. Of a single frame, all counts as temporal."""
     moving = next((c.pixel_dn2 for c in frames.changing.values()), None)
-    left, least = _order_moments(part.of_median)[1], 0.05 * study.step_dn
+    left, least = _order_moments(part.of_median)[1], 0.05 * dataset.step_dn
     if moving is None:
         return max(part.spread_dn, least), 0.0
     return max(float(np.sqrt(moving)), least), float(np.sqrt(max(part.spread_dn**2 - left * moving, 0.0)))
@@ -197,16 +197,16 @@ def _upper(z: FloatArray, skew: float) -> FloatArray:
     return np.asarray(ndtr(-z) + np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) * skew / 6.0 * (z * z - 1.0))
 
 
-def flickering_pixel_block(study: Study) -> Block:
+def measure_flickering_pixels(dataset: Dataset) -> Observable:
     """Anscombe-transformed numbers of pixels by their temporal variance over that of their surroundings, all dark
     frames together.
 
     Raises NotDetermined without repeats, and where codes are too coarse.
     """
-    fine = fine_conditions("flickering_pixels", study.once(dark_frames), LEAST_COUNTED_DN * study.step_dn)
+    fine = fine_conditions("flickering_pixels", dataset.once(dark_frames), LEAST_COUNTED_DN * dataset.step_dn)
     draws = _JumpDraws.of(fine)
     parts = {out: [(k, f) for k, f in enumerate(fine) if out in f.changing] for out in by_part(fine)}
-    size = study.camera.rows * study.camera.cols
+    size = dataset.camera.rows * dataset.camera.cols
     value, labels, sums = [], [], []
     for out, part in parts.items():
         freedom = sum(f.changing[out].contrasts for _, f in part)
@@ -218,26 +218,26 @@ def flickering_pixel_block(study: Study) -> Block:
         sums.append((out, part, freedom, edges))
 
     def expected(effects: Effects) -> FloatArray:
-        model, found = Uniform(study.camera, effects), []
+        model, found = Uniform(dataset.camera, effects), []
         particles = model.particles
         for out, part, freedom, edges in sums:
             shares = _chance_above(np.array([freedom], float), np.zeros(1), edges)[0]
             for hot in model.hot:
                 weight, rate = hot.nodes()
-                shares = shares + weight @ (_hot_above(study, [f for _, f in part], out, rate, edges) - shares)
+                shares = shares + weight @ (_hot_above(dataset, [f for _, f in part], out, rate, edges) - shares)
             for jumps in model.telegraph:
                 weight, distance_e = jumps.nodes()
                 unit = np.sum([draws.sums[k, out] / f.changing[out].pixel_dn2 for k, f in part], axis=0)
-                above = _jump_above(study, unit, draws.weights(jumps.high_share), distance_e, edges, freedom)
+                above = _jump_above(dataset, unit, draws.weights(jumps.high_share), distance_e, edges, freedom)
                 shares = shares + weight @ (above - shares)
             for law in particles:
-                shares = shares + _hit_above(study, law, [f for _, f in part], out, edges, freedom)
+                shares = shares + _hit_above(dataset, law, [f for _, f in part], out, edges, freedom)
             found.append(size * (shares - np.append(shares[1:], 0.0)))
         return np.maximum(np.concatenate(found), 0.0)
 
     base = expected(())
     position = np.array([label.x for label in labels])
-    return Block(
+    return Observable(
         measurement=FLICKERING_PIXELS, reach=1.0,
         value=np.concatenate(value), covariance=_count_covariance(base, base), labels=tuple(labels),
         reads=DEFECTS | PARTICLES, predict=lambda effects: Prediction(rooted_counts(expected(effects)), {}),
@@ -262,13 +262,13 @@ def _chance_above(freedom: FloatArray, noncentral: FloatArray, edges: FloatArray
 
 
 def _hot_above(
-    study: Study, part: Sequence[DarkStatistics], out: bool, rate: FloatArray, edges: FloatArray
+    dataset: Dataset, part: Sequence[DarkStatistics], out: bool, rate: FloatArray, edges: FloatArray
 ) -> FloatArray:
     """Probability (rates, edges) that the shot noise of hot pixels of `rate` (e/s) takes them above the edges: a scaled
     chi-squared variable with the right first two moments."""
     count = np.array([f.changing[out].contrasts for f in part], float)
     noise = np.array([f.changing[out].pixel_dn2 for f in part])
-    charge = study.noise.gain**2 * rate[:, None] * np.array([f.condition.exposure_s for f in part])
+    charge = dataset.noise.gain**2 * rate[:, None] * np.array([f.condition.exposure_s for f in part])
     factor = 1.0 + charge / noise
     mean, variance = factor @ count, 2.0 * np.square(factor) @ count
     scale = variance / (2.0 * mean)
@@ -277,17 +277,17 @@ def _hot_above(
 
 
 def _hit_above(
-    study: Study, law: Particles, part: Sequence[DarkStatistics], out: bool, edges: FloatArray, freedom: int
+    dataset: Dataset, law: Particles, part: Sequence[DarkStatistics], out: bool, edges: FloatArray, freedom: int
 ) -> FloatArray:
     """Probability (edges,) that a particle's charge takes a pixel above the edges: over all frames in which it may be
     hit."""
-    pitch_um = study.camera.pixel_pitch_um
+    pitch_um = dataset.camera.pixel_pitch_um
     number, charge_e = law.pixels_e(pitch_um)
     found: FloatArray = np.zeros(len(edges))
     for f in part:
         hit = law.expected_number(1, pitch_um, f.condition.exposure_s)
         for weight in np.sum(np.square(contrast_weights(f.condition, out)), axis=0):
-            away = np.square(study.noise.gain * charge_e) * weight / f.changing[out].pixel_dn2
+            away = np.square(dataset.noise.gain * charge_e) * weight / f.changing[out].pixel_dn2
             found = found + hit * number @ _chance_above(
                 np.full(len(away), float(freedom)), np.maximum(away, 1e-9), edges
             )
@@ -339,7 +339,7 @@ class _JumpDraws:
 
 
 def _jump_above(
-    study: Study,
+    dataset: Dataset,
     unit: FloatArray,
     weight: FloatArray,
     amplitude_e: FloatArray,
@@ -350,7 +350,7 @@ def _jump_above(
     weights `weight`. `unit` (draws,): the non-centrality of an amplitude of 1 DN."""
     found = []
     for amplitude in amplitude_e:
-        away = np.square(study.noise.gain * amplitude) * unit
+        away = np.square(dataset.noise.gain * amplitude) * unit
         found.append(weight @ _chance_above(np.full(len(away), float(freedom)), np.maximum(away, 1e-9), edges))
     return np.array(found)
 
@@ -361,7 +361,7 @@ DEFECTIVE_PIXELS = Measurement(
     order=190,
     axis="deviation",
     unit="standard deviations",
-    make=defective_pixel_block,
+    make=measure_defective_pixels,
     quantity="number of pixels, 2 sqrt(n + 3/8), 4 more where any lies far off",
     conditions="exposure and temperature",
 )
@@ -373,6 +373,6 @@ FLICKERING_PIXELS = Measurement(
     order=195,
     axis="variance",
     unit="times their surroundings'",
-    make=flickering_pixel_block,
+    make=measure_flickering_pixels,
     quantity="number of pixels, 2 sqrt(n + 3/8)",
 )

@@ -10,8 +10,8 @@ from scipy import ndimage
 from lab.errors import NotDetermined
 from lab.observables.darks.defective_pixels import COUNT_STD, rooted_counts
 from lab.observables.darks.frames import DarkStatistics, captures_of, dark_frames
-from lab.observables.dataset import Study
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.dataset import Dataset
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
@@ -38,7 +38,7 @@ class _Events:
     counts: FloatArray
 
 
-def count_events(study: Study) -> list[_Events]:
+def count_events(dataset: Dataset) -> list[_Events]:
     """Return the events of all conditions of `LEAST_FRAMES` dark frames and more.
 
     A pixel is hit in a frame where it exceeds its value in every other one by `BRIGHT` standard deviations of its
@@ -46,17 +46,17 @@ def count_events(study: Study) -> list[_Events]:
     event, as bright as its brightest.
     """
     found: list[_Events] = []
-    for dark in study.once(dark_frames):
+    for dark in dataset.once(dark_frames):
         captures = dark.condition.captures[:MOST_FRAMES]
         moving = next((part.pixel_dn2 for part in dark.changing.values()), None)
         if len(captures) < LEAST_FRAMES or moving is None:
             continue
-        frames = np.array([study.recordings.frame(c) for c in captures], np.float32)
+        frames = np.array([dataset.recordings.frame(c) for c in captures], np.float32)
         frames -= np.median(frames, axis=(1, 2), keepdims=True)
         top = np.sort(frames, axis=0)[-2:]
         usual = np.median(frames, axis=0)
-        std = np.sqrt(moving + study.noise.gain * np.maximum(usual, 0.0))
-        least = np.maximum(BRIGHT * std, LEAST_STEPS * study.step_dn)
+        std = np.sqrt(moving + dataset.noise.gain * np.maximum(usual, 0.0))
+        least = np.maximum(BRIGHT * std, LEAST_STEPS * dataset.step_dn)
         hit = top[1] - top[0] > least
         edges = float(np.median(least)) * np.array(EVENT_EDGES)
         counts = {True: np.zeros(len(edges)), False: np.zeros(len(edges))}
@@ -74,34 +74,34 @@ def count_events(study: Study) -> list[_Events]:
     return found
 
 
-def dark_event_block(study: Study) -> Block:
+def measure_dark_events(dataset: Dataset) -> Observable:
     """Anscombe-transformed numbers of events by brightness, by exposure. None are expected of normal noise; of
     telegraph noise those pixels that are at the higher level in one frame alone.
 
     Raises NotDetermined without `LEAST_FRAMES` repeats of a dark frame.
     """
-    points = study.once(count_events)
+    points = dataset.once(count_events)
     if not points:
         raise NotDetermined(
             "dark_events", f"fewer than {LEAST_FRAMES} dark frames of the same exposure and temperature"
         )
-    pixels, pitch_um = study.camera.rows * study.camera.cols, study.camera.pixel_pitch_um
+    pixels, pitch_um = dataset.camera.rows * dataset.camera.cols, dataset.camera.pixel_pitch_um
     value = rooted_counts(np.concatenate([p.counts for p in points]))
 
     def expected(effects: Effects) -> FloatArray:
-        model = Uniform(study.camera, effects)
+        model = Uniform(dataset.camera, effects)
         found = []
         for p in points:
             number: FloatArray = np.zeros(len(p.edges_dn))
             for law in model.particles:
                 events = law.expected_number(pixels, pitch_um, p.dark.condition.exposure_s) * p.frames
-                bright = study.noise.gain * law.brightest_e(pitch_um)
+                bright = dataset.noise.gain * law.brightest_e(pitch_um)
                 number = number + events * np.histogram(bright, [*p.edges_dn, np.inf])[0] / bright.size
             for jumps in model.telegraph:
                 shares, distance_e = jumps.nodes()
                 high = jumps.high_share
                 alone = high * (1.0 - high) ** (p.repeats - 1)
-                bins = np.histogram(study.noise.gain * distance_e, [*p.edges_dn, np.inf], weights=shares)[0]
+                bins = np.histogram(dataset.noise.gain * distance_e, [*p.edges_dn, np.inf], weights=shares)[0]
                 number = number + p.frames * pixels * alone * bins
             found.append(number)
         return np.concatenate(found)
@@ -111,7 +111,7 @@ def dark_event_block(study: Study) -> Block:
         for p in points
         for edge in p.edges_dn
     )
-    return Block(
+    return Observable(
         measurement=DARK_EVENTS, reach=1.0, value=value,
         covariance=np.eye(len(value)) * (1.0 + COUNT_STD**2), labels=labels,
         reads=frozenset({"charge.particles", "signal.telegraph"}),
@@ -126,7 +126,7 @@ DARK_EVENTS = Measurement(
     order=198,
     axis="brightness",
     unit="DN",
-    make=dark_event_block,
+    make=measure_dark_events,
     quantity="number of events, 2 sqrt(n + 3/8)",
     conditions="exposure and temperature",
 )

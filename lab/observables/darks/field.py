@@ -8,8 +8,8 @@ import numpy as np
 from lab.errors import NotDetermined
 from lab.observables.darks.frames import CELL_FLOOR_DN, CELLS, cell_means, dark_frames
 from lab.observables.darks.level import dark_current_map
-from lab.observables.dataset import Study
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.dataset import Dataset
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import ADDED, DARK_CURRENT, LINES
 from sim.effects.base import Effects
 from sim.sensor.lines import Lines
@@ -20,24 +20,24 @@ CELL_PX = 4  # the least side of a cell
 SLOW_CYCLES = 6  # down a frame, of noise whose waves cells tell
 
 
-def dark_field_block(study: Study) -> Block:
+def measure_dark_field(dataset: Dataset) -> Observable:
     """Means over 4 x 6 cells of the mean dark frame of each condition, less the frame's mean, DN.
 
     The level of each mean frame is a nuisance parameter. Raises NotDetermined where cells are narrower than `CELL_PX`.
     """
-    frames = [f for f in study.once(dark_frames) if f.fixed]
+    frames = [f for f in dataset.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
     rows, cols = CELLS
     count = rows * cols
-    if min(study.camera.rows // rows, study.camera.cols // cols) < CELL_PX:
+    if min(dataset.camera.rows // rows, dataset.camera.cols // cols) < CELL_PX:
         raise NotDetermined(
             "dark_field",
-            f"frames of {study.camera.rows} x {study.camera.cols} px: too small to be split into cells, which need "
+            f"frames of {dataset.camera.rows} x {dataset.camera.cols} px: too small to be split into cells, which need "
             f"{rows * CELL_PX} x {cols * CELL_PX} px",
         )
     value = np.concatenate([part.cells.ravel() - part.cells.mean() for *_, part in points])
     row, col = (g.ravel() for g in np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij"))
-    size = study.camera.rows * study.camera.cols / count
+    size = dataset.camera.rows * dataset.camera.cols / count
     changing: list[float] = []
     fixed: list[float] = []
     line_dn2: dict[Lines, float] = {"rows": 0.0, "columns": 0.0}
@@ -51,10 +51,10 @@ def dark_field_block(study: Study) -> Block:
             noise = moving.line_dn2[lines] / part.frames if moving is not None else 0.0
             line_dn2[lines] = max(most, part.line_dn2[lines] - noise)
     pattern = np.eye(count) * float(np.max(fixed))
-    pattern += (row[:, None] == row) * line_dn2["rows"] * rows / study.camera.rows
-    pattern += (col[:, None] == col) * line_dn2["columns"] * cols / study.camera.cols
+    pattern += (row[:, None] == row) * line_dn2["rows"] * rows / dataset.camera.rows
+    pattern += (col[:, None] == col) * line_dn2["columns"] * cols / dataset.camera.cols
     covariance = np.kron(np.ones((len(points), len(points))), pattern) + np.diag(
-        np.repeat(changing, count) + (CELL_FLOOR_DN * study.step_dn) ** 2
+        np.repeat(changing, count) + (CELL_FLOOR_DN * dataset.step_dn) ** 2
     )
     exposures = np.array([f.condition.exposure_s for f, *_ in points])
     half = 0.5 * np.hypot(rows, cols)
@@ -62,22 +62,22 @@ def dark_field_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         mean = np.zeros(len(value))
-        model = Uniform(study.camera, effects)
+        model = Uniform(dataset.camera, effects)
         if model.adds_signal:
             added = cell_means(model.added_e.astype(np.float32))
-            mean += np.tile((study.noise.gain * (added - added.mean())).ravel(), len(points))
+            mean += np.tile((dataset.noise.gain * (added - added.mean())).ravel(), len(points))
         if model.changes_dark_current:
-            dark_at = dark_current_map(study, effects)
+            dark_at = dark_current_map(dataset, effects)
             for i, (f, *_) in enumerate(points):
                 cells = cell_means(dark_at(f.condition.temperature_c).astype(np.float32))
-                here = study.noise.gain * f.condition.exposure_s * (cells - cells.mean())
+                here = dataset.noise.gain * f.condition.exposure_s * (cells - cells.mean())
                 mean[i * count : (i + 1) * count] += here.ravel()
         jacobian = {}
         for i in range(len(points)):
             column = np.zeros(len(value))
             column[i * count : (i + 1) * count] = 1.0
             jacobian[f"dark_field:{i}"] = column
-        for number, shape in enumerate(_slow_rows(study, model)):
+        for number, shape in enumerate(_slow_rows(dataset, model)):
             for i, (*_, part) in enumerate(points):
                 column = np.zeros(len(value))
                 column[i * count : (i + 1) * count] = shape / np.sqrt(part.frames)
@@ -85,7 +85,7 @@ def dark_field_block(study: Study) -> Block:
         return Prediction(mean, jacobian)
 
     longest = max(float(exposures.max()), 1e-9)
-    return Block(
+    return Observable(
         measurement=DARK_FIELD, reach=0.5, value=value, covariance=np.asarray(covariance, float),
         labels=tuple(Label(float(radius[k]), "all", f.condition.name, part.captures, out) for f, out,
         part in points for k in range(count)),
@@ -94,12 +94,12 @@ def dark_field_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _slow_rows(study: Study, model: Uniform) -> list[FloatArray]:
+def _slow_rows(dataset: Dataset, model: Uniform) -> list[FloatArray]:
     """Vectors (cells,) by which single frames' cells scatter with waves of `SLOW_CYCLES` cycles down the rows that
     effects' noise has, DN: few of them, so that their scatter isn't that of independent cells."""
     if not (model.lines or model.reading_order):
         return []
-    shape = study.camera.rows, study.camera.cols
+    shape = dataset.camera.rows, dataset.camera.cols
     cycles = np.arange(1.0, SLOW_CYCLES + 1.0)
     frequency = cycles / shape[0]
     power_e2 = np.zeros(len(cycles))
@@ -109,7 +109,7 @@ def _slow_rows(study: Study, model: Uniform) -> list[FloatArray]:
     for ordered in model.reading_order:
         power_e2 += ordered.plane_e2(shape, np.zeros(len(cycles)), frequency) / shape[1]
     phase = 2.0 * np.pi * cycles[:, None] * np.arange(shape[0]) / shape[0]
-    size_dn = study.noise.gain * np.sqrt(2.0 * power_e2 / shape[0])
+    size_dn = dataset.noise.gain * np.sqrt(2.0 * power_e2 / shape[0])
     waves = np.concatenate([size_dn[:, None] * np.cos(phase), size_dn[:, None] * np.sin(phase)])
     return [cell_means(np.tile(wave[:, None], (1, shape[1]))).ravel() for wave in waves]
 
@@ -120,7 +120,7 @@ DARK_FIELD = Measurement(
     order=130,
     axis="field",
     unit="of half the diagonal",
-    make=dark_field_block,
+    make=measure_dark_field,
     quantity="dark signal less the frame's mean, DN",
     conditions="exposure and temperature",
 )

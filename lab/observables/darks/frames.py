@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from lab.capture_kinds.dark import DarkCapture
 from lab.errors import NotDetermined
-from lab.observables.dataset import Study, held_out_of
+from lab.observables.dataset import Dataset, held_out_of
 from lab.observables.noise.figures import (
     CLIP,
     MEDIAN_OF,
@@ -122,13 +122,13 @@ def contrast_weights(condition: DarkCondition, held_out: bool) -> FloatArray:
     return weights[max(seen - 1, 0) :] if held_out else weights[: max(seen - 1, 0)]
 
 
-def conditions(study: Study) -> list[DarkCondition]:
+def conditions(dataset: Dataset) -> list[DarkCondition]:
     """Dark captures by exposure and temperature, at the most frequent gain. The last third of the repeats is held out.
 
     Two repeats stay together, as temporal noise needs both: in every third condition both are held out. Raises
     NotDetermined without dark captures.
     """
-    captures = study.recordings.captures(DarkCapture, study.side)
+    captures = dataset.recordings.captures(DarkCapture, dataset.side)
     if not captures:
         raise NotDetermined("dark", "no dark captures")
     gains = [c.gain_db for c in captures]
@@ -147,7 +147,7 @@ def conditions(study: Study) -> list[DarkCondition]:
         else:
             groups.append([c])
     place = {c.id: i for i, c in enumerate(captures)}
-    groups = [sorted(g, key=lambda c: (study.elapsed_s(c), place[c.id])) for g in groups]
+    groups = [sorted(g, key=lambda c: (dataset.elapsed_s(c), place[c.id])) for g in groups]
     groups.sort(key=lambda g: (g[0].exposure_s, g[0].temperature_c or 0.0))
     found = []
     for i, group in enumerate(groups):
@@ -167,51 +167,53 @@ def conditions(study: Study) -> list[DarkCondition]:
     return found
 
 
-def usual_conditions(study: Study, every: Sequence[DarkCondition]) -> Sequence[DarkCondition]:
+def usual_conditions(dataset: Dataset, every: Sequence[DarkCondition]) -> Sequence[DarkCondition]:
     """Return the conditions at the usual temperature; all where none is."""
     return [
         c
         for c in every
-        if study.temperature_c is None or c.temperature_c is None or abs(c.temperature_c - study.temperature_c) < 2.0
+        if dataset.temperature_c is None
+        or c.temperature_c is None
+        or abs(c.temperature_c - dataset.temperature_c) < 2.0
     ] or every
 
 
-def dark_frames(study: Study) -> list[DarkStatistics]:
+def dark_frames(dataset: Dataset) -> list[DarkStatistics]:
     """Return the statistics of all dark captures by condition. Raises NotDetermined where there are none, or where the
     frames are too small to be split into cells."""
-    every = conditions(study)
+    every = conditions(dataset)
     least_px = LEAST_CELL_PX * max(CELLS)
-    if min(study.camera.rows, study.camera.cols) < least_px:
+    if min(dataset.camera.rows, dataset.camera.cols) < least_px:
         raise NotDetermined(
-            "dark", f"frames of {study.camera.rows} x {study.camera.cols} px: their cells need {least_px} px a side"
+            "dark", f"frames of {dataset.camera.rows} x {dataset.camera.cols} px: their cells need {least_px} px a side"
         )
-    usual = usual_conditions(study, every)
+    usual = usual_conditions(dataset, every)
     warmest = max(every, key=lambda c: (c.temperature_c or 0.0, c.exposure_s))
     picked = list(dict.fromkeys([usual[0].name, usual[-1].name, warmest.name]))[:MOST_CONDITIONS]
-    sound = study.once(sound_pixels)
-    return [_read(study, c, c.name in picked, sound) for c in every]
+    sound = dataset.once(sound_pixels)
+    return [_read(dataset, c, c.name in picked, sound) for c in every]
 
 
-def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDArray[np.bool_]) -> DarkStatistics:
+def _read(dataset: Dataset, condition: DarkCondition, with_pattern: bool, sound: NDArray[np.bool_]) -> DarkStatistics:
     """Return the statistics of one condition. `sound` (rows, cols): mask of the pixels that count in the frames'
     means."""
     means: dict[str, float] = {}
-    mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
+    mean = np.zeros((dataset.camera.rows, dataset.camera.cols), np.float32)
     changing: dict[bool, _Contrasts] = {}
     fixed: dict[bool, _Mean] = {}
     for k, capture in enumerate(condition.captures):
-        frame = study.recordings.frame(capture).astype(np.float32)
+        frame = dataset.recordings.frame(capture).astype(np.float32)
         means[capture.id] = float(frame.mean(dtype=np.float64, where=sound))
         level = float(frame.mean(dtype=np.float64))
         held_out = k >= len(condition.seen)
         frame -= np.float32(level)
         if k:
-            changing.setdefault(held_out, _Contrasts(mean.shape, study.step_dn)).add(
+            changing.setdefault(held_out, _Contrasts(mean.shape, dataset.step_dn)).add(
                 (frame - mean) * np.float32(np.sqrt(k / (k + 1.0)))
             )
         mean += (frame - mean) / np.float32(k + 1)
         if with_pattern:
-            fixed.setdefault(held_out, _Mean(mean.shape, study.step_dn)).add(frame, capture.id)
+            fixed.setdefault(held_out, _Mean(mean.shape, dataset.step_dn)).add(frame, capture.id)
     return DarkStatistics(
         condition,
         means,

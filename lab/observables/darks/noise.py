@@ -15,9 +15,9 @@ from lab.observables.darks.frames import (
     too_coarse,
 )
 from lab.observables.darks.level import added_dark_e_per_s
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.noise.figures import CLIP
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import DARK_CURRENT, LAG, LINES, PARTICLES, acting
 from sim.effects.base import Effects
 from sim.sensor.reading_order import ReadingOrderNoise
@@ -29,27 +29,27 @@ CARRIED_STD = 0.3  # relative prior standard deviation of what frames before lea
 LEAST_NOISE_DN = 0.4  # of codes of a step of 1 DN; below, codes are too coarse to measure temporal noise
 
 
-def dark_noise_block(study: Study) -> Block:
+def measure_dark_noise(dataset: Dataset) -> Observable:
     """Temporal variance of dark frames by exposure and temperature, DN^2. It grows with the dark signal (shot noise),
     not with an offset.
 
     Nuisance parameters: read noise, dark current, gain, charge that frames before leave. Raises NotDetermined without
     repeats, and where codes are too coarse."""
-    frames = study.once(dark_frames)
+    frames = dataset.once(dark_frames)
     points = [(f, out, c) for f in frames for out, c in f.changing.items()]
     if not points:
         raise NotDetermined("dark_noise", "no two dark frames of the same exposure and temperature")
     value = np.array([c.variance_dn2 for *_, c in points])
-    least_dn = LEAST_NOISE_DN * study.step_dn
+    least_dn = LEAST_NOISE_DN * dataset.step_dn
     if np.sqrt(value.min()) < least_dn:
         raise NotDetermined("dark_noise", too_coarse([f for f, *_ in points], least_dn))
-    size = study.camera.rows * study.camera.cols
-    noise = study.noise
+    size = dataset.camera.rows * dataset.camera.cols
+    noise = dataset.noise
     exposures = np.array([f.condition.exposure_s for f, *_ in points])
     count = np.array([c.contrasts for *_, c in points])
     lines = np.array(
         [
-            c.line_dn2["rows"] ** 2 / study.camera.rows + c.line_dn2["columns"] ** 2 / study.camera.cols
+            c.line_dn2["rows"] ** 2 / dataset.camera.rows + c.line_dn2["columns"] ** 2 / dataset.camera.cols
             for *_, c in points
         ]
     )
@@ -64,29 +64,29 @@ def dark_noise_block(study: Study) -> Block:
     shortest = float(value[int(np.argmin(exposures))])
     base = shortest + dark - float(dark.min())
     # relative prior standard deviation of the gain: measured by flats, stated, or unknown
-    flats = len(study.flat_levels()) > 1
-    gain_std = 0.05 if flats else 0.3 if study.stated.conversion_gain_dn_per_e is not None else 10.0
+    flats = len(dataset.flat_levels()) > 1
+    gain_std = 0.05 if flats else 0.3 if dataset.stated.conversion_gain_dn_per_e is not None else 10.0
 
     def predict(effects: Effects) -> Prediction:
         mean = base.copy()
         shot, carried = dark.copy(), np.zeros(len(points))
-        model = Uniform(study.camera, effects)
-        more_at = added_dark_e_per_s(study, effects)
+        model = Uniform(dataset.camera, effects)
+        more_at = added_dark_e_per_s(dataset, effects)
         lines = sum((one.variance_e2(()) for one in model.lines), 0.0)
         lines += sum((one.variance_e2(()) for one in model.reading_order), 0.0)
         for i, (f, out, _) in enumerate(points):
             t, temperature = f.condition.exposure_s, f.condition.temperature_c
-            carried[i] = noise.gain**2 * _carried_e(study, effects, f.condition, out)
+            carried[i] = noise.gain**2 * _carried_e(dataset, effects, f.condition, out)
             shot[i] += noise.gain**2 * more_at(temperature) * t + carried[i]
             mean[i] += shot[i] - dark[i]
             mean[i] += _defect_variance(model, noise.gain, t, float(value[i])) + noise.gain**2 * lines
-            mean[i] += _particle_variance(study, model, f.condition, out, float(value[i]))
+            mean[i] += _particle_variance(dataset, model, f.condition, out, float(value[i]))
         # flats measure K F^2, by which the dark signal's shot noise is predicted, too: an excess factor leaves it
         jacobian = {
             "dark_read": np.full(len(points), 0.5 * shortest + 0.1),
             "dark": noise.gain * exposures * noise.dark_std,
         }
-        slow_dn2 = noise.gain**2 * sum((_slow_scatter_e2(study, one) for one in model.reading_order), 0.0)
+        slow_dn2 = noise.gain**2 * sum((_slow_scatter_e2(dataset, one) for one in model.reading_order), 0.0)
         if slow_dn2 > 0.0:
             for i, contrasts in enumerate(count):
                 jacobian[f"dark_noise:slow:{i}"] = np.where(
@@ -97,7 +97,7 @@ def dark_noise_block(study: Study) -> Block:
         jacobian["gain" if flats else "dark_gain"] = gain_std * shot
         return Prediction(mean, jacobian)
 
-    return Block(
+    return Observable(
         measurement=DARK_NOISE, reach=float(max(np.ptp(exposures), 1e-3)), value=value,
         covariance=covariance,
         labels=tuple(Label(f.condition.exposure_s, "all", f.condition.name, captures_of(f, out), out) for f, out,
@@ -106,20 +106,20 @@ def dark_noise_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _slow_scatter_e2(study: Study, one: ReadingOrderNoise) -> float:
+def _slow_scatter_e2(dataset: Dataset, one: ReadingOrderNoise) -> float:
     """Standard deviation of a frame's variance by the rows' few slow waves: sqrt(2 sum P^2) / pixels, P their power."""
-    shape = study.camera.rows, study.camera.cols
+    shape = dataset.camera.rows, dataset.camera.cols
     down = np.arange(1, shape[0]) / shape[0]
     power = one.plane_e2(shape, np.zeros(len(down)), down)
     return float(np.sqrt(2.0 * np.sum(np.square(power)))) / (shape[0] * shape[1])
 
 
-def _carried_e(study: Study, effects: Effects, condition: DarkCondition, held_out: bool) -> float:
+def _carried_e(dataset: Dataset, effects: Effects, condition: DarkCondition, held_out: bool) -> float:
     """Return the mean electrons that frames before leave in the contrasts of one part of a condition, whose shot noise
     is theirs: contrast k has k / (k + 1) (e_k + <e_0 .. e_(k-1)> / k)."""
     if not acting(effects, LAG):
         return 0.0
-    carried = study.carried_mean_e(effects)
+    carried = dataset.carried_mean_e(effects)
     e = np.array([carried(c) for c in condition.captures])
     k = np.arange(1.0, len(e))
     contrasts = k / (k + 1.0) * (e[1:] + np.cumsum(e)[:-1] / k**2)
@@ -148,15 +148,15 @@ def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn
 
 
 def _particle_variance(
-    study: Study, model: Uniform, condition: DarkCondition, held_out: bool, variance_dn2: float
+    dataset: Dataset, model: Uniform, condition: DarkCondition, held_out: bool, variance_dn2: float
 ) -> float:
     """Return what particles add to the mean variance (DN^2) of a part's contrasts, which are clipped."""
-    pitch_um, more = study.camera.pixel_pitch_um, 0.0
+    pitch_um, more = dataset.camera.pixel_pitch_um, 0.0
     for law in model.particles:
         number, charge_e = law.pixels_e(pitch_um)
         hit = law.expected_number(1, pitch_um, condition.exposure_s) * number
         for weight in contrast_weights(condition, held_out):
-            apart = study.noise.gain * np.outer(weight, charge_e)
+            apart = dataset.noise.gain * np.outer(weight, charge_e)
             still = np.full_like(apart, variance_dn2)
             more += float(np.sum(hit * (_cut_square(apart, still, CLIP * np.sqrt(variance_dn2)) - variance_dn2)))
     return more / max(len(contrast_weights(condition, held_out)), 1)
@@ -178,7 +178,7 @@ DARK_NOISE = Measurement(
     order=120,
     axis="exposure",
     unit="s",
-    make=dark_noise_block,
+    make=measure_dark_noise,
     quantity="temporal variance, DN²",
     of_variances=True,
     conditions="exposure and temperature",

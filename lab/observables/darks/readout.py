@@ -24,9 +24,9 @@ from lab.observables.darks.frames import (
     dark_frames,
     fine_conditions,
 )
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.noise.line_spectra import LEVEL_BAND, Bands, log_mean_bias, log_mean_variance
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import ADDED, LINES, READ_SPECTRUM
 from sim.effects.base import Effects
 from sim.sensor import mosaic
@@ -46,20 +46,20 @@ LEAST_FREQUENCIES = 2  # below the level band: `Bands` makes no band of fewer
 LEAST_LINE_DN = 0.3  # of codes of a step of 1 DN: temporal noise of a pixel below which codes are too coarse
 
 
-def temporal_line_block(lines: Lines, study: Study) -> Block:
+def measure_temporal_lines(lines: Lines, dataset: Dataset) -> Observable:
     """Temporal row (column) noise: ln of the power spectrum of the lines' means over that of white noise, by frequency
     band.
 
     0 where pixels are independent. Raises NotDetermined without repeats, and where codes are too coarse.
     """
-    frames = study.once(dark_frames)
+    frames = dataset.once(dark_frames)
     name = "row_noise" if lines == "rows" else "column_noise"
-    fine = fine_conditions(f"dark_{name}", frames, LEAST_LINE_DN * study.step_dn)
+    fine = fine_conditions(f"dark_{name}", frames, LEAST_LINE_DN * dataset.step_dn)
     parts = by_part(fine)
     frequency = next(iter(parts.values()))[0].lines[lines][0]
     # narrow bands at low frequencies tell a ripple of a few cycles a frame from correlated row noise
     bands = Bands.of(frequency, 8, 1.5)
-    length = study.camera.cols if lines == "rows" else study.camera.rows
+    length = dataset.camera.cols if lines == "rows" else dataset.camera.rows
     value, variance, labels, inverse = [], [], [], []
     for out, part in parts.items():
         weight = np.array([min(c.contrasts, 6) for c in part], float)
@@ -74,29 +74,29 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
     sets, whites = len(parts), [1.0 / float(one[0]) for one in inverse]
 
     def predict(effects: Effects) -> Prediction:
-        model, total = Uniform(study.camera, effects), np.zeros(len(frequency))
+        model, total = Uniform(dataset.camera, effects), np.zeros(len(frequency))
         for one in model.lines:
             if one.lines == lines:
                 total += one.spectrum_e2(frequency, fixed=False)
-        total += _ordered_power(study, model, lines, frequency) / length
-        shared = over * np.tile(study.noise.gain**2 * length * bands.mean(total), sets)
+        total += _ordered_power(dataset, model, lines, frequency) / length
+        shared = over * np.tile(dataset.noise.gain**2 * length * bands.mean(total), sets)
         # the means of rows hold the read noise's power at frequency 0, those of columns its spectrum
         along = frequency if lines == "columns" else np.zeros(len(frequency))
-        own = np.concatenate([bands.mean(_coloured_power(study, model, along, white)) for white in whites])
+        own = np.concatenate([bands.mean(_coloured_power(dataset, model, along, white)) for white in whites])
         return Prediction(np.log1p(shared + own), {})
 
     n = len(labels)
-    return Block(
+    return Observable(
         measurement=ROW_NOISE if lines == "rows" else COLUMN_NOISE, reach=0.1, value=np.concatenate(value),
         covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES | READ_SPECTRUM,
         predict=predict, scale=np.ones(n),
     )  # fmt: skip
 
 
-def _ordered_power(study: Study, model: Uniform, lines: Lines, frequency_cy_per_px: FloatArray) -> FloatArray:
+def _ordered_power(dataset: Dataset, model: Uniform, lines: Lines, frequency_cy_per_px: FloatArray) -> FloatArray:
     """Return the power of lines' means by noise in reading order, times the pixels of a line, less its power in
     `LEVEL_BAND`; e^2."""
-    shape, zero = (study.camera.rows, study.camera.cols), np.zeros(len(frequency_cy_per_px))
+    shape, zero = (dataset.camera.rows, dataset.camera.cols), np.zeros(len(frequency_cy_per_px))
     found = zero
     for one in model.reading_order:
         across, down = (zero, frequency_cy_per_px) if lines == "rows" else (frequency_cy_per_px, zero)
@@ -104,11 +104,11 @@ def _ordered_power(study: Study, model: Uniform, lines: Lines, frequency_cy_per_
     return found
 
 
-def _alternating_e2(study: Study, one: ReadingOrderNoise, lines: Lines) -> float:
+def _alternating_e2(dataset: Dataset, one: ReadingOrderNoise, lines: Lines) -> float:
     """Power of noise in reading order that alternates from line to line; the difference of a frame's odd and even lines
     has 4 times that over its pixels, e^2."""
     across, down = (0.0, 0.5) if lines == "rows" else (0.5, 0.0)
-    return float(one.plane_e2((study.camera.rows, study.camera.cols), np.array(across), np.array(down)))
+    return float(one.plane_e2((dataset.camera.rows, dataset.camera.cols), np.array(across), np.array(down)))
 
 
 def _ordered_level(one: ReadingOrderNoise) -> float:
@@ -116,22 +116,22 @@ def _ordered_level(one: ReadingOrderNoise) -> float:
     return float(np.mean(one.spectrum_e2(np.linspace(*LEVEL_BAND, 33))))
 
 
-def _coloured_power(study: Study, model: Uniform, frequency_cy_per_px: FloatArray, white_dn2: float) -> FloatArray:
+def _coloured_power(dataset: Dataset, model: Uniform, frequency_cy_per_px: FloatArray, white_dn2: float) -> FloatArray:
     """Return the power of a pixel's noise at frequencies along the row over `white_dn2`, the power in `LEVEL_BAND`,
     less 1. Read noise is a part of it, the rest is white."""
-    read_dn2 = study.noise.read_dn**2
+    read_dn2 = dataset.noise.read_dn**2
     level_dn2 = read_dn2 * float(np.mean(model.read_power(np.linspace(*LEVEL_BAND, 33))))
     found_dn2 = max(white_dn2 - level_dn2, 0.0) + read_dn2 * model.read_power(frequency_cy_per_px)
     return np.asarray(found_dn2 / max(white_dn2, level_dn2) - 1.0)
 
 
-def fixed_line_block(lines: Lines, study: Study) -> Block:
+def measure_fixed_lines(lines: Lines, dataset: Dataset) -> Observable:
     """Fixed row (column) pattern in the mean frame of the shortest exposure.
 
     The numbers are ln of the power spectrum of the lines' means over that of white noise, by frequency band, and the
     mean of odd lines less that of even ones, DN. Raises NotDetermined where codes are too coarse.
     """
-    frames = study.once(dark_frames)
+    frames = dataset.once(dark_frames)
     name = "row_pattern" if lines == "rows" else "column_pattern"
     first = next(f for f in frames if f.fixed)
     if min(part.white_dn2 for part in first.fixed.values()) < 1e-3:
@@ -140,8 +140,8 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
         )
     frequency = next(iter(first.fixed.values())).lines[lines][0]
     bands = Bands.of(frequency, BANDS)
-    length = study.camera.cols if lines == "rows" else study.camera.rows
-    size = study.camera.rows * study.camera.cols
+    length = dataset.camera.cols if lines == "rows" else dataset.camera.rows
+    size = dataset.camera.rows * dataset.camera.cols
     value: list[FloatArray] = []
     labels: list[Label] = []
     factor: list[FloatArray] = []
@@ -150,7 +150,7 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
         _, power, level = part.lines[lines]
         value.append(np.log(bands.mean(power)) - log_mean_bias(bands.modes) - log_mean_bias(level))
         labels += [Label(float(x), "all", "fixed", part.captures, out) for x in bands.middle]
-        factor.append(np.full(len(bands.middle), study.noise.gain**2 * length / part.white_dn2))
+        factor.append(np.full(len(bands.middle), dataset.noise.gain**2 * length / part.white_dn2))
     pieces = len(first.fixed)
     one = np.diag(log_mean_variance(bands.modes))
     correlation = np.array([[1.0 if a == b else share[a] * share[b] for b in first.fixed] for a in first.fixed])
@@ -159,7 +159,7 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
     scatter = np.array([4.0 * _line_dn2(part, lines, length) * length / size for part in first.fixed.values()])
     # powers are squares: lines themselves have the root of the powers' correlation
     parity_cov = (
-        np.sqrt(np.outer(scatter, scatter) * correlation) + np.eye(pieces) * (CELL_FLOOR_DN * study.step_dn) ** 2
+        np.sqrt(np.outer(scatter, scatter) * correlation) + np.eye(pieces) * (CELL_FLOOR_DN * dataset.step_dn) ** 2
     )
     n = len(covariance)
     whole = np.zeros((n + pieces, n + pieces))
@@ -169,7 +169,7 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         still, moving, odd = np.zeros(len(frequency)), np.zeros(len(frequency)), 0.0
-        model = Uniform(study.camera, effects)
+        model = Uniform(dataset.camera, effects)
         if model.adds_signal:
             means = model.added_e.mean(axis=1 if lines == "rows" else 0)
             # the periodogram's frequencies above 0 and below 0.5 cy/px
@@ -180,18 +180,18 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
                 still += one.spectrum_e2(frequency, fixed=True)
                 moving += one.spectrum_e2(frequency, fixed=False)
                 odd += one.odd_even_e
-        moving += _ordered_power(study, model, lines, frequency) / length
+        moving += _ordered_power(dataset, model, lines, frequency) / length
         parts = zip(factor, first.fixed.values(), strict=True)
         power = np.concatenate([np.log1p(f * bands.mean(still + moving / part.frames)) for f, part in parts])
-        apart = 4.0 / size * sum((_alternating_e2(study, one, lines) for one in model.reading_order), 0.0)
+        apart = 4.0 / size * sum((_alternating_e2(dataset, one, lines) for one in model.reading_order), 0.0)
         jacobian = {}
         for k, part in enumerate(first.fixed.values() if apart > 0.0 else ()):
             column = np.zeros(n + pieces)
-            column[n + k] = study.noise.gain * np.sqrt(apart / part.frames)
+            column[n + k] = dataset.noise.gain * np.sqrt(apart / part.frames)
             jacobian[f"dark_{name}:odd:{k}"] = column
-        return Prediction(np.concatenate([power, np.full(pieces, study.noise.gain * odd)]), jacobian)
+        return Prediction(np.concatenate([power, np.full(pieces, dataset.noise.gain * odd)]), jacobian)
 
-    return Block(
+    return Observable(
         measurement=ROW_PATTERN if lines == "rows" else COLUMN_PATTERN, reach=0.1,
         value=np.concatenate([*value, parity]), covariance=whole, labels=tuple(labels),
         reads=LINES | ADDED, predict=predict,
@@ -216,14 +216,14 @@ def _fixed_share(frames: DarkStatistics, lines: Lines, length: int) -> dict[bool
     }
 
 
-def correlation_block(study: Study) -> Block:
+def measure_dark_correlation(dataset: Dataset) -> Observable:
     """Correlation of temporal noise along rows and columns: ln of its power at low frequencies over that of white
     noise.
 
     The means of the lines are excluded. 0 where pixels are independent. Raises NotDetermined where codes are too coarse
     or frames too small.
     """
-    fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN * study.step_dn)
+    fine = fine_conditions("dark_correlation", dataset.once(dark_frames), LEAST_LINE_DN * dataset.step_dn)
     value, variance, labels = [], [], []
     # lines, bands, frequencies, DN^2 of white noise, contrasts
     along: list[tuple[str, Bands, FloatArray, float, float]] = []
@@ -247,28 +247,28 @@ def correlation_block(study: Study) -> Block:
     if not labels:
         raise NotDetermined(
             "dark_correlation",
-            f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share is measured from "
+            f"frames of {dataset.camera.rows} x {dataset.camera.cols} px: noise that neighbours share is measured from "
             f"{int(np.ceil(LEAST_FREQUENCIES / LEVEL_BAND[0]))} px along rows or columns on",
         )
 
     def predict(effects: Effects) -> Prediction:
         # row and column noise has no spectrum along its lines; that of read noise along columns is its mean over rows
-        model, means = Uniform(study.camera, effects), []
-        shape = study.camera.rows, study.camera.cols
+        model, means = Uniform(dataset.camera, effects), []
+        shape = dataset.camera.rows, dataset.camera.cols
         scatter = []
         for lines, bands, frequency, white_dn2, contrasts in along:
             if lines == "rows":
-                power = bands.mean(_coloured_power(study, model, frequency, white_dn2))
+                power = bands.mean(_coloured_power(dataset, model, frequency, white_dn2))
             else:
-                every = _coloured_power(study, model, np.linspace(0.0, 0.5, 257), white_dn2)
+                every = _coloured_power(dataset, model, np.linspace(0.0, 0.5, 257), white_dn2)
                 power = np.full(len(bands.middle), every.mean())
             for one in model.reading_order:
                 own = (one.along_rows_e2 if lines == "rows" else one.along_columns_e2)(shape, frequency)
-                power = power + study.noise.gain**2 / white_dn2 * bands.mean(own - _ordered_level(one))
+                power = power + dataset.noise.gain**2 / white_dn2 * bands.mean(own - _ordered_level(one))
             means.append(np.log1p(power))
             waves = [one.plane_e2(shape, np.full(len(frequency), 0.5), frequency) for one in model.reading_order]
             few = bands.mean(np.square(sum(waves, np.zeros(len(frequency))))) / bands.modes / contrasts
-            alone = 2.0 / shape[1] * study.noise.gain**2 / white_dn2 * np.sqrt(few)
+            alone = 2.0 / shape[1] * dataset.noise.gain**2 / white_dn2 * np.sqrt(few)
             scatter.append(alone / (1.0 + power) if lines == "columns" else np.zeros(len(alone)))
         # of waves that alternate from column to column each band has few
         each = np.diag(np.concatenate(scatter))
@@ -277,7 +277,7 @@ def correlation_block(study: Study) -> Block:
             {f"dark_correlation:few:{k}": column for k, column in enumerate(each) if column.any()},
         )
 
-    return Block(
+    return Observable(
         measurement=DARK_CORRELATION, reach=0.03, value=np.concatenate(value),
         covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES | READ_SPECTRUM,
         predict=predict, scale=np.ones(len(labels)),
@@ -290,7 +290,7 @@ DARK_CORRELATION = Measurement(
     order=180,
     axis="spatial_frequency",
     unit="cy/px",
-    make=correlation_block,
+    make=measure_dark_correlation,
     quantity="power over white noise, ln",
     conditions="direction",
 )
@@ -300,7 +300,7 @@ ROW_NOISE = Measurement(
     order=140,
     axis="spatial_frequency",
     unit="cy/px",
-    make=partial(temporal_line_block, "rows"),
+    make=partial(measure_temporal_lines, "rows"),
     quantity="power over single pixels', ln",
 )
 COLUMN_NOISE = Measurement(
@@ -309,7 +309,7 @@ COLUMN_NOISE = Measurement(
     order=150,
     axis="spatial_frequency",
     unit="cy/px",
-    make=partial(temporal_line_block, "columns"),
+    make=partial(measure_temporal_lines, "columns"),
     quantity="power over single pixels', ln",
 )
 ROW_PATTERN = Measurement(
@@ -318,7 +318,7 @@ ROW_PATTERN = Measurement(
     order=160,
     axis="spatial_frequency",
     unit="cy/px",
-    make=partial(fixed_line_block, "rows"),
+    make=partial(measure_fixed_lines, "rows"),
     quantity="power over single pixels', ln",
     conditions="pattern",
 )
@@ -328,7 +328,7 @@ COLUMN_PATTERN = Measurement(
     order=170,
     axis="spatial_frequency",
     unit="cy/px",
-    make=partial(fixed_line_block, "columns"),
+    make=partial(measure_fixed_lines, "columns"),
     quantity="power over single pixels', ln",
     conditions="pattern",
 )
@@ -410,22 +410,25 @@ def row_profile(frame: NDArray[np.floating], step: int) -> FloatArray:
     return np.asarray(frame.mean(1, dtype=float)[: rows * step].reshape(rows, step).mean(1))
 
 
-def dark_readout(study: Study) -> DarkReadOut | None:
+def dark_readout(dataset: Dataset) -> DarkReadOut | None:
     """Return what repeated dark frames show of the read-out; None where there are none, or their codes are too coarse
     to show it.
 
     Noise is measured by Helmert contrasts: frame k less the mean of those before it, times sqrt(k / (k + 1)). Fixed
     offsets are those of exposures up to the longest flat's, as a dark current that differs from pixel to pixel grows
     with the exposure."""
-    every = conditions(study) if study.recordings.captures("dark", study.side) else []
-    step, longest_s = mosaic.step(study.camera.cfa), max((g[0].exposure_s for g in study.flat_levels()), default=0.0)
+    every = conditions(dataset) if dataset.recordings.captures("dark", dataset.side) else []
+    step, longest_s = (
+        mosaic.step(dataset.camera.cfa),
+        max((g[0].exposure_s for g in dataset.flat_levels()), default=0.0),
+    )
     power, pixel_dn2, contrasts = np.zeros(0), 0.0, 0
-    total, frames = np.zeros((study.camera.rows, study.camera.cols), np.float32), 0
+    total, frames = np.zeros((dataset.camera.rows, dataset.camera.cols), np.float32), 0
     for condition in every:
         if len(condition.captures) < 2:
             continue
-        lines, own, mean = _read(study, condition, step)
-        if own <= (LEAST_LINE_DN * study.step_dn) ** 2:
+        lines, own, mean = _read(dataset, condition, step)
+        if own <= (LEAST_LINE_DN * dataset.step_dn) ** 2:
             continue
         power = lines.sum(0) + (power if contrasts else 0.0)
         pixel_dn2, contrasts = pixel_dn2 + len(lines) * own, contrasts + len(lines)
@@ -437,19 +440,19 @@ def dark_readout(study: Study) -> DarkReadOut | None:
     return DarkReadOut(
         contrasts=contrasts,
         power_dn2=power / contrasts,
-        white_dn2=pixel_dn2 / contrasts / (step * study.camera.cols),
+        white_dn2=pixel_dn2 / contrasts / (step * dataset.camera.cols),
         offsets_dn=np.asarray(total / np.float32(frames), np.float32),
         frames=frames,
     )
 
 
-def _read(study: Study, condition: DarkCondition, step: int) -> tuple[FloatArray, float, NDArray[np.float32]]:
+def _read(dataset: Dataset, condition: DarkCondition, step: int) -> tuple[FloatArray, float, NDArray[np.float32]]:
     """Of the repeats of one condition: power of the rows of each contrast (contrasts, rows / 2 + 1), DN^2; variance of
     a pixel without that of whole rows, DN^2; and the mean frame, DN."""
     lines, pixel = [], []
-    mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
+    mean = np.zeros((dataset.camera.rows, dataset.camera.cols), np.float32)
     for k, capture in enumerate(condition.captures[:MOST_FRAMES]):
-        away = np.asarray(study.recordings.frame(capture), np.float32) - mean
+        away = np.asarray(dataset.recordings.frame(capture), np.float32) - mean
         mean += away / np.float32(k + 1)
         if k == 0:
             continue
@@ -457,5 +460,5 @@ def _read(study: Study, condition: DarkCondition, step: int) -> tuple[FloatArray
         profile = row_profile(away, step)
         lines.append(np.abs(np.fft.rfft(profile)) ** 2 / len(profile))
         away -= away.mean(1, keepdims=True)
-        pixel.append(float(np.mean(np.square(away), dtype=float)) / (1.0 - 1.0 / study.camera.cols))
+        pixel.append(float(np.mean(np.square(away), dtype=float)) / (1.0 - 1.0 / dataset.camera.cols))
     return np.array(lines), float(np.mean(pixel)), mean

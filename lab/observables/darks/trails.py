@@ -12,9 +12,9 @@ import numpy as np
 
 from lab.errors import NotDetermined
 from lab.observables.darks.frames import DarkStatistics, captures_of, dark_frames
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.noise.figures import MEDIAN_OF, Image, from_surroundings
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from sim.effects.base import Effects
 from sim.point import trail_behind
 from sim.spectrum import FloatArray
@@ -76,13 +76,13 @@ def _trails(away: Image, local: Image, below_dn: Image) -> list[_Trail]:
     return found
 
 
-def dark_trail_block(study: Study) -> Block:
+def measure_dark_trails(dataset: Dataset) -> Observable:
     """Signal behind hot pixels less that before them, over the hot pixels', by distance, along rows and columns, in
     both halves of the frame, of the median of repeated dark frames of the condition of most dark signal.
 
     Raises NotDetermined where no half of the frame has `LEAST_HOT` hot pixels.
     """
-    frames = [f for f in study.once(dark_frames) if f.fixed]
+    frames = [f for f in dataset.once(dark_frames) if f.fixed]
     if not frames:
         raise NotDetermined("dark_trails", "no dark captures")
     warmest = max(frames, key=lambda f: (f.condition.temperature_c or 0.0, f.condition.exposure_s))
@@ -90,9 +90,9 @@ def dark_trail_block(study: Study) -> Block:
     labels: list[Label] = []
     common: list[float] = []
     for held_out in warmest.fixed:
-        trails, fixed_share = _of_part(study, warmest, held_out)
+        trails, fixed_share = _of_part(dataset, warmest, held_out)
         for one in trails:
-            side = "first" if one.line < 0.5 * (study.camera.rows, study.camera.cols)[one.axis] else "second"
+            side = "first" if one.line < 0.5 * (dataset.camera.rows, dataset.camera.cols)[one.axis] else "second"
             condition = f"{('rows', 'columns')[one.axis]}, {side} half"
             labels.append(Label(float(one.lag), "all", condition, captures_of(warmest, held_out), held_out))
         values += trails
@@ -112,22 +112,22 @@ def dark_trail_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         return Prediction(
-            np.array([trail_behind(study.camera, effects, one.axis, one.line, one.lag) for one in values]), {}
+            np.array([trail_behind(dataset.camera, effects, one.axis, one.line, one.lag) for one in values]), {}
         )
 
-    return Block(
+    return Observable(
         measurement=DARK_TRAILS, reach=2.0, value=np.array([one.share for one in values]),
         covariance=covariance + TRAIL_FLOOR**2 * np.eye(len(values)), labels=tuple(labels),
         reads=frozenset({"charge.trails"}), predict=predict, scale=np.full(len(values), 0.01),
     )  # fmt: skip
 
 
-def _of_part(study: Study, dark: DarkStatistics, held_out: bool) -> tuple[list[_Trail], float]:
+def _of_part(dataset: Dataset, dark: DarkStatistics, held_out: bool) -> tuple[list[_Trail], float]:
     """Return the trails in a part's frames, and the share of their variance that is the fixed pattern's."""
     captures = (dark.condition.held_out if held_out else dark.condition.seen)[:MEDIAN_OF]
-    raw = [study.recordings.frame(c).astype(np.float32) for c in captures]
-    away, local = from_surroundings([f - np.float32(f.mean(dtype=np.float64)) for f in raw], study.step_dn)
-    below = np.float32(0.9 * study.saturation_dn) - np.max(raw, axis=0)
+    raw = [dataset.recordings.frame(c).astype(np.float32) for c in captures]
+    away, local = from_surroundings([f - np.float32(f.mean(dtype=np.float64)) for f in raw], dataset.step_dn)
+    below = np.float32(0.9 * dataset.saturation_dn) - np.max(raw, axis=0)
     moving = next((part.pixel_dn2 for part in dark.changing.values()), 0.0)
     variance: FloatArray = np.square(np.median(local))
     factor = 1.0 if len(raw) == 1 else MEDIAN_VARIANCE / len(raw)
@@ -140,7 +140,7 @@ DARK_TRAILS = Measurement(
     order=197,
     axis="distance",
     unit="px",
-    make=dark_trail_block,
+    make=measure_dark_trails,
     quantity="signal behind a hot pixel less that before it, over the hot pixel's",
     conditions="direction and half of the frame",
 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 
@@ -101,7 +102,7 @@ def edges_of(recordings: RecordingSet, capture: EdgeCapture) -> tuple[FoundEdge,
         found = find_edges(recordings.frame(capture), cfa, saturation_dn)
         for edge in found:
             key = _key([capture], cfa, "Y" if cfa == "MONO" else "G", edge.region)
-            recordings.once(key, partial(getattr, edge, "summary"), whatever_is_stated=True)
+            recordings.once(key, partial(attrgetter("summary"), edge), whatever_is_stated=True)
         return found
 
     return recordings.once(("edges", frame, cfa, saturation_dn), find, whatever_is_stated=True)

@@ -16,7 +16,7 @@ from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.edges.profile import GRID_PX
 from lab.observables.edges.quadrature import Quadrature
 from lab.observables.edges.side import SideEdge
@@ -80,17 +80,17 @@ def _kept(store: dict[K, V], key: K, make: Callable[[], V]) -> V:
 
 class PredictedEdges:
     """Edges of one side at one f-number, that of `camera`: their measured OTFs and the model's predictions. Effects are
-    stated for the study's f-number."""
+    stated for the dataset's f-number."""
 
-    def __init__(self, study: Study, edges: list[SideEdge], camera: CameraModel) -> None:
-        self._study, self._camera = study, camera
+    def __init__(self, dataset: Dataset, edges: list[SideEdge], camera: CameraModel) -> None:
+        self._dataset, self._camera = dataset, camera
         self.edges = edges
         lights = list(dict.fromkeys(e.part[0].light_radiance for e in self.edges))
         #: All channels in every light, as charge may come from neighbours of other channels.
-        self._sights = [(c, light) for light in lights for c in study.channels]
+        self._sights = [(c, light) for light in lights for c in dataset.channels]
         self._sight = np.array([self._sights.index((e.channel, e.part[0].light_radiance)) for e in self.edges])
         self._turns, self._turn = _clusters(np.array([e.direction_deg for e in self.edges]), ALIKE_DEG)
-        places = [_place_um(study, e) for e in self.edges]
+        places = [_place_um(dataset, e) for e in self.edges]
         if len(set(places)) == 1:  # edges at one place can't tell a change over the field
             places = [(0.0, 0.0)] * len(places)
         self._places = list(dict.fromkeys(places))
@@ -116,13 +116,15 @@ class PredictedEdges:
         half = self._odd.shape[1] // 2
         self._distance_px = GRID_PX * np.arange(-half, half + 1, dtype=float)
         #: Level of the dark side above the black level, over the contrast.
-        self._offset = np.array([max(e.summary.levels[0] - study.noise.black, 0.0) / e.summary.contrast for e in edges])
+        self._offset = np.array(
+            [max(e.summary.levels[0] - dataset.noise.black, 0.0) / e.summary.contrast for e in edges]
+        )
         self._shaded = np.array([self._shade(k, ()) for k in range(len(edges))])
         self._operators = self._made_operators()
         self._baseline = self._otf(())
 
     def _light(self, path: str | None) -> Spectrum | None:
-        return self._study.spectrum(path) if path else None
+        return self._dataset.spectrum(path) if path else None
 
     def _cutoff_cy_per_px(self) -> float:
         """Return the lens's cutoff at the shortest detected wavelength."""
@@ -152,7 +154,7 @@ class PredictedEdges:
 
     def predict(self, effects: Effects) -> FloatArray:
         """Predicted OTFs of all edges at `frequencies`, (edges, frequencies)."""
-        key = effects_at_f_number(effects, self._study.camera.lens.f_number, self._camera.lens.f_number)
+        key = effects_at_f_number(effects, self._dataset.camera.lens.f_number, self._camera.lens.f_number)
         return _kept(self._numbers_of, key, lambda: self._numbers(self._reported(key)))
 
     def _numbers(self, rows: FloatArray) -> FloatArray:
@@ -306,7 +308,7 @@ class PredictedEdges:
         change = np.zeros_like(light)
         if not model.is_linear:
             for i, edge in enumerate(self.edges):
-                scale = edge.summary.contrast / self._study.noise.gain
+                scale = edge.summary.contrast / self._dataset.noise.gain
                 level = np.linspace(0.0, 1.1, 45) * float(light[i].max())
                 bent = model.response(level * scale)
                 change[i] += np.interp(light[i], level, bent / scale) - light[i]
@@ -363,7 +365,7 @@ class PredictedEdges:
         step, places = mosaic.step(cfa), mosaic.phases(cfa)
         channel = {place: c for c, mine in places.items() for place in mine}
         for edge, profile in zip(self.edges, self._light_profile, strict=True):
-            scale = edge.summary.contrast / self._study.noise.gain
+            scale = edge.summary.contrast / self._dataset.noise.gain
             turn, light = np.deg2rad(edge.direction_deg), edge.part[0].light_radiance
             rates = {c: self._rate(self._sights.index((c, light))) for c in self._camera.channels}
             own = max(rates[edge.channel], 1e-9)
@@ -469,11 +471,11 @@ def _clusters(angle_deg: FloatArray, width: float) -> tuple[FloatArray, NDArray[
     return np.bincount(which, angle_deg) / count, which
 
 
-def _place_um(study: Study, edge: SideEdge) -> tuple[float, float]:
+def _place_um(dataset: Dataset, edge: SideEdge) -> tuple[float, float]:
     """(x, y) of the edge's middle from the sensor's centre, um."""
     field_mm = edge.part[0].field_mm
     if field_mm is not None and edge.part[0].region is not None:
         return 1000.0 * field_mm[1], 1000.0 * field_mm[0]
-    pitch = study.camera.pixel_pitch_um
+    pitch = dataset.camera.pixel_pitch_um
     row0, col0, row1, col1 = edge.region
-    return 0.5 * pitch * (col0 + col1 - study.camera.cols), 0.5 * pitch * (row0 + row1 - study.camera.rows)
+    return 0.5 * pitch * (col0 + col1 - dataset.camera.cols), 0.5 * pitch * (row0 + row1 - dataset.camera.rows)

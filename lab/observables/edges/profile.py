@@ -289,7 +289,7 @@ def _fit_profile(
         levels=(dark_level, light_level),
         noise_std=(std_dark * contrast, std_light * contrast),
         residual_chi2_per_sample=float((weight * residual**2).sum())
-        / max(np.count_nonzero(used) - len(solution) - len(edge.poly), 1),
+        / max(int(used.sum()) - len(solution) - len(edge.poly), 1),
     )
 
 

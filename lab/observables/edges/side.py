@@ -12,7 +12,7 @@ import numpy as np
 from lab.capture_kinds.slanted_edge import EdgeCapture
 from lab.capture_kinds.stopped_edge import StoppedEdgeCapture
 from lab.errors import NotDetermined
-from lab.observables.dataset import Study, held_out_of
+from lab.observables.dataset import Dataset, held_out_of
 from lab.observables.edges.finding import Region
 from lab.observables.edges.measured import edges_of, measure_edge
 from lab.observables.edges.profile import EdgeSummary
@@ -56,16 +56,16 @@ class SideEdge:
         return self.region, round(self.direction_deg), self.channel
 
 
-def edges_of_side(study: Study, kind: type[EdgeCapture], step: str) -> list[SideEdge]:
+def edges_of_side(dataset: Dataset, kind: type[EdgeCapture], step: str) -> list[SideEdge]:
     """Return all edges of the captures of a kind, by region and channel. Edges are searched for where no region is
     stated.
 
     Raises NotDetermined of `step` where f-number or pixel pitch isn't stated, without captures of the kind, and where
     no edge is measured.
     """
-    if not study.diffraction_is_known:
+    if not dataset.diffraction_is_known:
         raise NotDetermined(step, "f-number or pixel pitch isn't stated: no diffraction to hold the edges against")
-    groups = study.groups(
+    groups = dataset.groups(
         kind,
         lambda c: (f_number_of(c), c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm),
     )
@@ -76,21 +76,23 @@ def edges_of_side(study: Study, kind: type[EdgeCapture], step: str) -> list[Side
     for i, group in enumerate(groups):
         out = held_out_of(group, i, len(groups))
         try:
-            regions = [group[0].region] if group[0].region else [f.region for f in edges_of(study.recordings, group[0])]
+            regions = (
+                [group[0].region] if group[0].region else [f.region for f in edges_of(dataset.recordings, group[0])]
+            )
         except NotDetermined as refused:
             reasons.append(refused.reason)
             continue
         for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
-            for channel in study.channels if part else ():
+            for channel in dataset.channels if part else ():
                 for region in regions:
                     try:
-                        summary = measure_edge(study.recordings, part, channel, study.fitted, region)
-                        check_phases(step, study.stated.cfa, channel, region, summary.angle_deg)
+                        summary = measure_edge(dataset.recordings, part, channel, dataset.fitted, region)
+                        check_phases(step, dataset.stated.cfa, channel, region, summary.angle_deg)
                         _refuse_narrow(step, part[0], channel, summary)
                     except NotDetermined as refused:
                         reasons.append(refused.reason)
                         continue
-                    share = _fixed_share(study, group, len(part), channel, region, summary)
+                    share = _fixed_share(dataset, group, len(part), channel, region, summary)
                     edges.append(SideEdge(tuple(part), channel, summary, part[0].id in out, region, share))
     if not edges:
         raise NotDetermined(step, reasons[0])
@@ -119,7 +121,7 @@ def f_number_of(capture: EdgeCapture) -> float | None:
 
 
 def _fixed_share(
-    study: Study, group: Sequence[EdgeCapture], frames: int, channel: str, region: Region, summary: EdgeSummary
+    dataset: Dataset, group: Sequence[EdgeCapture], frames: int, channel: str, region: Region, summary: EdgeSummary
 ) -> float:
     """Share of the noise variance of a mean of `frames` frames that is fixed (PRNU): 1 - temporal variance / total
     variance.
@@ -129,17 +131,17 @@ def _fixed_share(
     """
     if len(group) > 1:
         row0, col0, row1, col1 = region
-        mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))[row0:row1, col0:col1]
+        mask = dataset.plane_mask(channel, (dataset.camera.rows, dataset.camera.cols))[row0:row1, col0:col1]
         first, second = (
-            np.asarray(study.recordings.frame(c)[row0:row1, col0:col1], float)[mask] for c in (group[0], group[1])
+            np.asarray(dataset.recordings.frame(c)[row0:row1, col0:col1], float)[mask] for c in (group[0], group[1])
         )
         light = 0.5 * (first + second) > 0.5 * sum(summary.levels) + 0.35 * summary.contrast
         apart = (first - second)[light]
         if apart.size < LEAST_PAIRS:
             return 0.0
         temporal = 0.5 * float(np.var(apart))
-    elif study.stated.conversion_gain_dn_per_e is not None:
-        temporal = study.noise.gain * (summary.levels[1] - study.noise.black) + study.noise.read_dn**2
+    elif dataset.stated.conversion_gain_dn_per_e is not None:
+        temporal = dataset.noise.gain * (summary.levels[1] - dataset.noise.black) + dataset.noise.read_dn**2
     else:
         return 0.0
     total = max(summary.noise_std[1] ** 2, 1e-300)

@@ -13,9 +13,9 @@ import numpy as np
 from lab.capture_kinds.dark import DarkCapture
 from lab.errors import NotDetermined
 from lab.observables.darks.readout import OFFSETS_STD, DarkReadOut, dark_readout
-from lab.observables.dataset import Study, held_out_flats
+from lab.observables.dataset import Dataset, held_out_flats
 from lab.observables.flats.row_light import ROW_LIGHT, nuisances, row_light_scatter
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import ADDED, COLLECTED, GAINS, LEAK, LINE_GAINS, acting
 from sim.camera import CameraModel
 from sim.effects.base import Effects
@@ -41,44 +41,44 @@ class FlatLevel:
     ratios: tuple[float, ...]  # of each frame: signal of green on red rows over green on blue rows, less 1
 
 
-def _unclipped(study: Study, capture: Any) -> bool:
+def _unclipped(dataset: Dataset, capture: Any) -> bool:
     """Return whether no channel of the capture clips."""
-    return all(m is not None for m in study.levels(capture).mean.values())
+    return all(m is not None for m in dataset.levels(capture).mean.values())
 
 
-def flats(study: Study) -> tuple[list[FlatLevel], dict[bool, tuple[FloatArray, float]]]:
+def flats(dataset: Dataset) -> tuple[list[FlatLevel], dict[bool, tuple[FloatArray, float]]]:
     """Unclipped flats by level, darkest first; and for seen (False) and held-out (True) ones a mean image with its
     pixels' variance.
 
     The image (rows, cols) is the mean over frames above the dark level, each plane of the mosaic over its mean,
     weighted by signal. The variance is that of a pixel of the image by shot and read noise.
     """
-    out = study.once(held_out_flats)
+    out = dataset.once(held_out_flats)
     levels: list[FlatLevel] = []
     total: dict[bool, Any] = {}
     weights: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
-    for group in study.flat_levels():
+    for group in dataset.flat_levels():
         for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
-            part = [c for c in part if _unclipped(study, c)]  # noqa: PLW2901
+            part = [c for c in part if _unclipped(dataset, c)]  # noqa: PLW2901
             if not part:
                 continue
             held_out = part[0].id in out
             means, ratios = [], []
             for capture in part:
-                frame = np.asarray(study.recordings.frame(capture), np.float32) - np.float32(
-                    dark_level_dn(study, capture)
+                frame = np.asarray(dataset.recordings.frame(capture), np.float32) - np.float32(
+                    dark_level_dn(dataset, capture)
                 )
-                own = {n: float(p.mean(dtype=float)) for n, p in mosaic.planes(frame, study.camera.cfa).items()}
+                own = {n: float(p.mean(dtype=float)) for n, p in mosaic.planes(frame, dataset.camera.cfa).items()}
                 means.append(own)
                 if "G1" in own:
-                    ratios.append(green_ratio(study, frame))
+                    ratios.append(green_ratio(dataset, frame))
                 weight = float(np.mean(list(own.values())))
-                if weight < LEAST_SIGNAL * study.noise.read_dn:
+                if weight < LEAST_SIGNAL * dataset.noise.read_dn:
                     continue
-                for name, plane in mosaic.planes(frame, study.camera.cfa).items():
+                for name, plane in mosaic.planes(frame, dataset.camera.cfa).items():
                     np.multiply(plane, np.float32(weight / own[name]), out=plane)
                 total[held_out] = total[held_out] + frame if held_out in total else frame
-                noise = sum((study.noise.gain * m + study.noise.read_dn**2) / m**2 for m in own.values()) / len(own)
+                noise = sum((dataset.noise.gain * m + dataset.noise.read_dn**2) / m**2 for m in own.values()) / len(own)
                 weights[held_out].append((weight, noise))
             mean = {n: float(np.mean([m[n] for m in means])) for n in means[0]}
             levels.append(FlatLevel(tuple(part), held_out, mean, tuple(ratios)))
@@ -90,28 +90,28 @@ def flats(study: Study) -> tuple[list[FlatLevel], dict[bool, tuple[FloatArray, f
     return sorted(levels, key=lambda u: sum(u.mean.values())), images
 
 
-def dark_level_dn(study: Study, capture: Any) -> float:
+def dark_level_dn(dataset: Dataset, capture: Any) -> float:
     """Mean of a capture without light: black level + dark current x exposure, DN."""
-    return study.noise.black + study.noise.dark_dn_per_s * float(capture.exposure_s)
+    return dataset.noise.black + dataset.noise.dark_dn_per_s * float(capture.exposure_s)
 
 
-def _green_dark(study: Study) -> float:
+def _green_dark(dataset: Dataset) -> float:
     """Difference of the two greens in dark frames, DN, by fixed patterns of the read-out; 0 without dark captures.
 
     In longer exposures than a flat's, hot pixels make it another.
     """
-    every = study.recordings.captures(DarkCapture, study.side)
-    longest_s = max((g[0].exposure_s for g in study.flat_levels()), default=0.0)
+    every = dataset.recordings.captures(DarkCapture, dataset.side)
+    longest_s = max((g[0].exposure_s for g in dataset.flat_levels()), default=0.0)
     longest_s = max(longest_s, min((c.exposure_s for c in every), default=0.0))
     captures = [c for c in every if c.exposure_s <= longest_s][:16]
-    pairs = [green_planes(study, np.asarray(study.recordings.frame(c), np.float32)) for c in captures]
+    pairs = [green_planes(dataset, np.asarray(dataset.recordings.frame(c), np.float32)) for c in captures]
     return float(np.mean([float(a.mean(dtype=float)) - float(b.mean(dtype=float)) for a, b in pairs])) if pairs else 0.0
 
 
-def green_planes(study: Study, frame: Any) -> tuple[Any, Any]:
+def green_planes(dataset: Dataset, frame: Any) -> tuple[Any, Any]:
     """Return the green pixels on red rows, without those at the border, and for each the mean of its four diagonal
     neighbours, the greens on blue rows. A gradient of the light cancels in their ratio."""
-    row, col = mosaic.phases(study.camera.cfa)["G"][0]
+    row, col = mosaic.phases(dataset.camera.cfa)["G"][0]
     red_rows = frame[row + 2 * (row == 0) : -1 : 2, col + 2 * (col == 0) : -1 : 2]
     first = row + 2 * (row == 0) - 1, col + 2 * (col == 0) - 1
     blue_rows = frame[first[0] :: 2, first[1] :: 2]
@@ -120,12 +120,12 @@ def green_planes(study: Study, frame: Any) -> tuple[Any, Any]:
     return red_rows, 0.25 * (corners[0] + corners[1] + corners[2] + corners[3])
 
 
-def green_ratio(study: Study, frame: Any) -> float:
+def green_ratio(dataset: Dataset, frame: Any) -> float:
     """Ratio of the two greens' means in a frame above the dark level, less 1, corrected for their difference in dark
     frames."""
-    red_rows, blue_rows = green_planes(study, frame)
+    red_rows, blue_rows = green_planes(dataset, frame)
     below = max(float(blue_rows.mean(dtype=float)), 1e-3)
-    return (float(red_rows.mean(dtype=float)) - study.once(_green_dark)) / below - 1.0
+    return (float(red_rows.mean(dtype=float)) - dataset.once(_green_dark)) / below - 1.0
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -140,24 +140,24 @@ LEAST_LINES = 8  # least side of a plane of the mosaic, lines: half of them dete
 LEAST_PLACES = 8  # places from which on the spread of steps is measured; with fewer it is that by noise and PRNU
 
 
-def line_block(study: Study) -> Block:
+def measure_flat_lines(dataset: Dataset) -> Observable:
     """Steps in the means of rows and columns at halves and quarters of a side, and the difference of even and odd lines
     of a plane of the mosaic, relative to the mean signal.
 
     What dark frames have of both is subtracted, and may be another in light by `OFFSETS_STD`. The standard deviation of
     a step is measured at all other places. Raises NotDetermined without unclipped flats, and for frames too small.
     """
-    _, images = study.once(flats)
+    _, images = dataset.once(flats)
     if not images:
         raise NotDetermined("flat_lines", "no unclipped flat captures")
-    period = mosaic.step(study.camera.cfa)
-    side_px = min(study.camera.rows, study.camera.cols)
+    period = mosaic.step(dataset.camera.cfa)
+    side_px = min(dataset.camera.rows, dataset.camera.cols)
     if side_px < LEAST_LINES * period:
         raise NotDetermined(
             "flat_lines",
             f"frames of {side_px} px: lines are told from the light's slope from {LEAST_LINES * period} px on",
         )
-    levels, dark = study.once(flats)[0], study.once(dark_readout)
+    levels, dark = dataset.once(flats)[0], dataset.once(dark_readout)
     values: list[float] = []
     labels: list[Label] = []
     whole: list[tuple[float, float]] = []
@@ -165,11 +165,11 @@ def line_block(study: Study) -> Block:
     for held_out, (whole_image, noise) in sorted(images.items()):
         part = [u for u in levels if u.held_out == held_out]
         members = tuple(c.id for u in part for c in u.captures)
-        image, of_dark = (whole_image, 0.0) if dark is None else without_dark(study, dark, part, whole_image)
+        image, of_dark = (whole_image, 0.0) if dark is None else without_dark(dataset, dark, part, whole_image)
         for axis, name in ((0, "column"), (1, "row")):
             line, with_dark = (np.asarray(one.mean(axis=axis, dtype=float)) for one in (image, whole_image))
             shot = noise / image.shape[axis]
-            least = float(np.sqrt((study.noise.prnu**2 + of_dark) / image.shape[axis] + shot))
+            least = float(np.sqrt((dataset.noise.prnu**2 + of_dark) / image.shape[axis] + shot))
             for share, value, std, size in _steps(line, period, least):
                 values.append(value)
                 whole.append((std**2 + LINE_FLOOR**2, shot * size))
@@ -196,11 +196,11 @@ def line_block(study: Study) -> Block:
         if not differing:
             return Prediction(np.zeros(len(values)), jacobian)
         found = []
-        for line in even_lines(study.camera, differing):
+        for line in even_lines(dataset.camera, differing):
             found += [step for _, step, *_ in _steps(line, period, 0.0)] + [_stripes(line, period, 0.0)[0]]
         return Prediction(np.tile(found, len(images)), jacobian)
 
-    return Block(
+    return Observable(
         measurement=FLAT_LINES, reach=1.0, value=np.array(values), covariance=covariance, labels=tuple(labels),
         reads=COLLECTED | GAINS, predict=predict,
         scale=np.ones(len(values)),
@@ -229,20 +229,20 @@ def collect_rows(camera: CameraModel, effects: Effects) -> FloatArray:
 
 
 def without_dark(
-    study: Study, dark: DarkReadOut, levels: Sequence[FlatLevel], image: FloatArray
+    dataset: Dataset, dark: DarkReadOut, levels: Sequence[FlatLevel], image: FloatArray
 ) -> tuple[FloatArray, float]:
     """Return the mean image of flat `levels` without the offsets of dark frames, (rows, cols), and the variance that
     their noise adds to a pixel."""
     signal = np.array([float(np.mean(list(u.mean.values()))) for u in levels])
     # each frame of the image counts by its signal, and is divided by that of the plane
-    weight = np.where(signal >= LEAST_SIGNAL * study.noise.read_dn, signal * [len(u.captures) for u in levels], 0.0)
+    weight = np.where(signal >= LEAST_SIGNAL * dataset.noise.read_dn, signal * [len(u.captures) for u in levels], 0.0)
     if not weight.any():
         return image, 0.0
     offsets, size = np.array(dark.offsets_dn), []
-    for name, plane in mosaic.planes(offsets, study.camera.cfa).items():
+    for name, plane in mosaic.planes(offsets, dataset.camera.cfa).items():
         size.append(float(np.average([1.0 / u.mean[name] for u in levels], weights=weight)))
         np.multiply(plane, np.float32(size[-1]), out=plane)
-    return image - offsets, study.noise.read_dn**2 / dark.frames * float(np.mean(np.square(size)))
+    return image - offsets, dataset.noise.read_dn**2 / dark.frames * float(np.mean(np.square(size)))
 
 
 def _steps(line: FloatArray, period: int, least: float) -> list[tuple[float, float, float, float]]:
@@ -288,7 +288,7 @@ FLAT_LINES = Measurement(
     order=260,
     axis="field",
     unit="px",
-    make=line_block,
+    make=measure_flat_lines,
     quantity="step over the mean signal",
 )
 
@@ -328,26 +328,27 @@ class _ChannelCells:
     row_covariance: FloatArray  # (ROWS, ROWS): relative covariance of rows of cells by flicker of the light
 
 
-def shading_block(study: Study) -> Block:
+def measure_flat_field(dataset: Dataset) -> Observable:
     """Means over 6 x 8 cells of the brightest unclipped flats, relative to the mean of the frame, by channel.
 
     Nuisance parameters: row and column of the optical axis. Raises NotDetermined where focal length or pixel pitch
     isn't stated, for frames too small, and without unclipped flats.
     """
-    if study.stated.focal_length_mm is None or study.stated.pixel_pitch_um is None:
+    if dataset.stated.focal_length_mm is None or dataset.stated.pixel_pitch_um is None:
         raise NotDetermined(
             "flat_field", "the focal length or the pixel pitch isn't stated: the fall-off of the light isn't known"
         )
-    least_px = max(ROWS, COLS, 2 * BLOCK_PX) * mosaic.step(study.camera.cfa)
-    if min(study.camera.rows, study.camera.cols) < least_px:
+    least_px = max(ROWS, COLS, 2 * BLOCK_PX) * mosaic.step(dataset.camera.cfa)
+    if min(dataset.camera.rows, dataset.camera.cols) < least_px:
         raise NotDetermined(
             "flat_field",
-            f"frames of {study.camera.rows} x {study.camera.cols} px: {ROWS} x {COLS} cells need {least_px} px a side",
+            f"frames of {dataset.camera.rows} x {dataset.camera.cols} px: {ROWS} x {COLS} cells need {least_px} px a "
+            "side",
         )
-    planes = _planes(study)
+    planes = _planes(dataset)
     if not planes:
         raise NotDetermined("flat_field", "no unclipped flat captures")
-    camera = study.camera
+    camera = dataset.camera
 
     off_px = (AXIS_STD_KNOWN if camera.geometry is not None else AXIS_STD) * float(np.hypot(camera.rows, camera.cols))
     place = _cell_points(camera, 0.0, 0.0)
@@ -360,7 +361,7 @@ def shading_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         # what pixels do stays where it is if the lens's axis moves
-        own, model = _own_factors(planes, place, effects, study), Uniform(camera, effects)
+        own, model = _own_factors(planes, place, effects, dataset), Uniform(camera, effects)
         read_out = of_pixels(acting(effects, ADDED | GAINS))
         even = even_share(camera, effects)
         base = _shaded(planes, place, model, even, read_out, own)
@@ -369,7 +370,7 @@ def shading_block(study: Study) -> Block:
         return Prediction(base, axis | scatter)
 
     radius = np.hypot(x_mm, y_mm)
-    return Block(
+    return Observable(
         measurement=FLAT_FIELD, reach=0.2 * float(np.ptp(x_mm)),
         value=np.concatenate([p.cells for p in planes]), covariance=_covariance(planes),
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures),
@@ -382,34 +383,36 @@ def shading_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _planes(study: Study) -> list[_ChannelCells]:
+def _planes(dataset: Dataset) -> list[_ChannelCells]:
     """Return the mean of the brightest levels' frames by channel, seen and held-out ones apart. Levels are ranked by
     rounded means, so that noise doesn't choose."""
-    out = study.once(held_out_flats)
-    groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
-    groups.sort(key=lambda g: -float(np.round(np.mean(list(study.levels(g[0]).whole.values())), 0)))
+    out = dataset.once(held_out_flats)
+    groups = [
+        g for g in dataset.flat_levels() if all(m is not None for c in g for m in dataset.levels(c).mean.values())
+    ]
+    groups.sort(key=lambda g: -float(np.round(np.mean(list(dataset.levels(g[0]).whole.values())), 0)))
     planes: list[_ChannelCells] = []
     for held in (False, True):
         parts = [[c for c in g if (c.id in out) == held] for g in groups]
         picked = [part for part in parts if part][:MOST_LEVELS]
         captures = tuple(c for part in picked for c in part)[:MOST_FRAMES]
         if captures:
-            planes += _summed(study, captures, held)
+            planes += _summed(dataset, captures, held)
     return planes
 
 
-def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_ChannelCells]:
+def _summed(dataset: Dataset, captures: Sequence[Any], held_out: bool) -> list[_ChannelCells]:
     """Return the mean of some captures above the dark level, by channel."""
-    noise, step = study.noise, mosaic.step(study.camera.cfa)
+    noise, step = dataset.noise, mosaic.step(dataset.camera.cfa)
     total: dict[str, FloatArray] = {}
     inverse_per_dn: dict[str, float] = {}
-    bands: dict[str, list[FloatArray]] = {c: [] for c in study.channels}
+    bands: dict[str, list[FloatArray]] = {c: [] for c in dataset.channels}
     for capture in captures:
-        frame = np.asarray(study.recordings.frame(capture), np.float32) - np.float32(
+        frame = np.asarray(dataset.recordings.frame(capture), np.float32) - np.float32(
             noise.black + noise.dark_dn_per_s * capture.exposure_s
         )
-        for channel in study.channels:
-            phases = mosaic.phases(study.camera.cfa)[channel]
+        for channel in dataset.channels:
+            phases = mosaic.phases(dataset.camera.cfa)[channel]
             plane = np.mean([frame[r::step, c::step] for r, c in phases], axis=0, dtype=float)
             inverse_per_dn[channel] = inverse_per_dn.get(channel, 0.0) + 1.0 / float(plane.mean()) / len(captures)
             # each frame over its own mean, as levels may differ
@@ -419,8 +422,8 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Chan
     planes: list[_ChannelCells] = []
     rows_dn2 = np.zeros((ROWS, ROWS))
     for channel, plane in total.items():
-        count = len(mosaic.phases(study.camera.cfa)[channel])
-        means = np.array([study.levels(c).mean[channel] or 0.0 for c in captures])
+        count = len(mosaic.phases(dataset.camera.cfa)[channel])
+        means = np.array([dataset.levels(c).mean[channel] or 0.0 for c in captures])
         levels = means - noise.black - noise.dark_dn_per_s * np.array([c.exposure_s for c in captures])
         single = (noise.gain * levels + noise.read_dn**2) / levels**2 / count  # relative variance of a plane's pixel
         shot = float(single.mean()) / len(captures)
@@ -548,10 +551,10 @@ def _shaded(
 
 
 def _own_factors(
-    planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effects, study: Study
+    planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effects, dataset: Dataset
 ) -> list[FloatArray | float]:
     """Factor on the cells (cells,) of each plane by what tells its pixels from others."""
-    model, collected = Uniform(study.camera, effects), _collected(study, effects)
+    model, collected = Uniform(dataset.camera, effects), _collected(dataset, effects)
     strayed = {out: _strayed([p for p in planes if p.held_out == out], place, model) for out in (False, True)}
     return [strayed[p.held_out].get(p.channel, 1.0) * collected.get(p.channel, 1.0) for p in planes]
 
@@ -565,15 +568,15 @@ def _strayed(planes: Sequence[_ChannelCells], place: FieldPoints, model: Uniform
     return {p.channel: _cell_means(after[p.channel]) / p.level_e for p in planes}
 
 
-def _collected(study: Study, effects: Effects) -> dict[str, FloatArray]:
+def _collected(dataset: Dataset, effects: Effects) -> dict[str, FloatArray]:
     """Factor on the cells (cells,) of each channel by pixels that collect light unlike others of their colour, as rows
     that repeat fall unevenly into cells."""
     collecting = acting(effects, COLLECTED)
     if not collecting:
         return {}
-    step, rows = mosaic.step(study.camera.cfa), collect_rows(study.camera, collecting)
+    step, rows = mosaic.step(dataset.camera.cfa), collect_rows(dataset.camera, collecting)
     found = {}
-    for channel, phases in mosaic.phases(study.camera.cfa).items():
+    for channel, phases in mosaic.phases(dataset.camera.cfa).items():
         own = np.mean([rows[r::step, c] for r, c in phases], axis=0)
         found[channel] = _cells(np.tile(own[:, None], COLS)).ravel()
     return found
@@ -631,6 +634,6 @@ FLAT_FIELD = Measurement(
     order=270,
     axis="field",
     unit="mm",
-    make=shading_block,
+    make=measure_flat_field,
     quantity="signal over the mean",
 )

@@ -10,10 +10,10 @@ import numpy as np
 
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.flats.field import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
 from lab.observables.noise.figures import BLACK_FLOOR_DN
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import COLLECTED, LINE_GAINS, acting
 from sim.effects.base import Effects
 from sim.frame import collected_mosaic
@@ -43,34 +43,34 @@ class _Ratio:
     elapsed_s: float
 
 
-def green_block(study: Study) -> Block:
+def measure_green_balance(dataset: Dataset) -> Observable:
     """Signal of the green pixels on red rows over that on blue rows, less 1.
 
     It is measured by level of flats, by wavelength of narrowband light, and by cell of the frame relative to the cells'
     mean. Raises NotDetermined for a camera without a mosaic, for frames too small, and without unclipped captures of
     uniform light."""
-    if study.camera.cfa == "MONO":
+    if dataset.camera.cfa == "MONO":
         raise NotDetermined("green_balance", "the camera has no colour mosaic")
-    if any(n < cells for n, cells in zip(_green_shape(study), CELLS, strict=True)):
+    if any(n < cells for n, cells in zip(_green_shape(dataset), CELLS, strict=True)):
         least = " x ".join(str(2 * (cells + 1)) for cells in CELLS)
         raise NotDetermined(
             "green_balance",
-            f"frames of {study.camera.rows} x {study.camera.cols} px: {CELLS[0]} x {CELLS[1]} cells of greens need "
+            f"frames of {dataset.camera.rows} x {dataset.camera.cols} px: {CELLS[0]} x {CELLS[1]} cells of greens need "
             f"{least} px",
         )
-    levels, images = study.once(flats)
-    rows_dn2 = _rows_dn2(study, levels)
-    every = *_by_level(study, levels, rows_dn2), *_by_wavelength(study, rows_dn2)
+    levels, images = dataset.once(flats)
+    rows_dn2 = _rows_dn2(dataset, levels)
+    every = *_by_level(dataset, levels, rows_dn2), *_by_wavelength(dataset, rows_dn2)
     ratios = [r for r in every if r.std < GREEN_NOISE]
     if not ratios:
         raise NotDetermined("green_balance", "no unclipped flat or narrowband captures")
-    common = study.noise.prnu**2 * _share(*_green_shape(study))
+    common = dataset.noise.prnu**2 * _share(*_green_shape(dataset))
     value = np.array([r.value for r in ratios])
     covariance = np.diag([r.std**2 + GREEN_FLOOR**2 for r in ratios]) + common
     labels = [Label(r.x, "G", r.condition, r.captures, r.held_out) for r in ratios]
     number = CELLS[0] * CELLS[1]
     for held_out, (image, noise) in sorted(images.items()):  # seen frames first
-        red_rows, blue_rows = green_planes(study, image)
+        red_rows, blue_rows = green_planes(dataset, image)
         place = _cell_means(red_rows) / _cell_means(blue_rows)
         members = tuple(c.id for u in levels if u.held_out == held_out for c in u.captures)
         value = np.concatenate([value, (place / place.mean() - 1.0).ravel()])
@@ -80,44 +80,44 @@ def green_block(study: Study) -> Block:
         one = centring @ np.diag(_cell_shares(red_rows.shape)) @ centring
         bigger = np.zeros((size + number, size + number))
         bigger[:size, :size] = covariance
-        bigger[size:, size:] = (study.noise.prnu**2 + noise) * one + GREEN_FLOOR**2 * np.eye(number)
+        bigger[size:, size:] = (dataset.noise.prnu**2 + noise) * one + GREEN_FLOOR**2 * np.eye(number)
         if held_out and False in images:
             # PRNU is the same in seen and held-out frames
-            bigger[size:, size - number : size] = study.noise.prnu**2 * one
-            bigger[size - number : size, size:] = study.noise.prnu**2 * one
+            bigger[size:, size - number : size] = dataset.noise.prnu**2 * one
+            bigger[size - number : size, size:] = dataset.noise.prnu**2 * one
         covariance = bigger
     cells = len(value) - len(ratios)
 
     def predict(effects: Effects) -> Prediction:
         differing, moving = acting(effects, GREENS), acting(effects, KERNELS)
         if moving:  # by how much depends on what the other colours hold
-            found = [_predicted_ratio(r, differing, study) for r in ratios]
+            found = [_predicted_ratio(r, differing, dataset) for r in ratios]
         else:
-            found = [_predicted_ratio(ratios[0], differing, study) if differing else 0.0] * len(ratios)
-        model = Uniform(study.camera, effects)
+            found = [_predicted_ratio(ratios[0], differing, dataset) if differing else 0.0] * len(ratios)
+        model = Uniform(dataset.camera, effects)
         placed = np.zeros(cells)
         if model.strays:
-            parted = np.array([_parted(r, study, model) for r in ratios])
+            parted = np.array([_parted(r, dataset, model) for r in ratios])
             found = [ratio + float(own.mean()) for ratio, own in zip(found, parted, strict=True)]
             flat = [r.x == 0.0 for r in ratios]  # none where only narrowband light is there, or every flat is noisy
             of_flats = parted[flat if any(flat) else slice(None)].mean(0)
             placed = np.tile(of_flats - of_flats.mean(), cells // number)
         return Prediction(np.concatenate([found, placed]), _line_gains(model, len(ratios), cells // number))
 
-    return Block(
+    return Observable(
         measurement=GREEN_BALANCE, reach=25.0, value=value, covariance=covariance, labels=tuple(labels),
         reads=GREENS | STRAYS, scattered_by=LINE_GAINS, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
-def _rows_dn2(study: Study, levels: Sequence[FlatLevel]) -> float:
+def _rows_dn2(dataset: Dataset, levels: Sequence[FlatLevel]) -> float:
     """Variance of the greens' difference from frame to frame beyond shot and read noise, DN^2: row noise. It is reduced
     by about its uncertainty, so that chance isn't taken for row noise; at least 0."""
     excess, weights = 0.0, 0.0
     for u in levels:
         signal = u.mean["G2"]
         if len(u.ratios) > 1 and signal > 0:
-            shot = _shot_dn2(study, signal)
+            shot = _shot_dn2(dataset, signal)
             weight = (len(u.ratios) - 1) / shot**2
             excess += weight * (float(np.var(u.ratios, ddof=1)) * signal**2 - shot)
             weights += weight
@@ -125,14 +125,14 @@ def _rows_dn2(study: Study, levels: Sequence[FlatLevel]) -> float:
     return max(excess / weights - weights**-0.5, 0.0) if weights > 0 else 0.0
 
 
-def _shot_dn2(study: Study, signal: float) -> float:
+def _shot_dn2(dataset: Dataset, signal: float) -> float:
     """Variance of the difference of the greens' means in one frame by shot and read noise, DN^2."""
-    return (study.noise.gain * signal + study.noise.read_dn**2) * _share(*_green_shape(study))
+    return (dataset.noise.gain * signal + dataset.noise.read_dn**2) * _share(*_green_shape(dataset))
 
 
-def _green_shape(study: Study) -> tuple[int, int]:
+def _green_shape(dataset: Dataset) -> tuple[int, int]:
     """Rows and columns of the green pixels that `green_planes` compares."""
-    return study.camera.rows // 2 - 1, study.camera.cols // 2 - 1
+    return dataset.camera.rows // 2 - 1, dataset.camera.cols // 2 - 1
 
 
 def _share(rows: FloatArray | int, cols: FloatArray | int) -> Any:
@@ -152,44 +152,46 @@ def _cell_shares(shape: tuple[int, int]) -> FloatArray:
     return np.asarray(_share(rows[:, None], cols[None, :])).ravel()
 
 
-def _by_level(study: Study, levels: Sequence[FlatLevel], rows_dn2: float) -> list[_Ratio]:
+def _by_level(dataset: Dataset, levels: Sequence[FlatLevel], rows_dn2: float) -> list[_Ratio]:
     """Return the ratios of flats, one a level."""
     found = []
     for u in levels:
         signal = u.mean["G2"]
         if signal <= 0:
             continue
-        dn2 = (_shot_dn2(study, signal) + rows_dn2) / len(u.ratios) + 2.0 * (BLACK_FLOOR_DN * study.step_dn) ** 2
+        dn2 = (_shot_dn2(dataset, signal) + rows_dn2) / len(u.ratios) + 2.0 * (BLACK_FLOOR_DN * dataset.step_dn) ** 2
         std = float(np.sqrt(dn2)) / signal
         c = u.captures[0]
         mean = {"R": u.mean["R"], "G": 0.5 * (u.mean["G1"] + signal), "B": u.mean["B"]}
         found.append(
             _Ratio(float(np.mean(u.ratios)), std, 0.0, f"{signal:.4g} DN", tuple(c.id for c in u.captures), u.held_out,
-            mean, c.exposure_s, study.elapsed_s(c))
+            mean, c.exposure_s, dataset.elapsed_s(c))
         )  # fmt: skip
     return found
 
 
-def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
+def _by_wavelength(dataset: Dataset, rows_dn2: float) -> list[_Ratio]:
     """Return the ratios of unclipped narrowband captures, one a capture."""
     found = []
-    groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    groups = dataset.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
     for i, group in enumerate(groups):
         for capture in group:
-            if study.levels(capture).mean["G"] is None:
+            if dataset.levels(capture).mean["G"] is None:
                 continue
-            frame = np.asarray(study.recordings.frame(capture), np.float32) - np.float32(dark_level_dn(study, capture))
-            own = {n: float(p.mean(dtype=float)) for n, p in mosaic.planes(frame, study.camera.cfa).items()}
+            frame = np.asarray(dataset.recordings.frame(capture), np.float32) - np.float32(
+                dark_level_dn(dataset, capture)
+            )
+            own = {n: float(p.mean(dtype=float)) for n, p in mosaic.planes(frame, dataset.camera.cfa).items()}
             signal = own["G2"]
             if signal < 5.0:
                 continue
-            dn2 = _shot_dn2(study, signal) + rows_dn2 + 2.0 * (BLACK_FLOOR_DN * study.step_dn) ** 2
+            dn2 = _shot_dn2(dataset, signal) + rows_dn2 + 2.0 * (BLACK_FLOOR_DN * dataset.step_dn) ** 2
             found.append(
                 _Ratio(
-                    green_ratio(study, frame), float(np.sqrt(dn2)) / signal, capture.wavelength_nm,
+                    green_ratio(dataset, frame), float(np.sqrt(dn2)) / signal, capture.wavelength_nm,
                     f"{capture.wavelength_nm:g} nm", (capture.id,), i % 3 == 1, {"R": own["R"],
                     "G": 0.5 * (own["G1"] + signal), "B": own["B"]},
-                    capture.exposure_s, study.elapsed_s(capture),
+                    capture.exposure_s, dataset.elapsed_s(capture),
                 )
             )  # fmt: skip
     return found
@@ -201,20 +203,20 @@ KERNELS = frozenset({"charge.kernels", "charge.trails"})
 GREENS = COLLECTED | KERNELS
 
 
-def _predicted_ratio(ratio: _Ratio, effects: Effects, study: Study) -> float:
+def _predicted_ratio(ratio: _Ratio, effects: Effects, dataset: Dataset) -> float:
     """Return the ratio less 1 in a small uniform frame of the measured signals, with effects."""
     shape = TILE_ROWS, TILE_COLS
-    electrons = {c: np.full(shape, max(m, 0.0) / study.noise.gain) for c, m in ratio.mean.items()}
-    tile = mosaic.assemble(electrons, study.camera.cfa)
-    tile = collected_mosaic(study.camera, tile, effects, exposure_s=ratio.exposure_s, elapsed_s=ratio.elapsed_s)
-    planes = mosaic.planes(tile, study.camera.cfa)
+    electrons = {c: np.full(shape, max(m, 0.0) / dataset.noise.gain) for c, m in ratio.mean.items()}
+    tile = mosaic.assemble(electrons, dataset.camera.cfa)
+    tile = collected_mosaic(dataset.camera, tile, effects, exposure_s=ratio.exposure_s, elapsed_s=ratio.elapsed_s)
+    planes = mosaic.planes(tile, dataset.camera.cfa)
     return float(planes["G1"].mean() / max(float(planes["G2"].mean()), 1e-9)) - 1.0
 
 
-def _parted(ratio: _Ratio, study: Study, model: Uniform) -> FloatArray:
+def _parted(ratio: _Ratio, dataset: Dataset, model: Uniform) -> FloatArray:
     """Return by how much the greens' ratio grows in each cell (cells,) by light that falls on the next pixels."""
     rows, cols = CELLS
-    place = FieldPoints.of(study.camera, 4 * rows, 4 * cols)
+    place = FieldPoints.of(dataset.camera, 4 * rows, 4 * cols)
     more = model.part_greens({c: np.array(m) for c, m in ratio.mean.items()}, place) / max(ratio.mean["G"], 1e-9)
     return np.asarray(more.reshape(rows, 4, cols, 4).mean((1, 3)).ravel())
 
@@ -251,6 +253,6 @@ GREEN_BALANCE = Measurement(
     order=250,
     axis="wavelength",
     unit="nm",
-    make=green_block,
+    make=measure_green_balance,
     quantity="green over green, less 1",
 )

@@ -13,10 +13,10 @@ from scipy.special import polygamma
 
 from lab.errors import NotDetermined
 from lab.observables.darks.readout import OFFSETS_STD, DarkReadOut, dark_readout
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.flats.field import LEAST_SIGNAL, dark_level_dn, even_lines, flats
 from lab.observables.noise.line_spectra import log_mean_bias
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import COLLECTED, GAINS, LINE_GAINS, acting
 from sim.effects.base import Effects
 from sim.sensor import mosaic
@@ -60,7 +60,7 @@ class _Lines:
     light: float  # mean square of the light along the lines
 
 
-def line_gain_block(study: Study) -> Block:
+def measure_line_gains(dataset: Dataset) -> Observable:
     """Power of the rows' and columns' means in the mean flat image over that of its pixels, ln, by band of frequency.
 
     0 where pixels are independent. Both powers are taken at the same frequency across the lines: that of lines at
@@ -70,24 +70,24 @@ def line_gain_block(study: Study) -> Block:
     difference of two halves of the frames. Raises NotDetermined without unclipped, repeated flats, without repeated
     dark frames, and for frames that are too small.
     """
-    _, images = study.once(flats)
+    _, images = dataset.once(flats)
     if not images:
         raise NotDetermined("line_gains", "no unclipped flat captures")
-    side_px = min(study.camera.rows, study.camera.cols)
+    side_px = min(dataset.camera.rows, dataset.camera.cols)
     if side_px < LEAST_PX:
         raise NotDetermined(
             "line_gains", f"frames of {side_px} px: lines are told from pixels from {LEAST_PX} px a side on"
         )
-    dark = study.once(dark_readout)
+    dark = dataset.once(dark_readout)
     if dark is None:
         raise NotDetermined(
             "line_gains",
             "no repeated dark frames whose noise exceeds a code: gains of lines aren't told from their offsets",
         )
-    halves = {held_out: _halves(study, dark, held_out) for held_out in sorted(images)}
-    directions: tuple[Lines, ...] = ("columns", "rows") if study.camera.rows >= LEAST_ROWS else ("columns",)
+    halves = {held_out: _halves(dataset, dark, held_out) for held_out in sorted(images)}
+    directions: tuple[Lines, ...] = ("columns", "rows") if dataset.camera.rows >= LEAST_ROWS else ("columns",)
     parts = [
-        _read(study, dark, lines, held_out, half)
+        _read(dataset, dark, lines, held_out, half)
         for lines in directions
         for held_out, half in halves.items()
         if half is not None
@@ -102,14 +102,14 @@ def line_gain_block(study: Study) -> Block:
     bands = len(BAND_EDGES) - 1
 
     def predict(effects: Effects) -> Prediction:
-        model = Uniform(study.camera, effects)
+        model = Uniform(dataset.camera, effects)
         still = acting(effects, COLLECTED | GAINS)
-        even = dict(zip(("columns", "rows"), even_lines(study.camera, still), strict=True)) if still else {}
+        even = dict(zip(("columns", "rows"), even_lines(dataset.camera, still), strict=True)) if still else {}
         pattern = []
         for part in parts:
             variance = model.line_gain_std(part.lines) ** 2
             steps = _line_power(even[part.lines], part.lines) if even else np.zeros(bands)
-            pattern.append(_pixels_of(study, part.lines) * (variance * part.light + steps))
+            pattern.append(_pixels_of(dataset, part.lines) * (variance * part.light + steps))
         ratio = 1.0 + (np.concatenate(pattern) + shared) / white
         slope = 1.0 / white / ratio
         jacobian = {"line_gains:offsets in light": OFFSETS_STD**2 * offsets * slope}
@@ -117,7 +117,7 @@ def line_gain_block(study: Study) -> Block:
             jacobian[f"line_gains:noise:{k}"] = np.where(np.arange(len(slope)) == k, shared_std * slope, 0.0)
         return Prediction(np.log(ratio), jacobian)
 
-    return Block(
+    return Observable(
         measurement=LINE_GAIN_POWER, reach=0.1, value=np.log(power / white) - bias, covariance=_covariance(parts),
         labels=tuple(Label(f, "all", part.lines, part.captures, part.held_out) for part in parts for f in _middles()),
         reads=LINE_GAINS | COLLECTED | GAINS, predict=predict, scale=np.ones(len(bias)),
@@ -143,9 +143,9 @@ def _middles() -> list[float]:
     return [0.5 * (low + high) for low, high in pairwise(BAND_EDGES)]
 
 
-def _pixels_of(study: Study, lines: Lines) -> int:
+def _pixels_of(dataset: Dataset, lines: Lines) -> int:
     """Pixels of one line."""
-    return study.camera.rows if lines == "columns" else study.camera.cols
+    return dataset.camera.rows if lines == "columns" else dataset.camera.cols
 
 
 def _bands(count: int) -> list[slice]:
@@ -231,22 +231,24 @@ def _without_light(image: FloatArray) -> FloatArray:
     return np.asarray(image - down @ (down.T @ image @ across) @ across.T)
 
 
-def _halves(study: Study, dark: DarkReadOut, held_out: bool) -> tuple[FloatArray, FloatArray, float] | None:
+def _halves(dataset: Dataset, dark: DarkReadOut, held_out: bool) -> tuple[FloatArray, FloatArray, float] | None:
     """Mean images (rows, cols) of every other frame of the flats of one part, each plane of the mosaic over its mean,
     and the mean inverse signal of their frames, 1/DN; None with a single frame."""
     total: list[Any] = [0.0, 0.0]
     weight = [0.0, 0.0]
     frames = 0
-    for level in study.once(flats)[0]:
+    for level in dataset.once(flats)[0]:
         if level.held_out != held_out:
             continue
         for capture in level.captures:
-            frame = np.asarray(study.recordings.frame(capture), np.float32) - np.float32(dark_level_dn(study, capture))
+            frame = np.asarray(dataset.recordings.frame(capture), np.float32) - np.float32(
+                dark_level_dn(dataset, capture)
+            )
             frame -= dark.offsets_dn
-            planes = mosaic.planes(frame, study.camera.cfa)
+            planes = mosaic.planes(frame, dataset.camera.cfa)
             own = {name: float(plane.mean(dtype=float)) for name, plane in planes.items()}
             signal = float(np.mean(list(own.values())))
-            if signal < LEAST_SIGNAL * study.noise.read_dn:
+            if signal < LEAST_SIGNAL * dataset.noise.read_dn:
                 continue
             for name, plane in planes.items():
                 np.multiply(plane, np.float32(signal / own[name]), out=plane)
@@ -260,7 +262,7 @@ def _halves(study: Study, dark: DarkReadOut, held_out: bool) -> tuple[FloatArray
 
 
 def _read(
-    study: Study, dark: DarkReadOut, lines: Lines, held_out: bool, halves: tuple[FloatArray, FloatArray, float]
+    dataset: Dataset, dark: DarkReadOut, lines: Lines, held_out: bool, halves: tuple[FloatArray, FloatArray, float]
 ) -> _Lines:
     """Return the powers of one direction's lines, of the two images of `halves`."""
     *images, inverse_per_dn = halves
@@ -277,7 +279,7 @@ def _read(
     return _Lines(
         lines=lines,
         held_out=held_out,
-        captures=tuple(c.id for u in study.once(flats)[0] if u.held_out == held_out for c in u.captures),
+        captures=tuple(c.id for u in dataset.once(flats)[0] if u.held_out == held_out for c in u.captures),
         modes=modes,
         pixel_modes=pixel_modes,
         power=power,
@@ -296,7 +298,7 @@ LINE_GAIN_POWER = Measurement(
     order=265,
     axis="spatial_frequency",
     unit="cy/px",
-    make=line_gain_block,
+    make=measure_line_gains,
     quantity="power over single pixels', ln",
     conditions="direction",
 )

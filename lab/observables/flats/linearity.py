@@ -13,41 +13,41 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
 from lab.formats.results import CameraFit, InconsistentLevel
 from lab.observables.darks.level import added_dark_dn
-from lab.observables.dataset import Study, held_out_flats
+from lab.observables.dataset import Dataset, held_out_flats
 from lab.observables.flats.row_light import ROW_LIGHT, row_light_variance
 from lab.observables.flats.stated_light import stated_light
 from lab.observables.noise.figures import RepeatedMeans, level_std, repeated_levels, steady, weighted_median
 from lab.observables.noise.line_means import LineMeans
-from lab.observables.observable import LEVEL_REACH, Block, Label, Measurement, Prediction
+from lab.observables.observable import LEVEL_REACH, Label, Measurement, Observable, Prediction
 from lab.observables.reads import DARK_CURRENT, LAG, LINES, acting
 from sim.effects.base import Effects
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import LEVEL, SPECTRAL, Uniform, electron_rate
 
 if TYPE_CHECKING:
-    from lab.observables.dataset import Study
+    from lab.observables.dataset import Dataset
 
 
 class UniformLevels:
     """Mean levels of n pairs of capture and channel. `captures` lists each capture once."""
 
-    def __init__(self, study: Study, points: Sequence[tuple[Capture, str]]) -> None:
+    def __init__(self, dataset: Dataset, points: Sequence[tuple[Capture, str]]) -> None:
         """`points`: n of (capture, channel)."""
-        self._study = study
+        self._dataset = dataset
         self.captures: tuple[Capture, ...] = tuple({capture.id: capture for capture, _ in points}.values())
         number = {capture.id: i for i, capture in enumerate(self.captures)}
         self._of = np.array([number[capture.id] for capture, _ in points])
         self._points = tuple(points)
         self._channel = np.array([channel for _, channel in points])
         self._exposure_s = np.array([capture.exposure_s for capture in self.captures])
-        self._elapsed_s = np.array([study.elapsed_s(capture) for capture in self.captures])
-        self.lines = LineMeans(study, points)
+        self._elapsed_s = np.array([dataset.elapsed_s(capture) for capture in self.captures])
+        self.lines = LineMeans(dataset, points)
 
     def of_light_dn(self, effects: Effects, rates: Mapping[str, FloatArray]) -> FloatArray:
         """DN (n,) by light and the baseline's dark current, after read-out. `rates`: channel -> electrons a second on
         axis, (captures,)."""
-        model = Uniform(self._study.camera, effects)
-        field = model.field(self._study.field)
+        model = Uniform(self._dataset.camera, effects)
+        field = model.field(self._dataset.field)
         electrons = model.electrons(rates, self._exposure_s, field=field, elapsed_s=self._elapsed_s)
         found = np.empty(len(self._of))
         for channel, dn in model.mean_dn(electrons).items():
@@ -57,11 +57,11 @@ class UniformLevels:
 
     def beside_light_dn(self, effects: Effects) -> FloatArray:
         """DN (n,) by all else: black level, offsets, image lag, and dark current that effects add."""
-        study = self._study
-        offset, dark, carried = study.offset(effects), added_dark_dn(study, effects), study.carried_e(effects)
-        of_capture = np.array([study.noise.black + offset(capture) + dark(capture) for capture in self.captures])
+        dataset = self._dataset
+        offset, dark, carried = dataset.offset(effects), added_dark_dn(dataset, effects), dataset.carried_e(effects)
+        of_capture = np.array([dataset.noise.black + offset(capture) + dark(capture) for capture in self.captures])
         lag_e = np.array([carried(capture, channel) for capture, channel in self._points])
-        return np.asarray(of_capture[self._of] + study.noise.gain * lag_e)
+        return np.asarray(of_capture[self._of] + dataset.noise.gain * lag_e)
 
 
 # --- The stated light of flats: a measured radiance, or a number of photons a pixel -----------------------------------
@@ -77,10 +77,10 @@ class FlatLight:
     photons_per_s: float = 0.0  # a pixel, where no spectrum is stated
 
 
-def reading(study: Study, flat: FlatCapture) -> FlatLight | None:
+def reading(dataset: Dataset, flat: FlatCapture) -> FlatLight | None:
     """Return the stated light of a flat; None where nothing is stated, or where exposure or photon number is 0."""
     if flat.radiance is not None:
-        return FlatLight(flat.radiance, study.lamps[flat.radiance], flat.radiance)
+        return FlatLight(flat.radiance, dataset.lamps[flat.radiance], flat.radiance)
     light = stated_light(flat)
     if light.unit != "photons" or flat.exposure_s <= 0 or light.amount <= 0:
         return None
@@ -88,25 +88,25 @@ def reading(study: Study, flat: FlatCapture) -> FlatLight | None:
     return FlatLight(name, light.lamp, None, light.amount / flat.exposure_s)
 
 
-def relative_rates(study: Study, readings: Sequence[FlatLight]) -> Mapping[tuple[str, str], float]:
+def relative_rates(dataset: Dataset, readings: Sequence[FlatLight]) -> Mapping[tuple[str, str], float]:
     """(reading, channel) -> electron rate (photon rate, where photons are stated) over that by the first reading of the
     same lamp."""
     first: dict[Hashable, FlatLight] = {}
     for one in readings:
         first.setdefault(one.lamp, one)
     found = {}
-    for channel in study.channels:
-        rate = {one.name: _rate(study, one, channel) for one in readings}
+    for channel in dataset.channels:
+        rate = {one.name: _rate(dataset, one, channel) for one in readings}
         for one in readings:
             found[one.name, channel] = rate[one.name] / max(rate[first[one.lamp].name], 1e-300)
     return found
 
 
-def _rate(study: Study, one: FlatLight, channel: str) -> float:
+def _rate(dataset: Dataset, one: FlatLight, channel: str) -> float:
     if one.path is None:
         return one.photons_per_s
-    spectrum: Spectrum = study.spectrum(one.path)
-    return electron_rate(study.camera, channel, spectrum)
+    spectrum: Spectrum = dataset.spectrum(one.path)
+    return electron_rate(dataset.camera, channel, spectrum)
 
 
 def misstated_levels(fit: CameraFit | None) -> tuple[InconsistentLevel, ...]:
@@ -126,7 +126,7 @@ READING_COLOUR_STD = 5e-4  # of a radiometer's reading in one channel: its noise
 RADIOMETER_STD = 0.002  # of a radiometer's reading, common to the channels; the most that narrowband readings may have
 
 
-def linearity_block(study: Study) -> Block:
+def measure_photon_transfer(dataset: Dataset) -> Observable:
     """Mean of every unclipped flat frame by channel, DN, against the exposure, or the number of photons where that is
     stated.
 
@@ -134,57 +134,59 @@ def linearity_block(study: Study) -> Block:
     readings. What remains is nonlinearity. Raises NotDetermined for flats without stated light, for fewer than three
     levels, and where fewer than four means are unclipped.
     """
-    groups = [g for g in study.flat_levels() if reading(study, g[0]) is not None and g[0].id not in study.misstated]
-    if not groups and study.flat_levels():
+    groups = [
+        g for g in dataset.flat_levels() if reading(dataset, g[0]) is not None and g[0].id not in dataset.misstated
+    ]
+    if not groups and dataset.flat_levels():
         raise NotDetermined(
             "photon_transfer", "flat captures without a radiance file or photon numbers: their levels aren't comparable"
         )
     if len({(g[0].exposure_s, g[0].photons_per_pixel) for g in groups}) < 3:
         raise NotDetermined("photon_transfer", "fewer than three levels of flat captures")
-    points = _flat_points(study, groups)
+    points = _flat_points(dataset, groups)
     if len(points) < 4:
         raise NotDetermined("photon_transfer", "almost all flat captures are clipped: expose them shorter")
     exposures = np.array([c.exposure_s for c, *_ in points])
     value = np.array([mean for _, _, mean, _ in points])
-    noise = study.noise
+    noise = dataset.noise
     signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 1e-3)
-    of = {c.id: found for c, *_ in points if (found := reading(study, c)) is not None}
+    of = {c.id: found for c, *_ in points if (found := reading(dataset, c)) is not None}
     readings = list({one.name: one for one in of.values()}.values())
     # readings of a lamp against its first one, by channel: the change of the lamp between passes
-    relative = relative_rates(study, readings)
+    relative = relative_rates(dataset, readings)
     key = [(of[c.id].lamp, channel) for c, channel, *_ in points]
     scaled = exposures * np.array([relative[of[c.id].name, channel] for c, channel, *_ in points])
     rate = {}
     for pair in dict.fromkeys(key):
         mine = np.array([k == pair for k in key])
-        low = mine & (signal < 0.6 * (study.saturation_dn - noise.black))
+        low = mine & (signal < 0.6 * (dataset.saturation_dn - noise.black))
         use = low if low.sum() > 1 else mine
         # the median isn't moved by a level that contradicts the others
         typical = weighted_median(signal[use] / scaled[use], scaled[use])
-        rate[pair] = typical / noise.gain / float(study.field.light.mean())
-    covariance = _level_covariance(study, study.flat_levels(), points, signal)
+        rate[pair] = typical / noise.gain / float(dataset.field.light.mean())
+    covariance = _level_covariance(dataset, dataset.flat_levels(), points, signal)
 
-    levels = UniformLevels(study, [(c, channel) for c, channel, *_ in points])
+    levels = UniformLevels(dataset, [(c, channel) for c, channel, *_ in points])
     lights = [of[c.id] for c in levels.captures]
-    baseline = {c: np.array([rate.get((one.lamp, c), 0.0) for one in lights]) for c in study.channels}
+    baseline = {c: np.array([rate.get((one.lamp, c), 0.0) for one in lights]) for c in dataset.channels}
     of_lamp = {(lamp, channel): np.array([k == (lamp, channel) for k in key]) for lamp, channel in rate}
-    of_reading = _of_readings(study, readings, [of[c.id] for c, *_ in points], [channel for _, channel, *_ in points])
+    of_reading = _of_readings(dataset, readings, [of[c.id] for c, *_ in points], [channel for _, channel, *_ in points])
 
     def predict(effects: Effects) -> Prediction:
-        changed = _changed(study, readings, relative, effects)
+        changed = _changed(dataset, readings, relative, effects)
         rates = {c: level * np.array([changed[one.name, c] for one in lights]) for c, level in baseline.items()}
         light_dn = levels.of_light_dn(effects, rates)
         lit = light_dn - noise.dark_dn_per_s * exposures
 
         def jacobian() -> dict[str, FloatArray]:
-            found = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
+            found = dataset.free_offsets(exposures) | dataset.free_warmth([c for c, *_ in points])
             found |= levels.lines.jacobian(effects)
             found |= {f"rate:{lamp}:{channel}": 0.05 * lit * mine for (lamp, channel), mine in of_lamp.items()}
             return found | {name: std * lit * mine for name, (std, mine) in of_reading.items()}
 
         return Prediction(light_dn + levels.beside_light_dn(effects), jacobian)
 
-    return Block(
+    return Observable(
         measurement=PHOTON_TRANSFER, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value,
         covariance=covariance,
         labels=tuple(Label(float(v), channel, _setting(c), (c.id,), out) for (c, channel, _, out), v in zip(points,
@@ -194,7 +196,7 @@ def linearity_block(study: Study) -> Block:
 
 
 def _changed(
-    study: Study, readings: list[FlatLight], relative: Mapping[tuple[str, str], float], effects: Effects
+    dataset: Dataset, readings: list[FlatLight], relative: Mapping[tuple[str, str], float], effects: Effects
 ) -> Mapping[tuple[str, str], float]:
     """`relative` rates, (reading, channel) -> rate over that by the lamp's first reading, as effects on the spectrum
     change them.
@@ -205,15 +207,15 @@ def _changed(
         return relative
     changed = dict(relative)
     for one in readings:
-        for channel in study.channels if one.path is not None else ():
-            below = electron_rate(study.camera, channel, study.spectrum(one.path or ""))
-            above = electron_rate(study.camera, channel, study.spectrum(one.path or ""), effects)
+        for channel in dataset.channels if one.path is not None else ():
+            below = electron_rate(dataset.camera, channel, dataset.spectrum(one.path or ""))
+            above = electron_rate(dataset.camera, channel, dataset.spectrum(one.path or ""), effects)
             changed[one.name, channel] *= above / below if below > 0 else 1.0
     return changed
 
 
 def _of_readings(
-    study: Study, readings: list[FlatLight], lights: list[FlatLight], channels: list[str]
+    dataset: Dataset, readings: list[FlatLight], lights: list[FlatLight], channels: list[str]
 ) -> dict[str, tuple[float, np.ndarray]]:
     """Nuisance parameters of the radiometer's readings: name -> (relative prior standard deviation, mask (n,) of the
     means it changes).
@@ -226,17 +228,17 @@ def _of_readings(
     for one in readings:
         read_there = np.array([light == one for light in lights])
         found[f"reading:{one.name}"] = RADIOMETER_STD, read_there
-        for channel in study.channels if len(study.channels) > 1 and one.path is not None else ():
+        for channel in dataset.channels if len(dataset.channels) > 1 and one.path is not None else ():
             mine = read_there & np.array([c == channel for c in channels])
             found[f"reading:{one.name}:{channel}"] = READING_COLOUR_STD, mine
     return found
 
 
-def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], signal: FloatArray) -> FloatArray:
+def _level_covariance(dataset: Dataset, groups: list[list[Any]], points: list[Any], signal: FloatArray) -> FloatArray:
     """Covariance (n, n) of flat frames' means, DN^2: shot and read noise, the lamp's repeatability (common to a frame's
     channels), and floor and rounding (common to repeats)."""
-    noise = study.noise
-    pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
+    noise = dataset.noise
+    pixels = np.array([dataset.levels(c).pixels[channel] for c, channel, *_ in points])
     group_of = {c.id: i for i, group in enumerate(groups) for c in group}
     group = np.array([group_of[c.id] for c, *_ in points])
     channel_of = np.array([channel for _, channel, *_ in points])
@@ -246,7 +248,7 @@ def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], 
     rounding = noise.rounding_std_dn(signal)
     covariance += repeats * np.outer(rounding, rounding)
     same = np.array([[a[0].id == b[0].id for b in points] for a in points])
-    lamp = signal * level_std(study, groups)[group]
+    lamp = signal * level_std(dataset, groups)[group]
     covariance += same * (np.outer(lamp, lamp) + noise.jitter_dn**2)
     return np.asarray(covariance)
 
@@ -258,14 +260,14 @@ def _setting(capture: FlatCapture) -> str:
     return f"{capture.photons_per_pixel:.6g} photons, {capture.exposure_s:.4g} s"
 
 
-def _flat_points(study: Study, groups: list[list[Any]]) -> list[tuple[Any, str, float, bool]]:
+def _flat_points(dataset: Dataset, groups: list[list[Any]]) -> list[tuple[Any, str, float, bool]]:
     """(capture, channel, mean in DN, held out) of all unclipped channels of flat frames."""
     points = []
-    out = study.once(held_out_flats)
+    out = dataset.once(held_out_flats)
     for group in groups:
         for capture in group:
-            for channel in study.channels:
-                mean = study.levels(capture).mean[channel]
+            for channel in dataset.channels:
+                mean = dataset.levels(capture).mean[channel]
                 if mean is not None:
                     points.append((capture, channel, mean, capture.id in out))
     return points
@@ -277,7 +279,7 @@ PHOTON_TRANSFER = Measurement(
     order=200,
     axis="level",
     unit="DN",
-    make=linearity_block,
+    make=measure_photon_transfer,
     quantity="mean level, DN",
     is_level=True,
 )
@@ -295,7 +297,7 @@ STEADY_LAMP = 5.0e-4
 LEAST_FREEDOM, MOST_NUMBERS = 4, 4
 
 
-def level_repeats_block(study: Study) -> Block:
+def measure_level_repeats(dataset: Dataset) -> Observable:
     """(S / noise)^(1/3) of flat settings with repeats, pooled over neighbouring exposures.
 
     S is the variance of a setting's relative levels, with f = n - 1 degrees of freedom; noise its expectation by the
@@ -307,7 +309,7 @@ def level_repeats_block(study: Study) -> Block:
     is. Image lag adds to S what each repeat's predecessor leaves in it. Settings out of line with the others are left
     out (`steady`): other measurements find those. Raises NotDetermined for fewer than `LEAST_FREEDOM` degrees of
     freedom."""
-    groups = _by_exposure(_seen(study))
+    groups = _by_exposure(_seen(dataset))
     if not groups:
         raise NotDetermined(
             "level_repeats",
@@ -322,15 +324,15 @@ def level_repeats_block(study: Study) -> Block:
     exposure_s = np.array([_weighted(group, [r.captures[0].exposure_s for r in group]) for group in groups])
 
     per_dn2 = np.array([_weighted(group, [r.signal_dn**-2 for r in group]) for group in groups])
-    dark_dn2, dark_std_dn2 = _dark_scatter(study)
+    dark_dn2, dark_std_dn2 = _dark_scatter(dataset)
 
     def predict(effects: Effects) -> Prediction:
-        model = Uniform(study.camera, effects)
+        model = Uniform(dataset.camera, effects)
         more = dark_dn2 * per_dn2 + np.array(
-            [model.unsteadiness**2 + row_light_variance(model, study.camera.rows, float(t)) for t in exposure_s]
+            [model.unsteadiness**2 + row_light_variance(model, dataset.camera.rows, float(t)) for t in exposure_s]
         )
         if acting(effects, LAG):
-            more = more + np.array([_of_lag(study, effects, group) for group in groups])
+            more = more + np.array([_of_lag(dataset, effects, group) for group in groups])
         root = np.cbrt(1.0 + more / noise)
         usual = np.cbrt(1.0 + (more + STEADY_LAMP**2) / noise) - root
         darker = np.cbrt(1.0 + (more + dark_std_dn2 * per_dn2) / noise) - root
@@ -343,17 +345,17 @@ def level_repeats_block(study: Study) -> Block:
         Label(float(np.log(t)), "all", f"{t:.4g} s", tuple(c.id for r in group for c in r.captures), held_out=False)
         for t, group in zip(exposure_s, groups, strict=True)
     )
-    return Block(
+    return Observable(
         measurement=LEVEL_REPEATS, reach=1.0, value=value, covariance=np.diag(variance), labels=labels,
         reads=frozenset({"light.unsteadiness"}) | ROW_LIGHT | LAG, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
-def _seen(study: Study) -> list[RepeatedMeans]:
+def _seen(dataset: Dataset) -> list[RepeatedMeans]:
     """Return the repeats that aren't held out, of settings in line with each other (`steady`)."""
-    noise, out = study.noise, study.once(held_out_flats)
+    noise, out = dataset.noise, dataset.once(held_out_flats)
     found = []
-    for one in repeated_levels(study, noise.black, noise.gain, noise.read_dn):
+    for one in repeated_levels(dataset, noise.black, noise.gain, noise.read_dn):
         kept = [i for i, c in enumerate(one.captures) if c.id not in out]
         if len(kept) > 1:
             captures, elapsed = tuple(one.captures[i] for i in kept), one.elapsed_s[kept]
@@ -362,13 +364,13 @@ def _seen(study: Study) -> list[RepeatedMeans]:
     return steady(found)
 
 
-def _dark_scatter(study: Study) -> tuple[float, float]:
+def _dark_scatter(dataset: Dataset) -> tuple[float, float]:
     """Variance of a dark frame's mean beside that by the noise of independent pixels, DN^2, and its standard deviation.
 
     A variance v of f degrees of freedom stands for a true one of about v f / (f - 2), known to sqrt(2 / f) of it.
     Without repeated dark frames it may be as large as rows leave whose noise is that of their pixels.
     """
-    noise, camera = study.noise, study.camera
+    noise, camera = dataset.noise, dataset.camera
     whole = noise.jitter_dn**2
     if noise.jitter_freedom == 0.0:
         return 0.0, max(whole, noise.read_dn**2 / camera.rows)
@@ -403,16 +405,16 @@ def _weighted(group: list[RepeatedMeans], value: list[float]) -> float:
     return float(np.average(value, weights=[len(r.away) - 1 for r in group]))
 
 
-def _of_lag(study: Study, effects: Effects, group: list[RepeatedMeans]) -> float:
+def _of_lag(dataset: Dataset, effects: Effects, group: list[RepeatedMeans]) -> float:
     """Variance that image lag adds to the repeats' relative levels about the mean of each setting, as the first repeat
     often follows another level."""
-    carried, total = study.carried_e(effects), 0.0
+    carried, total = dataset.carried_e(effects), 0.0
     for repeats in group:
         signal_e = [
-            sum(max(v - study.noise.black, 1e-9) for v in study.levels(c).whole.values()) / study.noise.gain
+            sum(max(v - dataset.noise.black, 1e-9) for v in dataset.levels(c).whole.values()) / dataset.noise.gain
             for c in repeats.captures
         ]
-        added_e = [sum(carried(c, channel) for channel in study.levels(c).whole) for c in repeats.captures]
+        added_e = [sum(carried(c, channel) for channel in dataset.levels(c).whole) for c in repeats.captures]
         share = np.array(added_e) / np.array(signal_e)
         total += float(np.sum(np.square(share - share.mean())))
     return total / sum(len(r.away) - 1 for r in group)
@@ -424,7 +426,7 @@ LEVEL_REPEATS = Measurement(
     order=205,
     axis="exposure",
     unit="log s",
-    make=level_repeats_block,
+    make=measure_level_repeats,
     quantity="variance over noise, cube root",
     of_variances=True,
 )

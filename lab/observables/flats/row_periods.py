@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from lab.errors import NotDetermined
 from lab.observables.darks.readout import OFFSETS_STD, dark_readout
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.flats.field import LINE_FLOOR, collect_rows, flats, without_dark
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import COLLECTED, acting
 from sim.effects.base import Effects
 from sim.sensor import mosaic
@@ -67,7 +67,7 @@ class _Rows:
         return 1.4826 * float(np.median(np.abs(away))) / np.sqrt(2.0) if len(away) else 0.0
 
 
-def row_period_block(study: Study) -> Block:
+def measure_row_periods(dataset: Dataset) -> Observable:
     """Means of the rows of the mean flat field by their place in a period of 48 rows, relative to the mean signal.
 
     In a mosaic even and odd pixels of the rows are apart, each colour's plane over its mean. What is smooth over a
@@ -75,11 +75,11 @@ def row_period_block(study: Study) -> Block:
     standard deviation of a row is measured on rows one period apart, and is that by noise and PRNU at least. Raises
     NotDetermined without unclipped flats, and for frames too low.
     """
-    levels, images = study.once(flats)
+    levels, images = dataset.once(flats)
     if not images:
         raise NotDetermined("row_periods", "no unclipped flat captures")
-    rows, step = _Rows.of(study.camera.rows), mosaic.step(study.camera.cfa)
-    dark = study.once(dark_readout)
+    rows, step = _Rows.of(dataset.camera.rows), mosaic.step(dataset.camera.cfa)
+    dark = dataset.once(dark_readout)
     count = np.bincount(rows.place)
     values: list[FloatArray] = []
     labels: list[Label] = []
@@ -88,13 +88,13 @@ def row_period_block(study: Study) -> Block:
     for held_out, (whole_image, noise) in sorted(images.items()):
         part = [u for u in levels if u.held_out == held_out]
         members = tuple(c.id for u in part for c in u.captures)
-        image, of_dark = (whole_image, 0.0) if dark is None else without_dark(study, dark, part, whole_image)
+        image, of_dark = (whole_image, 0.0) if dark is None else without_dark(dataset, dark, part, whole_image)
         for first in range(step):
             line, with_dark = (
                 np.asarray(one[:, first::step].mean(axis=1, dtype=float)) for one in (image, whole_image)
             )
-            pixels = study.camera.cols // step
-            least2 = (study.noise.prnu**2 + of_dark + noise) / pixels
+            pixels = dataset.camera.cols // step
+            least2 = (dataset.noise.prnu**2 + of_dark + noise) / pixels
             row2 = max(rows.spread(line) ** 2, least2) / count
             shot2 = np.minimum(noise / pixels / count, row2)
             values.append(rows.means(line))
@@ -115,11 +115,11 @@ def row_period_block(study: Study) -> Block:
         collecting = acting(effects, COLLECTED)
         if not collecting:
             return Prediction(np.zeros(len(labels)), {})
-        collected = collect_rows(study.camera, collecting)
+        collected = collect_rows(dataset.camera, collecting)
         one = np.concatenate([rows.means(line) for line in collected.T])
         return Prediction(np.tile(one, len(images)), {})
 
-    return Block(
+    return Observable(
         measurement=ROW_PERIODS, reach=1.0, value=np.concatenate(values), covariance=covariance, labels=tuple(labels),
         reads=COLLECTED, predict=predict, scale=np.ones(len(labels)),
     )  # fmt: skip
@@ -131,6 +131,6 @@ ROW_PERIODS = Measurement(
     order=262,
     axis="row",
     unit="px",
-    make=row_period_block,
+    make=measure_row_periods,
     quantity="departure from the mean signal",
 )

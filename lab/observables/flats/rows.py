@@ -11,10 +11,10 @@ import numpy as np
 
 from lab.errors import NotDetermined
 from lab.observables.darks.readout import DarkRowPower, dark_readout, row_profile
-from lab.observables.dataset import Study, held_out_flats
+from lab.observables.dataset import Dataset, held_out_flats
 from lab.observables.flats.field import LEAST_SIGNAL, dark_level_dn
 from lab.observables.flats.row_light import PHASES, ROW_LIGHT
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import ADDED, LEAK
 from sim.effects.base import Effects
 from sim.sensor import mosaic
@@ -60,7 +60,7 @@ class _Level:
     weight: FloatArray  # (frames,): in that mean
 
 
-def flicker_block(study: Study) -> Block:
+def measure_flat_rows(dataset: Dataset) -> Observable:
     """Power spectrum of the rows of single flat frames, relative to the mean of all, over that of the pixels' noise;
     cube roots.
 
@@ -74,23 +74,25 @@ def flicker_block(study: Study) -> Block:
     at that time within a period of the light for which the predicted rows are most like its own. Raises NotDetermined
     without unclipped, repeated flats, and for too few rows.
     """
-    groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
-    groups = [g[:MOST_FRAMES] for g in groups if len(g) > 1 and _is_lit(study, g[0])]
+    groups = [
+        g for g in dataset.flat_levels() if all(m is not None for c in g for m in dataset.levels(c).mean.values())
+    ]
+    groups = [g[:MOST_FRAMES] for g in groups if len(g) > 1 and _is_lit(dataset, g[0])]
     if len(groups) < 1:
         raise NotDetermined(
             "flicker", "no unclipped flat captures that are repeated: rows of single frames aren't comparable"
         )
     groups = [groups[i] for i in np.unique(np.linspace(0, len(groups) - 1, min(MOST_LEVELS, len(groups))).astype(int))]
-    step = mosaic.step(study.camera.cfa)
-    rows = study.camera.rows // step
+    step = mosaic.step(dataset.camera.cfa)
+    rows = dataset.camera.rows // step
     if rows < LEAST_ROWS:
         raise NotDetermined(
-            "flicker", f"frames of {study.camera.rows} rows: too few to see bands in, which takes {LEAST_ROWS * step}"
+            "flicker", f"frames of {dataset.camera.rows} rows: too few to see bands in, which takes {LEAST_ROWS * step}"
         )
     bands = _bands(rows, HIGHEST * step)
-    dark = study.once(dark_readout)
-    levels = _measured(study, groups, bands, np.zeros(rows) if dark is None else row_profile(dark.offsets_dn, step))
-    noise = _any_row_noise(study, levels) if dark is None else dark.noise(bands)
+    dark = dataset.once(dark_readout)
+    levels = _measured(dataset, groups, bands, np.zeros(rows) if dark is None else row_profile(dark.offsets_dn, step))
+    noise = _any_row_noise(dataset, levels) if dark is None else dark.noise(bands)
     frequency = np.array([np.sqrt(b[0] * b[-1]) for b in bands]) / (rows * step)
     freedom = np.concatenate([level.freedom for level in levels])
     value = np.cbrt(np.concatenate([level.power for level in levels]))
@@ -117,12 +119,12 @@ def flicker_block(study: Study) -> Block:
     band = np.tile(np.arange(len(bands)), len(levels))
 
     def predict(effects: Effects) -> Prediction:
-        model = Uniform(study.camera, effects)
+        model = Uniform(dataset.camera, effects)
         power = usual
         if model.varies_by_row:
-            power = power + _added_power(model, study.camera.rows, levels, bands, step)
+            power = power + _added_power(model, dataset.camera.rows, levels, bands, step)
         if model.leaks or (dark is None and model.adds_signal):
-            power = power + _pattern_power(study, levels, model, bands, step, added=dark is None)
+            power = power + _pattern_power(dataset, levels, model, bands, step, added=dark is None)
         mean = np.cbrt(power) * (1.0 - 2.0 / (9.0 * freedom))
         slope = mean / (3.0 * power)
         jacobian = {}
@@ -131,7 +133,7 @@ def flicker_block(study: Study) -> Block:
                 jacobian[f"rows:{name}:{k}"] = np.where(band == k, slope * std, 0.0)
         return Prediction(mean, jacobian)
 
-    return Block(
+    return Observable(
         measurement=FLAT_ROWS, reach=LOG_REACH, along=np.log(np.tile(frequency, len(levels))),
         value=value, covariance=np.diag(np.cbrt(np.square(usual)) * 2.0 / (9.0 * freedom)),
         labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s",
@@ -142,11 +144,11 @@ def flicker_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _is_lit(study: Study, capture: Any) -> bool:
+def _is_lit(dataset: Dataset, capture: Any) -> bool:
     """Return whether a flat's signal exceeds the noise by as much as one that is part of a mean image: rows are
     relative to it."""
-    signal = float(np.mean(list(study.levels(capture).whole.values()))) - dark_level_dn(study, capture)
-    return signal >= LEAST_SIGNAL * study.noise.read_dn
+    signal = float(np.mean(list(dataset.levels(capture).whole.values()))) - dark_level_dn(dataset, capture)
+    return signal >= LEAST_SIGNAL * dataset.noise.read_dn
 
 
 LOG_REACH = 1.0  # correlation length in ln(frequency)
@@ -165,20 +167,20 @@ def _bands(rows: int, highest_cy_per_row: float) -> list[range]:
 
 
 def _measured(
-    study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[range], offsets_dn: FloatArray
+    dataset: Dataset, groups: Sequence[Sequence[Any]], bands: Sequence[range], offsets_dn: FloatArray
 ) -> list[_Level]:
     """Return the levels of groups of repeated flats, without the rows' fixed `offsets_dn` (rows,)."""
-    step, cols = mosaic.step(study.camera.cfa), study.camera.cols
-    out = study.once(held_out_flats)
+    step, cols = mosaic.step(dataset.camera.cfa), dataset.camera.cols
+    out = dataset.once(held_out_flats)
     profiles, pixels, signals = [], [], []
     for group in groups:
-        frames = [np.asarray(study.recordings.frame(c), np.float32) for c in group]
+        frames = [np.asarray(dataset.recordings.frame(c), np.float32) for c in group]
         mean = sum(frames[1:], frames[0]) / len(frames)
         # pixels' noise without that of whole rows
         left = [f - mean for f in frames]
         left = [d - d.mean(1, keepdims=True) for d in left]
         pixel = float(np.mean([np.mean(np.square(d, dtype=float)) for d in left])) / (1.0 - 1.0 / cols)
-        own = np.array([row_profile(f, step) for f in frames]) - dark_level_dn(study, group[0]) - offsets_dn
+        own = np.array([row_profile(f, step) for f in frames]) - dark_level_dn(dataset, group[0]) - offsets_dn
         profiles.append(own / own.mean(1, keepdims=True))
         signals.append(float(own.mean()))
         pixels.append(pixel * len(frames) / (len(frames) - 1))
@@ -218,7 +220,7 @@ def _measured(
     return found
 
 
-def _any_row_noise(study: Study, levels: Sequence[_Level]) -> DarkRowPower:
+def _any_row_noise(dataset: Dataset, levels: Sequence[_Level]) -> DarkRowPower:
     """Return the noise of rows where no dark frames tell it: what is most like the seen flats beside light that varies
     from row to row, and so wide a standard deviation that any other is as good.
 
@@ -227,10 +229,10 @@ def _any_row_noise(study: Study, levels: Sequence[_Level]) -> DarkRowPower:
     variance."""
     from scipy.optimize import nnls  # here: the library takes a while to load
 
-    stated_e = study.stated.read_noise_e
+    stated_e = dataset.stated.read_noise_e
     read_dn2 = min(level.pixel_dn2 for level in levels)  # the darkest level's at most
-    if stated_e is not None and study.noise.gain_is_known:
-        read_dn2 = min(read_dn2, (study.noise.gain * stated_e) ** 2 + study.noise.quantisation_dn2)
+    if stated_e is not None and dataset.noise.gain_is_known:
+        read_dn2 = min(read_dn2, (dataset.noise.gain * stated_e) ** 2 + dataset.noise.quantisation_dn2)
     seen = [level for level in levels if not level.held_out]
     power = np.array([level.power for level in seen])  # (levels, bands)
     design = np.array([[level.row_share, 1.0 / level.variance] for level in seen])
@@ -284,17 +286,17 @@ def _nearest(rows: FloatArray, by_phase: FloatArray) -> FloatArray:
 
 
 def _pattern_power(
-    study: Study, levels: Sequence[_Level], model: Uniform, bands: Sequence[range], step: int, *, added: bool
+    dataset: Dataset, levels: Sequence[_Level], model: Uniform, bands: Sequence[range], step: int, *, added: bool
 ) -> FloatArray:
     """Power (levels x bands,) that fixed rows add, which are a larger share of a low level than of the mean of all:
     what read-out adds (`added`), and light beside the exposure."""
-    rows = study.camera.rows
-    leaked = model.leaked_s(FieldPoints.at(study.camera, np.arange(float(rows)), np.zeros(rows)))
+    rows = dataset.camera.rows
+    leaked = model.leaked_s(FieldPoints.at(dataset.camera, np.arange(float(rows)), np.zeros(rows)))
     lit_s = np.array([level.captures[0].exposure_s for level in levels]) + leaked.mean()
     share = (leaked - leaked.mean()) / lit_s[:, None]
     share = share[:, : rows // step * step].reshape(len(levels), -1, step).mean(axis=2)
     if added:
-        offsets = study.noise.gain * row_profile(model.added_e - model.added_e.mean(), step)
+        offsets = dataset.noise.gain * row_profile(model.added_e - model.added_e.mean(), step)
         share = share + np.array([offsets / level.signal for level in levels])
     weight = np.array([float(level.weight.sum()) for level in levels])
     relative = (1.0 + share) / (1.0 + weight @ share)
@@ -309,7 +311,7 @@ FLAT_ROWS = Measurement(
     order=210,
     axis="row_frequency",
     unit="cy/row",
-    make=flicker_block,
+    make=measure_flat_rows,
     quantity="power over noise, cube root",
     conditions="exposure",
     conditions_words="flats of",

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import NotDetermined
-from lab.observables.dataset import CLIPPED_SHARE, Study, held_out_flats
+from lab.observables.dataset import CLIPPED_SHARE, Dataset, held_out_flats
 from lab.observables.noise.temporal import OUTLIER, level_out
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import AMPLIFIERS
 from sim.effects.base import Effects
 from sim.sensor import mosaic
@@ -88,7 +88,7 @@ class _Correlations:
     scatter: float  # variance of parts over that of independent pixels
 
 
-def amplifier_block(study: Study) -> Block:
+def measure_amplifier_correlation(dataset: Dataset) -> Observable:
     """Correlation of pixels' temporal noise with that of the pixels that other areas' amplifiers may read at the same
     time (`RELATIONS`), in the dark and in even light.
 
@@ -96,12 +96,12 @@ def amplifier_block(study: Study) -> Block:
     `temporal_noise`, whose expectation is subtracted. Raises NotDetermined without repeats whose noise exceeds a code,
     and for frames too small.
     """
-    side_px = min(study.camera.rows, study.camera.cols)
+    side_px = min(dataset.camera.rows, dataset.camera.cols)
     if side_px < LEAST_PX:
         raise NotDetermined(
             "amplifier_correlation", f"frames of {side_px} px: areas are compared from {LEAST_PX} px a side on"
         )
-    every = [found for group in _settings(study) if (found := _read(study, *group)) is not None]
+    every = [found for group in _settings(dataset) if (found := _read(dataset, *group)) is not None]
     if not every:
         raise NotDetermined(
             "amplifier_correlation", "no repeats of dark or unclipped flat captures whose noise exceeds a code"
@@ -110,7 +110,7 @@ def amplifier_block(study: Study) -> Block:
     kinds = [(lit, out) for lit in (False, True) for out in (False, True)]
     pooled = [part for part in ([c for c in every if (c.lit, c.held_out) == kind] for kind in kinds) if part]
     names = list(RELATIONS)
-    pairs = _pairs(study)
+    pairs = _pairs(dataset)
     values, variances, labels, pixel_dn2 = [], [], [], []
     for part in pooled:
         freedom = np.array([c.freedom for c in part], float)
@@ -120,35 +120,35 @@ def amplifier_block(study: Study) -> Block:
         labels += [Label(float(part[0].lit), name, "even light" if part[0].lit else "dark", ids, part[0].held_out)
                    for name in names]  # fmt: skip
         pixel_dn2.append(float(np.average([c.pixel_dn2 for c in part], weights=freedom)))
-    shape, period = (study.camera.rows, study.camera.cols), mosaic.step(study.camera.cfa)
+    shape, period = (dataset.camera.rows, dataset.camera.cols), mosaic.step(dataset.camera.cfa)
 
     def predict(effects: Effects) -> Prediction:
-        model = Uniform(study.camera, effects)
+        model = Uniform(dataset.camera, effects)
         of_light, of_noise = (
             _coupled([law for law in model.amplifiers if law.of_noise or every]) for every in (True, False)
         )
         ordered_e2 = sum((_ordered(one, shape, period) for one in model.reading_order), np.zeros(len(names)))
         means = []
         for dn2 in pixel_dn2:
-            light = max(1.0 - study.noise.read_dn**2 / dn2, 0.0)
+            light = max(1.0 - dataset.noise.read_dn**2 / dn2, 0.0)
             coupled = light * of_light + (1.0 - light) * of_noise
-            means.append(coupled + study.noise.gain**2 * ordered_e2 / dn2)
+            means.append(coupled + dataset.noise.gain**2 * ordered_e2 / dn2)
         return Prediction(np.concatenate(means), {})
 
-    return Block(
+    return Observable(
         measurement=AMPLIFIER_CORRELATION, reach=0.1, value=np.concatenate(values),
         covariance=np.diag(np.concatenate(variances)), labels=tuple(labels),
         reads=AMPLIFIERS | {"signal.reading_order"}, predict=predict, scale=np.ones(len(labels)),
     )  # fmt: skip
 
 
-def _settings(study: Study) -> list[tuple[list[Any], bool, bool]]:
+def _settings(dataset: Dataset) -> list[tuple[list[Any], bool, bool]]:
     """(captures, lit, held out) of repeated settings."""
     found: list[tuple[list[Any], bool, bool]] = []
-    dark = [g for g in study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db)) if len(g) > 1]
+    dark = [g for g in dataset.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db)) if len(g) > 1]
     found += [(list(g), False, len(dark) >= 3 and i % 3 == 1) for i, g in enumerate(dark[:MOST_LEVELS])]
-    out = study.once(held_out_flats)
-    for group in study.flat_levels():
+    out = dataset.once(held_out_flats)
+    for group in dataset.flat_levels():
         for held_out in (False, True):
             part = [c for c in group if (c.id in out) == held_out]
             if len(part) > 1:
@@ -156,25 +156,25 @@ def _settings(study: Study) -> list[tuple[list[Any], bool, bool]]:
     return found
 
 
-def _pairs(study: Study) -> FloatArray:
+def _pairs(dataset: Dataset) -> FloatArray:
     """Number of pairs of each relation, each counted once."""
-    frame = np.arange(study.camera.rows * study.camera.cols).reshape(study.camera.rows, study.camera.cols)
+    frame = np.arange(dataset.camera.rows * dataset.camera.cols).reshape(dataset.camera.rows, dataset.camera.cols)
     return np.array([float(one(frame)[0].size) for one in RELATIONS.values()])
 
 
-def _read(study: Study, captures: Sequence[Any], lit: bool, held_out: bool) -> _Correlations | None:
+def _read(dataset: Dataset, captures: Sequence[Any], lit: bool, held_out: bool) -> _Correlations | None:
     """Return the correlations of the repeats of one setting; None where they clip, or codes are too coarse."""
-    cfa = study.camera.cfa
-    frames = [np.array(study.recordings.frame(c), np.float32) for c in captures[:MOST_FRAMES]]
-    clipped = max(float(np.mean((f >= study.saturation_dn) | (f <= 0))) for f in frames)
-    level = float(np.mean(frames[0])) - study.noise.black
+    cfa = dataset.camera.cfa
+    frames = [np.array(dataset.recordings.frame(c), np.float32) for c in captures[:MOST_FRAMES]]
+    clipped = max(float(np.mean((f >= dataset.saturation_dn) | (f <= 0))) for f in frames)
+    level = float(np.mean(frames[0])) - dataset.noise.black
     if lit and clipped > 0.1 * CLIPPED_SHARE:
         return None
-    bright = level > 20.0 * max(abs(study.noise.dark_dn_per_s) * captures[0].exposure_s, 1.0)
-    level_out(frames, cfa, study.noise.black if lit and bright else None)
+    bright = level > 20.0 * max(abs(dataset.noise.dark_dn_per_s) * captures[0].exposure_s, 1.0)
+    level_out(frames, cfa, dataset.noise.black if lit and bright else None)
     freedom = len(frames) - 1
     pixel_dn2 = sum(float(np.mean(np.square(f), dtype=float)) for f in frames) / freedom
-    if pixel_dn2 < (LEAST_DN * study.step_dn) ** 2:
+    if pixel_dn2 < (LEAST_DN * dataset.step_dn) ** 2:
         return None
     for name in mosaic.planes(frames[0], cfa):
         planes = [mosaic.planes(f, cfa)[name] for f in frames]
@@ -188,7 +188,7 @@ def _read(study: Study, captures: Sequence[Any], lit: bool, held_out: bool) -> _
         sums.append(products.sum() / freedom / products[0].size)
         split = [np.sum(p) for p in np.array_split(products.sum(0), PARTS, axis=0)]
         parts.append(np.var(split, ddof=1) * PARTS / products[0].size / freedom)
-    value = np.array(sums) - _expected(study.camera.rows, study.camera.cols, mosaic.step(cfa))
+    value = np.array(sums) - _expected(dataset.camera.rows, dataset.camera.cols, mosaic.step(cfa))
     return _Correlations(
         tuple(c.id for c in captures[:MOST_FRAMES]), lit, held_out, pixel_dn2, value, freedom, float(np.mean(parts))
     )
@@ -241,7 +241,7 @@ AMPLIFIER_CORRELATION = Measurement(
     order=235,
     axis="light",
     unit="1",
-    make=amplifier_block,
+    make=measure_amplifier_correlation,
     quantity="correlation",
     of_variances=True,
     conditions="light",

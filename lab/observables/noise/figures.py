@@ -28,7 +28,7 @@ from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 
 if TYPE_CHECKING:
-    from lab.observables.dataset import Study
+    from lab.observables.dataset import Dataset
 
 # --- repeatability ---------------------------------------------------------------------------------------------------
 # Repeatability of levels: the scatter of repeats of one setting beyond the noise of pixels.
@@ -59,21 +59,21 @@ class RepeatedMeans:
     signal_dn: float = 0.0  # mean level where these are relative to it; 0: they are in DN
 
 
-def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[RepeatedMeans]:
+def repeated_levels(dataset: Dataset, black: float, gain: float, read_dn: float) -> list[RepeatedMeans]:
     """Return the repeats of every flat setting: levels over all unclipped channels, relative to their mean. Frames that
-    may hold image lag of another level are left out (`Study.settled`). `black` in DN, `gain` in DN/e."""
+    may hold image lag of another level are left out (`Dataset.settled`). `black` in DN, `gain` in DN/e."""
     found = []
-    for group in map(study.settled, study.flat_levels()):
-        planes = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
+    for group in map(dataset.settled, dataset.flat_levels()):
+        planes = [c for c in dataset.channels if all(dataset.levels(k).mean[c] is not None for k in group)]
         if len(group) < 2 or not planes:
             continue
-        size = np.array([study.levels(group[0]).pixels[c] for c in planes], float)
-        levels = np.array([[study.levels(k).mean[c] or 0.0 for c in planes] for k in group]) - black
+        size = np.array([dataset.levels(group[0]).pixels[c] for c in planes], float)
+        levels = np.array([[dataset.levels(k).mean[c] or 0.0 for c in planes] for k in group]) - black
         total = levels @ size
         if total.mean() <= 0:
             continue
         noise = float(((gain * np.maximum(levels.mean(0), 0.0) + read_dn**2) * size).sum()) / total.mean() ** 2
-        elapsed = np.array([study.elapsed_s(k) for k in group])
+        elapsed = np.array([dataset.elapsed_s(k) for k in group])
         signal_dn = float(total.mean() / size.sum())
         found.append(
             RepeatedMeans(tuple(group), total / total.mean() - 1.0, elapsed - elapsed.mean(), noise, signal_dn)
@@ -134,13 +134,13 @@ def level_repeatability(repeats: Sequence[RepeatedMeans]) -> float:
     return float(np.sqrt(max(float(weight @ left) / free, 0.0))) if free > 0 else 0.0
 
 
-def level_std(study: Study, groups: list[list[Any]]) -> FloatArray:
+def level_std(dataset: Dataset, groups: list[list[Any]]) -> FloatArray:
     """Relative standard deviation (groups,) of a frame's level: the common one, or a setting's own where that is
     larger, as in a flickering light that short exposures don't average. A setting out of line has the common one."""
-    noise = study.noise
+    noise = dataset.noise
     found = np.full(len(groups), noise.jitter_lamp)
     place = {c.id: i for i, group in enumerate(groups) for c in group}
-    for repeats in steady(repeated_levels(study, noise.black, noise.gain, noise.read_dn)):
+    for repeats in steady(repeated_levels(dataset, noise.black, noise.gain, noise.read_dn)):
         moved = float(repeats.elapsed_s @ repeats.elapsed_s)
         left, free = repeats.away, len(repeats.away) - 1
         if free > 1 and moved > 0:  # without a linear trend with time
@@ -160,7 +160,7 @@ def level_std(study: Study, groups: list[list[Any]]) -> FloatArray:
 Image = NDArray[np.float32]
 
 if TYPE_CHECKING:
-    from lab.observables.dataset import Study
+    from lab.observables.dataset import Dataset
 
 CLIP = 4.5  # standard deviations at which pixels are clipped in robust statistics
 MEDIAN_OF = 5  # most frames whose median shows defective pixels
@@ -170,22 +170,22 @@ SMOOTH_PX, LOCAL_PX = 9, 33  # sides of the boxes for the local mean and the loc
 DEFECTIVE = 10.0
 
 
-def sound_pixels(study: Study) -> NDArray[np.bool_]:
+def sound_pixels(dataset: Dataset) -> NDArray[np.bool_]:
     """Mask (rows, cols) of the pixels that aren't defective.
 
     A defective pixel departs by more than `DEFECTIVE` standard deviations from its surroundings in the median of
     repeated dark frames, at the longest exposure or at the highest temperature. In a small frame, a single hot pixel of
     3000 e/s would dominate the noise of the mean, and one that saturates would make it nonlinear.
     """
-    groups = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
-    sound = np.ones((study.camera.rows, study.camera.cols), bool)
+    groups = dataset.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
+    sound = np.ones((dataset.camera.rows, dataset.camera.cols), bool)
     if not groups:
         return sound
     longest = max(groups, key=lambda g: g[0].exposure_s)
     warmest = max(groups, key=lambda g: (g[0].temperature_c or 0.0, g[0].exposure_s))
     for group in (longest, warmest) if longest is not warmest else (longest,):
-        frames = [study.recordings.frame(c).astype(np.float32) for c in group[:MEDIAN_OF]]
-        away, local = from_surroundings([f - np.float32(f.mean(dtype=np.float64)) for f in frames], study.step_dn)
+        frames = [dataset.recordings.frame(c).astype(np.float32) for c in group[:MEDIAN_OF]]
+        away, local = from_surroundings([f - np.float32(f.mean(dtype=np.float64)) for f in frames], dataset.step_dn)
         sound &= np.abs(away) <= DEFECTIVE * local
     return sound
 
@@ -322,37 +322,37 @@ class NoiseFigures:
         return QUANTISATION_DN2 * self.step_dn**2
 
 
-def noise_figures(study: Study) -> NoiseFigures:
+def noise_figures(dataset: Dataset) -> NoiseFigures:
     """Return the noise fit's gain, black level, dark current and PRNU where there is a fit; else first estimates from
     dark and flat captures. The read noise is that of the dark frames as recorded, rounding included. What these don't
     determine is taken from the data sheet, else a usual value.
 
     Without a fit, the gain is the slope of temporal variance over signal of repeated flats, else the stated one, else
     that of any repeats."""
-    first = _from_darks(study, _as_stated(study))
-    fitted = study.fitted
+    first = _from_darks(dataset, _as_stated(dataset))
+    fitted = dataset.fitted
     if fitted is not None and fitted.conversion_gain_dn_per_e is not None:
-        return _as_fitted(study, first, fitted, fitted.conversion_gain_dn_per_e)
-    signal, variance, prnu = _transfer_points(study, first.black)
-    gain, lamp = study.stated.conversion_gain_dn_per_e, USUAL_LAMP
+        return _as_fitted(dataset, first, fitted, fitted.conversion_gain_dn_per_e)
+    signal, variance, prnu = _transfer_points(dataset, first.black)
+    gain, lamp = dataset.stated.conversion_gain_dn_per_e, USUAL_LAMP
     if len(signal) > 1:
         s, v = np.array(signal), np.array(variance)
-        low = s < 0.5 * (study.saturation_dn - first.black)
+        low = s < 0.5 * (dataset.saturation_dn - first.black)
         use = low if low.sum() > 2 else np.ones_like(low)
         gain = _transfer_slope(s[use], v[use], first.read_dn)
-        lamp = level_repeatability(repeated_levels(study, first.black, gain, first.read_dn))
+        lamp = level_repeatability(repeated_levels(dataset, first.black, gain, first.read_dn))
     elif gain is None:
-        gain = _scene_gain(study, first.black, first.read_dn)
+        gain = _scene_gain(dataset, first.black, first.read_dn)
     if gain is None or gain <= 0:
         return replace(first, prnu=prnu, jitter_lamp=max(lamp, LAMP_FLOOR))
     return replace(first, gain=gain, gain_is_known=True, prnu=prnu, jitter_lamp=max(lamp, LAMP_FLOOR))
 
 
-def _as_fitted(study: Study, first: NoiseFigures, fitted: NoiseFit, gain_at_0_db: float) -> NoiseFigures:
+def _as_fitted(dataset: Dataset, first: NoiseFigures, fitted: NoiseFit, gain_at_0_db: float) -> NoiseFigures:
     """Return the noise fit's figures in the place of first estimates. The fit states its gain for 0 dB, and its read
     noise without
     rounding: that of the dark frames stays."""
-    flats = study.recordings.captures(FlatCapture, study.side)
+    flats = dataset.recordings.captures(FlatCapture, dataset.side)
     gain = gain_at_0_db * 10.0 ** (most_frequent_gain_db(flats) / 20.0)
     black = first.black if fitted.black_level_dn is None else fitted.black_level_dn
     return replace(
@@ -365,44 +365,44 @@ def _as_fitted(study: Study, first: NoiseFigures, fitted: NoiseFit, gain_at_0_db
         gain=gain,
         gain_is_known=True,
         prnu=first.prnu if fitted.prnu_percent is None else 0.01 * fitted.prnu_percent,
-        jitter_lamp=max(level_repeatability(repeated_levels(study, black, gain, first.read_dn)), LAMP_FLOOR),
+        jitter_lamp=max(level_repeatability(repeated_levels(dataset, black, gain, first.read_dn)), LAMP_FLOOR),
     )
 
 
-def _as_stated(study: Study) -> NoiseFigures:
+def _as_stated(dataset: Dataset) -> NoiseFigures:
     """Return what the data sheet states, with usual values in the place of what it doesn't."""
-    stated = study.stated
-    black, black_std = 0.0, 0.05 * study.camera.white_level_dn
+    stated = dataset.stated
+    black, black_std = 0.0, 0.05 * dataset.camera.white_level_dn
     if stated.black_level_dn is not None:
         black = stated.black_level_dn
         black_std = max(STATED_BLACK_DN, STATED_BLACK_SHARE * black)
     # without dark frames: a dark current as stated, or of some tens of electrons
     expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
     return NoiseFigures(
-        black=black, dark_dn_per_s=0.0, dark_c=study.temperature_c, gain=1.0, gain_is_known=False, read_dn=1.0,
+        black=black, dark_dn_per_s=0.0, dark_c=dataset.temperature_c, gain=1.0, gain_is_known=False, read_dn=1.0,
         prnu=USUAL_PRNU,
-        jitter_dn=BLACK_FLOOR_DN * study.step_dn, jitter_freedom=0.0, jitter_lamp=USUAL_LAMP, black_std=black_std,
-        dark_std=max(expected * (stated.conversion_gain_dn_per_e or 1.0), 0.5), step_dn=study.step_dn,
+        jitter_dn=BLACK_FLOOR_DN * dataset.step_dn, jitter_freedom=0.0, jitter_lamp=USUAL_LAMP, black_std=black_std,
+        dark_std=max(expected * (stated.conversion_gain_dn_per_e or 1.0), 0.5), step_dn=dataset.step_dn,
     )  # fmt: skip
 
 
-def _from_darks(study: Study, stated: NoiseFigures) -> NoiseFigures:
+def _from_darks(dataset: Dataset, stated: NoiseFigures) -> NoiseFigures:
     """Return black level, dark current, read noise and repeatability by the dark captures; as stated where there are
     none.
 
     They are of one temperature, that of most captures: the baseline's dark current doesn't depend on it.
     """
-    recordings = study.recordings
-    darks = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
+    recordings = dataset.recordings
+    darks = dataset.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
     if not darks:
         return stated
     off = [
         0.0
-        if study.temperature_c is None or g[0].temperature_c is None
-        else abs(g[0].temperature_c - study.temperature_c)
+        if dataset.temperature_c is None or g[0].temperature_c is None
+        else abs(g[0].temperature_c - dataset.temperature_c)
         for g in darks
     ]
-    sound = study.once(sound_pixels)
+    sound = dataset.once(sound_pixels)
     frames_mean = [np.array([float(recordings.frame(c).mean(where=sound)) for c in g]) for g in darks]
     near = [i for i, away in enumerate(off) if away <= min(off) + ALIKE_C]
     t = np.array([darks[i][0].exposure_s for i in near])
@@ -426,44 +426,44 @@ def _from_darks(study: Study, stated: NoiseFigures) -> NoiseFigures:
             repeats.add(recordings.frame(capture))
         read = float(np.sqrt(repeats.variance_dn2))
         own_dn2 = read**2 / recordings.frame(first[0]).size
-    jitter, freedom = _jitter(study, darks, frames_mean, own_dn2)
-    white_dn = _white_jitter(study, darks, frames_mean, own_dn2)
+    jitter, freedom = _jitter(dataset, darks, frames_mean, own_dn2)
+    white_dn = _white_jitter(dataset, darks, frames_mean, own_dn2)
     return replace(
         stated, black=black, dark_dn_per_s=dark, dark_c=dark_c, read_dn=read,
-        jitter_dn=max(jitter, BLACK_FLOOR_DN * study.step_dn),
+        jitter_dn=max(jitter, BLACK_FLOOR_DN * dataset.step_dn),
         jitter_freedom=freedom,
         black_std=black_std, dark_std=dark_std,
-        white_jitter_dn=None if white_dn is None else max(white_dn, BLACK_FLOOR_DN * study.step_dn),
+        white_jitter_dn=None if white_dn is None else max(white_dn, BLACK_FLOOR_DN * dataset.step_dn),
     )  # fmt: skip
 
 
-def _transfer_points(study: Study, black: float) -> tuple[list[float], list[float], float]:
+def _transfer_points(dataset: Dataset, black: float) -> tuple[list[float], list[float], float]:
     """Signal (DN) and temporal variance (DN^2) of repeated flats by level and channel; and the PRNU, of the last plane
     whose signal is between 0.3 and 0.8 of saturation."""
-    step, prnu = mosaic.step(study.camera.cfa), USUAL_PRNU
+    step, prnu = mosaic.step(dataset.camera.cfa), USUAL_PRNU
     signal, variance = [], []
-    for group in study.flat_levels():
+    for group in dataset.flat_levels():
         if len(group) < 2:
             continue
         evened = {
             channel: TemporalVariance()
-            for channel in study.channels
-            if all(study.levels(c).mean[channel] is not None for c in group)
+            for channel in dataset.channels
+            if all(dataset.levels(c).mean[channel] is not None for c in group)
         }
         if not evened:
             continue
-        total = np.zeros((study.camera.rows, study.camera.cols))
+        total = np.zeros((dataset.camera.rows, dataset.camera.cols))
         for capture in group:
-            frame = study.recordings.frame(capture)
+            frame = dataset.recordings.frame(capture)
             total += frame
             even = _even_rows(frame, step)  # without flicker of the light
             for channel, repeats in evened.items():
-                repeats.add(channel_pixels(even, study.camera.cfa, channel))
+                repeats.add(channel_pixels(even, dataset.camera.cfa, channel))
         for channel, repeats in evened.items():
-            signal.append(float(np.mean([study.levels(c).whole[channel] for c in group])) - black)
-            variance.append(repeats.variance_dn2 / (1.0 - step / study.camera.cols))
-            if 0.3 < signal[-1] / (study.saturation_dn - black) < 0.8:
-                row, col = mosaic.phases(study.camera.cfa)[channel][0]
+            signal.append(float(np.mean([dataset.levels(c).whole[channel] for c in group])) - black)
+            variance.append(repeats.variance_dn2 / (1.0 - step / dataset.camera.cols))
+            if 0.3 < signal[-1] / (dataset.saturation_dn - black) < 0.8:
+                row, col = mosaic.phases(dataset.camera.cfa)[channel][0]
                 plane = total[row::step, col::step] / len(group)
                 if min(plane.shape) >= LEAST_PLANE_PX:
                     fixed = max(variance_between_pixels(plane) - variance[-1] / len(group), 0.0)
@@ -482,20 +482,20 @@ def variance_between_pixels(plane: FloatArray) -> float:
     return float(rough.var() / (1.0 - 1.0 / width**2))
 
 
-def _scene_gain(study: Study, black: float, read_dn: float) -> float | None:
+def _scene_gain(dataset: Dataset, black: float, read_dn: float) -> float | None:
     """Gain (DN/e) from two repeats of any scene: temporal variance over signal, in eight bins of pixels of similar
     signal. None without repeats."""
     signal, variance = [], []
-    for group in study.groups(None, lambda c: c.model_dump_json(exclude={"id", "frame", "time", "temperature_c"})):
+    for group in dataset.groups(None, lambda c: c.model_dump_json(exclude={"id", "frame", "time", "temperature_c"})):
         if len(group) < 2 or group[0].kind == "dark":
             continue
-        one, two = (np.asarray(study.recordings.frame(c), float) - black for c in group[:2])
+        one, two = (np.asarray(dataset.recordings.frame(c), float) - black for c in group[:2])
         two = two * one.sum() / max(two.sum(), 1e-9)
         mean, apart = 0.5 * (one + two).ravel(), 0.5 * np.square(one - two).ravel()
         edges = np.quantile(mean, np.linspace(0.0, 1.0, 9))
         for low, high in pairwise(edges):
             alike = (mean >= low) & (mean <= high)
-            if alike.sum() > 200 and high < 0.8 * (study.saturation_dn - black):
+            if alike.sum() > 200 and high < 0.8 * (dataset.saturation_dn - black):
                 signal.append(float(mean[alike].mean()))
                 variance.append(float(apart[alike].mean()))
     s = np.array(signal)
@@ -520,7 +520,7 @@ def _even_rows(frame: Any, step: int) -> FloatArray:
 
 
 def _jitter(
-    study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float
+    dataset: Dataset, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float
 ) -> tuple[float, float]:
     """Standard deviation of the repeats' means (DN) about a linear drift with time that all groups have in common, and
     its degrees of freedom.
@@ -529,15 +529,15 @@ def _jitter(
     `USUAL_JITTER_DN`^2 + `own_dn2`, that of a frame's mean by its pixels' noise, counts as `USUAL_JITTER_FREEDOM`
     degrees of freedom."""
     repeats = []
-    usual_dn2 = (USUAL_JITTER_DN * study.step_dn) ** 2 + own_dn2
+    usual_dn2 = (USUAL_JITTER_DN * dataset.step_dn) ** 2 + own_dn2
     for group, mean in zip(groups, means, strict=True):
         if len(group) > 1:
-            time = np.array([study.elapsed_s(c) for c in group])
+            time = np.array([dataset.elapsed_s(c) for c in group])
             repeats.append(RepeatedMeans(tuple(group), mean - mean.mean(), time - time.mean(), usual_dn2))
     repeats = steady(repeats)
     freedom = sum(len(r.away) - 1 for r in repeats)
     if freedom == 0:
-        return UNKNOWN_JITTER_DN * study.step_dn, 0.0
+        return UNKNOWN_JITTER_DN * dataset.step_dn, 0.0
     rest, elapsed = np.concatenate([r.away for r in repeats]), np.concatenate([r.elapsed_s for r in repeats])
     if freedom > 2 and np.any(elapsed):
         rest = rest - elapsed * float(elapsed @ rest) / float(elapsed @ elapsed)
@@ -548,21 +548,21 @@ def _jitter(
 
 
 def _white_jitter(
-    study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float
+    dataset: Dataset, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float
 ) -> float | None:
     """Standard deviation of the repeats' means (DN) about what their order in time shows
     (`lab.observables.noise.repeats`): a trend, a decay or a step of a setting isn't scatter but a mismatch. None where
     no setting has one.
 
     It is pooled over all settings with `USUAL_JITTER_FREEDOM` degrees of freedom of the usual variance."""
-    place = {capture.id: number for number, capture in enumerate(study.in_time_order)}
+    place = {capture.id: number for number, capture in enumerate(dataset.in_time_order)}
     settings: list[RepeatedSetting] = []
     for group, mean in zip(groups, means, strict=True):
         if len(group) < 2:
             continue
         order = sorted(range(len(group)), key=lambda k, group=group: place[group[k].id])  # type: ignore[misc]
         captures = tuple(group[k] for k in order)
-        elapsed = np.array([study.elapsed_s(c) for c in captures])
+        elapsed = np.array([dataset.elapsed_s(c) for c in captures])
         is_timed = bool(np.all(np.diff(elapsed) > 0.0))
         numbers = np.array([place[c.id] for c in captures])
         settings.append(
@@ -578,7 +578,7 @@ def _white_jitter(
     drifts = {drift.captures: drift for drift in drifts_of(settings) if drift.is_of_one_setting}
     if not drifts:
         return None
-    usual_dn2 = (USUAL_JITTER_DN * study.step_dn) ** 2 + own_dn2
+    usual_dn2 = (USUAL_JITTER_DN * dataset.step_dn) ** 2 + own_dn2
     squares, freedom = USUAL_JITTER_FREEDOM * usual_dn2, USUAL_JITTER_FREEDOM
     for setting in settings:
         drift = drifts.get(tuple(c.id for c in setting.captures))

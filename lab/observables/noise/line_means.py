@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from lab.capture_kinds.base import Capture
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from sim.effects.base import Effects
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -25,9 +25,9 @@ MOST_KEPT = 16
 class LineMeans:
     """Jacobian of n frame means by the line noise of each capture: its mean over lines, and its even-odd difference."""
 
-    def __init__(self, study: Study, points: Sequence[tuple[Capture, str | None]]) -> None:
+    def __init__(self, dataset: Dataset, points: Sequence[tuple[Capture, str | None]]) -> None:
         """`points`: n of (capture, channel); channel None: the mean of the whole frame."""
-        self._study = study
+        self._dataset = dataset
         self._channels = [channel for _, channel in points]
         at: dict[str, list[int]] = {}
         for number, (capture, _) in enumerate(points):
@@ -39,7 +39,7 @@ class LineMeans:
         """Name of a nuisance parameter -> column (n,), DN per standard deviation. Empty without effects that add line
         noise."""
         columns: dict[str, FloatArray] = {}
-        camera, gain = self._study.camera, self._study.noise.gain
+        camera, gain = self._dataset.camera, self._dataset.noise.gain
         for one in Uniform(camera, effects).lines:
             count = camera.rows if one.lines == "rows" else camera.cols
             for name, frequency in (("mean", 0.0), ("odd", 0.5)):
@@ -63,7 +63,7 @@ class LineMeans:
 
     def _of_captures(self, lines: str, name: str, std_dn: float) -> Iterator[tuple[str, FloatArray]]:
         """Yield the columns of one strength, one for each capture."""
-        sign = {c: 1.0 if name == "mean" else _even_over_odd(self._study, lines, c) for c in {*self._channels}}
+        sign = {c: 1.0 if name == "mean" else _even_over_odd(self._dataset, lines, c) for c in {*self._channels}}
         change = std_dn * np.array([sign[c] for c in self._channels])
         for capture, mine in self._at.items():
             if np.any(change[mine]):
@@ -72,9 +72,9 @@ class LineMeans:
                 yield f"{lines}:{name}:{capture}", column
 
 
-def _even_over_odd(study: Study, lines: str, channel: str | None) -> float:
+def _even_over_odd(dataset: Dataset, lines: str, channel: str | None) -> float:
     """Mean over the lines of a channel of 1 on even lines and -1 on odd ones."""
-    if channel is None or mosaic.step(study.camera.cfa) == 1:
+    if channel is None or mosaic.step(dataset.camera.cfa) == 1:
         return 0.0
-    phases = mosaic.phases(study.camera.cfa)[channel]
+    phases = mosaic.phases(dataset.camera.cfa)[channel]
     return float(np.mean([1.0 - 2.0 * (phase[0 if lines == "rows" else 1] % 2) for phase in phases]))

@@ -10,9 +10,9 @@ from scipy.linalg import block_diag
 from scipy.ndimage import convolve1d
 
 from lab.errors import NotDetermined
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.noise.temporal import OUTLIER, PAIRS, dark_repeats, flat_repeats
-from lab.observables.observable import LEVEL_REACH, Block, Label, Measurement, Prediction
+from lab.observables.observable import LEVEL_REACH, Label, Measurement, Observable, Prediction
 from lab.observables.reads import READ_SPECTRUM
 from sim.camera import CameraModel, Cfa
 from sim.effects.base import Effects
@@ -25,18 +25,20 @@ from sim.uniform import Uniform
 CORRELATION_FLOOR = 3e-4  # standard deviation of a correlation beside chance
 
 
-def neighbour_block(study: Study) -> Block:
+def measure_noise_neighbours(dataset: Dataset) -> Observable:
     """Correlation of the temporal noise of neighbouring pixels (`PAIRS`), by level of light and in the dark.
 
     It is 0 where pixels are independent, whatever gain, noise and level are. Raises NotDetermined without repeats whose
     noise exceeds a code.
     """
-    points = [r for r in (*study.once(dark_repeats), *study.once(flat_repeats)) if np.all(np.isfinite(r.correlation))]
+    points = [
+        r for r in (*dataset.once(dark_repeats), *dataset.once(flat_repeats)) if np.all(np.isfinite(r.correlation))
+    ]
     if not points:
         raise NotDetermined(
             "noise_neighbours", "no repeats of dark or unclipped flat captures whose noise exceeds a code"
         )
-    noise, camera = study.noise, study.camera
+    noise, camera = dataset.noise, dataset.camera
     lit = [r.level > max(20.0 * abs(noise.dark_dn_per_s) * r.exposure_s, 4.0 * noise.read_dn) for r in points]
     level = np.array([max(r.level, 1.0) for r in points])
     value = np.concatenate([r.correlation for r in points])
@@ -51,7 +53,7 @@ def neighbour_block(study: Study) -> Block:
             return Prediction(np.zeros(len(value)), {})
         parts = []
         for r in points:
-            gain, gain_db = noise.gain * r.gain, study.usual_gain_db + 20.0 * np.log10(r.gain)
+            gain, gain_db = noise.gain * r.gain, dataset.usual_gain_db + 20.0 * np.log10(r.gain)
             electrons = np.array([max(s, 0.0) / gain for s in r.signal.values()])
             read = max(noise.read_dn**2 - noise.quantisation_dn2, 0.1 * noise.read_dn**2) / noise.gain**2
             slow = sum(one.own_e2 for one in ordered)  # a part of what is measured as read noise
@@ -70,7 +72,7 @@ def neighbour_block(study: Study) -> Block:
             )
         return Prediction(np.concatenate(parts), {})
 
-    return Block(
+    return Observable(
         measurement=NOISE_NEIGHBOURS, reach=LEVEL_REACH, along=np.repeat(np.log(level), len(names)),
         value=value, covariance=covariance + CORRELATION_FLOOR**2 * np.eye(len(value)),
         labels=tuple(Label(r.level if bright else 0.0, name, f"{r.exposure_s:.4g} s" if bright else f"dark, {r.exposure_s:.4g} s", r.captures, r.held_out)  # noqa: E501
@@ -81,7 +83,7 @@ def neighbour_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def tone_block(study: Study) -> Block:
+def measure_noise_tones(dataset: Dataset) -> Observable:
     """Share of tones in the variance of dark frames' temporal noise.
 
     Tones are frequencies across a frame that stand out of the noise by `temporal_noise.OUTLIER`, beside those of whole
@@ -89,7 +91,7 @@ def tone_block(study: Study) -> Block:
     settings, as phases are random (of a single one, its share), and that of one tone. Raises NotDetermined without
     repeated dark frames whose noise exceeds a code.
     """
-    dark = [r for r in study.once(dark_repeats) if np.all(np.isfinite(r.correlation))]
+    dark = [r for r in dataset.once(dark_repeats) if np.all(np.isfinite(r.correlation))]
     if not dark:
         raise NotDetermined("noise_tones", "no repeats of dark captures whose noise exceeds a code")
     value, variance, labels = [], [], []
@@ -101,7 +103,7 @@ def tone_block(study: Study) -> Block:
         variance.append((spread**2 + float(np.mean([r.one_tone for r in points])) ** 2) / len(points))
         labels.append(Label(0.0, "all", "dark", tuple(c for r in points for c in r.captures), held_out))
     # no effect leaves tones
-    return Block(
+    return Observable(
         measurement=NOISE_TONES, reach=LEVEL_REACH, value=np.array(value), covariance=np.diag(variance),
         labels=tuple(labels), reads=frozenset(),
         predict=lambda effects: Prediction(np.zeros(len(value)), {}), scale=np.ones(len(value)),
@@ -227,7 +229,7 @@ NOISE_NEIGHBOURS = Measurement(
     order=230,
     axis="level",
     unit="DN",
-    make=neighbour_block,
+    make=measure_noise_neighbours,
     quantity="correlation",
     of_variances=True,
 )
@@ -237,7 +239,7 @@ NOISE_TONES = Measurement(
     order=185,
     axis="level",
     unit="DN",
-    make=tone_block,
+    make=measure_noise_tones,
     quantity="share of the temporal variance",
     of_variances=True,
 )

@@ -14,10 +14,10 @@ import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
-from lab.observables.dataset import CLIPPED_SHARE, Study, held_out_flats
+from lab.observables.dataset import CLIPPED_SHARE, Dataset, held_out_flats
 from lab.observables.flats.noise import behind
 from lab.observables.noise.temporal import ENOUGH, OUTLIER
-from lab.observables.observable import LEVEL_REACH, Block, Label, Measurement, Prediction
+from lab.observables.observable import LEVEL_REACH, Label, Measurement, Observable, Prediction
 from lab.observables.plane_means import channel_pixels
 from sim.effects.base import Effects
 from sim.sensor.electrons import multiplied_skewness
@@ -39,32 +39,32 @@ class _Skewness:
     value: float
     std: float
     setting: str
-    gain: float  # factor on the study's conversion gain
+    gain: float  # factor on the dataset's conversion gain
     gain_db: float
     captures: tuple[str, ...]
     held_out: bool
 
 
-def _of_repeats(study: Study, captures: Sequence[FlatCapture], held_out: bool) -> list[_Skewness]:
+def _of_repeats(dataset: Dataset, captures: Sequence[FlatCapture], held_out: bool) -> list[_Skewness]:
     """Return the numbers of one level's repeats by channel.
 
     k3 = n / ((n - 1)(n - 2)) sum (x - <x>)^3 is unbiased. Of normal noise s^2 its variance is 6 n s^6 / ((n - 1)(n -
     2)) a pixel. Frames are brought to one level by factors; pixels beyond `OUTLIER` standard deviations are left out.
     """
-    cfa, noise, found = study.camera.cfa, study.noise, []
-    first = study.recordings.frame(captures[0])
+    cfa, noise, found = dataset.camera.cfa, dataset.noise, []
+    first = dataset.recordings.frame(captures[0])
     use = list(captures)[: max(LEAST_REPEATS, int(np.ceil(ENOUGH / first.size)))]
     n, gain_db = len(use), captures[0].gain_db or 0.0
-    gain = 10.0 ** ((gain_db - study.usual_gain_db) / 20.0)
-    frames = [study.recordings.frame(c) for c in use]
-    for channel in study.channels:
+    gain = 10.0 ** ((gain_db - dataset.usual_gain_db) / 20.0)
+    frames = [dataset.recordings.frame(c) for c in use]
+    for channel in dataset.channels:
         planes = np.array([channel_pixels(frame, cfa, channel) for frame in frames], np.float64)
-        if float(np.mean((planes >= study.saturation_dn) | (planes <= 0))) >= 0.1 * CLIPPED_SHARE:
+        if float(np.mean((planes >= dataset.saturation_dn) | (planes <= 0))) >= 0.1 * CLIPPED_SHARE:
             continue
         planes -= noise.black
         means = planes.reshape(n, -1).mean(axis=1)
         signal = float(means.mean())
-        if not 0.0 < signal < HIGHEST_SHARE * (study.saturation_dn - noise.black):
+        if not 0.0 < signal < HIGHEST_SHARE * (dataset.saturation_dn - noise.black):
             continue
         planes *= (signal / means).reshape(-1, *(1,) * (planes.ndim - 1))
         away = planes - planes.mean(axis=0)
@@ -73,7 +73,7 @@ def _of_repeats(study: Study, captures: Sequence[FlatCapture], held_out: bool) -
         pixels = int(np.count_nonzero(kept))
         variance = float(squares[kept].mean())
         shot = variance - (noise.read_dn * gain) ** 2
-        if shot < 0.2 * variance or variance < LEAST_DN2 * study.step_dn**2:
+        if shot < 0.2 * variance or variance < LEAST_DN2 * dataset.step_dn**2:
             continue
         factor = n / ((n - 1.0) * (n - 2.0))
         third = factor * float(np.sum(away[:, kept] ** 3)) / pixels
@@ -88,17 +88,17 @@ def _of_repeats(study: Study, captures: Sequence[FlatCapture], held_out: bool) -
     return found
 
 
-def skewness_block(study: Study) -> Block:
+def measure_noise_skewness(dataset: Dataset) -> Observable:
     """k3 mu / (variance - read noise's)^2 of faint flats by channel: 1 of single electrons.
 
     Raises NotDetermined where no faint flat is repeated `LEAST_REPEATS` times.
     """
-    out = study.once(held_out_flats)
+    out = dataset.once(held_out_flats)
     points: list[_Skewness] = []
-    for group in study.flat_levels():
+    for group in dataset.flat_levels():
         for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
             if len(part) >= LEAST_REPEATS:
-                points += _of_repeats(study, part, part[0].id in out)
+                points += _of_repeats(dataset, part, part[0].id in out)
     if not points:
         raise NotDetermined(
             "noise_skewness",
@@ -110,10 +110,10 @@ def skewness_block(study: Study) -> Block:
     std = np.array([p.std for p in points])
 
     def predict(effects: Effects) -> Prediction:
-        model = Uniform(study.camera, effects)
-        return Prediction(np.array([_predicted(study, model, effects, p) for p in points]), {})
+        model = Uniform(dataset.camera, effects)
+        return Prediction(np.array([_predicted(dataset, model, effects, p) for p in points]), {})
 
-    return Block(
+    return Observable(
         measurement=NOISE_SKEWNESS, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)),
         value=np.array([p.value for p in points]), covariance=np.diag(np.square(std) + SKEWNESS_FLOOR**2),
         labels=tuple(Label(p.signal_dn, p.channel, p.setting, p.captures, p.held_out) for p in points),
@@ -122,14 +122,14 @@ def skewness_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _predicted(study: Study, model: Uniform, effects: Effects, p: _Skewness) -> float:
+def _predicted(dataset: Dataset, model: Uniform, effects: Effects, p: _Skewness) -> float:
     """Multiplications by g leave E g^3 / (E g^2)^2. A response r adds 3 r r'' / r'^2, as
     normal noise gets skewed; what scales the noise by s leaves s^3 of the third moment over s^4; a filter k of a plane
     leaves sum k^3 / (sum k^2)^2."""
     excess = model.excess_factor(p.gain_db)
     value = multiplied_skewness(excess)
-    gain = study.noise.gain * p.gain
-    electrons, _ = behind(np.array([p.signal_dn / gain]), np.ones(1), effects, study)
+    gain = dataset.noise.gain * p.gain
+    electrons, _ = behind(np.array([p.signal_dn / gain]), np.ones(1), effects, dataset)
     e = float(electrons[0, 0])
     ratio = float(model.shot_e2(np.array([e]), p.gain_db)[0]) / (excess * e)
     value /= np.sqrt(max(ratio, 1e-3))
@@ -150,7 +150,7 @@ NOISE_SKEWNESS = Measurement(
     order=225,
     axis="level",
     unit="DN",
-    make=skewness_block,
+    make=measure_noise_skewness,
     quantity="third moment x mean / (shot noise's variance)²",
     of_variances=True,
 )

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import fft
 
 from lab.errors import NotDetermined
-from lab.observables.dataset import CLIPPED_SHARE, Study, held_out_flats
+from lab.observables.dataset import CLIPPED_SHARE, Dataset, held_out_flats
 from sim.camera import Cfa
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -46,7 +46,7 @@ class Repeats:
 
     captures: tuple[str, ...]
     exposure_s: float
-    gain: float  # factor on the study's conversion gain, that of its usual setting, by the setting in dB
+    gain: float  # factor on the dataset's conversion gain, that of its usual setting, by the setting in dB
     held_out: bool
     signal: dict[str, float]  # mean above black, DN
     variance: dict[str, float | None]  # DN^2; None where the plane clips, or rounding hides the noise
@@ -62,28 +62,28 @@ class Repeats:
         return float(np.mean(list(self.signal.values())))
 
 
-def flat_repeats(study: Study) -> list[Repeats]:
+def flat_repeats(dataset: Dataset) -> list[Repeats]:
     """Return the temporal noise of all repeated flat settings, seen and held-out repeats apart, darkest first."""
-    out = study.once(held_out_flats)
+    out = dataset.once(held_out_flats)
     found = []
-    for group in study.flat_levels():
+    for group in dataset.flat_levels():
         for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
             if len(part) > 1:
-                found.append(repeats_of(study, part, part[0].id in out))
+                found.append(repeats_of(dataset, part, part[0].id in out))
     return sorted(found, key=lambda r: r.level)
 
 
-def dark_repeats(study: Study) -> list[Repeats]:
+def dark_repeats(dataset: Dataset) -> list[Repeats]:
     """Return the temporal noise of all repeated dark settings, of three or more of which every third is held out."""
-    groups = [g for g in study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db)) if len(g) > 1]
-    return [repeats_of(study, g, len(groups) >= 3 and i % 3 == 1) for i, g in enumerate(groups)]
+    groups = [g for g in dataset.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db)) if len(g) > 1]
+    return [repeats_of(dataset, g, len(groups) >= 3 and i % 3 == 1) for i, g in enumerate(groups)]
 
 
-def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats:
+def repeats_of(dataset: Dataset, captures: Sequence[Any], held_out: bool) -> Repeats:
     """Return the temporal noise of two or more repeats of one setting. Raises NotDetermined where the frames are too
     small."""
-    cfa, lit = study.camera.cfa, captures[0].kind != "dark"
-    first = study.recordings.frame(captures[0])
+    cfa, lit = dataset.camera.cfa, captures[0].kind != "dark"
+    first = dataset.recordings.frame(captures[0])
     least_px = LEAST_PLANE_PX * mosaic.step(cfa)
     if min(first.shape) < least_px:
         raise NotDetermined(
@@ -92,15 +92,15 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
             f"few values are left; {least_px} px a side are enough",
         )
     use = list(captures)[: max(2, int(np.ceil(ENOUGH / first.size)) + 1)]
-    frames = [np.array(study.recordings.frame(c), np.float32) for c in use]
+    frames = [np.array(dataset.recordings.frame(c), np.float32) for c in use]
     signal, clipped = {}, {}
     for name in mosaic.planes(first, cfa):
         planes = [mosaic.planes(f, cfa)[name] for f in frames]
-        clipped[name] = max(float(np.mean((p >= study.saturation_dn) | (p <= 0))) for p in planes)
-        signal[name] = float(np.mean([p.mean(dtype=float) for p in planes])) - study.noise.black
+        clipped[name] = max(float(np.mean((p >= dataset.saturation_dn) | (p <= 0))) for p in planes)
+        signal[name] = float(np.mean([p.mean(dtype=float) for p in planes])) - dataset.noise.black
     level = float(np.mean(list(signal.values())))
-    dark_dn = abs(study.noise.dark_dn_per_s) * captures[0].exposure_s
-    level_out(frames, cfa, study.noise.black if lit and level > 20.0 * max(dark_dn, 1.0) else None)
+    dark_dn = abs(dataset.noise.dark_dn_per_s) * captures[0].exposure_s
+    level_out(frames, cfa, dataset.noise.black if lit and level > 20.0 * max(dark_dn, 1.0) else None)
     freedom = len(frames) - 1
     sizes = {name: plane.shape for name, plane in mosaic.planes(first, cfa).items()}
     variance = {}
@@ -115,7 +115,7 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
     correlation = _correlations(frames, freedom, cfa)
     covariance = independent_correlations(first.shape, freedom, cfa)[1]
     clean = {name: share < 0.1 * CLIPPED_SHARE for name, share in clipped.items()}
-    moving = min(variance.values()) > LEAST_DN2 * study.step_dn**2
+    moving = min(variance.values()) > LEAST_DN2 * dataset.step_dn**2
     if not (moving and (all(clean.values()) or not lit)):
         correlation = np.full(len(PAIRS), np.nan)
     # correlation of the noise widens the standard deviations
@@ -124,7 +124,7 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
     return Repeats(
         captures=tuple(c.id for c in use),
         exposure_s=captures[0].exposure_s,
-        gain=10.0 ** (((captures[0].gain_db or 0.0) - study.usual_gain_db) / 20.0),
+        gain=10.0 ** (((captures[0].gain_db or 0.0) - dataset.usual_gain_db) / 20.0),
         held_out=held_out,
         signal=signal,
         variance={n: v if clean[n] and moving else None for n, v in variance.items()},

@@ -16,8 +16,8 @@ from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
 from lab.errors import NotDetermined
-from lab.observables.dataset import Study, held_out_of, mean_frame
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.dataset import Dataset, held_out_of, mean_frame
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.plane_means import channel_pixels
 from lab.observables.reads import BLUR, REFLECTIONS, SHOWN, acting
 from lab.observables.screens.pattern_fit import mean_rate
@@ -36,14 +36,14 @@ RADII, ANGLES = 24, 4  # nodes of frequency and orientation between which a tran
 FINE_CY_PER_PX = 0.01  # frequency below which the nodes are evenly spaced
 
 
-def screen_block(study: Study) -> Block:
+def measure_screen(dataset: Dataset) -> Observable:
     """Mean level in the dark squares of a pattern on a screen, less that of the dark screen, by channel, DN.
 
     Only pixels at least 7 px away from lit ones count. The baseline's point spread function reaches them, which is
     predicted from the lit pixels. A veil adds a share of the frame's mean. Raises NotDetermined without white, black
     and patterned captures of one pose and exposure, or without dark squares wide enough.
     """
-    recordings, side, camera, noise = study.recordings, study.side, study.camera, study.noise
+    recordings, side, camera, noise = dataset.recordings, dataset.side, dataset.camera, dataset.noise
     by_pose: dict[str, dict[str, list[Any]]] = {}
     shown: list[WhiteCapture | BlackCapture | CheckerboardCapture | BernoulliCapture] = [
         *recordings.captures(WhiteCapture, side), *recordings.captures(BlackCapture, side),
@@ -67,7 +67,7 @@ def screen_block(study: Study) -> Block:
             for part in ([c for c in patterned if c.id not in out], [c for c in patterned if c.id in out]):
                 if part:
                     points += _dark_squares(
-                        study,
+                        dataset,
                         part,
                         mean_frame(recordings, part),
                         levels["white"],
@@ -88,7 +88,7 @@ def screen_block(study: Study) -> Block:
     white = np.array([p.white for p in points])
     channel, digits = np.array([p.channel for p in points]), np.array([p.digits for p in points])
     covariance += (
-        same * np.outer(tail, tail) * study.tail_std**2
+        same * np.outer(tail, tail) * dataset.tail_std**2
         + np.outer(beyond, beyond)
         + np.outer(white, white) * SCREEN_FLOOR**2
         + np.diag(np.square(1e-4 * white))
@@ -108,7 +108,7 @@ def screen_block(study: Study) -> Block:
             shift = shift + np.array([_copied(p, effects, camera) for p in points])
         return Prediction(wide_contrast(camera, effects) * tail + even_share(camera, effects) * lift + shift, {})
 
-    return Block(
+    return Observable(
         measurement=SCREEN, reach=1e9, value=value, covariance=covariance,
         labels=tuple(Label(float(i), p.channel, p.kind, p.captures, p.held_out) for i, p in enumerate(points)),
         reads=REFLECTIONS | BLUR | {"image.veils", "signal.response"}, predict=predict,
@@ -190,7 +190,7 @@ def _copied(squares: _DarkSquares, effects: Effects, camera: CameraModel) -> flo
 
 
 def _dark_squares(
-    study: Study,
+    dataset: Dataset,
     part: Sequence[Any],
     shown: FloatArray,
     white: FloatArray,
@@ -200,11 +200,11 @@ def _dark_squares(
 ) -> list[_DarkSquares]:
     """Return the dark squares of a pattern in each channel. `part`: its captures; `shown`, `white`, `black`: mean
     frames of the pattern, of the lit and of the dark screen; `blacks`: number of dark-screen captures."""
-    camera, noise = study.camera, study.noise
+    camera, noise = dataset.camera, dataset.noise
     found = []
     step = mosaic.step(camera.cfa)
     lit_by_channel: dict[str, Any] = {}
-    for channel in study.channels:
+    for channel in dataset.channels:
         row, col = mosaic.phases(camera.cfa)[channel][0]
         plane = (slice(row, None, step), slice(col, None, step))
         full = (white - black)[plane]
@@ -226,7 +226,7 @@ def _dark_squares(
         picture = np.where((share > 0.5) & bright, full, 0.0)
         fy: FloatArray = np.fft.fftfreq(2 * share.shape[0], step)[:, None].astype(float)
         fx: FloatArray = np.fft.rfftfreq(2 * share.shape[1], step)[None, :].astype(float)
-        radiance = study.spectrum(part[0].screen.radiance) if part[0].screen.radiance else None
+        radiance = dataset.spectrum(part[0].screen.radiance) if part[0].screen.radiance else None
         otf = np.real(optical_transfer(camera, channel, radiance, fx, fy))
         # The mean over the dark squares, by Parseval: columns of the half spectrum stand for two. Pixels above half the
         # contrast are drawn as lit: the total is right, and far away the outline doesn't matter. How far a screen goes
@@ -245,7 +245,7 @@ def _dark_squares(
         difference = added[use]
         lights = np.maximum([float(frame[plane][use].mean()) - noise.black for frame in (shown, black)], 0.0)
         variance = (noise.gain * lights[1] + noise.read_dn**2) * (1 / len(part) + 1 / blacks)
-        means = [float(channel_pixels(f, study.camera.cfa, channel).mean()) for f in (shown, black)]
+        means = [float(channel_pixels(f, dataset.camera.cfa, channel).mean()) for f in (shown, black)]
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
                          float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
@@ -263,7 +263,7 @@ SCREEN = Measurement(
     order=400,
     axis="level",
     unit="DN",
-    make=screen_block,
+    make=measure_screen,
     quantity="light beyond the dark screen's, DN",
     conditions="pattern",
     places="dark squares",
@@ -301,30 +301,30 @@ class _Line:
         return normal if normal < CERTAIN else CERTAIN * (1.0 + float(np.log(normal / CERTAIN)))
 
 
-def grid_block(study: Study) -> Block:
+def measure_screen_grid(dataset: Dataset) -> Observable:
     """Strength of the strongest spectral line of the lit screen by channel, as a standard normal quantile.
 
     Lines along rows and columns, and lines that flats show as well, are the camera's and left out. Raises NotDetermined
     without white captures, and where the screen fills too little of the frame.
     """
-    groups = study.groups(WhiteCapture, lambda c: (c.screen.pose, c.exposure_s))
+    groups = dataset.groups(WhiteCapture, lambda c: (c.screen.pose, c.exposure_s))
     if not groups:
         raise NotDetermined("screen_grid", "no white captures")
     found: list[_Line] = []
     reason = ""
     for group in groups:
-        for channel in study.channels:
+        for channel in dataset.channels:
             try:
-                found.append(_line(study, group, channel))
+                found.append(_line(dataset, group, channel))
             except NotDetermined as refused:
                 reason = refused.reason
     if not found:
         raise NotDetermined("screen_grid", reason)
-    half = np.arange(48) * 0.37 * study.camera.pixel_pitch_um
+    half = np.arange(48) * 0.37 * dataset.camera.pixel_pitch_um
     x, y = np.meshgrid(half, half)
 
     def predict(effects: Effects) -> Prediction:
-        shown = screen_light(study.camera, np.ones_like(x), x, y, effects)
+        shown = screen_light(dataset.camera, np.ones_like(x), x, y, effects)
         size = 2.0 * float(np.std(shown)) / float(np.mean(shown))
         return Prediction(
             np.array(
@@ -333,7 +333,7 @@ def grid_block(study: Study) -> Block:
             {},
         )
 
-    return Block(
+    return Observable(
         measurement=SCREEN_GRID, reach=1e9,
         value=np.array([line.normal(line.power) for line in found]), covariance=GRID_STD**2 * np.eye(len(found)),
         labels=tuple(Label(line.cycles_per_px, line.channel, "lit screen", line.captures, False) for line in found),
@@ -341,19 +341,19 @@ def grid_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _line(study: Study, group: Sequence[Any], channel: str) -> _Line:
+def _line(dataset: Dataset, group: Sequence[Any], channel: str) -> _Line:
     """Return the strongest line in one channel of the mean of some captures."""
-    step = mosaic.step(study.camera.cfa)
-    row, col = mosaic.phases(study.camera.cfa)[channel][0]
-    plane = mean_rate(study, group)[row::step, col::step]
+    step = mosaic.step(dataset.camera.cfa)
+    row, col = mosaic.phases(dataset.camera.cfa)[channel][0]
+    plane = mean_rate(dataset, group)[row::step, col::step]
     bright = plane > 0.5 * np.quantile(plane, 0.98)
     box = _box(bright)
     power, noise, window = _power(plane[box], step)
     fy, fx = fft.fftfreq(window.shape[0])[:, None], fft.rfftfreq(window.shape[1])[None, :]
     count = (fx > 2.5 / window.shape[1]) & (np.abs(fy) > 2.5 / window.shape[0]) & (np.hypot(fx, fy) > GRID_LOWEST)
-    flats = study.flat_levels()
+    flats = dataset.flat_levels()
     if flats:
-        lit = mean_frame(study.recordings, flats[len(flats) // 2])[row::step, col::step] - study.noise.black
+        lit = mean_frame(dataset.recordings, flats[len(flats) // 2])[row::step, col::step] - dataset.noise.black
         of_flats, level, _ = _power(lit[box], step)
         count &= ndimage.maximum_filter(of_flats / level, 3) < GRID_OF_CAMERA
     relative = np.where(count, power / noise, 0.0)
@@ -405,6 +405,6 @@ SCREEN_GRID = Measurement(
     order=450,
     axis="spatial_frequency",
     unit="cy/px",
-    make=grid_block,
+    make=measure_screen_grid,
     quantity="strength of the line, sigma",
 )

@@ -6,23 +6,23 @@ import numpy as np
 
 from lab.errors import NotDetermined
 from lab.observables.colour_shift import COLOUR_FLOOR_PX, colour_shift_px
-from lab.observables.dataset import Study
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.dataset import Dataset
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import SHIFT
 from lab.observables.screens.pattern_fit import ACROSS, RADIAL, RADIAL3, Pattern, patterns
 from sim.effects.base import Effects
 
 
-def colour_block(study: Study) -> Block:
+def measure_lateral_colour(dataset: Dataset) -> Observable:
     """Displacement (px) of a pattern's red and blue images from the green one: radial at two distances from the frame's
     middle, and tangential at one.
 
     Raises NotDetermined for a camera without a green channel, and where no pattern is fitted.
     """
-    if "G" not in study.channels:
+    if "G" not in dataset.channels:
         raise NotDetermined("lateral_colour", "one channel: nothing to hold it against")
     points: list[tuple[Pattern, Pattern]] = []
-    for group in patterns(study):
+    for group in patterns(dataset):
         for p in group:
             if p.channel != "G":
                 green = next(q for q in group if q.channel == "G" and q.held_out == p.held_out)
@@ -53,10 +53,10 @@ def colour_block(study: Study) -> Block:
         if effects:
             for k, (p, distance, outwards) in enumerate(places):
                 if outwards:
-                    mean[k] = colour_shift_px(study, p.channel, distance, p.light, effects)
+                    mean[k] = colour_shift_px(dataset, p.channel, distance, p.light, effects)
         return Prediction(mean, {})
 
-    return Block(
+    return Observable(
         measurement=LATERAL_COLOUR, reach=0.5, value=np.concatenate(values),
         covariance=covariance + np.diag(np.full(3 * n, COLOUR_FLOOR_PX**2)), labels=tuple(labels),
         reads=SHIFT, predict=predict, scale=np.ones(3 * n),
@@ -69,7 +69,7 @@ LATERAL_COLOUR = Measurement(
     order=440,
     axis="field",
     unit="half diagonals",
-    make=colour_block,
+    make=measure_lateral_colour,
     quantity="displacement from green, px",
     conditions="direction",
 )

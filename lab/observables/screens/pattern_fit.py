@@ -30,8 +30,8 @@ from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
 from lab.errors import NotDetermined
-from lab.observables.dataset import Study, held_out_of
-from lab.observables.observable import Block, Label, Measurement, Prediction
+from lab.observables.dataset import Dataset, held_out_of
+from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import REFLECTIONS, SHOWN, acting
 from lab.observables.screens.registration import ScreenWarp, draw_by_area, reference_pixels, register
 from sim.camera import CameraModel
@@ -275,24 +275,24 @@ class _Above:
         return np.asarray((largest >= low) & (largest < end))
 
 
-def lens_otf(study: Study, channel: str, light: Spectrum | None) -> CubicSpline:
+def lens_otf(dataset: Dataset, channel: str, light: Spectrum | None) -> CubicSpline:
     """OTF of the baseline's lens without the pixel's aperture, against frequency (cy/px). On axis it is the same in all
     directions."""
     f = np.linspace(0.0, 2.0, 101)
-    whole = np.real(optical_transfer(study.camera, channel, light, f, 0.0 * f, (), "bernoulli"))
-    return CubicSpline(f, whole / aperture_otf(f, 0.0 * f, study.camera.fill_factor))
+    whole = np.real(optical_transfer(dataset.camera, channel, light, f, 0.0 * f, (), "bernoulli"))
+    return CubicSpline(f, whole / aperture_otf(f, 0.0 * f, dataset.camera.fill_factor))
 
 
-def channel_pixels(study: Study, canvas: Canvas, channel: str, seen: FloatArray) -> NDArray[np.bool_]:
+def channel_pixels(dataset: Dataset, canvas: Canvas, channel: str, seen: FloatArray) -> NDArray[np.bool_]:
     """Mask (rows, cols) of the window's pixels of a channel inside the pattern. `seen`: the frame, NaN where the screen
     isn't.
 
     Raises NotDetermined for fewer than `LEAST_PIXELS`.
     """
     mask = canvas.inside & np.isfinite(seen[canvas.window])
-    step = mosaic.step(study.camera.cfa)
+    step = mosaic.step(dataset.camera.cfa)
     own = np.zeros_like(mask)
-    for row, col in mosaic.phases(study.camera.cfa)[channel]:
+    for row, col in mosaic.phases(dataset.camera.cfa)[channel]:
         own[row::step, col::step] = True
     mask &= own
     if mask.sum() < LEAST_PIXELS:
@@ -322,14 +322,14 @@ SCREEN_BLUR_PX = 0.08  # prior standard deviation of the Gaussian blur of the ce
 PLACINGS = 4  # Gauss-Newton steps that find an image's shift
 
 
-def contrast_block(study: Study) -> Block:
+def measure_bernoulli(dataset: Dataset) -> Observable:
     """Contrast of a random pattern over that of the baseline, by frequency, orientation and channel: the bands'
     coefficients of `pattern_fit`.
 
     Nuisance parameters: the contrast's scale, and a blur of the screen's cells. Raises NotDetermined where no band is
     known to `LARGEST_STD`.
     """
-    found = patterns(study)
+    found = patterns(dataset)
     labels: list[Label] = []
     places: list[tuple[int, Pattern, int]] = []
     for number, group in enumerate(found):
@@ -343,7 +343,7 @@ def contrast_block(study: Study) -> Block:
         raise NotDetermined("bernoulli", "the patterns are too noisy, or too few of their cells are in view")
     value = np.array([p.value[b] for _, p, b in places])
     frequency = np.array([label.x for label in labels])
-    covariance = joint_covariance(places, study) + np.diag(np.full(len(value), CONTRAST_FLOOR**2))
+    covariance = joint_covariance(places, dataset) + np.diag(np.full(len(value), CONTRAST_FLOOR**2))
     scales = [f"pattern:{number}:{p.channel}:{p.held_out}" for number, p, _ in places]
     # seen and held-out repeats of a pattern share one prediction
     poses: list[dict[str, tuple[Pattern, list[int], list[int]]]] = [{} for _ in found]
@@ -352,14 +352,14 @@ def contrast_block(study: Study) -> Block:
         members.append(k)
         parts.append(b)
     poses = [sights for sights in poses if sights]
-    plain = [_transfers(study, sights, ()) for sights in poses]
+    plain = [_transfers(dataset, sights, ()) for sights in poses]
     weights = {id(p): _node_weights(p) for sights in poses for p, *_ in sights.values()}
 
     def predict(effects: Effects) -> Prediction:
         mean = np.ones(len(places))
         if effects:
             for sights, before in zip(poses, plain, strict=True):
-                changed = _transfers(study, sights, effects) / np.where(np.abs(before) > 1e-3, before, np.inf)
+                changed = _transfers(dataset, sights, effects) / np.where(np.abs(before) > 1e-3, before, np.inf)
                 for (p, members, parts), ratio in zip(sights.values(), changed, strict=True):
                     real, imaginary, outside = weights[id(p)]
                     within, beyond = np.split(ratio, [real.shape[1]])
@@ -373,7 +373,7 @@ def contrast_block(study: Study) -> Block:
             jacobian[name] = CONTRAST_SCALE_STD * mean * np.array([s == name for s in scales])
         return Prediction(mean, jacobian)
 
-    return Block(
+    return Observable(
         measurement=BERNOULLI, reach=0.2, value=value, covariance=covariance,
         labels=tuple(labels), reads=TRANSFER_AT | SHOWN | {"image.transmittance"}, predict=predict,
         scale=np.ones(len(value)),
@@ -381,11 +381,11 @@ def contrast_block(study: Study) -> Block:
 
 
 def _transfers(
-    study: Study, sights: dict[str, tuple[Pattern, list[int], list[int]]], effects: Effects
+    dataset: Dataset, sights: dict[str, tuple[Pattern, list[int], list[int]]], effects: Effects
 ) -> NDArray[np.complex128]:
     """OTFs of the channels of one pose, (channels, nodes), at the nodes of all bands and then of the parts beyond the
     bands."""
-    camera, first = study.camera, next(iter(sights.values()))[0]
+    camera, first = dataset.camera, next(iter(sights.values()))[0]
     fx = np.concatenate([*(b.fx for b in first.bands), first.beyond[:, 0].ravel()])
     fy = np.concatenate([*(b.fy for b in first.bands), first.beyond[:, 1].ravel()])
     mixing = mixes_colours(camera, effects)
@@ -447,7 +447,7 @@ BERNOULLI = Measurement(
     order=410,
     axis="spatial_frequency",
     unit="cy/px",
-    make=contrast_block,
+    make=measure_bernoulli,
     quantity="contrast over the baseline's",
     conditions="orientation",
     conditions_words="bands at",
@@ -529,27 +529,27 @@ class Band:
     upper: NDArray[np.bool_]  # (nodes,): in the upper half of the band's frequencies
 
 
-def patterns(study: Study) -> list[list[Pattern]]:
-    """Return the fits of all Bernoulli patterns, computed once a study: a list for each (pose, target), by channel,
+def patterns(dataset: Dataset) -> list[list[Pattern]]:
+    """Return the fits of all Bernoulli patterns, computed once a dataset: a list for each (pose, target), by channel,
     seen and held out.
 
     Raises NotDetermined where f-number or pixel pitch isn't stated, and where no pattern is fitted.
     """
-    return study.once(_patterns)
+    return dataset.once(_patterns)
 
 
-def _patterns(study: Study) -> list[list[Pattern]]:
-    if not study.diffraction_is_known:
+def _patterns(dataset: Dataset) -> list[list[Pattern]]:
+    if not dataset.diffraction_is_known:
         raise NotDetermined("bernoulli", "f-number or pixel pitch isn't stated: no diffraction to draw patterns with")
-    captures: Any = study.recordings.captures
-    groups = study.groups(BernoulliCapture, lambda c: (c.screen.pose, c.target))
+    captures: Any = dataset.recordings.captures
+    groups = dataset.groups(BernoulliCapture, lambda c: (c.screen.pose, c.target))
     if not groups:
         raise NotDetermined("bernoulli", "no bernoulli captures")
     found, reason = [], ""
     for i, group in enumerate(groups):
         pose = group[0].screen.pose
         whites, blacks, boards = (
-            [c for c in captures(k, study.side) if c.screen.pose == pose]
+            [c for c in captures(k, dataset.side) if c.screen.pose == pose]
             for k in (WhiteCapture, BlackCapture, CheckerboardCapture)
         )
         missing = [n for n, some in (("white", whites), ("black", blacks), ("checkerboard", boards)) if not some]
@@ -558,7 +558,7 @@ def _patterns(study: Study) -> list[list[Pattern]]:
             continue
         out = held_out_of(group, i, 0) if len(group) > 1 else set()
         try:
-            found.append(_measured(study, group, whites, blacks, boards, out))
+            found.append(_measured(dataset, group, whites, blacks, boards, out))
         except NotDetermined as refused:
             reason = refused.reason
     if not found:
@@ -566,14 +566,14 @@ def _patterns(study: Study) -> list[list[Pattern]]:
     return found
 
 
-def mean_rate(study: Study, captures: Sequence[Capture]) -> FloatArray:
+def mean_rate(dataset: Dataset, captures: Sequence[Capture]) -> FloatArray:
     """Mean of the captures' frames above black level and dark current, DN/s. Raises NotDetermined where one is
     saturated."""
-    recordings, noise = study.recordings, study.noise
-    total = np.zeros((study.camera.rows, study.camera.cols))
+    recordings, noise = dataset.recordings, dataset.noise
+    total = np.zeros((dataset.camera.rows, dataset.camera.cols))
     for capture in captures:
         frame = recordings.frame(capture)
-        clipped = float(np.mean(frame >= study.saturation_dn))
+        clipped = float(np.mean(frame >= dataset.saturation_dn))
         if clipped > 0.001:
             raise NotDetermined("bernoulli", f"{capture.id}: {100 * clipped:.1f} % of the frame is saturated")
         total += (frame - noise.black) / max(capture.exposure_s, 1e-12) - noise.dark_dn_per_s
@@ -581,7 +581,7 @@ def mean_rate(study: Study, captures: Sequence[Capture]) -> FloatArray:
 
 
 def _measured(
-    study: Study,
+    dataset: Dataset,
     group: Sequence[Any],
     whites: Sequence[Any],
     blacks: Sequence[Any],
@@ -590,35 +590,35 @@ def _measured(
 ) -> list[Pattern]:
     """Return the fits of one pattern at one pose. `group`: its captures, of which those in `out` are held out;
     `boards`: checkerboards."""
-    camera = study.camera
-    white, black = mean_rate(study, whites), mean_rate(study, blacks)
+    camera = dataset.camera
+    white, black = mean_rate(dataset, whites), mean_rate(dataset, blacks)
     contrast = white - black
     for plane in mosaic.planes(contrast, camera.cfa).values():
         plane[plane < 0.2 * np.quantile(plane, 0.98)] = np.nan  # beside the screen
     boards = [c for c in boards if c.target == boards[0].target]
-    cells = study.recordings.target(group[0].target)
+    cells = dataset.recordings.target(group[0].target)
     if cells.size < FEWEST_CELLS or not 0.02 < float(np.mean(cells > 0)) < 0.98:
         raise NotDetermined("bernoulli", f"{group[0].target} holds no random pattern of {FEWEST_CELLS} cells or more")
     target = np.asarray(cells, float) / float(cells.max())
     parts = [p for p in ([c for c in group if c.id not in out], [c for c in group if c.id in out]) if p]
-    seen = [(mean_rate(study, part) - black) / contrast for part in parts]
+    seen = [(mean_rate(dataset, part) - black) / contrast for part in parts]
     whole = np.average(seen, axis=0, weights=[len(p) for p in parts])
     warp = register(
-        (mean_rate(study, boards) - black) / contrast, whole, study.recordings.target(boards[0].target),
+        (mean_rate(dataset, boards) - black) / contrast, whole, dataset.recordings.target(boards[0].target),
         (target > 0.5).astype(np.uint8), group[0].screen.cell_camera_px, reference_pixels(whole.shape, camera.cfa),
     )  # fmt: skip
-    light = study.spectrum(group[0].screen.radiance) if group[0].screen.radiance else None
+    light = dataset.spectrum(group[0].screen.radiance) if group[0].screen.radiance else None
     window = pattern_window(whole, warp, target.shape)
     reference = "Y" if camera.cfa == "MONO" else "G"
-    warp = _refine_warp(study, whole, target, warp, window, reference, light)
+    warp = _refine_warp(dataset, whole, target, warp, window, reference, light)
     canvas = Canvas.of(target, warp, window)
     # the same nodes for all channels, so that an effect's OTF is evaluated once
-    otfs = [lens_otf(study, channel, light) for channel in camera.channels]
+    otfs = [lens_otf(dataset, channel, light) for channel in camera.channels]
     laid = np.sum([np.square(np.abs(canvas.low * canvas.passed(otf, camera.fill_factor))) for otf in otfs], axis=0)
     turned = ndimage.gaussian_filter(np.nan_to_num(whole), GHOST_BLUR_PX)[::-1, ::-1]
     found = []
     for channel in camera.channels:
-        design = _LinearModel.of(study, canvas, channel, light, whole, turned, laid)
+        design = _LinearModel.of(dataset, canvas, channel, light, whole, turned, laid)
         picture = whole[window]
         points = mask_points(design.mask, window)
         drawn, moved = canvas, np.zeros(len(design.coefficients(picture[design.mask])[design.shifts]))
@@ -634,7 +634,9 @@ def _measured(
                 field = _field(camera, points, moved + part)
                 there = np.linalg.lstsq(warp.basis(points).T, field.T, rcond=1e-12)[0].T
                 displaced = Canvas.of(target, warp.displace(there), window)
-                tried.append((part, displaced, _LinearModel.of(study, displaced, channel, light, whole, turned, laid)))
+                tried.append(
+                    (part, displaced, _LinearModel.of(dataset, displaced, channel, light, whole, turned, laid))
+                )
             part, displaced, anew = min(tried, key=lambda one: one[2].left_rms(picture))
             if anew.left_rms(picture) >= design.left_rms(picture):
                 break
@@ -642,14 +644,14 @@ def _measured(
         area = contrast[window][design.mask]
         exposure = group[0].exposure_s
         levels = (
-            float(np.nanmean(black[window][design.mask])) * exposure / study.noise.gain,
-            float(np.nanmean(white[window][design.mask])) * exposure / study.noise.gain,
+            float(np.nanmean(black[window][design.mask])) * exposure / dataset.noise.gain,
+            float(np.nanmean(white[window][design.mask])) * exposure / dataset.noise.gain,
         )
-        ghost_by, shown_by = _ghost_by(study, design, whole, window), _shown_by(study, design, drawn)
+        ghost_by, shown_by = _ghost_by(dataset, design, whole, window), _shown_by(dataset, design, drawn)
         solved = []
         for part, picture in zip(parts, seen, strict=True):
             dn = np.maximum(picture[window][design.mask] * area + black[window][design.mask], 0.0) * exposure
-            temporal = (study.noise.gain * dn + study.noise.read_dn**2) / len(part) / (area * exposure) ** 2
+            temporal = (dataset.noise.gain * dn + dataset.noise.read_dn**2) / len(part) / (area * exposure) ** 2
             solved.append(design.solved(picture[window][design.mask], temporal))
         # one matrix for seen and held-out repeats, so that their joint covariance stays positive definite
         common = np.mean([c for *_, c in solved], axis=0)
@@ -688,7 +690,7 @@ def _field(camera: CameraModel, points: FloatArray, shifts: FloatArray) -> Float
 
 
 def _ghost_by(
-    study: Study, design: _LinearModel, seen: FloatArray, window: tuple[slice, slice]
+    dataset: Dataset, design: _LinearModel, seen: FloatArray, window: tuple[slice, slice]
 ) -> Callable[[Effects], float]:
     """Function of effects: change of the ghost's coefficient by their reflections. They act on the pattern's and on the
     lit screen's image, whose ratio is fitted."""
@@ -698,21 +700,21 @@ def _ghost_by(
 
     def coefficient(effects: Effects) -> float:
         shown, white = picture, lit
-        shown, white = (with_reflections(study.camera, image, effects) for image in (shown, white))
+        shown, white = (with_reflections(dataset.camera, image, effects) for image in (shown, white))
         after = shown[window][design.mask] / np.maximum(white[window][design.mask], 1e-6)
         return float(weight @ (after - before))
 
     return coefficient
 
 
-def _shown_by(study: Study, design: _LinearModel, canvas: Canvas) -> Callable[[Effects], FloatArray]:
+def _shown_by(dataset: Dataset, design: _LinearModel, canvas: Canvas) -> Callable[[Effects], FloatArray]:
     """Function of effects: change (k,) of a pattern's coefficients by those on the screen's light. The pattern is drawn
     as such a screen shows it, over the lit screen."""
     none = np.zeros(len(design.weights))
 
     @lru_cache(maxsize=8)
     def changed(showing: tuple[Effect, ...]) -> FloatArray:
-        change = canvas.picture((canvas.as_shown(showing, study.camera) - canvas.low) * design.passed)
+        change = canvas.picture((canvas.as_shown(showing, dataset.camera) - canvas.low) * design.passed)
         return np.asarray(design.weights @ change[design.mask])
 
     def coefficients(effects: Effects) -> FloatArray:
@@ -723,7 +725,7 @@ def _shown_by(study: Study, design: _LinearModel, canvas: Canvas) -> Callable[[E
 
 
 def _refine_warp(
-    study: Study,
+    dataset: Dataset,
     seen: FloatArray,
     target: FloatArray,
     warp: ScreenWarp,
@@ -738,9 +740,9 @@ def _refine_warp(
     the step's smooth OTF doesn't follow then looks like a displacement, up to 0.2 px, and the next steps go on from
     there. The residual is therefore compared with a smooth OTF of `JUDGED_ORDER`. A displacement that it doesn't show
     is left at what the corners say."""
-    best = _PlacedPattern.of(study, seen, target, warp, window, channel, light)
+    best = _PlacedPattern.of(dataset, seen, target, warp, window, channel, light)
     for _ in range(REFINEMENTS):
-        tried = _PlacedPattern.of(study, seen, target, best.step(), window, channel, light)
+        tried = _PlacedPattern.of(dataset, seen, target, best.step(), window, channel, light)
         if tried.left_rms >= best.left_rms:
             break
         best = tried
@@ -759,7 +761,7 @@ class _PlacedPattern:
 
     @staticmethod
     def of(
-        study: Study,
+        dataset: Dataset,
         seen: FloatArray,
         target: FloatArray,
         warp: ScreenWarp,
@@ -769,11 +771,11 @@ class _PlacedPattern:
     ) -> _PlacedPattern:
         """Draw the cells `target` for the window of the recorded image `seen`. Raises NotDetermined for too few
         pixels."""
-        canvas, otf = Canvas.of(target, warp, window), lens_otf(study, channel, light)
-        mask = channel_pixels(study, canvas, channel, seen)
+        canvas, otf = Canvas.of(target, warp, window), lens_otf(dataset, channel, light)
+        mask = channel_pixels(dataset, canvas, channel, seen)
         whole = canvas.whole
         lens = whole.spectrum * otf(np.minimum(np.hypot(whole.fx, whole.fy), otf.x[-1]))
-        drawn = lens * aperture_otf(whole.fx, whole.fy, study.camera.fill_factor)
+        drawn = lens * aperture_otf(whole.fx, whole.fy, dataset.camera.fill_factor)
         picture, across, down = (
             canvas.sampled(part)[mask] for part in (drawn, 2j * np.pi * whole.fx * drawn, 2j * np.pi * whole.fy * drawn)
         )
@@ -849,7 +851,7 @@ class _LinearModel:
 
     @staticmethod
     def of(
-        study: Study,
+        dataset: Dataset,
         canvas: Canvas,
         channel: str,
         light: Spectrum | None,
@@ -859,13 +861,13 @@ class _LinearModel:
     ) -> _LinearModel:
         """Return the model of a channel. `seen`: the recorded image; `turned`: the same, blurred and rotated by 180
         degrees; `laid` (rows, cols / 2 + 1): power spectrum by which the nodes of the bands are placed."""
-        camera = study.camera
+        camera = dataset.camera
         fy, fx = canvas.frequencies
         radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
-        otf = lens_otf(study, channel, light)
+        otf = lens_otf(dataset, channel, light)
         passed = canvas.passed(otf, camera.fill_factor)
         spectrum = canvas.low * passed
-        mask = channel_pixels(study, canvas, channel, seen)
+        mask = channel_pixels(dataset, canvas, channel, seen)
         power = np.abs(spectrum) ** 2
         bands, columns, halves, turned_halves = [], [], [], []
         inside = radius < RINGS_CY_PER_PX[-1]
@@ -997,7 +999,7 @@ def _band(
     )
 
 
-def joint_covariance(places: Sequence[tuple[int, Pattern, int]], study: Study) -> FloatArray:
+def joint_covariance(places: Sequence[tuple[int, Pattern, int]], dataset: Dataset) -> FloatArray:
     """Covariance (n, n) of n coefficients, each (number of the group, pattern, index).
 
     Seen and held-out repeats of one pattern in one channel share `Pattern.common`.
@@ -1020,19 +1022,19 @@ def joint_covariance(places: Sequence[tuple[int, Pattern, int]], study: Study) -
 BORDER_FLOOR = 0.0015  # standard deviation of the light at borders beside noise
 
 
-def cell_border_block(study: Study) -> Block:
+def measure_cell_borders(dataset: Dataset) -> Observable:
     """Coefficient of P (1 - P) in the fit of the pattern P, which is 0 on dark and 1 on lit cells (`pattern_fit`).
 
     It is the excess of light where the blurred picture is grey: at borders of cells. A nonlinear response of the camera
     and the grey levels of the screen change it.
     """
-    found = patterns(study)
+    found = patterns(dataset)
     points = [(g, p, len(p.bands) + BORDER) for g, group in enumerate(found) for p in group]
     value = np.array([p.value[b] for _, p, b in points])
 
     def predict(effects: Effects) -> Prediction:
         mean = np.zeros(len(points))
-        model = Uniform(study.camera, effects)
+        model = Uniform(dataset.camera, effects)
         for k, (_, p, b) in enumerate(points):
             mean[k] = p.shown_by(effects)[b]
             if not model.is_linear:
@@ -1042,9 +1044,9 @@ def cell_border_block(study: Study) -> Block:
                 mean[k] += 4.0 * float((out[1] - out[0]) / (out[2] - out[0]) - 0.5)
         return Prediction(mean, {})
 
-    return Block(
+    return Observable(
         measurement=CELL_BORDERS, reach=1e9, value=value,
-        covariance=joint_covariance(points, study) + np.diag(np.full(len(value), BORDER_FLOOR**2)),
+        covariance=joint_covariance(points, dataset) + np.diag(np.full(len(value), BORDER_FLOOR**2)),
         labels=tuple(Label(float(i), p.channel, "borders of cells", p.captures, p.held_out) for i, (_, p,
         _) in enumerate(points)),
         reads=SHOWN | {"signal.response"}, predict=predict, scale=np.ones(len(value)),
@@ -1057,7 +1059,7 @@ CELL_BORDERS = Measurement(
     order=420,
     axis="level",
     unit="1",
-    make=cell_border_block,
+    make=measure_cell_borders,
     quantity="excess light at borders, share",
     places="borders",
 )
@@ -1069,18 +1071,18 @@ CELL_BORDERS = Measurement(
 GHOST_FLOOR = 1.5e-4  # standard deviation of a ghost's share beside noise
 
 
-def ghost_block(study: Study) -> Block:
+def measure_ghost(dataset: Dataset) -> Observable:
     """Coefficient of the rotated image in the fit of the pattern: the ghost's share of the light."""
-    points = [(g, p, len(p.bands) + GHOST) for g, group in enumerate(patterns(study)) for p in group]
+    points = [(g, p, len(p.bands) + GHOST) for g, group in enumerate(patterns(dataset)) for p in group]
     value = np.array([p.value[b] for _, p, b in points])
 
     def predict(effects: Effects) -> Prediction:
         reflecting = acting(effects, REFLECTIONS)
         return Prediction(np.array([p.ghost(effects) if reflecting else 0.0 for _, p, _ in points]), {})
 
-    return Block(
+    return Observable(
         measurement=PATTERN_GHOST, reach=1e9, value=value,
-        covariance=joint_covariance(points, study) + np.diag(np.full(len(value), GHOST_FLOOR**2)),
+        covariance=joint_covariance(points, dataset) + np.diag(np.full(len(value), GHOST_FLOOR**2)),
         labels=tuple(Label(float(i), p.channel, "ghost", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
         reads=REFLECTIONS, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
@@ -1092,7 +1094,7 @@ PATTERN_GHOST = Measurement(
     order=430,
     axis="level",
     unit="1",
-    make=ghost_block,
+    make=measure_ghost,
     quantity="ghost's share of the light",
     places="ghosts",
 )

@@ -9,7 +9,7 @@ from functools import cache, cached_property, partial
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.reads import acting
 from sim.effects.base import Effect, Effects
 from sim.spectrum import FloatArray, Spectrum, linear_shares
@@ -41,7 +41,7 @@ class CurveJacobian:
 
     def __init__(
         self,
-        study: Study,
+        dataset: Dataset,
         items: Sequence[tuple[str, str, float, str, Spectrum | None]],
         measured_e_per_s: FloatArray | None = None,
         scale: float = 1.0,
@@ -49,10 +49,10 @@ class CurveJacobian:
         """`items`: n of (path of the radiance, channel, exposure in s, kind of capture, reflectance).
         `measured_e_per_s` (n,): where gain, f-number or pitch aren't known, the rates are scaled to their sum, and the
         common level is a nuisance parameter. `scale`: a factor on all rates."""
-        self.study, self.items = study, items
+        self.dataset, self.items = dataset, items
         self.kind = items[0][3]
-        lights = {path: study.spectrum(path) for path in {item[0] for item in items}}
-        camera = study.camera
+        lights = {path: dataset.spectrum(path) for path in {item[0] for item in items}}
+        camera = dataset.camera
         low = min(light.arrays[0][0] for light in lights.values())
         high = max(light.arrays[0][-1] for light in lights.values())
         self.wavelength = np.arange(np.floor(low), np.ceil(high) + 1.0)
@@ -74,7 +74,7 @@ class CurveJacobian:
             [electron_rate(camera, c, lights[path], kind=kind, reflectance=r) for path, c, _, kind, r in items]
         )
         #: Factor on the rates, for the unknown gain, aperture or pixel area.
-        self.scale, self._is_free = scale, measured_e_per_s is not None and not study.level_is_known
+        self.scale, self._is_free = scale, measured_e_per_s is not None and not dataset.level_is_known
         if measured_e_per_s is not None and self._is_free:
             self.scale = max(float(measured_e_per_s.sum()), 1e-9) / max(float(self._rate.sum()), 1e-300)
         self._rate = self._rate * self.scale
@@ -99,7 +99,7 @@ class CurveJacobian:
         """Standard deviation (n,) of the rates, e/s, by the rounding of the curves' values, each independent."""
         found = []
         for i, (path, channel, *_) in enumerate(self.items):
-            samples, value = self.study.camera.quantum_efficiency[channel].arrays
+            samples, value = self.dataset.camera.quantum_efficiency[channel].arrays
             share = self.radiance[path] * self._level[i] / (LEAK_STD * value.max())
             each = linear_shares(self.wavelength, share, samples)
             found.append(
@@ -118,7 +118,7 @@ class CurveJacobian:
         deviation: of most sets of effects, nobody asks for these."""
         spectral = acting(effects, SPECTRAL)
         if spectral not in self._kept:
-            model = Uniform(self.study.camera, spectral)
+            model = Uniform(self.dataset.camera, spectral)
             weight, *_ = self._weights(spectral, model)
             through = model.transmittance(self.wavelength)
             rate = self._rate * (weight @ through) / np.maximum(self._total, 1e-300)
@@ -151,7 +151,7 @@ class CurveJacobian:
         """Name of a nuisance parameter -> derivative (n,) of the rates, e/s per prior standard deviation."""
         table = self._under(effects)[1]()
         named = {}
-        for channel in self.study.channels:
+        for channel in self.dataset.channels:
             mine = np.array([item[1] == channel for item in self.items])
             if mine.any():
                 for i in range(table.shape[1]):

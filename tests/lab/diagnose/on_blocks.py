@@ -14,9 +14,9 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.gaussian import chi2
-from lab.observables.observable import Block, Measurement
+from lab.observables.observable import Measurement, Observable
 from mocks.former import ConcealedCamera, Law, Plan
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
@@ -32,7 +32,7 @@ WAVELENGTH = np.arange(380.0, 781.0)
 def declared(name: str, axis: str, unit: str, *, conditions: str = "", places: str = "") -> Measurement:
     """The declaration of a measurement whose numbers a test makes up."""
 
-    def make(study: Study) -> Block:
+    def make(dataset: Dataset) -> Observable:
         raise NotImplementedError(f"{name}: a test makes its numbers")
 
     return Measurement(name, name, 0, axis, unit, make, "made up", conditions=conditions, places=places)
@@ -45,16 +45,16 @@ def former(
     return recordings_of(ConcealedCamera(seed, laws, cfa=cfa, rows=96, cols=128), Plan(kinds, shuttle=shuttle))
 
 
-def study(recordings: RecordingSet) -> Study:
-    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+def dataset(recordings: RecordingSet) -> Dataset:
+    return Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
-def measured_model(recordings: RecordingSet, *makers: Callable[[Study], Block]) -> MeasurementModel:
-    looked_at = study(recordings)
+def measured_model(recordings: RecordingSet, *makers: Callable[[Dataset], Observable]) -> MeasurementModel:
+    looked_at = dataset(recordings)
     return MeasurementModel(tuple(make(looked_at) for make in makers), looked_at.camera)
 
 
-def verdict(recordings: RecordingSet, *makers: Callable[[Study], Block]) -> Verdict:
+def verdict(recordings: RecordingSet, *makers: Callable[[Dataset], Observable]) -> Verdict:
     return decide(measured_model(recordings, *makers), np.random.default_rng(0), DecisionPolicy())
 
 

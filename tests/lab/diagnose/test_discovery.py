@@ -13,7 +13,7 @@ from lab.challenge.draw import recording_set, recordings_of
 from lab.diagnose import diagnose, discovery, examine
 from lab.diagnose.discovery import PredictiveTable, discover, law_of
 from lab.diagnose.discovery.profile import Profile, curve_forms, description_length, fitted, formulas
-from lab.diagnose.inference.side_model import study_of
+from lab.diagnose.inference.side_model import dataset_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.fit import FOR_DIAGNOSIS, fit_recording_set
 from lab.formats.importers import ImportOptions, read_foreign
@@ -64,7 +64,7 @@ def _changed(seed: int, change: Callable[[Frame, str, float], Frame], cfa: str =
 
 
 def _found(recordings: RecordingSet) -> tuple[PredictiveTable, ...]:
-    return discover(study_of(recordings, "left"), (), DecisionPolicy())
+    return discover(dataset_of(recordings, "left"), (), DecisionPolicy())
 
 
 @pytest.mark.parametrize("seed", [772011, 772012, 772013])
@@ -142,8 +142,8 @@ def test_offsets_of_columns_are_told_from_gains() -> None:
     one = found["signal", "column"]
     assert one.period == 4
     assert one.departure == pytest.approx(offset, abs=0.1)  # darks of 96 rows, rounded to 1 DN
-    study = study_of(recordings, "left")
-    assert np.array(law_of(one, study).table) * study.noise.gain == pytest.approx(one.departure)
+    dataset = dataset_of(recordings, "left")
+    assert np.array(law_of(one, dataset).table) * dataset.noise.gain == pytest.approx(one.departure)
 
 
 def test_what_a_named_effect_does_is_no_law() -> None:
@@ -152,10 +152,10 @@ def test_what_a_named_effect_does_is_no_law() -> None:
     def shifted(frame: Frame, kind: str, black_dn: float) -> Frame:
         return frame + np.resize([-1.0, 1.0], frame.shape[1])
 
-    study = study_of(_changed(772012, shifted), "left")
-    assert [one.period for one in discover(study, (), DecisionPolicy())] == [2]
-    named = ColumnNoise(odd_even_e=2.0 / study.noise.gain)
-    assert not discover(study, (named,), DecisionPolicy())
+    dataset = dataset_of(_changed(772012, shifted), "left")
+    assert [one.period for one in discover(dataset, (), DecisionPolicy())] == [2]
+    named = ColumnNoise(odd_even_e=2.0 / dataset.noise.gain)
+    assert not discover(dataset, (named,), DecisionPolicy())
 
 
 def test_one_bright_line_is_no_law() -> None:
@@ -182,7 +182,7 @@ def test_the_step_where_two_read_outs_meet_is_found_with_its_size(cfa: str) -> N
     assert np.flatnonzero(np.diff(light)).tolist() == [63]
     assert light[-1] - light[0] == pytest.approx(0.01, abs=0.01 * per_column + 1e-3)  # taken at a mean of unlike halves
     assert dark[-1] - dark[0] == pytest.approx(3.0, abs=5.0 * per_column)
-    law = law_of(found["charge"], study_of(recordings, "left"))
+    law = law_of(found["charge"], dataset_of(recordings, "left"))
     assert law.at == pytest.approx((63.5 / 128, 64.5 / 128))
 
 
@@ -203,7 +203,7 @@ def test_pixels_that_differ_within_a_cell_are_found() -> None:
     recordings = _changed(772012, shaded)
     (one,) = _found(recordings)
     assert (one.look.stage, one.look.along) == ("charge", "row and column")
-    law = law_of(one, study_of(recordings, "left"))
+    law = law_of(one, dataset_of(recordings, "left"))
     cell = np.array(law.table).reshape(law.period, law.columns) - 1.0
     # pixels scatter by 1 %, 96 x 128 of them in two classes
     assert cell[:2, :2] == pytest.approx(board, abs=4.0 * 0.01 / np.sqrt(96 * 128 / 4))
@@ -220,8 +220,8 @@ def test_rows_of_unequal_noise_in_the_dark_are_found() -> None:
     recordings = _changed(772012, noisier)
     (one,) = _found(recordings)
     assert (one.look.stage, one.look.along, one.look.of, one.period) == ("signal", "row", "variance", 4)
-    study = study_of(recordings, "left")
-    added_dn2 = study.noise.gain**2 * np.array(law_of(one, study).table)
+    dataset = dataset_of(recordings, "left")
+    added_dn2 = dataset.noise.gain**2 * np.array(law_of(one, dataset).table)
     assert int(np.argmax(added_dn2)) == 1
     # variances of 24 rows of 128 pixels by two contrasts are known to sqrt(2 / 6144) = 1.8 %, of some 30 DN^2
     assert added_dn2[1] - np.delete(added_dn2, 1).mean() == pytest.approx(25.0, rel=0.15)
@@ -233,7 +233,7 @@ def test_beyond_a_number_of_codes_none_are_tabled(monkeypatch: pytest.MonkeyPatc
     recordings = recordings_of(ConcealedCamera(772302, (DigitalGainLaw(10.0),), rows=96, cols=128), LIT_AND_DARK)
     (one,) = _found(recordings)
     assert one.period == 11
-    (law,) = discovery.told("left", study_of(recordings, "left"), (one,))
+    (law,) = discovery.told("left", dataset_of(recordings, "left"), (one,))
     assert "Single codes aren't tabled: more than 1000 were counted" in law.statement
     assert max(len(law.table), len(law.shown_departure)) == 11
     assert not _found(recordings_of(ConcealedCamera(772021, (LossyCodesLaw(0.05),), rows=96, cols=128), LIT_AND_DARK))
@@ -348,7 +348,7 @@ def test_the_codes_of_a_real_ccd_repeat_every_four(tmp_path: Path) -> None:
     """An independent look: four numbers take most off chi2 of codes left out, a table by code more (to 2.7)."""
     recordings = read(write(read_foreign("emva1288", DATA / "emva1288_ccd", ImportOptions()), tmp_path / "set"))
     fit = fit_recording_set(recordings, None, FOR_DIAGNOSIS)
-    found = discover(study_of(recordings, "left", fit), (), DecisionPolicy())
+    found = discover(dataset_of(recordings, "left", fit), (), DecisionPolicy())
     codes = next(one for one in found if one.look.stage == "codes")
     assert codes.shorter[0].period == 4
     before, after, n = codes.chi2
@@ -391,9 +391,9 @@ def test_noise_that_grows_with_the_time_is_found() -> None:
     recordings = recordings_of(camera, Plan())
     one = _found(recordings)[0]
     assert (one.look.stage, one.look.along, one.look.of) == ("signal", "time", "variance")
-    law = law_of(one, study_of(recordings, "left"))
+    law = law_of(one, dataset_of(recordings, "left"))
     slope = (law.table[-1] - law.table[0]) / (law.at[-1] - law.at[0])
-    std = 4.0 * float(one.std.max()) / study_of(recordings, "left").noise.gain ** 2 / (law.at[-1] - law.at[0])
+    std = 4.0 * float(one.std.max()) / dataset_of(recordings, "left").noise.gain ** 2 / (law.at[-1] - law.at[0])
     assert slope == pytest.approx(16.0 / 600.0, abs=max(std, 0.1 * 16.0 / 600.0))
 
 

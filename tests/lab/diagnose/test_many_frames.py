@@ -15,7 +15,7 @@ from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.acquisition_errors import exchanged_frames
 from lab.observables.darks.frames import dark_frames
-from lab.observables.dataset import Study, mean_frame
+from lab.observables.dataset import Dataset, mean_frame
 from lab.observables.noise.figures import TemporalVariance
 
 SIDE_PX = 128
@@ -59,15 +59,15 @@ def _recordings(repeats: int) -> RecordingSet:
     return RecordingSet(manifest, frames, cache_bytes=0)
 
 
-def _study(recordings: RecordingSet) -> Study:
-    return Study(recordings, "left", camera_model(recordings, "left"))
+def _dataset(recordings: RecordingSet) -> Dataset:
+    return Dataset(recordings, "left", camera_model(recordings, "left"))
 
 
 STEPS: dict[str, Callable[[RecordingSet], Any]] = {
     "exposures of darks": lambda recordings: misstated_dark_exposure(recordings, "left"),
     "exchanged frames": lambda recordings: exchanged_frames(recordings, "left"),
-    "first estimates": _study,
-    "dark frames": lambda recordings: dark_frames(_study(recordings)),
+    "first estimates": _dataset,
+    "dark frames": lambda recordings: dark_frames(_dataset(recordings)),
     "mean frame": lambda recordings: mean_frame(recordings, recordings.captures("flat")),
 }
 

@@ -16,8 +16,8 @@ from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.outcome.mismatches import located, unexplained
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet
-from lab.observables.darks.level import dark_level_block
-from lab.observables.flats.linearity import linearity_block
+from lab.observables.darks.level import measure_dark
+from lab.observables.flats.linearity import measure_photon_transfer
 from mocks.former import ConcealedCamera, Plan
 from tests.lab.diagnose.on_blocks import measured_model, verdict
 
@@ -51,7 +51,7 @@ PLACES = {
 @pytest.mark.parametrize("place", PLACES)
 def test_captures_with_a_wrong_shutter_are_found(factor: float, place: str) -> None:
     frames, shuttle = PLACES[place]
-    model = measured_model(_recorded(3, factor, frames, shuttle=shuttle), linearity_block)
+    model = measured_model(_recorded(3, factor, frames, shuttle=shuttle), measure_photon_transfer)
     (level,) = outlying_levels(model, 0, (), DecisionPolicy())
     assert level.captures == tuple(f"c{k:04d}" for k in frames)
     assert abs(level.factor - factor) < 4.0 * level.factor_std
@@ -69,7 +69,7 @@ def test_captures_with_a_wrong_shutter_are_found(factor: float, place: str) -> N
 def test_a_wrong_shutter_is_told_and_not_named(place: str) -> None:
     frames, shuttle = PLACES[place]
     recordings = _recorded(3, 1.1, frames, shuttle=shuttle)
-    found = verdict(recordings, linearity_block)
+    found = verdict(recordings, measure_photon_transfer)
     assert not found.named
     assert not found.kernels  # a wrong shutter is no property of the camera
     assert located("left", found)
@@ -85,7 +85,9 @@ def test_a_wrong_shutter_disturbs_no_other_measurement() -> None:
     """The level pulls at the black level that darks share with it: held-out darks contradict the others for that, until
     it has a factor."""
     frames, shuttle = PLACES["a seen level"]
-    model = measured_model(_recorded(3, 1.25, frames, shuttle=shuttle, cfa="RGGB"), linearity_block, dark_level_block)
+    model = measured_model(
+        _recorded(3, 1.25, frames, shuttle=shuttle, cfa="RGGB"), measure_photon_transfer, measure_dark
+    )
     policy = DecisionPolicy()
     outlying = {0: outlying_levels(model, 0, (), policy)}
     assert outlying[0]
@@ -96,7 +98,7 @@ def test_a_wrong_shutter_disturbs_no_other_measurement() -> None:
 
 def test_healthy_levels_have_no_outlier() -> None:
     for seed, shuttle in ((4, False), (5, True)):
-        found = verdict(_recorded(seed, 1.0, (), shuttle=shuttle, cfa="RGGB"), linearity_block)
+        found = verdict(_recorded(seed, 1.0, (), shuttle=shuttle, cfa="RGGB"), measure_photon_transfer)
         assert not found.before
         assert not found.held_out
         assert not found.outlying
@@ -109,7 +111,7 @@ def test_factors_of_a_wrong_shutter_have_true_uncertainties() -> None:
     pulls = []
     for seed in range(20, 40):
         (level,) = verdict(
-            _recorded(seed, 1.1, range(DARKS + 12, DARKS + 15), shuttle=False), linearity_block
+            _recorded(seed, 1.1, range(DARKS + 12, DARKS + 15), shuttle=False), measure_photon_transfer
         ).outlying[0]
         pulls.append((level.factor - 1.1) / level.factor_std)
     assert np.mean(np.square(pulls)) < 1.0 + 3.0 * np.sqrt(2.0 / 20)

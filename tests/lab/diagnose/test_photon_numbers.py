@@ -14,10 +14,10 @@ from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.camera_model import assumptions, camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
-from lab.observables.flats.linearity import linearity_block, misstated_levels
+from lab.observables.flats.linearity import measure_photon_transfer, misstated_levels
 from sim.effects.base import Effect
 from sim.effects.nonlinearity import Nonlinearity
-from tests.lab.diagnose.on_blocks import measured_model, names, rendered, sigmas, study, verdict
+from tests.lab.diagnose.on_blocks import dataset, measured_model, names, rendered, sigmas, verdict
 
 PHOTONS_PER_S = 4.0e6
 WAVELENGTH_NM = 540.0
@@ -48,7 +48,7 @@ def _fit(recordings: RecordingSet) -> FitResult:
 
 def test_a_linear_camera_agrees_with_its_photon_numbers() -> None:
     """chi2 / n within 4 standard deviations above its mean; it may be less, as readings have a tolerance."""
-    model = measured_model(_recorded(), linearity_block)
+    model = measured_model(_recorded(), measure_photon_transfer)
     assert len(model.value) == 24  # eight levels, three repeats
     assert sigmas(model) < 4.0
     assert not mismatches(model, model.gaussian(), DecisionPolicy())
@@ -56,7 +56,7 @@ def test_a_linear_camera_agrees_with_its_photon_numbers() -> None:
 
 def test_a_bent_response_is_named_from_photon_numbers() -> None:
     """3 % at full scale, which exposures alone would show, too; the photons vary with them here."""
-    assert names(verdict(_recorded(Nonlinearity(quadratic_percent=-3.0)), linearity_block)) == ["nonlinearity"]
+    assert names(verdict(_recorded(Nonlinearity(quadratic_percent=-3.0)), measure_photon_transfer)) == ["nonlinearity"]
 
 
 def test_photons_at_one_exposure_are_levels() -> None:
@@ -68,7 +68,7 @@ def test_photons_at_one_exposure_are_levels() -> None:
             capture["exposure_s"] = 0.01
     frames = {c.frame: recordings.frame(c) for c in recordings.manifest.captures}
     dimmed = RecordingSet(Manifest.model_validate(content), frames, source="dimmed")
-    model = measured_model(dimmed, linearity_block)
+    model = measured_model(dimmed, measure_photon_transfer)
     assert not mismatches(model, model.gaussian(), DecisionPolicy())
     assert len({label.condition for label in model.blocks[0].labels}) == 8
 
@@ -99,7 +99,7 @@ def test_flats_of_which_no_light_is_stated_are_refused() -> None:
         Manifest.model_validate(content), {c.frame: recordings.frame(c) for c in recordings.manifest.captures}
     )
     with pytest.raises(NotDetermined, match="without a radiance file or photon numbers"):
-        linearity_block(study(unlit))
+        measure_photon_transfer(dataset(unlit))
 
 
 def test_the_measured_efficiency_is_the_models_at_its_wavelength() -> None:

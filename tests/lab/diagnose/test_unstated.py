@@ -17,7 +17,7 @@ from lab.diagnose.inference.side_model import measurement_model
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from mocks.former import ConcealedCamera, Plan
 
 
@@ -92,7 +92,7 @@ def test_edges_in_unknown_light_are_not_called_defocus() -> None:
 def test_the_gain_is_estimated_from_any_repeated_captures() -> None:
     """By repeats of a chart to a few per cent: thousands of pixels, but pixels of a level aren't quite alike."""
     studies = [
-        Study(r, "left", camera_model(r, "left", None, maker_curves=True))
+        Dataset(r, "left", camera_model(r, "left", None, maker_curves=True))
         for r in (_whole(), _changed(_only("chart")), _changed(_only("narrowband")))
     ]
     by_flats, by_chart, by_single = (s.noise for s in studies)

@@ -10,13 +10,13 @@ from lab.diagnose.inference.refit import refit
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.observables.spectra.curves import BEYOND_STD, LEAK_STD, CurveJacobian, _last_place
-from lab.observables.spectra.narrowband import narrowband_block
+from lab.observables.spectra.narrowband import measure_narrowband
 from mocks.former import Law
 from mocks.former.laws import StrayLightLaw
 from sim.effects.stray_light import StrayLight
 from sim.spectrum import Spectrum
 from sim.uniform import electron_rate
-from tests.lab.diagnose.on_blocks import former, measured_model, study
+from tests.lab.diagnose.on_blocks import dataset, former, measured_model
 
 
 def test_decimals_of_a_curve_are_counted() -> None:
@@ -27,7 +27,7 @@ def test_decimals_of_a_curve_are_counted() -> None:
 def test_a_leak_is_a_flat_sensitivity_and_a_scale_the_curve_itself() -> None:
     """The leak's column against the forward model with a curve of LEAK_STD of the peak: sums at 1 nm, good to 1e-3."""
     recordings = former(3, kinds=("dark", "narrowband"))
-    looked_at = study(recordings)
+    looked_at = dataset(recordings)
     capture = recordings.captures("narrowband")[8]
     curves = CurveJacobian(looked_at, [(capture.radiance, "Y", capture.exposure_s, "narrowband", None)])
     columns = list(curves.jacobian(()).values())
@@ -43,7 +43,7 @@ def test_a_leak_is_a_flat_sensitivity_and_a_scale_the_curve_itself() -> None:
 def test_rounding_of_unrounded_curves_is_next_to_nothing() -> None:
     recordings = former(3, kinds=("dark", "narrowband"))
     capture = recordings.captures("narrowband")[8]
-    curves = CurveJacobian(study(recordings), [(capture.radiance, "Y", capture.exposure_s, "narrowband", None)])
+    curves = CurveJacobian(dataset(recordings), [(capture.radiance, "Y", capture.exposure_s, "narrowband", None)])
     assert curves.rounding[0] < 1e-5 * curves.rates(())[0]
 
 
@@ -66,7 +66,7 @@ def _short_curves(*laws: Law) -> RecordingSet:
 def test_what_a_curve_leaves_out_beyond_its_end_is_in_the_uncertainty_of_stray_light() -> None:
     """A sensor sees more of the stray light than the stated part of its curve does: the share is found too large by as
     much."""
-    model = measured_model(_short_curves(StrayLightLaw(1.0)), narrowband_block)
+    model = measured_model(_short_curves(StrayLightLaw(1.0)), measure_narrowband)
     fit = refit(model, (StrayLight(share_percent=0.5),), DecisionPolicy())
     std = fit.std[0]["share_percent"]
     assert std is not None
@@ -77,7 +77,7 @@ def test_sensitivity_beyond_a_curve_falls_to_where_silicon_ends() -> None:
     """The column against the forward model with a curve that falls from the last value to 0 at 1107 nm; light there
     only by the stray share."""
     recordings, stray = _short_curves(), (StrayLight(share_percent=5.0),)
-    looked_at = study(recordings)
+    looked_at = dataset(recordings)
     capture = recordings.captures("narrowband")[3]
     curves = CurveJacobian(looked_at, [(capture.radiance, "R", capture.exposure_s, "narrowband", None)])
     last = looked_at.camera.quantum_efficiency["R"].value[-1]

@@ -16,8 +16,8 @@ from scipy.special import chdtri, ndtri
 from lab.challenge.draw import recordings_of
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
-from lab.observables.dataset import Study
-from lab.observables.observable import Block, measurements
+from lab.observables.dataset import Dataset
+from lab.observables.observable import Observable, measurements
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import ChargeDiffusionLaw, LateralColourLaw, OpticalLowPassFilterLaw
 from sim.effects.base import Effects
@@ -67,22 +67,22 @@ FEW = (
 CASES = [pytest.param(case, id=str(case), marks=() if case in FEW else pytest.mark.slow) for case in GRID]
 
 
-def _blocks(case: Mosaic, plan: Plan) -> tuple[list[Block], Effects]:
+def _blocks(case: Mosaic, plan: Plan) -> tuple[list[Observable], Effects]:
     """Return what a small camera's recordings determine, and the concealed effect."""
     law = case.concealed()
     recordings = recordings_of(ConcealedCamera(SEED, (law,), cfa=case.cfa, rows=192, cols=256), plan)
-    study = Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+    dataset = Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
     found = []
     for measurement in measurements():
         try:
-            found.append(measurement.make(study))
+            found.append(measurement.make(dataset))
         except NotDetermined as refused:
             assert refused.reason, measurement.name
     (effect,) = (one for one in candidates() if one.name == law.effect)
     return found, (effect(**law.library_parameters()),)
 
 
-def _pulls(block: Block, effects: Effects) -> tuple[np.ndarray, np.ndarray]:
+def _pulls(block: Observable, effects: Effects) -> tuple[np.ndarray, np.ndarray]:
     """Return the pulls of a measurement's numbers, and those along the principal axes of their correlations."""
     prediction = block.predict(effects)
     jacobian = np.reshape(list(prediction.jacobian.values()), (-1, len(block.value)))

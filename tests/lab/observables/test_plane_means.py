@@ -11,8 +11,8 @@ from lab.fit.spectral.recordings import fit_spectral
 from lab.formats.recording_set import FrameCodes, RecordingSet
 from lab.formats.results import NoiseFit
 from lab.observables.plane_means import central_codes, central_part, channel_means, channel_pixels
-from lab.observables.spectra.narrowband import narrowband_block
-from tests.lab.diagnose.on_blocks import UNIFORM, former, study
+from lab.observables.spectra.narrowband import measure_narrowband
+from tests.lab.diagnose.on_blocks import UNIFORM, dataset, former
 
 
 def frame(rows: int, cols: int) -> np.ndarray:
@@ -69,7 +69,7 @@ def test_no_statement_about_camera_or_capture_enters() -> None:
 
 def test_the_diagnosis_reads_the_means_that_the_fit_took(monkeypatch: pytest.MonkeyPatch) -> None:
     recordings = former(3, cfa="RGGB", kinds=UNIFORM)
-    looked_at = study(recordings)  # looks for copies of frames, and for the level from which on they clip
+    looked_at = dataset(recordings)  # looks for copies of frames, and for the level from which on they clip
     read: list[str] = []
     load = RecordingSet.frame
 
@@ -82,5 +82,5 @@ def test_the_diagnosis_reads_the_means_that_the_fit_took(monkeypatch: pytest.Mon
     fit_spectral(recordings, "left", NoiseFit(conversion_gain_dn_per_e=looked_at.noise.gain))
     assert set(read) == {c.id for c in recordings.captures("narrowband")}
     read.clear()
-    narrowband_block(looked_at)
+    measure_narrowband(looked_at)
     assert not read

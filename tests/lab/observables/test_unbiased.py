@@ -18,9 +18,9 @@ from scipy.special import ndtri
 from lab.challenge.draw import recordings_of
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.noise.line_spectra import Bands, log_mean_bias, log_mean_variance, periodogram
-from lab.observables.observable import Block, measurements
+from lab.observables.observable import Observable, measurements
 from mocks.former import ConcealedCamera, Plan
 
 #: Probability that a healthy measurement fails a whole test, over all its comparisons (Bonferroni).
@@ -86,17 +86,17 @@ GRID = (
 )
 
 
-def _study(case: Healthy, seed: int) -> Study:
+def _dataset(case: Healthy, seed: int) -> Dataset:
     camera = ConcealedCamera(seed, cfa=case.cfa, rows=case.side_px, cols=case.side_px, bit_depth=case.bit_depth)
     recordings = recordings_of(camera, Plan(case.kinds, repeats=case.repeats))
-    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+    return Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
 def _drawn(case: Healthy) -> dict[str, Pulls]:
     """Pulls by measurement; a measurement may be skipped, and nothing else."""
     found: dict[str, Pulls] = defaultdict(Pulls)
     for draw in range(case.draws):
-        looked_at = _study(case, 1000 + draw)
+        looked_at = _dataset(case, 1000 + draw)
         for measurement in measurements():
             try:
                 block = measurement.make(looked_at)
@@ -107,7 +107,7 @@ def _drawn(case: Healthy) -> dict[str, Pulls]:
     return found
 
 
-def _add(pulls: Pulls, block: Block) -> None:
+def _add(pulls: Pulls, block: Observable) -> None:
     prediction = block.predict(())
     jacobian = np.reshape(list(prediction.jacobian.values()), (-1, len(block.value)))
     covariance = block.covariance + jacobian.T @ jacobian
@@ -173,7 +173,7 @@ def test_frames_too_small_are_skipped_saying_so(side_px: int, cfa: str) -> None:
     """What is left is finite, which `_drawn` checks; what isn't there says how many px it needs."""
     case = Healthy(side_px, 3, cfa, 12, 1)
     drawn = _drawn(case)
-    looked_at = _study(case, 1000)
+    looked_at = _dataset(case, 1000)
     for measurement in measurements():
         if measurement.name == "noise_neighbours" and side_px < 8 and cfa != "MONO":
             with pytest.raises(NotDetermined, match=r"4 x 4 px.*8 px a side"):

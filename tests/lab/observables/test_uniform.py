@@ -13,8 +13,8 @@ from lab.diagnose.inference.side_model import measurement_model
 from lab.observables.codes.rounding import rounding_std_dn
 from lab.observables.darks.frames import cell_means
 from lab.observables.darks.level import added_dark_dn, dark_current_map
-from lab.observables.flats.field import shading_block
-from lab.observables.flats.linearity import RADIOMETER_STD, linearity_block
+from lab.observables.flats.field import measure_flat_field
+from lab.observables.flats.linearity import RADIOMETER_STD, measure_photon_transfer
 from lab.observables.gaussian import chi2
 from lab.observables.noise.figures import (
     NARROW_WINDOW_PX,
@@ -31,7 +31,7 @@ from lab.observables.spectra.light_readings import (
     reading_std,
     sample_std,
 )
-from lab.observables.spectra.narrowband import narrowband_block
+from lab.observables.spectra.narrowband import measure_narrowband
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     AbsorptionBandLaw,
@@ -50,7 +50,7 @@ from sim.effects.persistence import Persistence
 from sim.effects.second_order_light import SecondOrderLight
 from sim.spectrum import Spectrum
 from sim.uniform import Uniform
-from tests.lab.diagnose.on_blocks import UNIFORM, former, measured_model, names, rendered, sigmas, study, verdict
+from tests.lab.diagnose.on_blocks import UNIFORM, dataset, former, measured_model, names, rendered, sigmas, verdict
 
 LEVELS: list[tuple[Law, bool]] = [
     (law, shuttle)
@@ -67,7 +67,7 @@ LEVELS: list[tuple[Law, bool]] = [
 def test_effects_on_levels_are_told_apart(law: Law, shuttle: bool) -> None:
     """A series of levels upwards only, in which time and level go together except in repeats; and one up and down. The
     cells of the flats say that no row has more time than another."""
-    found = verdict(former(31, law, shuttle=shuttle), linearity_block, shading_block)
+    found = verdict(former(31, law, shuttle=shuttle), measure_photon_transfer, measure_flat_field)
     assert names(found) == [law.effect]
     for name, value in law.library_parameters().items():
         std = found.named[0].std[name]
@@ -86,7 +86,7 @@ def test_effects_on_levels_are_told_apart(law: Law, shuttle: bool) -> None:
     ids=lambda law: law.name,
 )
 def test_effects_on_narrowband_light_are_told_apart(law: Law) -> None:
-    found = verdict(former(32, law, cfa="RGGB", kinds=UNIFORM), linearity_block, narrowband_block)
+    found = verdict(former(32, law, cfa="RGGB", kinds=UNIFORM), measure_photon_transfer, measure_narrowband)
     assert names(found) == [law.effect]
 
 
@@ -99,7 +99,7 @@ def test_structure_that_no_law_has_is_located_and_gets_no_name(law: Law) -> None
     """The red leak of a MONO sensor isn't told by its colour: the radiometer's law explained a part of it, and left
     more."""
     cfa = "MONO" if isinstance(law, RedLeakLaw) else "RGGB"
-    found = verdict(former(33, law, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
+    found = verdict(former(33, law, cfa=cfa, kinds=UNIFORM), measure_photon_transfer, measure_narrowband)
     assert not found.named
     assert {s.block.measurement.name for s in found.before} == {"narrowband"}
 
@@ -108,7 +108,7 @@ def test_second_order_light_shows_where_half_the_wavelength_is_seen() -> None:
     """A sweep to 900 nm: beyond 800 nm a line at half the wavelength is visible. Share within 3 standard
     uncertainties."""
     truth = SecondOrderLight(share_percent=3.0)
-    found = verdict(rendered(6, (truth,), sweep_to_nm=900, repeats=2), linearity_block, narrowband_block)
+    found = verdict(rendered(6, (truth,), sweep_to_nm=900, repeats=2), measure_photon_transfer, measure_narrowband)
     assert names(found) == ["second_order_light"]
     std = found.named[0].std["share_percent"]
     assert std is not None
@@ -118,7 +118,7 @@ def test_second_order_light_shows_where_half_the_wavelength_is_seen() -> None:
 def test_healthy_levels_agree_with_their_covariance() -> None:
     """4 cameras: no more than noise; less, as a few numbers in ten are free."""
     for seed, cfa in ((1, "MONO"), (2, "RGGB"), (3, "GBRG"), (4, "MONO")):
-        found = measured_model(former(seed, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
+        found = measured_model(former(seed, cfa=cfa, kinds=UNIFORM), measure_photon_transfer, measure_narrowband)
         assert -6.0 < sigmas(found) < 3.0
 
 
@@ -126,7 +126,7 @@ def test_a_drifting_lamp_is_repeatable() -> None:
     """0.5 % a minute makes repeats differ by 0.17 %; a trend common to all levels leaves the repeatability that there
     was, 0."""
     for shuttle in (False, True):
-        looked_at = study(former(34, SourceDriftLaw(0.5), shuttle=shuttle))
+        looked_at = dataset(former(34, SourceDriftLaw(0.5), shuttle=shuttle))
         noise = looked_at.noise
         found = level_repeatability(repeated_levels(looked_at, noise.black, noise.gain, noise.read_dn))
         assert found < 4e-4
@@ -176,7 +176,7 @@ def test_standard_deviation_within_readings_is_measured_and_capped(std: float) -
 def test_a_warmer_frame_s_dark_current_is_free() -> None:
     """A tenth of the dark current for each degree above the dark frames; nothing where no temperature is stated."""
     recordings = former(35, kinds=UNIFORM)
-    looked_at = study(recordings)
+    looked_at = dataset(recordings)
     capture = recordings.captures("narrowband")[0]
     assert looked_at.noise.dark_c is not None
     warm = capture.model_copy(update={"temperature_c": looked_at.noise.dark_c + 3.0})
@@ -187,14 +187,14 @@ def test_a_warmer_frame_s_dark_current_is_free() -> None:
 
 
 def test_after_dummy_frames_image_lag_holds_nothing_of_the_capture_before() -> None:
-    at = study(rendered(3))
+    at = dataset(rendered(3))
     bright, dark = at.recordings.captures("flat", "left")[-1], at.recordings.captures("dark", "left")[0]
     lag = (ImageLag(lag_percent=2.0),)
     assert at.carried_e(lag)(bright, at.channels[0]) != 0.0
     manifest = at.recordings.manifest
     after = [c.model_copy(update={"dummy_frames": 2}) for c in manifest.captures]
     at.recordings.manifest = manifest.model_copy(update={"captures": tuple(after)})
-    again = study(at.recordings)
+    again = dataset(at.recordings)
     for capture in (bright, dark):
         assert again.carried_e(lag)(capture, again.channels[0]) == 0.0
 
@@ -203,7 +203,7 @@ def test_traps_fill_with_measured_levels_and_dummy_frames() -> None:
     """As `Uniform.released_e` says of the levels that were read; two dummy frames before each flat fill traps, too.
     Without times nothing is known."""
     camera = ConcealedCamera(35, cfa="MONO", rows=96, cols=128)
-    at = study(recordings_of(camera, Plan(UNIFORM, dark_again=True)))
+    at = dataset(recordings_of(camera, Plan(UNIFORM, dark_again=True)))
     traps = (Persistence(share_percent=2.0, release_s=30.0),)
     last, channel = at.recordings.captures("dark")[-1], at.channels[0]
     order = sorted(at.recordings.captures(), key=at.elapsed_s)
@@ -222,20 +222,20 @@ def test_traps_fill_with_measured_levels_and_dummy_frames() -> None:
     manifest = at.recordings.manifest
     two = [c.model_copy(update={"dummy_frames": 2 if c.kind == "flat" else None}) for c in manifest.captures]
     at.recordings.manifest = manifest.model_copy(update={"captures": tuple(two)})
-    assert study(at.recordings).carried_e(traps)(last, channel) == pytest.approx(wanted + dummies, rel=1e-9)
+    assert dataset(at.recordings).carried_e(traps)(last, channel) == pytest.approx(wanted + dummies, rel=1e-9)
 
     undated = [c.model_copy(update={"time": None}) for c in manifest.captures]
     at.recordings.manifest = manifest.model_copy(update={"captures": tuple(undated)})
-    assert study(at.recordings).carried_e(traps)(last, channel) == 0.0
+    assert dataset(at.recordings).carried_e(traps)(last, channel) == 0.0
 
 
 def test_a_glow_that_brightens_darks_brightens_light_frames_as_much() -> None:
     """Dark current is one nuisance parameter of darks, flats and narrowband light: what an effect adds is the same in
     all."""
-    at = study(rendered(3))
+    at = dataset(rendered(3))
     glow = (AmplifierGlow(glow_e_per_s=40.0, reach_mm=0.3),)
     more = added_dark_dn(at, glow)
-    block = linearity_block(at)
+    block = measure_photon_transfer(at)
     change = block.predict(glow).mean - block.predict(()).mean
     captures = {c.id: c for c in at.recordings.captures("flat", "left")}
     wanted = [more(captures[label.captures[0]]) for label in block.labels]
@@ -245,7 +245,7 @@ def test_a_glow_that_brightens_darks_brightens_light_frames_as_much() -> None:
 
 def test_a_dark_current_over_the_field_is_that_of_the_pixels() -> None:
     """A coarse grid would move the glow's corner and the cells' borders: by 4 % of a cell's mean at 8 px a point."""
-    at = study(rendered(3))
+    at = dataset(rendered(3))
     glow = (AmplifierGlow(glow_e_per_s=60.0, reach_mm=0.5, corner="bottom_right"),)
     at.camera = at.camera.model_copy(update={"rows": 384, "cols": 512})
     found = cell_means(dark_current_map(at, glow)(None).astype(np.float32))

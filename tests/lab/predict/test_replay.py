@@ -12,7 +12,7 @@ from lab.challenge.draw import recordings_of
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.predict.replay import Replay
 from mocks.former import ConcealedCamera, Plan
 from sim.effects.library import effect
@@ -26,8 +26,8 @@ def recordings() -> RecordingSet:
 
 @pytest.fixture(scope="module")
 def replay(recordings: RecordingSet) -> Replay:
-    study = Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
-    return Replay(recordings, "left", study.camera)
+    dataset = Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+    return Replay(recordings, "left", dataset.camera)
 
 
 def test_edges_come_out_where_they_were_recorded(replay: Replay, recordings: RecordingSet) -> None:

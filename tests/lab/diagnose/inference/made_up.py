@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.observables.observable import Block, Label, Prediction
+from lab.observables.observable import Label, Observable, Prediction
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.point import TRANSFER, Blur
@@ -49,7 +49,7 @@ def contrast_model(
     )
     n = len(labels)
     value = np.concatenate([_transfer(truth, a) + extra for a in angles]) + NOISE * rng.standard_normal(n)
-    block = Block(
+    block = Observable(
         measurement=declared("slanted_edge", "spatial_frequency", "cy/px"), reach=0.2, value=value,
         covariance=NOISE**2 * np.eye(n),
         labels=labels, reads=TRANSFER, scale=np.ones(n),
@@ -63,7 +63,7 @@ def spectral_model(rng: np.random.Generator, extra: Callable[[np.ndarray], np.nd
     x = np.arange(400.0, 700.0, 10.0)
     labels = tuple(Label(float(w), "Y", "", (f"narrow-{i}",), i % 3 == 1) for i, w in enumerate(x))
     n = len(x)
-    block = Block(
+    block = Observable(
         measurement=declared("narrowband", "wavelength", "nm"), reach=40.0,
         value=extra(x) + NOISE * rng.standard_normal(n),
         covariance=NOISE**2 * np.eye(n), labels=labels, reads=frozenset({"image.transmittance"}),

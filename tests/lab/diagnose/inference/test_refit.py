@@ -19,7 +19,7 @@ from lab.diagnose.inference.refit import (
     refit,
 )
 from lab.diagnose.policy import DecisionPolicy
-from lab.observables.observable import Block, Label, Prediction
+from lab.observables.observable import Label, Observable, Prediction
 from sim.effects.base import Effect
 from sim.effects.library import effect
 from sim.effects.light_flicker import LightFlicker
@@ -94,7 +94,7 @@ def _timed_model(rng: np.random.Generator, drift: float, noise: float) -> Measur
         return np.array([light.source(60.0 * t) for t in minutes])
 
     value = levels((SourceDrift(drift_percent_per_min=drift),)) + noise * rng.standard_normal(len(minutes))
-    block = Block(
+    block = Observable(
         measurement=declared("photon_transfer", "level", "DN"), reach=1.0, value=value,
         covariance=noise**2 * np.eye(len(minutes)),
         labels=labels, reads=frozenset({"light.level"}), predict=lambda acting: Prediction(levels(acting), {}),

@@ -10,7 +10,7 @@ import pytest
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.score import Signatures, signatures
-from lab.observables.observable import Block
+from lab.observables.observable import Observable
 from sim.effects.base import Effect
 from sim.effects.library import effect, effects
 from tests.lab.diagnose.inference.made_up import CAMERA, FREQUENCY, NOISE, contrast_model
@@ -21,7 +21,7 @@ def test_score_is_the_likelihood_ratio_of_a_small_effect() -> None:
     truth = effect("defocus")(defocus_um=5.0)
     model = contrast_model(np.random.default_rng(1), (truth,))
     exact = model.mean((truth,))
-    clean = MeasurementModel((Block(**{**model.blocks[0].__dict__, "value": exact}),), CAMERA)
+    clean = MeasurementModel((Observable(**{**model.blocks[0].__dict__, "value": exact}),), CAMERA)
     change = (exact - clean.mean())[clean.seen] / NOISE
     score = next(s for s in signatures(clean, CAMERA, (), [effect("defocus")]).scores())
     assert score.value == pytest.approx(float(change @ change), rel=0.05)

@@ -18,7 +18,7 @@ from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.policy import DecisionPolicy
 from lab.observables.gaussian import BlockCovariance
-from lab.observables.observable import Block, Label, Prediction
+from lab.observables.observable import Label, Observable, Prediction
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.families import Family
@@ -113,7 +113,7 @@ def _model(truth: Sequence[Effect], rng: np.random.Generator) -> MeasurementMode
     def line(acting: Sequence[Effect]) -> FloatArray:
         return np.array([Uniform(camera, acting).offset_dn(float(x), None, 0.01) for x in X])
 
-    block = Block(
+    block = Observable(
         measurement=declared("dark", "time", "s"), reach=0.2, value=line(truth) + NOISE * rng.standard_normal(X.size),
         covariance=NOISE**2 * np.eye(X.size), labels=tuple(Label(float(x), "all", "", (f"c{i}",), False) for i,
         x in enumerate(X)),

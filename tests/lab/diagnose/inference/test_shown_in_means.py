@@ -14,16 +14,16 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.fit.noise.noise_fit import fit_noise
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
-from lab.observables.flats.linearity import linearity_block
-from lab.observables.flats.noise import variance_block
-from lab.observables.noise.neighbours import neighbour_block
+from lab.observables.flats.linearity import measure_photon_transfer
+from lab.observables.flats.noise import measure_noise
+from lab.observables.noise.neighbours import measure_noise_neighbours
 from sim.effects.adc_step import AdcStep
 from sim.effects.brighter_fatter import BrighterFatter
 from sim.effects.inter_pixel_capacitance import InterPixelCapacitance
 from sim.effects.nonlinearity import Nonlinearity
 from sim.effects.row_noise import RowNoise
 from tests.lab.diagnose.metadata.lies import restated
-from tests.lab.diagnose.on_blocks import measured_model, names, rendered, study, verdict
+from tests.lab.diagnose.on_blocks import dataset, measured_model, names, rendered, verdict
 
 BEND = Nonlinearity(quadratic_percent=-10.0)
 
@@ -36,7 +36,7 @@ def _bent() -> RecordingSet:
 def test_which_effects_must_show_in_means_follows_from_what_they_change() -> None:
     """A response and a converter change levels and variances alike; charge that repels charge changes variances
     alone."""
-    model = measured_model(_bent(), variance_block, neighbour_block)
+    model = measured_model(_bent(), measure_noise, measure_noise_neighbours)
     must = {
         kind
         for kind in (Nonlinearity, AdcStep, BrighterFatter, InterPixelCapacitance, RowNoise)
@@ -47,24 +47,24 @@ def test_which_effects_must_show_in_means_follows_from_what_they_change() -> Non
 
 def test_a_bend_that_variances_alone_show_is_no_name() -> None:
     """Its means show it as well, where they are judged."""
-    found = verdict(_bent(), variance_block)
+    found = verdict(_bent(), measure_noise)
     assert not found.named
     assert [c.effect.name for c in found.abstained] == ["nonlinearity"]
     (told,) = unexplained(_bent(), "left", found, (Correction("noise", None, ""),), DecisionPolicy())
     assert "nonlinearity, which has to show in mean levels, and no light of theirs is stated" in told.shape
-    assert names(verdict(_bent(), variance_block, linearity_block)) == ["nonlinearity"]
+    assert names(verdict(_bent(), measure_noise, measure_photon_transfer)) == ["nonlinearity"]
 
 
 def test_means_of_a_straight_response_contradict_a_bend() -> None:
     """Variances of a bent camera, means of a straight one."""
-    bent, straight = study(_bent()), study(rendered(3))
+    bent, straight = dataset(_bent()), dataset(rendered(3))
     policy = DecisionPolicy()
-    both = MeasurementModel((variance_block(bent), linearity_block(bent)), bent.camera)
+    both = MeasurementModel((measure_noise(bent), measure_photon_transfer(bent)), bent.camera)
     assert shown_in_means(both, BEND, (BEND,), (), policy)
-    against = MeasurementModel((variance_block(bent), linearity_block(straight)), bent.camera)
+    against = MeasurementModel((measure_noise(bent), measure_photon_transfer(straight)), bent.camera)
     assert is_judged_in_means(against, Nonlinearity)
     assert not shown_in_means(against, BEND, (BEND,), (), policy)
-    assert not shown_in_means(MeasurementModel((variance_block(bent),), bent.camera), BEND, (BEND,), (), policy)
+    assert not shown_in_means(MeasurementModel((measure_noise(bent),), bent.camera), BEND, (BEND,), (), policy)
 
 
 def test_an_exposure_typed_ten_times_too_long_is_told_where_no_light_is_stated() -> None:

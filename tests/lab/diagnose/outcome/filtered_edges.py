@@ -10,7 +10,7 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
 from lab.formats.camera_file import default_camera
-from lab.observables.observable import Block, Label, Prediction
+from lab.observables.observable import Label, Observable, Prediction
 from sim.effects.base import Effect
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.point import TRANSFER, Blur
@@ -36,7 +36,7 @@ def filtered_edges(named: tuple[Effect, ...] = ()) -> Verdict:
         Label(float(f), "G", f"{a:g}", (f"edge-{i}",), i % 2 == 1) for i, a in enumerate(angles) for f in FREQUENCY
     )
     value = predict((TRUTH,)).mean + NOISE * np.random.default_rng(8).standard_normal(len(labels))
-    block = Block(
+    block = Observable(
         measurement=declared("slanted_edge", "spatial_frequency", "cy/px", conditions="orientation"), reach=0.2,
         value=value,
         covariance=NOISE**2 * np.eye(len(labels)), labels=labels, reads=TRANSFER, predict=predict,

@@ -27,9 +27,9 @@ from lab.diagnose.outcome.goodness_of_fit import (
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import NamedEffect, Rival, SideModels, Unexplained, Visibility
-from lab.observables.flats.linearity import linearity_block
+from lab.observables.flats.linearity import measure_photon_transfer
 from lab.observables.observable import Prediction
-from lab.observables.spectra.narrowband import narrowband_block
+from lab.observables.spectra.narrowband import measure_narrowband
 from lab.report.diagnosis import _visibility
 from mocks.former.laws import RowNoiseLaw
 from sim.effects.amplifier_glow import AmplifierGlow
@@ -63,7 +63,9 @@ def test_the_baseline_is_drawn_as_a_camera_without_the_effect() -> None:
     cuts the light from 600 nm on, and the level falls; the baseline's curve stays. (The baseline's own fit would follow
     the filter with its nuisance parameters.)"""
     truth = InfraredCutFilter(cut_wavelength_nm=600.0, width_nm=5.0)
-    model = measured_model(rendered(6, (truth,), sweep_to_nm=720, repeats=2), linearity_block, narrowband_block)
+    model = measured_model(
+        rendered(6, (truth,), sweep_to_nm=720, repeats=2), measure_photon_transfer, measure_narrowband
+    )
     assert np.ptp(model.fitted_mean()[model.slices[1]]) > 2000.0
     named = Verdict(model, 12.0, 60.0, (), (Candidate(truth, {}, 1.0, (), 100.0),), (), (), ())
     curves = [curve for curve in residual_curves("left", named) if curve.measurement == "narrowband"]

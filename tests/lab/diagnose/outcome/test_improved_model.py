@@ -19,7 +19,7 @@ from lab.formats.camera_file import CameraFile, default_camera, read_camera, wri
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.gaussian import chi2
-from lab.observables.observable import Block, Label, Prediction
+from lab.observables.observable import Label, Observable, Prediction
 from lab.predict.simulate import SimulateOptions, simulate
 from mocks.former import ConcealedCamera, Plan
 from mocks.former import laws as concealed_laws
@@ -87,7 +87,7 @@ FREQUENCY = np.linspace(0.02, 0.9, 23)
 NOISE = 0.004
 
 
-def _edges(departs: np.ndarray) -> tuple[Block, CameraFile]:
+def _edges(departs: np.ndarray) -> tuple[Observable, CameraFile]:
     """Contrasts exp(-2 f) of two channels, off by `departs`; a model without effects, with corrections only."""
     content = default_camera()
     labels = tuple(Label(float(f), c, "5 deg", ("edge-1",), False) for c in "RG" for f in FREQUENCY)
@@ -98,7 +98,7 @@ def _edges(departs: np.ndarray) -> tuple[Block, CameraFile]:
         return Prediction(contrast * np.real(factor), {})
 
     value = contrast * np.tile(1.0 + departs, 2) + NOISE * np.random.default_rng(3).standard_normal(46)
-    block = Block(
+    block = Observable(
         measurement=declared("slanted_edge", "spatial_frequency", "cy/px", conditions="orientation"), reach=0.2,
         value=value, covariance=NOISE**2 * np.eye(46),
         labels=labels, reads=TRANSFER, predict=predict, scale=np.ones(46),

@@ -23,7 +23,7 @@ from lab.errors import InputError
 from lab.formats.camera_file import default_camera
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import NextCapture, Unexplained
-from lab.observables.observable import Block, Label, Prediction
+from lab.observables.observable import Label, Observable, Prediction
 from sim.effects.astigmatism import Astigmatism
 from sim.effects.base import Effect
 from sim.effects.black_level_drift import BlackLevelDrift
@@ -53,7 +53,7 @@ def _model(acting: Sequence[Effect] = ()) -> MeasurementModel:
         factor = Blur(CAMERA, effects).beside_lens(550.0, FREQUENCY, 0.0 * FREQUENCY)
         return Prediction(np.exp(-2.0 * FREQUENCY) * np.real(factor), {})
 
-    block = Block(
+    block = Observable(
         measurement=declared("slanted_edge", "spatial_frequency", "cy/px"), reach=0.2, value=predict(acting).mean,
         covariance=4e-6 * np.eye(16),
         labels=tuple(Label(float(f), "G", "5 deg", ("edge-1",), False) for f in FREQUENCY), reads=TRANSFER,
@@ -201,7 +201,7 @@ def _dark_model(recordings: RecordingSet) -> MeasurementModel:
         return Prediction(np.full(len(names), 64.0 + moved), {})
 
     names = [c.id for c in recordings.captures()]
-    block = Block(
+    block = Observable(
         measurement=declared("dark", "exposure", "s"), reach=1.0, value=predict(()).mean, covariance=np.eye(len(names)),
         labels=tuple(Label(1.0, "all", "", (n,), False) for n in names), reads=frozenset({"signal.offset_dn"}),
         predict=predict, scale=np.ones(len(names)),

@@ -17,10 +17,10 @@ from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
 from lab.observables.boards.calibration import Calibration, calibrate, calibration_of, with_model_error
 from lab.observables.boards.corners import board_corners, channel_corners, plane_corners
-from lab.observables.boards.lateral_colour import board_colour_block
-from lab.observables.boards.residuals import CellResiduals, board_block, cell_residuals
+from lab.observables.boards.lateral_colour import measure_board_colour
+from lab.observables.boards.residuals import CellResiduals, cell_residuals, measure_boards
 from lab.observables.boards.views import BoardView
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
 from sim.camera import Geometry
@@ -35,8 +35,8 @@ def recorded(*laws: Law, cfa: str = "RGGB", noise_draw: int = 0) -> RecordingSet
     return recordings_of(camera, Plan(kinds=("dark", "charuco")))
 
 
-def study_of(recordings: RecordingSet) -> Study:
-    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+def dataset_of(recordings: RecordingSet) -> Dataset:
+    return Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
 @pytest.mark.parametrize("cfa", ["GBRG", "MONO"])
@@ -82,10 +82,10 @@ def test_boards_are_found_once_for_fit_and_diagnosis(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(RecordingSet, "frame", counted)
     fit = fit_geometry(recordings, "left")
     assert max(read.count(name) for name in read) <= 3  # straight edges, bent ones, planes
-    study = study_of(recordings)  # looks for frames that are copies of another
+    dataset = dataset_of(recordings)  # looks for frames that are copies of another
     read.clear()
-    board_block(study)
-    board_colour_block(study)
+    measure_boards(dataset)
+    measure_board_colour(dataset)
     assert not read
     assert fit.views == len(calibration_of(recordings, "left").views)
 
@@ -151,10 +151,10 @@ def test_distortion_of_drawn_frames_is_predicted_through_the_fit() -> None:
     camera = calibration_of(recorded(), "left").camera
     rows = tuple(tuple(float(v) for v in row) for row in camera.matrix)
     law = concealed.LensDistortionLaw(2.0, 0, 7)
-    study = study_of(recorded(law, noise_draw=1))
+    dataset = dataset_of(recorded(law, noise_draw=1))
     geometry = Geometry(camera_matrix=rows, distortion=tuple(float(v) for v in camera.distortion))  # type: ignore[arg-type]
-    study.camera = study.camera.model_copy(update={"geometry": geometry})
-    block = board_block(study)
+    dataset.camera = dataset.camera.model_copy(update={"geometry": geometry})
+    block = measure_boards(dataset)
     effect = library_effect(law.effect)(**law.library_parameters())
     without, rest = (block.value - block.predict(effects).mean for effects in ((), (effect,)))
     jacobian = np.array([*block.predict(()).jacobian.values()])
@@ -168,7 +168,7 @@ def test_distortion_of_drawn_frames_is_predicted_through_the_fit() -> None:
 def test_lateral_colour_of_drawn_frames_is_predicted(cfa: str) -> None:
     """3 um at the corner is a pixel; a ring has the floor of 0.012 px. chi2 within 3 sigma above n."""
     law = concealed.LateralColourLaw(3.0, 0, 5)
-    block = board_colour_block(study_of(recorded(law, cfa=cfa)))
+    block = measure_board_colour(dataset_of(recorded(law, cfa=cfa)))
     effect = library_effect(law.effect)(**law.library_parameters())
     for effects, least in (((effect,), 0.0), ((), 10.0 * len(block.value))):
         rest = block.value - block.predict(effects).mean
@@ -188,6 +188,8 @@ def test_boards_aligned_with_the_pixels_show_no_lateral_colour() -> None:
     view = board_corners(recordings, "right").views[0]
     fits = channel_corners(plane_corners(recordings, view), "RGGB")
     assert np.hypot(*np.mean(fits["R"].points - fits["G"].points, axis=0)) > 0.1
-    block = board_colour_block(Study(recordings, "right", camera_model(recordings, "right", None, maker_curves=True)))
+    block = measure_board_colour(
+        Dataset(recordings, "right", camera_model(recordings, "right", None, maker_curves=True))
+    )
     chi2 = float(block.value @ np.linalg.solve(block.covariance, block.value))
     assert chi2 < len(block.value) + 3.0 * np.sqrt(2.0 * len(block.value))

@@ -14,36 +14,36 @@ from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
-from lab.observables.charts.chart import chart_block
-from lab.observables.codes.density import code_block, widths
-from lab.observables.darks.level import dark_level_block
-from lab.observables.dataset import Study
-from lab.observables.flats.linearity import linearity_block
-from lab.observables.flats.noise import variance_block
+from lab.observables.charts.chart import measure_chart
+from lab.observables.codes.density import measure_code_density, widths
+from lab.observables.darks.level import measure_dark
+from lab.observables.dataset import Dataset
+from lab.observables.flats.linearity import measure_photon_transfer
+from lab.observables.flats.noise import measure_noise
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
 from sim.effects.adc_ripple import AdcRipple
 from sim.effects.bit_weights import BitWeights
 from sim.effects.library import effect
 from sim.uniform import Uniform
-from tests.lab.diagnose.on_blocks import rendered, study
+from tests.lab.diagnose.on_blocks import dataset, rendered
 
 
-def _study(seed: int, laws: Sequence[Law] = (), cfa: str | None = None) -> Study:
+def _dataset(seed: int, laws: Sequence[Law] = (), cfa: str | None = None) -> Dataset:
     recordings = recordings_of(
         ConcealedCamera(seed, laws, cfa=cfa, rows=96, cols=128), Plan(("dark", "flat", "narrowband"))
     )
-    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+    return Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
 @pytest.mark.parametrize("seed", [772011, 772012, 772013])
 def test_even_converters_show_nothing(seed: int) -> None:
     """chi2 of n numbers over n: 1 within 3 sqrt(2 / n) above, and no place stands out."""
-    study = _study(seed)
-    block = code_block(study)
+    dataset = _dataset(seed)
+    block = measure_code_density(dataset)
     chi2 = float(block.value @ np.linalg.solve(block.covariance, block.value)) / len(block.value)
     assert chi2 < 1.0 + 3.0 * np.sqrt(2.0 / len(block.value))
-    model = MeasurementModel((block,), study.camera)
+    model = MeasurementModel((block,), dataset.camera)
     assert not mismatches(model, model.gaussian(), DecisionPolicy())
 
 
@@ -51,8 +51,8 @@ def test_steps_are_measured_where_they_stand() -> None:
     """A highest bit that is 3 DN too heavy leaves 3 codes out at half scale: within 3.5 of the standard uncertainties
     and its law's tolerance, seen and held out. Places at 8 DN of 4096 and more beyond it see none of it."""
     law = AdcNonlinearityLaw(3.0, 0, 2)
-    study = _study(772302, (law,))
-    block = code_block(study)
+    dataset = _dataset(772302, (law,))
+    block = measure_code_density(dataset)
     std = np.sqrt(np.diag(block.covariance))
     expected = block.predict((effect("adc_nonlinearity")(error_dn=law.signed_strength),)).mean
     spacing = 4096 / 128
@@ -70,9 +70,9 @@ def test_steps_are_measured_where_they_stand() -> None:
 @pytest.mark.parametrize("variant", [0, 1])
 def test_wrong_bits_are_named(variant: int) -> None:
     law = AdcNonlinearityLaw(4.0, variant, 2)
-    study = _study(772302, (law,))
-    blocks = (linearity_block(study), variance_block(study), code_block(study))
-    verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
+    dataset = _dataset(772302, (law,))
+    blocks = (measure_photon_transfer(dataset), measure_noise(dataset), measure_code_density(dataset))
+    verdict = decide(MeasurementModel(blocks, dataset.camera), np.random.default_rng(0), DecisionPolicy())
     assert [c.effect.name for c in verdict.named] == ["adc_nonlinearity"]
     found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std["error_dn"]
     assert std is not None
@@ -85,9 +85,9 @@ def test_a_step_at_any_code_is_named() -> None:
     to a few."""
     law = AdcNonlinearityLaw(4.0, 4, 7)
     place = 4096.0 * (0.15 + 0.6 * law.uniform[1])
-    study = _study(772302, (law,))
-    blocks = (linearity_block(study), variance_block(study), code_block(study))
-    verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
+    dataset = _dataset(772302, (law,))
+    blocks = (measure_photon_transfer(dataset), measure_noise(dataset), measure_code_density(dataset))
+    verdict = decide(MeasurementModel(blocks, dataset.camera), np.random.default_rng(0), DecisionPolicy())
     assert [c.told_name for c in verdict.named] == ["adc_step"]
     found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std
     assert abs(found["code_dn"] - place) < 3.0 * (std["code_dn"] or 0.0)
@@ -97,8 +97,8 @@ def test_a_step_at_any_code_is_named() -> None:
 
 @pytest.mark.parametrize("law", [DigitalGainLaw(10.0), LossyCodesLaw(0.05)], ids=lambda law: law.name)
 def test_other_combs_are_located_and_at_most_their_family_is_named(law: Law) -> None:
-    study = _study(772021, (law,))
-    model = MeasurementModel((code_block(study),), study.camera)
+    dataset = _dataset(772021, (law,))
+    model = MeasurementModel((measure_code_density(dataset),), dataset.camera)
     verdict = decide(model, np.random.default_rng(0), DecisionPolicy())
     assert verdict.before[0].block.measurement.name == "code_density"
     assert {c.told_name for c in verdict.named} <= {"converter"}
@@ -109,7 +109,7 @@ def test_unequal_codes_show_alike_in_seen_and_in_held_out_frames() -> None:
     the codes' widths. A gain of 1.1 leaves one code of eleven out and makes the others 1.1 wide: 1.1^2 10 / 11 - 1 =
     0.1. Filters and unequal counts add some per cent, which a part of a few hundred codes knows to 3 sqrt(2 / 300) = 25
     %."""
-    block = code_block(_study(772302, (DigitalGainLaw(10.0),)))
+    block = measure_code_density(_dataset(772302, (DigitalGainLaw(10.0),)))
     at = [i for i, label in enumerate(block.labels) if label.channel == "variance"]
     held_out = np.array([block.labels[i].held_out for i in at])
     assert block.value[at][~held_out].mean() > 1.5 * block.value[at][held_out].mean()
@@ -122,7 +122,7 @@ def test_the_excess_of_unequal_codes_scatters_as_a_noncentral_chi2() -> None:
     would scatter a tenth as much."""
     law, pulls = BitWeights(last_dn=0.4, second_dn=-0.3), list[float]()
     for seed in range(6):
-        block = code_block(study(rendered(900 + seed, (law,))))
+        block = measure_code_density(dataset(rendered(900 + seed, (law,))))
         told = block.predict((law,))
         std = np.sqrt(np.diag(block.covariance) + np.square(list(told.jacobian.values())).sum(axis=0))
         of_variance = [label.channel == "variance" for label in block.labels]
@@ -135,9 +135,9 @@ def test_a_ripple_is_named_and_a_saw_tooth_is_the_converter(variant: int) -> Non
     """2.5 DN sin(2 pi code / 512 + phase): amplitude and period within three standard deviations. A saw tooth over 1024
     codes is off by its converter's gain where a boundary stands: its bits' weights are the nearest law, or hold."""
     law = AdcNonlinearityLaw(2.5 if variant == 2 else 5.0, variant, 3)
-    study = _study(772302, (law,))
-    blocks = (linearity_block(study), variance_block(study), code_block(study))
-    verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
+    dataset = _dataset(772302, (law,))
+    blocks = (measure_photon_transfer(dataset), measure_noise(dataset), measure_code_density(dataset))
+    verdict = decide(MeasurementModel(blocks, dataset.camera), np.random.default_rng(0), DecisionPolicy())
     assert [type(c.effect).family.value for c in verdict.named] == ["converter"]
     if variant == 3:
         assert verdict.named[0].effect.name == "adc_nonlinearity"
@@ -152,7 +152,7 @@ def test_a_ripple_is_named_and_a_saw_tooth_is_the_converter(variant: int) -> Non
 
 def test_codes_are_averaged_over_noise_in_a_mean() -> None:
     """Far from its step a converter's error is itself; on it, half; offset and gain as without."""
-    camera = _study(772011, cfa="MONO").camera
+    camera = _dataset(772011, cfa="MONO").camera
     one = effect("adc_nonlinearity")(error_dn=4.0)
     for level, wanted in ((1000.0, -4.0 * 1000.0 / 4096.0), (2048.0, 2.0 - 2.0), (3000.0, 4.0 - 4.0 * 3000.0 / 4096.0)):
         electrons = np.array([(level - camera.black_level_dn) / camera.conversion_gain_dn_per_e])
@@ -163,17 +163,17 @@ def test_codes_are_averaged_over_noise_in_a_mean() -> None:
 def test_what_the_converter_does_at_black_moves_darks_as_all_other_levels() -> None:
     """A ripple of 16 times the range is nearly an offset: of darks and flats alike, so that the black level takes it
     up. One of a quarter of the range moves darks by its value there, averaged over their noise."""
-    study = _study(7)
-    white, wide = study.camera.white_level_dn, AdcRipple(cosine_dn=0.5, period_dn=65536.0)
-    for make in (dark_level_block, linearity_block):
-        block = make(study)
+    dataset = _dataset(7)
+    white, wide = dataset.camera.white_level_dn, AdcRipple(cosine_dn=0.5, period_dn=65536.0)
+    for make in (measure_dark, measure_photon_transfer):
+        block = make(dataset)
         before = block.predict(()).mean
         wanted = 0.5 * np.cos(2.0 * np.pi * before / wide.period_dn)
         np.testing.assert_allclose(block.predict((wide,)).mean - before, wanted, atol=2e-3)
-    dark, short = dark_level_block(study), AdcRipple(sine_dn=0.4, cosine_dn=0.3, period_dn=0.25 * white)
+    dark, short = measure_dark(dataset), AdcRipple(sine_dn=0.4, cosine_dn=0.3, period_dn=0.25 * white)
     before = dark.predict(()).mean
     turn = 2.0 * np.pi * before / short.period_dn
-    blurred = np.exp(-0.5 * (2.0 * np.pi * study.noise.gain * study.camera.read_noise_e / short.period_dn) ** 2)
+    blurred = np.exp(-0.5 * (2.0 * np.pi * dataset.noise.gain * dataset.camera.read_noise_e / short.period_dn) ** 2)
     wanted = blurred * (0.4 * np.sin(turn) + 0.3 * np.cos(turn))
     np.testing.assert_allclose(dark.predict((short,)).mean - before, wanted, atol=1e-3)
 
@@ -183,8 +183,8 @@ def test_patches_of_a_chart_lie_off_by_what_the_converter_does_at_their_level() 
     by 48 values is good to 1e-3; levels that shot noise and shading move by less than 1e-3 of a period aren't
     counted."""
     recordings = recordings_of(ConcealedCamera(7, (), cfa="RGGB", rows=96, cols=128), Plan(("dark", "flat", "chart")))
-    looked_at = Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
-    block, white = chart_block(looked_at), looked_at.camera.white_level_dn
+    looked_at = Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+    block, white = measure_chart(looked_at), looked_at.camera.white_level_dn
     ripple = AdcRipple(sine_dn=0.4, cosine_dn=0.3, period_dn=0.25 * white)
     before, gain = block.predict(()).mean, looked_at.noise.gain
     noise_dn = gain * np.sqrt((before - looked_at.noise.black) / gain + looked_at.camera.read_noise_e**2)
@@ -198,7 +198,7 @@ def test_widths_of_codes_are_what_fine_samples_of_the_input_give() -> None:
     """A step between two codes, a step of many, a saw tooth of three bits and a ripple with a step, against 512 samples
     a code: an interval that straddles a step is sampled 64 times, so that a width is off by 1 / 64 of a code at most,
     and by less than 1e-3 elsewhere."""
-    study = _study(7)
+    dataset = _dataset(7)
     first, size = 300, 3000
     codes = SimpleNamespace(count=np.zeros(size), first=first)
     steps = effect("adc_step")
@@ -210,8 +210,8 @@ def test_widths_of_codes_are_what_fine_samples_of_the_input_give() -> None:
     )
     x = (np.arange((size + 200) * 512) + 0.5) / 512 - 0.5 + first - 100
     for acting in laws:
-        landed = np.rint(Uniform(study.camera, acting).codes(x)).astype(int) - first
+        landed = np.rint(Uniform(dataset.camera, acting).codes(x)).astype(int) - first
         wanted = np.bincount(landed[(landed >= 0) & (landed < size)], minlength=size) / 512
-        off = np.abs(widths(codes, acting, study) - wanted)  # type: ignore[arg-type]
+        off = np.abs(widths(codes, acting, dataset) - wanted)  # type: ignore[arg-type]
         assert off.max() < 1.0 / 64.0 + 1e-3
         assert np.sum(off > 5e-3) <= 8

@@ -22,11 +22,11 @@ from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.darks import defective_pixels
 from lab.observables.darks import noise as dark_noise
 from lab.observables.darks.frames import TAIL_EDGES, DarkCondition
-from lab.observables.darks.level import dark_level_block
-from lab.observables.darks.readout import correlation_block, fixed_line_block
-from lab.observables.dataset import Study
+from lab.observables.darks.level import measure_dark
+from lab.observables.darks.readout import measure_dark_correlation, measure_fixed_lines
+from lab.observables.dataset import Dataset
 from lab.observables.gaussian import chi2
-from lab.observables.observable import Block, measurements
+from lab.observables.observable import Observable, measurements
 from mocks.former import ConcealedCamera, Law, Plan, laws
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
@@ -83,20 +83,20 @@ def _concealed(seed: int, *built_in: Law, warm: bool = False) -> RecordingSet:
     return recordings_of(ConcealedCamera(seed, built_in, rows=ROWS, cols=COLS), Plan(("dark",), warm=warm, repeats=4))
 
 
-def _blocks(recordings: RecordingSet) -> tuple[Study, list[Block], dict[str, str]]:
-    study = Study(recordings, "left", camera_model(recordings, "left"))
+def _blocks(recordings: RecordingSet) -> tuple[Dataset, list[Observable], dict[str, str]]:
+    dataset = Dataset(recordings, "left", camera_model(recordings, "left"))
     found, refused = [], {}
     for measurement in OF_DARK_FRAMES:
         try:
-            found.append(measurement.make(study))
+            found.append(measurement.make(dataset))
         except NotDetermined as reason:
             refused[reason.step] = reason.reason
-    return study, found, refused
+    return dataset, found, refused
 
 
 def _verdict(recordings: RecordingSet) -> Verdict:
-    study, blocks, _ = _blocks(recordings)
-    return decide(MeasurementModel(tuple(blocks), study.camera), np.random.default_rng(0), DecisionPolicy())
+    dataset, blocks, _ = _blocks(recordings)
+    return decide(MeasurementModel(tuple(blocks), dataset.camera), np.random.default_rng(0), DecisionPolicy())
 
 
 def _names(verdict: Verdict) -> list[str]:
@@ -111,7 +111,7 @@ def test_odd_and_even_rows_share_what_is_fixed(noise_e: float, offset_e: float) 
     for seed in range(DRAWN):
         noisy = RowNoise(noise_e=noise_e, offset_e=offset_e, pattern_seed=seed)
         recordings = _sim_darks(seed, [noisy], plan=[(0.001, 25.0)] * 12)
-        block = fixed_line_block("rows", Study(recordings, "left", camera_model(recordings, "left")))
+        block = measure_fixed_lines("rows", Dataset(recordings, "left", camera_model(recordings, "left")))
         at = [k for k, label in enumerate(block.labels) if label.condition == "odd and even"]
         assert [block.labels[k].held_out for k in at] == [False, True]
         found.append(chi2((block.value - block.predict([noisy]).mean)[at], block.covariance[np.ix_(at, at)]))
@@ -128,12 +128,12 @@ def test_the_size_that_correlation_needs_is_the_one_that_is_named(shape: tuple[i
     sheet = {"rows": shape[0], "cols": shape[1], "cfa": "MONO", "bit_depth": 12}
     manifest = Manifest.model_validate({"cameras": {"left": sheet}, "captures": captures})
     recordings = RecordingSet(manifest, frames, {}, {})
-    study = Study(recordings, "left", camera_model(recordings, "left"))
+    dataset = Dataset(recordings, "left", camera_model(recordings, "left"))
     if is_measured:
-        assert correlation_block(study).labels
+        assert measure_dark_correlation(dataset).labels
         return
     with pytest.raises(NotDetermined, match="measured from 50 px along rows or columns on"):
-        correlation_block(study)
+        measure_dark_correlation(dataset)
 
 
 # --- statistics against drawn numbers ---------------------------------------------------------------------------------
@@ -231,9 +231,9 @@ def test_healthy_darks_agree_with_their_covariance() -> None:
         for k in range(8)
     ]
     for recordings in sets:
-        study, blocks, _ = _blocks(recordings)
+        dataset, blocks, _ = _blocks(recordings)
         for block in blocks:
-            model = MeasurementModel((block,), study.camera)
+            model = MeasurementModel((block,), dataset.camera)
             gaussian, seen = model.seen_gaussian(), model.seen
             if not seen.any():
                 continue
@@ -363,9 +363,9 @@ def test_a_frame_that_was_not_taken_anew_is_left_out_and_told() -> None:
     frames = {c.frame: np.array(recordings.frame(c)) for c in captures}
     frames[captures[5].frame] = frames[captures[4].frame].copy()
     stale = RecordingSet(recordings.manifest, frames, {}, {})
-    study = Study(stale, "left", camera_model(stale, "left"))
-    assert study.copies.ids == {"d5"}
-    assert "d5" not in {c.id for c in study.recordings.captures("dark")}
+    dataset = Dataset(stale, "left", camera_model(stale, "left"))
+    assert dataset.copies.ids == {"d5"}
+    assert "d5" not in {c.id for c in dataset.recordings.captures("dark")}
     _, skipped = measurement_model(stale, "left")
     lines = [s.reason for s in skipped if "bit for bit" in s.reason]
     assert len(lines) == 1
@@ -379,7 +379,7 @@ def test_repeats_that_are_all_copies_are_told_in_one_line() -> None:
     captures = list(recordings.manifest.captures)
     first = {c.exposure_s: np.array(recordings.frame(c)) for c in reversed(captures)}
     still = RecordingSet(recordings.manifest, {c.frame: first[c.exposure_s] for c in captures}, {}, {})
-    copies = Study(still, "left", camera_model(still, "left")).copies
+    copies = Dataset(still, "left", camera_model(still, "left")).copies
     assert copies.ids == {c.id for c in captures if not np.shares_memory(still.frame(c), still.frame(captures[0]))} - {
         next(c.id for c in captures if c.exposure_s == exposure_s) for exposure_s in first
     }
@@ -398,7 +398,7 @@ def test_a_hot_pixel_does_not_move_the_mean_of_a_small_frame(seed: int) -> None:
     law = laws.HotPixelsLaw(20000.0, 0, 5)
     camera = ConcealedCamera(seed, (law,), cfa="MONO", rows=48, cols=64, bit_depth=16)
     recordings = recordings_of(camera, Plan(("dark",), repeats=6))
-    block = dark_level_block(Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True)))
+    block = measure_dark(Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True)))
     prediction = block.predict(())
     free = np.array(list(prediction.jacobian.values()))
     n = len(block.value)

@@ -12,9 +12,9 @@ from lab.challenge.draw import recordings_of
 from lab.errors import NotDetermined
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet
-from lab.observables.darks.events import dark_event_block
-from lab.observables.darks.trails import dark_trail_block
-from lab.observables.noise.skewness import skewness_block
+from lab.observables.darks.events import measure_dark_events
+from lab.observables.darks.trails import measure_dark_trails
+from lab.observables.noise.skewness import measure_noise_skewness
 from mocks.former import ConcealedCamera, Plan
 from mocks.former.laws import PersistenceLaw
 from sim.effects.base import Effect
@@ -22,7 +22,7 @@ from sim.effects.charge_transfer_inefficiency import ChargeTransferInefficiency
 from sim.effects.cosmic_rays import CosmicRays
 from sim.effects.excess_noise import ExcessNoise
 from sim.effects.hot_pixels import HotPixels
-from tests.lab.diagnose.on_blocks import measured_model, rendered, sigmas, study
+from tests.lab.diagnose.on_blocks import dataset, measured_model, rendered, sigmas
 
 HOT = HotPixels(excess_e_per_s=800.0, share_ppm=20_000.0)
 TRAILS = ChargeTransferInefficiency(parallel_ppm=800.0, release_px=1.5)
@@ -37,7 +37,7 @@ def _recorded(*effects: Effect, repeats: int = 3) -> RecordingSet:
 
 def test_hot_pixels_trail_as_predicted_and_only_along_rows_that_are_clocked() -> None:
     """Chi2 of 24 numbers and more within four of its standard deviations; without the effect far off."""
-    model = measured_model(_recorded(HOT, TRAILS), dark_trail_block)
+    model = measured_model(_recorded(HOT, TRAILS), measure_dark_trails)
     assert abs(sigmas(model, (TRAILS,))) < 4.0
     assert sigmas(model) > 20.0
     across = [k for k, label in enumerate(model.blocks[0].labels) if label.condition.startswith("columns")]
@@ -46,25 +46,27 @@ def test_hot_pixels_trail_as_predicted_and_only_along_rows_that_are_clocked() ->
 
 
 def test_hot_pixels_alone_have_no_trails() -> None:
-    assert abs(sigmas(measured_model(_recorded(HOT), dark_trail_block))) < 4.0
+    assert abs(sigmas(measured_model(_recorded(HOT), measure_dark_trails))) < 4.0
     with pytest.raises(NotDetermined, match="hot pixels"):
-        dark_trail_block(study(_recorded()))
+        measure_dark_trails(dataset(_recorded()))
 
 
 def test_events_are_counted_as_predicted() -> None:
     """All numbers of events together: Poisson, four standard deviations; and none where none is."""
-    block = measured_model(_recorded(RAYS), dark_event_block).blocks[0]
+    block = measured_model(_recorded(RAYS), measure_dark_events).blocks[0]
     found, wanted = (np.sum(np.square(v) / 4.0 - 0.375) for v in (block.value, block.predict((RAYS,)).mean))
     assert wanted > 30.0
     # tracks that overlap in a frame, and the rim, take some away
     assert found == pytest.approx(wanted, abs=4.0 * np.sqrt(wanted) + 0.05 * wanted)
-    quiet = measured_model(_recorded(HOT), dark_event_block).blocks[0]
+    quiet = measured_model(_recorded(HOT), measure_dark_events).blocks[0]
     np.testing.assert_allclose(quiet.value, 2.0 * np.sqrt(0.375))
 
 
 def test_multiplied_electrons_have_skewed_noise() -> None:
     """The number is 1 of single electrons; a factor on the variance by the gain leaves it."""
-    plain, noisy = (measured_model(_recorded(*acting, repeats=12), skewness_block) for acting in ((), (EXCESS,)))
+    plain, noisy = (
+        measured_model(_recorded(*acting, repeats=12), measure_noise_skewness) for acting in ((), (EXCESS,))
+    )
     assert abs(sigmas(plain)) < 4.0
     assert abs(sigmas(noisy, (EXCESS,))) < 4.0
     weight = 1.0 / np.diag(noisy.blocks[0].covariance)
@@ -93,7 +95,7 @@ def test_a_decay_of_dark_frames_is_no_scatter_of_them() -> None:
     healthy camera has one scatter."""
     plan = Plan(("dark", "flat"), dark_again=True)
     fading, healthy = (
-        study(recordings_of(ConcealedCamera(930, laws, cfa="MONO", rows=96, cols=128), plan)).noise
+        dataset(recordings_of(ConcealedCamera(930, laws, cfa="MONO", rows=96, cols=128), plan)).noise
         for laws in ([PersistenceLaw(5.0, 0, 9)], [])
     )
     assert fading.jitter_dn > 0.3

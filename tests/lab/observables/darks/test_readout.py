@@ -17,15 +17,15 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.darks.readout import DarkReadOut
-from lab.observables.flats.field import line_block
-from lab.observables.flats.linearity import level_repeats_block
-from lab.observables.flats.rows import flicker_block
+from lab.observables.flats.field import measure_flat_lines
+from lab.observables.flats.linearity import measure_level_repeats
+from lab.observables.flats.rows import measure_flat_rows
 from mocks.former import ConcealedCamera, Plan
 from mocks.former.laws import TapOffsetLaw
 from sim.camera import Shutter
 from sim.effects.light_flicker import LightFlicker
 from sim.spectrum import FloatArray
-from tests.lab.diagnose.on_blocks import measured_model, names, sigmas, study, verdict
+from tests.lab.diagnose.on_blocks import dataset, measured_model, names, sigmas, verdict
 
 DATA = Path(__file__).resolve().parents[5] / "shared" / "data"
 GAIN_DN_PER_E, BLACK_DN, READ_DN = 0.42, 64.3, 0.6
@@ -93,13 +93,13 @@ def session(
 @pytest.mark.parametrize(("seed", "dark_repeats"), [(100, 10), (101, 2), (102, 0)])
 def test_coloured_noise_of_rows_is_no_flicker(seed: int, dark_repeats: int) -> None:
     """Seen in bands of rows and, as rows of a frame share it, in the means of whole frames."""
-    assert names(verdict(session(seed, dark_repeats), flicker_block, level_repeats_block)) == []
+    assert names(verdict(session(seed, dark_repeats), measure_flat_rows, measure_level_repeats)) == []
 
 
 def test_frames_means_scatter_as_those_of_dark_frames() -> None:
     """Noise of rows leaves `ROW_DN2` / 80 in a frame's mean: the darkest number's variance is 1 + that over the pixels'
     noise; ten dark frames know it to sqrt(2 / 9) = 47 %, so within 3 of these."""
-    block = level_repeats_block(study(session(100, 10, shape=(80, 768))))
+    block = measure_level_repeats(dataset(session(100, 10, shape=(80, 768))))
     pixels_dn2 = (30.0 * GAIN_DN_PER_E + READ_DN**2 + 1.0 / 12.0) / (80 * 768)
     expected = 1.0 + ROW_DN2 / 80 / pixels_dn2
     assert expected > 4.0
@@ -109,7 +109,7 @@ def test_frames_means_scatter_as_those_of_dark_frames() -> None:
 @pytest.mark.parametrize("dark_repeats", [10, 0])
 def test_flicker_beside_it_is_named(dark_repeats: int) -> None:
     """1 % of the light, with dark frames and without: it grows with the light, which noise of rows doesn't."""
-    found = verdict(session(700, dark_repeats, flicker=0.01), flicker_block, level_repeats_block)
+    found = verdict(session(700, dark_repeats, flicker=0.01), measure_flat_rows, measure_level_repeats)
     assert names(found) == ["light_flicker"]
     effect, std = found.named[0].effect, found.named[0].std
     assert isinstance(effect, LightFlicker)
@@ -123,9 +123,11 @@ def test_a_global_shutter_has_no_bands() -> None:
     flicker = LightFlicker(modulation_percent=5.0, frequency_hz=100.0, line_time_us=120.0)
     shutters: tuple[Shutter | None, ...] = "global", "rolling", None
     for shutter in shutters:
-        model = measured_model(session(103, 2, flicker=0.02, shutter=shutter, repeats=2, shape=(80, 64)), flicker_block)
+        model = measured_model(
+            session(103, 2, flicker=0.02, shutter=shutter, repeats=2, shape=(80, 64)), measure_flat_rows
+        )
         assert bool(np.any(model.mean((flicker,)) != model.mean())) == (shutter != "global")
-    found = verdict(session(103, 2, flicker=0.02, shutter="global", repeats=2, shape=(80, 64)), flicker_block)
+    found = verdict(session(103, 2, flicker=0.02, shutter="global", repeats=2, shape=(80, 64)), measure_flat_rows)
     assert "light_flicker" not in names(found)
 
 
@@ -135,7 +137,7 @@ def test_numbers_scatter_about_what_dark_frames_predict() -> None:
     pulls, chi2 = [], []
     for seed in range(8):
         recordings = session(500 + seed, 6, levels_dn=(60.0, 200.0, 1500.0), shape=(64, 256), repeats=3)
-        model = measured_model(recordings, flicker_block)
+        model = measured_model(recordings, measure_flat_rows)
         gaussian = model.gaussian()
         pulls.append(((model.value - gaussian.mean) / np.sqrt(np.diag(gaussian.covariance))).reshape(3, -1).mean(1))
         chi2.append(sigmas(model))
@@ -153,8 +155,8 @@ def test_strong_noise_of_rows_scatters_as_it_is_strong() -> None:
     found = []
     for seed in range(8):
         recordings = session(800 + seed, 6, row_dn2=8.0, levels_dn=(60.0, 200.0, 1500.0), shape=(64, 256), repeats=3)
-        found.append(sigmas(measured_model(recordings, flicker_block)))
-    assert np.max(measured_model(recordings, flicker_block).value) > 3.0
+        found.append(sigmas(measured_model(recordings, measure_flat_rows)))
+    assert np.max(measured_model(recordings, measure_flat_rows).value) > 3.0
     assert abs(np.mean(found)) < 3.0 / np.sqrt(len(found)) + 0.6
 
 
@@ -180,8 +182,8 @@ def test_a_step_of_the_dark_is_no_step_of_the_response() -> None:
     """An offset of half of the columns, 20 e, in dark frames and flats: a step of 0.4 % of the mean signal, which isn't
     left."""
     camera = ConcealedCamera(771016, (TapOffsetLaw(20.0),), cfa="RGGB", rows=96, cols=128)
-    looked_at = study(recordings_of(camera, Plan(("dark", "flat"))))
-    model = MeasurementModel((line_block(looked_at),), looked_at.camera)
+    looked_at = dataset(recordings_of(camera, Plan(("dark", "flat"))))
+    model = MeasurementModel((measure_flat_lines(looked_at),), looked_at.camera)
     assert not mismatches(model, model.gaussian(), DecisionPolicy())
 
 
@@ -191,6 +193,6 @@ def test_a_real_camera_with_noisy_rows() -> None:
     may."""
     if not (folder := DATA / "emva1288_cmos_crop").exists():
         pytest.skip("the shared recordings aren't here")
-    looked_at = study(read_emva1288(folder))
-    for make in (level_repeats_block, line_block):
+    looked_at = dataset(read_emva1288(folder))
+    for make in (measure_level_repeats, measure_flat_lines):
         assert sigmas(MeasurementModel((make(looked_at),), looked_at.camera)) < 4.0

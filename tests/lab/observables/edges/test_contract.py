@@ -17,13 +17,13 @@ from lab.challenge.draw import recordings_of
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.observables.dataset import Study
+from lab.observables.dataset import Dataset
 from lab.observables.edges.finding import region_planes
 from lab.observables.edges.measured import measure_edge
 from lab.observables.edges.prediction import EDGE_FLOOR, PredictedEdges
 from lab.observables.edges.profile import summarise_edge
 from lab.observables.edges.side import SideEdge
-from lab.observables.edges.slanted_edge import edge_block
+from lab.observables.edges.slanted_edge import measure_slanted_edge
 from lab.observables.gaussian import chi2
 from mocks.former import ConcealedCamera, Plan
 from sim.camera import CameraModel
@@ -46,8 +46,8 @@ class Drawn:
         self._rng = np.random.default_rng(seed)
         former = ConcealedCamera(seed, (), rows=size, cols=size, cfa=cfa, f_number=4.0, bit_depth=bits)
         self._given = recordings_of(former, Plan(("dark", "slanted_edge")))
-        self._study = Study(self._given, "left", camera_model(self._given, "left", None, maker_curves=True))
-        self.camera: CameraModel = self._study.camera
+        self._dataset = Dataset(self._given, "left", camera_model(self._given, "left", None, maker_curves=True))
+        self.camera: CameraModel = self._dataset.camera
         document = self._given.manifest.model_dump(mode="json", exclude_none=True)
         example = next(c for c in document["captures"] if c["kind"] == "slanted_edge")
         bright = self._given.spectrum(example["light_radiance"])
@@ -79,9 +79,11 @@ class Drawn:
         """Return the frames as a manifest describes them."""
         return self._given.with_frames(self._frames).under(Manifest.model_validate(document or self.document))
 
-    def study(self, document: dict[str, Any] | None = None) -> Study:
-        """Return the study of the frames, with the camera that drew them."""
-        return Study(self.recordings(document), "left", self.camera, self._study.saturation_dn, noise=self._study.noise)
+    def dataset(self, document: dict[str, Any] | None = None) -> Dataset:
+        """Return the dataset of the frames, with the camera that drew them."""
+        return Dataset(
+            self.recordings(document), "left", self.camera, self._dataset.saturation_dn, noise=self._dataset.noise
+        )
 
 
 @pytest.mark.parametrize("bits", [12, pytest.param(8, marks=pytest.mark.slow)])
@@ -92,7 +94,7 @@ def test_the_numbers_of_the_least_region_are_unbiased_and_their_covariance_is_tr
     """chi2 of n numbers is n within three standard deviations: sqrt(2 n) of normal numbers, and those of the variance
     of each edge's noise, sqrt(2 / 120) of some 120 samples beside it. The means of m whitened edges are normal with a
     variance of 1 / m: of 17 numbers, chi2 is 17 + 3 sqrt(34) at most."""
-    block = edge_block(Drawn(cfa, bits, LEAST_PX[cfa]).study())
+    block = measure_slanted_edge(Drawn(cfa, bits, LEAST_PX[cfa]).dataset())
     n = len(block.value)
     assert {label.channel for label in block.labels} == set("Y" if cfa == "MONO" else "RGB")
     residual = block.value - block.predict(()).mean
@@ -111,25 +113,26 @@ def test_the_numbers_of_the_least_region_are_unbiased_and_their_covariance_is_tr
 def test_a_prediction_is_what_the_estimator_reports_of_the_mean_frame(cfa: str, size: int) -> None:
     """Without noise and rounding: within three times the floor of the model's sampling of wavelengths and places."""
     drawn = Drawn(cfa, 12, size, edges=2)
-    study = drawn.study()
+    dataset = drawn.dataset()
     edges = []
-    for capture, mean in zip(study.recordings.captures(SlantedEdgeCapture), drawn.means, strict=True):
-        for channel in study.channels:
+    for capture, mean in zip(dataset.recordings.captures(SlantedEdgeCapture), drawn.means, strict=True):
+        for channel in dataset.channels:
             # weights as of a noisy frame
-            summary = summarise_edge(region_planes(mean, capture.region, cfa, channel), noise_std=2.0)
-            edges.append(SideEdge((capture,), channel, summary, False, capture.region, 0.0))
-    predicted = PredictedEdges(study, edges, drawn.camera)
+            region = (0, 0, size, size)
+            summary = summarise_edge(region_planes(mean, region, drawn.camera.cfa, channel), noise_std=2.0)
+            edges.append(SideEdge((capture,), channel, summary, False, region, 0.0))
+    predicted = PredictedEdges(dataset, edges, drawn.camera)
     np.testing.assert_allclose(predicted.value, predicted.predict(()), atol=3.0 * EDGE_FLOOR)
 
 
 def test_a_region_that_reaches_too_little_is_refused() -> None:
     with pytest.raises(NotDetermined, match=r"reach 7\.\d px from the edge, 8 px are needed: widen the region"):
-        edge_block(Drawn("MONO", 12, LEAST_PX["MONO"] - 4, edges=2).study())
+        measure_slanted_edge(Drawn("MONO", 12, LEAST_PX["MONO"] - 4, edges=2).dataset())
 
 
 def test_too_few_samples_are_refused() -> None:
     """28 x 28 px hold 14 x 14 reds, and twice as many greens."""
-    block = edge_block(Drawn("GBRG", 12, LEAST_PX["GBRG"] - 8, edges=2).study())
+    block = measure_slanted_edge(Drawn("GBRG", 12, LEAST_PX["GBRG"] - 8, edges=2).dataset())
     assert {label.channel for label in block.labels} == {"G"}
 
 
@@ -160,8 +163,8 @@ def test_no_statement_enters_the_numbers(of_camera: dict[str, Any], of_edges: di
     for document in (drawn.document, changed):
         recordings = drawn.recordings(document)
         camera = camera_model(recordings, "left", None, maker_curves=True)
-        values.append(edge_block(Study(recordings, "left", camera)).value)
-    np.testing.assert_array_equal(*values)
+        values.append(measure_slanted_edge(Dataset(recordings, "left", camera)).value)
+    np.testing.assert_array_equal(values[0], values[1])
 
 
 @pytest.mark.parametrize(("cfa", "other"), [("GRBG", "GBRG"), ("RGGB", "BGGR")])

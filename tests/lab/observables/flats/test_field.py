@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from lab.formats.recording_set import RecordingSet
-from lab.observables.darks.field import dark_field_block
-from lab.observables.darks.level import dark_level_block
-from lab.observables.darks.readout import fixed_line_block
-from lab.observables.dataset import Study
+from lab.observables.darks.field import measure_dark_field
+from lab.observables.darks.level import measure_dark
+from lab.observables.darks.readout import measure_fixed_lines
+from lab.observables.dataset import Dataset
 from lab.observables.flats.field import (
     ALIKE,
     _adjacent,
     _cell_means,
     _cell_points,
     _pattern_variance,
-    shading_block,
+    measure_flat_field,
 )
-from lab.observables.flats.green_balance import green_block
-from lab.observables.flats.linearity import linearity_block
-from lab.observables.flats.rows import flicker_block
-from lab.observables.observable import Block
+from lab.observables.flats.green_balance import measure_green_balance
+from lab.observables.flats.linearity import measure_photon_transfer
+from lab.observables.flats.rows import measure_flat_rows
+from lab.observables.observable import Observable
 from mocks.former.laws import (
     DustShadowLaw,
     MicrolensAngleLaw,
@@ -33,16 +33,16 @@ from mocks.former.laws import (
     VignettingDecentreLaw,
     VignettingLaw,
 )
-from tests.lab.diagnose.on_blocks import former, measured_model, names, rendered, sigmas, study, verdict
+from tests.lab.diagnose.on_blocks import dataset, former, measured_model, names, rendered, sigmas, verdict
 from tests.sim.local_effects import ReadOutRamp
 
-LOOKED_AT = (shading_block, linearity_block)
+LOOKED_AT = (measure_flat_field, measure_photon_transfer)
 
 
 def test_healthy_cells_scatter_as_they_should() -> None:
     """4 cameras: the mean of chi2's departures within 3 / sqrt(4) of its standard deviations, and 0.5 for the free axis
     and level."""
-    found = [sigmas(measured_model(former(s, cfa=c), shading_block)) for s in (1, 2) for c in ("MONO", "BGGR")]
+    found = [sigmas(measured_model(former(s, cfa=c), measure_flat_field)) for s in (1, 2) for c in ("MONO", "BGGR")]
     assert abs(np.mean(found)) < 3.0 / np.sqrt(4) + 0.5
     assert max(found) < 4.0
 
@@ -67,7 +67,7 @@ def test_a_fall_off_about_another_point_is_named(variant: int) -> None:
 
 def test_microlenses_at_another_angle_are_named_and_vignetting_is_not() -> None:
     """By the second image former; each parameter within 4 of its own standard deviations."""
-    blocks = (*LOOKED_AT, green_block)
+    blocks = (*LOOKED_AT, measure_green_balance)
     law = MicrolensAngleLaw(6.0, 0, 9)
     found = verdict(former(21, law, cfa="RGGB"), *blocks)
     assert names(found) == ["microlens_angle"]
@@ -112,7 +112,7 @@ def test_a_pattern_that_neighbours_share_counts_more() -> None:
 
 def test_means_over_cells_are_exact_for_the_fourth_power() -> None:
     """x^4 over a cell from a to b: (b^5 - a^5) / (5 (b - a))."""
-    camera = study(former(1, kinds=("dark", "flat"))).camera
+    camera = dataset(former(1, kinds=("dark", "flat"))).camera
     place = _cell_points(camera, 0.0, 0.0)
     edges = (np.linspace(0, camera.cols, 9) - camera.cols / 2) * camera.pixel_pitch_um
     exact = np.diff(edges**5) / (5.0 * np.diff(edges))
@@ -137,15 +137,15 @@ def without_darks(recordings: RecordingSet) -> RecordingSet:
 @pytest.mark.parametrize(
     ("make", "recordings"),
     [
-        (dark_field_block, recorded),
-        (partial(fixed_line_block, "rows"), recorded),
-        (shading_block, recorded),
-        (flicker_block, lambda: without_darks(recorded())),
+        (measure_dark_field, recorded),
+        (partial(measure_fixed_lines, "rows"), recorded),
+        (measure_flat_field, recorded),
+        (measure_flat_rows, lambda: without_darks(recorded())),
     ],
     ids=["dark_field", "dark_row_pattern", "flat_field", "flat_rows"],
 )
 def test_what_read_out_adds_is_predicted(
-    make: Callable[[Study], Block], recordings: Callable[[], RecordingSet]
+    make: Callable[[Dataset], Observable], recordings: Callable[[], RecordingSet]
 ) -> None:
     """Without the effect the numbers lie far off, with it chi-squared is within 4 of its standard deviations."""
     model = measured_model(recordings(), make)
@@ -155,11 +155,11 @@ def test_what_read_out_adds_is_predicted(
 
 def test_the_rows_of_flats_have_the_offsets_of_dark_rows() -> None:
     """The dark frames' mean rows are subtracted: no effect has to tell them once more."""
-    assert abs(sigmas(measured_model(recorded(), flicker_block))) < 4.0
+    assert abs(sigmas(measured_model(recorded(), measure_flat_rows))) < 4.0
 
 
 def test_its_mean_is_a_part_of_the_black_level() -> None:
     """The level that dark frames have at no exposure is measured with it."""
-    model = measured_model(recorded(), dark_level_block)
+    model = measured_model(recorded(), measure_dark)
     assert abs(sigmas(model)) < 4.0
     np.testing.assert_array_equal(model.mean((RAMP,)), model.mean(()))

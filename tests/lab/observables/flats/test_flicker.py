@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.observables.flats.field import shading_block
-from lab.observables.flats.linearity import linearity_block
-from lab.observables.flats.rows import flicker_block
+from lab.observables.flats.field import measure_flat_field
+from lab.observables.flats.linearity import measure_photon_transfer
+from lab.observables.flats.rows import measure_flat_rows
 from mocks.former.laws import LightFlickerLaw, PeriodicBandingLaw, RowNoiseLaw
 from sim.effects.light_flicker import LightFlicker
-from tests.lab.diagnose.on_blocks import former, measured_model, names, rendered, sigmas, study, verdict
+from tests.lab.diagnose.on_blocks import dataset, former, measured_model, names, rendered, sigmas, verdict
 
-LOOKED_AT = (flicker_block, linearity_block, shading_block)
+LOOKED_AT = (measure_flat_rows, measure_photon_transfer, measure_flat_field)
 
 
 def test_rows_of_healthy_frames_are_noise() -> None:
     """chi2 of about 60 numbers: its mean over 4 cameras within 3 / sqrt(4) of its standard deviation, and 0.3 for what
     is free."""
-    found = [sigmas(measured_model(former(s, cfa=c), flicker_block)) for s in (1, 2) for c in ("MONO", "RGGB")]
+    found = [sigmas(measured_model(former(s, cfa=c), measure_flat_rows)) for s in (1, 2) for c in ("MONO", "RGGB")]
     assert abs(np.mean(found)) < 3.0 / np.sqrt(4) + 0.3
     assert max(found) < 4.0
 
@@ -49,7 +49,7 @@ def test_flicker_of_sim_is_named_with_its_bands() -> None:
 
 def test_bands_that_move_from_repeat_to_repeat_are_no_shot_noise() -> None:
     """The first guess of the gain, from differences of repeats, beside the same camera in steady light: within 5 %."""
-    steady, flickering = (study(former(11, *laws)).noise.gain for laws in ((), (LightFlickerLaw(10.0, 0, 9),)))
+    steady, flickering = (dataset(former(11, *laws)).noise.gain for laws in ((), (LightFlickerLaw(10.0, 0, 9),)))
     assert flickering == pytest.approx(steady, rel=0.05)
 
 
@@ -61,4 +61,4 @@ def test_noise_of_rows_is_no_flicker() -> None:
 
 def test_recordings_that_determine_no_flicker_are_refused() -> None:
     with pytest.raises(NotDetermined, match="repeated"):
-        measured_model(former(1, kinds=("dark",)), flicker_block)
+        measured_model(former(1, kinds=("dark",)), measure_flat_rows)

@@ -7,19 +7,19 @@ import pytest
 
 from lab.errors import NotDetermined
 from lab.observables.flats import line_gains
-from lab.observables.flats.field import shading_block
-from lab.observables.flats.green_balance import green_block
-from lab.observables.flats.line_gains import line_gain_block
-from lab.observables.observable import Block
+from lab.observables.flats.field import measure_flat_field
+from lab.observables.flats.green_balance import measure_green_balance
+from lab.observables.flats.line_gains import measure_line_gains
+from lab.observables.observable import Observable
 from mocks.former import ConcealedCamera
 from mocks.former.laws import ColumnNoiseLaw, LineGainLaw, OnChipSmoothingLaw, PhaseDetectionRowsLaw, TapGainLaw
 from sim.effects.base import Effect
 from sim.effects.library import effect
-from tests.lab.diagnose.on_blocks import former, measured_model, sigmas, study
+from tests.lab.diagnose.on_blocks import dataset, former, measured_model, sigmas
 from tests.lab.mono_session import MonoSession
 
 
-def pulls(block: Block, effects: tuple[Effect, ...] = ()) -> tuple[np.ndarray, float]:
+def pulls(block: Observable, effects: tuple[Effect, ...] = ()) -> tuple[np.ndarray, float]:
     """Pulls of the numbers, and chi2 over their count."""
     prediction = block.predict(effects)
     jacobian = np.reshape(list(prediction.jacobian.values()), (-1, len(block.value)))
@@ -47,7 +47,7 @@ def test_powers_of_white_images_are_unbiased_and_scatter_as_said(
 def test_healthy_cameras_have_lines_like_their_pixels(cfa: str) -> None:
     """12 numbers of each of 6 cameras: chi2 to 4 sqrt(2 / 72), and the mean pull of a direction to 4 / sqrt(6 x 3), as
     seen and held-out flats share the pattern."""
-    found = [pulls(line_gain_block(study(former(3100 + seed, cfa=cfa)))) for seed in range(6)]
+    found = [pulls(measure_line_gains(dataset(former(3100 + seed, cfa=cfa)))) for seed in range(6)]
     assert np.mean([chi2 for _, chi2 in found]) < 1.0 + 4.0 * np.sqrt(2.0 / 72.0)
     means = np.array([z.reshape(2, -1).mean(1) for z, _ in found]).mean(0)
     assert np.all(np.abs(means) < 4.0 / np.sqrt(18.0))
@@ -58,7 +58,7 @@ def test_healthy_cameras_have_lines_like_their_pixels(cfa: str) -> None:
 def test_gains_are_predicted(cfa: str, variant: int, name: str) -> None:
     """Numbers of the other direction stay; those of this one need the effect, of which they are a sample: chi2 of 12 to
     4 sqrt(2 / 12)."""
-    block = line_gain_block(study(former(3201, LineGainLaw(0.8, variant, 5), cfa=cfa)))
+    block = measure_line_gains(dataset(former(3201, LineGainLaw(0.8, variant, 5), cfa=cfa)))
     _, without = pulls(block)
     _, with_it = pulls(block, (effect(name)(gain_percent=0.8),))
     assert without > 10.0
@@ -78,15 +78,15 @@ def test_gains_are_predicted(cfa: str, variant: int, name: str) -> None:
 def test_what_only_looks_like_gains_of_lines_is_none(law: object, known: tuple[Effect, ...]) -> None:
     """Offsets that stand in dark frames, too; a filter that correlates lines; areas; rows that repeat. To 5 standard
     deviations of chi2 of 12 numbers."""
-    _, chi2 = pulls(line_gain_block(study(former(3301, law))), known)  # type: ignore[arg-type]
+    _, chi2 = pulls(measure_line_gains(dataset(former(3301, law))), known)  # type: ignore[arg-type]
     assert chi2 < 1.0 + 5.0 * np.sqrt(2.0 / 12.0)
 
 
 def test_rows_of_low_frames_and_small_frames_are_skipped() -> None:
-    block = line_gain_block(study(MonoSession(shape=(48, 64), levels=4).recordings()))
+    block = measure_line_gains(dataset(MonoSession(shape=(48, 64), levels=4).recordings()))
     assert {label.condition for label in block.labels} == {"columns"}
     with pytest.raises(NotDetermined, match=r"frames of 20 px.*from 24 px"):
-        line_gain_block(study(MonoSession(shape=(20, 64), levels=4).recordings()))
+        measure_line_gains(dataset(MonoSession(shape=(20, 64), levels=4).recordings()))
 
 
 def test_the_list_of_laws_has_it() -> None:
@@ -98,5 +98,7 @@ def test_the_list_of_laws_has_it() -> None:
 def test_other_measurements_of_even_light_know_how_lines_scatter(variant: int) -> None:
     """Cells of flats and the greens' balance: chi2 of all numbers with the effect, to 4 of its standard deviations."""
     one = effect(("column_gain", "column_gain", "row_gain")[variant])(gain_percent=0.8)
-    model = measured_model(former(3401, LineGainLaw(0.8, variant, 5), cfa="RGGB"), shading_block, green_block)
+    model = measured_model(
+        former(3401, LineGainLaw(0.8, variant, 5), cfa="RGGB"), measure_flat_field, measure_green_balance
+    )
     assert sigmas(model, (one,)) < 4.0 < sigmas(model)

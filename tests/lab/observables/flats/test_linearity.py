@@ -9,16 +9,16 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
-from lab.observables.flats.linearity import level_repeats_block
+from lab.observables.flats.linearity import measure_level_repeats
 from lab.observables.noise.figures import RepeatedMeans, level_repeatability, steady
-from lab.observables.observable import Block
+from lab.observables.observable import Observable
 from mocks.former.laws import ImageLagLaw, LightFlickerLaw, SourceInstabilityLaw
 from sim.effects.base import Effects
 from sim.effects.image_lag import ImageLag
 from sim.effects.light_flicker import LightFlicker
 from sim.effects.source_instability import SourceInstability
 from sim.spectrum import FloatArray
-from tests.lab.diagnose.on_blocks import former, study
+from tests.lab.diagnose.on_blocks import dataset, former
 
 SCATTER, NOISE = 3e-4, 1e-4
 
@@ -75,7 +75,7 @@ def test_an_unsteady_light_is_no_outlier() -> None:
 # --- Repeatability of the light from frame to frame: cameras of the second image former, and drawn scatter ------------
 
 
-def std_of(block: Block, effects: Effects) -> FloatArray:
+def std_of(block: Observable, effects: Effects) -> FloatArray:
     """Standard deviation of each number under these effects."""
     jacobian = block.predict(effects).jacobian
     return np.sqrt(np.diag(block.covariance) + sum(np.square(column) for column in jacobian.values()))
@@ -83,16 +83,16 @@ def std_of(block: Block, effects: Effects) -> FloatArray:
 
 @pytest.mark.parametrize("seed", [772511, 772512, 772513, 772514])
 def test_a_steady_source_is_no_finding(seed: int) -> None:
-    block = level_repeats_block(study(former(seed)))
+    block = measure_level_repeats(dataset(former(seed)))
     assert np.all(np.abs(block.value - block.predict(()).mean) < 3.0 * std_of(block, ()))
 
 
 def test_an_unsteady_source_is_named_with_its_size() -> None:
     """1.2 % from frame to frame; with f degrees of freedom a standard deviation is known to sqrt(1 / (2 f)), 25 % for f
     = 8."""
-    here = study(former(772521, SourceInstabilityLaw(1.2, 0, 9)))
+    here = dataset(former(772521, SourceInstabilityLaw(1.2, 0, 9)))
     verdict = decide(
-        MeasurementModel((level_repeats_block(here),), here.camera), np.random.default_rng(0), DecisionPolicy()
+        MeasurementModel((measure_level_repeats(here),), here.camera), np.random.default_rng(0), DecisionPolicy()
     )
     assert [c.effect.name for c in verdict.named] == ["source_instability"]
     found, std = (
@@ -108,7 +108,7 @@ def test_flicker_within_frames_moves_whole_frames_too() -> None:
     """100 Hz over 96 rows of 60 us, 0.58 of a period: whole frames scatter by what the rows' mean leaves of the
     modulation, and no other light is asked for."""
     law = LightFlickerLaw(20.0, 0, 4)
-    block = level_repeats_block(study(former(772531, law)))
+    block = measure_level_repeats(dataset(former(772531, law)))
     flicker = LightFlicker(modulation_percent=20.0, frequency_hz=100.0, line_time_us=60.0)
     assert np.any(block.value - block.predict(()).mean > 3.0 * std_of(block, ()))
     assert np.all(np.abs(block.value - block.predict((flicker,)).mean) < 3.0 * std_of(block, (flicker,)))
@@ -119,8 +119,8 @@ def test_image_lag_scatters_repeats_by_what_the_frames_before_left(seed: int) ->
     """5 % of the frame before, exposures up and down, the same noise with and without it. Over 4 degrees of freedom,
     the product of both scatters S / noise by 2 sqrt(R / 4), R the lag's variance over the noise's. It was called
     source_instability."""
-    with_lag = level_repeats_block(study(former(seed, ImageLagLaw(5.0, 0, 9), shuttle=True)))
-    without = level_repeats_block(study(former(seed, shuttle=True)))
+    with_lag = measure_level_repeats(dataset(former(seed, ImageLagLaw(5.0, 0, 9), shuttle=True)))
+    without = measure_level_repeats(dataset(former(seed, shuttle=True)))
     mean = 1.0 - np.diag(with_lag.covariance)
     lag = (with_lag.predict((ImageLag(lag_percent=5.0),)).mean / mean) ** 3 - 1.0
     assert np.all(lag > 6.0)
@@ -129,7 +129,7 @@ def test_image_lag_scatters_repeats_by_what_the_frames_before_left(seed: int) ->
 
 def test_the_law_adds_its_variance() -> None:
     """((n + s^2) / n)^(1/3) grows with s, as s^(2/3) for large s; so does its scatter."""
-    block = level_repeats_block(study(former(772541)))
+    block = measure_level_repeats(dataset(former(772541)))
     small, large = (block.predict((SourceInstability(instability_percent=s),)) for s in (5.0, 10.0))
     np.testing.assert_allclose(large.mean, 2.0 ** (2.0 / 3.0) * small.mean, rtol=1e-3)
     wide = [

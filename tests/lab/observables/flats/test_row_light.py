@@ -9,7 +9,7 @@ import pytest
 from lab.observables.flats.row_light import row_light_scatter, row_light_variance
 from sim.effects.light_flicker import LightFlicker
 from sim.uniform import Uniform
-from tests.lab.diagnose.on_blocks import former, study
+from tests.lab.diagnose.on_blocks import dataset, former
 
 ROWS, EXPOSURE_S = 96, 2e-3
 FLICKER = LightFlicker(modulation_percent=6.0, frequency_hz=100.0, line_time_us=150.0)
@@ -18,7 +18,7 @@ PHASE = 2.0 * np.pi * 100.0 * 150e-6 * np.arange(ROWS)
 
 
 def _model(*effects: LightFlicker) -> Uniform:
-    return Uniform(study(former(1, kinds=("dark",))).camera, effects)
+    return Uniform(dataset(former(1, kinds=("dark",))).camera, effects)
 
 
 def test_rows_scatter_together() -> None:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.observables.noise.amplifier_correlation import RELATIONS, amplifier_block
+from lab.observables.noise.amplifier_correlation import RELATIONS, measure_amplifier_correlation
 from mocks.former import Law
 from mocks.former.laws import AmplifierCrosstalkLaw, ColumnNoiseLaw, OnChipSmoothingLaw, PinkNoiseLaw, RowNoiseLaw
 from sim.effects.base import Effect
 from sim.effects.library import effect
-from tests.lab.diagnose.on_blocks import former, measured_model, sigmas, study
+from tests.lab.diagnose.on_blocks import dataset, former, measured_model, sigmas
 from tests.lab.mono_session import MonoSession
 
 
@@ -19,7 +19,7 @@ from tests.lab.mono_session import MonoSession
 def test_healthy_cameras_have_none(cfa: str) -> None:
     """8 relations in the dark and in light, seen and held out, of 5 cameras: mean pull to 4 / sqrt(n), mean square to
     4 sqrt(2 / n), n = 160."""
-    blocks = [amplifier_block(study(former(4100 + seed, cfa=cfa))) for seed in range(5)]
+    blocks = [measure_amplifier_correlation(dataset(former(4100 + seed, cfa=cfa))) for seed in range(5)]
     pulls = np.concatenate([b.value / np.sqrt(np.diag(b.covariance)) for b in blocks])
     assert abs(pulls.mean()) < 4.0 / np.sqrt(len(pulls))
     assert abs(np.mean(np.square(pulls)) - 1.0) < 4.0 * np.sqrt(2.0 / len(pulls))
@@ -29,7 +29,7 @@ def test_healthy_cameras_have_none(cfa: str) -> None:
 @pytest.mark.parametrize("law", [RowNoiseLaw(4.0, 1, 3), ColumnNoiseLaw(4.0, 1, 3), OnChipSmoothingLaw(0.3, 1, 3)])
 def test_other_noise_that_pixels_share_is_none(law: Law, cfa: str) -> None:
     """Row noise goes with the rows' means, and what neighbours share widens the scatter that is measured."""
-    assert sigmas(measured_model(former(4201, law, cfa=cfa), amplifier_block)) < 4.0
+    assert sigmas(measured_model(former(4201, law, cfa=cfa), measure_amplifier_correlation)) < 4.0
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_other_noise_that_pixels_share_is_none(law: Law, cfa: str) -> None:
 )
 def test_what_couples_is_predicted(law: Law, known: Effect) -> None:
     """chi2 of all numbers within 4 of its standard deviations with the effect, and far beyond without."""
-    model = measured_model(former(4301, law), amplifier_block)
+    model = measured_model(former(4301, law), measure_amplifier_correlation)
     assert sigmas(model, (known,)) < 4.0
     if law.effect == "amplifier_crosstalk":
         assert sigmas(model) > 8.0
@@ -61,4 +61,4 @@ def test_small_frames_are_skipped_and_every_relation_pairs_all_pixels() -> None:
         assert here.shape == there.shape
         assert not np.any(here == there)
     with pytest.raises(NotDetermined, match=r"frames of 24 px.*from 32 px"):
-        amplifier_block(study(MonoSession(shape=(24, 64), levels=4).recordings()))
+        measure_amplifier_correlation(dataset(MonoSession(shape=(24, 64), levels=4).recordings()))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.observables.flats.linearity import linearity_block
+from lab.observables.flats.linearity import measure_photon_transfer
 from lab.observables.noise.line_means import LineMeans
 from sim.effects.row_noise import RowNoise
 from sim.sensor import mosaic
 from sim.sensor.lines import LineNoise
-from tests.lab.diagnose.on_blocks import rendered, study
+from tests.lab.diagnose.on_blocks import dataset, rendered
 
 DRAWS = 4000
 
@@ -18,7 +18,7 @@ DRAWS = 4000
 @pytest.mark.parametrize("correlation", [0.0, 0.5, -0.5])
 def test_means_scatter_as_drawn_rows_do(correlation: float) -> None:
     """Covariances of N draws within 4 sqrt(2 / N) of the largest variance."""
-    at = study(rendered(3))
+    at = dataset(rendered(3))
     capture = at.recordings.captures("flat", "left")[0]
     effects = (RowNoise(noise_e=3.0, correlation=correlation),)
     jacobian = np.array(list(LineMeans(at, [(capture, c) for c in at.channels]).jacobian(effects).values()))
@@ -44,7 +44,7 @@ def _ends(rows: int) -> float:
 
 
 def test_flats_of_a_camera_without_line_noise_have_no_such_terms() -> None:
-    at = study(rendered(3))
-    block = linearity_block(at)
+    at = dataset(rendered(3))
+    block = measure_photon_transfer(at)
     assert not [name for name in block.predict(()).jacobian if name.startswith("rows:")]
     assert [name for name in block.predict((RowNoise(noise_e=2.0),)).jacobian if name.startswith("rows:")]

@@ -14,13 +14,13 @@ from lab.diagnose.inference.refit import refit
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.observables.dataset import Study, held_out_flats
-from lab.observables.edges.slanted_edge import edge_block
-from lab.observables.flats.linearity import linearity_block
-from lab.observables.flats.noise import variance_block
-from lab.observables.noise.neighbours import correlations, neighbour_block, tone_block
+from lab.observables.dataset import Dataset, held_out_flats
+from lab.observables.edges.slanted_edge import measure_slanted_edge
+from lab.observables.flats.linearity import measure_photon_transfer
+from lab.observables.flats.noise import measure_noise
+from lab.observables.noise.neighbours import correlations, measure_noise_neighbours, measure_noise_tones
 from lab.observables.noise.temporal import PAIRS, independent_correlations, repeats_of
-from lab.observables.observable import Block
+from lab.observables.observable import Observable
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     AnisotropicBrighterFatterLaw,
@@ -45,16 +45,16 @@ SETS = 400  # of frames
 LIGHT = Spectrum.of([400.0, 700.0], [2e-3, 2e-3])
 
 
-def _study(recordings: RecordingSet) -> Study:
-    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+def _dataset(recordings: RecordingSet) -> Dataset:
+    return Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
-def _concealed(seed: int, laws: Sequence[Law] = (), cfa: str | None = None, repeats: int = 3) -> Study:
+def _concealed(seed: int, laws: Sequence[Law] = (), cfa: str | None = None, repeats: int = 3) -> Dataset:
     camera = ConcealedCamera(seed, laws, cfa=cfa, rows=96, cols=128)
-    return _study(recordings_of(camera, Plan(("dark", "flat"), repeats=repeats)))
+    return _dataset(recordings_of(camera, Plan(("dark", "flat"), repeats=repeats)))
 
 
-def _rendered(acting: Sequence[Effect], seed: int = 5, cfa: str = "MONO", tone_dn: float = 0.0) -> Study:
+def _rendered(acting: Sequence[Effect], seed: int = 5, cfa: str = "MONO", tone_dn: float = 0.0) -> Dataset:
     """Darks and flats of `sim`, with PRNU and a lamp that flickers by 0.3 %. `tone_dn`: of half the pixels' clock,
     whose sign changes from frame to frame, dithered."""
     channels = ("Y",) if cfa == "MONO" else ("R", "G", "B")
@@ -95,17 +95,17 @@ def _rendered(acting: Sequence[Effect], seed: int = 5, cfa: str = "MONO", tone_d
     "focal_length_mm": 8.0,
               "quantum_efficiency": dict.fromkeys(channels, "qe.csv")}  # fmt: skip
     manifest = Manifest.model_validate({"cameras": {"left": stated}, "captures": captures})
-    return _study(
+    return _dataset(
         RecordingSet(manifest, frames, {"lamp.csv": LIGHT, "qe.csv": Spectrum.of([400.0, 700.0], [0.5, 0.5])})
     )
 
 
-def _blocks(study: Study) -> tuple[Block, ...]:
-    return linearity_block(study), variance_block(study), neighbour_block(study)
+def _blocks(dataset: Dataset) -> tuple[Observable, ...]:
+    return measure_photon_transfer(dataset), measure_noise(dataset), measure_noise_neighbours(dataset)
 
 
-def _verdict(study: Study) -> Verdict:
-    return decide(MeasurementModel(_blocks(study), study.camera), np.random.default_rng(0), DecisionPolicy())
+def _verdict(dataset: Dataset) -> Verdict:
+    return decide(MeasurementModel(_blocks(dataset), dataset.camera), np.random.default_rng(0), DecisionPolicy())
 
 
 def test_correlations_of_a_filter_are_its_autocorrelation() -> None:
@@ -127,8 +127,8 @@ def test_correlations_of_a_filter_are_its_autocorrelation() -> None:
 def test_noise_of_healthy_cameras_is_what_the_covariances_say(cfa: str) -> None:
     """chi2 of both formers' cameras over their numbers: 3 sigma of 2 / n is 0.4 for 100 numbers; never above by
     more."""
-    for study in (_concealed(770011, cfa=cfa), _concealed(770012, cfa=cfa, repeats=6), _rendered((), cfa=cfa)):
-        for block in (variance_block(study), neighbour_block(study)):
+    for dataset in (_concealed(770011, cfa=cfa), _concealed(770012, cfa=cfa, repeats=6), _rendered((), cfa=cfa)):
+        for block in (measure_noise(dataset), measure_noise_neighbours(dataset)):
             residual = block.value - block.predict(()).mean
             jacobian = np.array(list(block.predict(()).jacobian.values())).reshape(-1, len(residual))
             covariance = block.covariance + jacobian.T @ jacobian
@@ -139,7 +139,7 @@ def test_noise_of_healthy_cameras_is_what_the_covariances_say(cfa: str) -> None:
 def test_a_lamp_that_flickers_and_rows_with_noise_leave_no_correlation() -> None:
     """Row noise of 3 e, as large as the pixels': row means are subtracted, and what that subtracts is corrected for.
     144 numbers."""
-    blocks = [neighbour_block(_rendered((effect("row_noise")(noise_e=3.0),), seed)) for seed in (20, 21, 22)]
+    blocks = [measure_noise_neighbours(_rendered((effect("row_noise")(noise_e=3.0),), seed)) for seed in (20, 21, 22)]
     pulls = np.concatenate([b.value / np.sqrt(np.diag(b.covariance)) for b in blocks])
     assert np.mean(np.square(pulls)) < 1.0 + 3.0 * np.sqrt(2.0 / len(pulls))
     assert abs(np.mean(pulls)) < 3.0 / np.sqrt(len(pulls))
@@ -149,9 +149,9 @@ def test_tones_of_the_read_out_are_told_and_leave_no_correlation() -> None:
     """0.6 DN of alternating sign have the variance 0.48 DN^2 in four repeats. Beside it stand 1.44 of read noise, 0.32
     of rounding and dither, and 0.40 of the dark current's shot noise in one of two settings: shares of 0.21 and 0.18,
     known to 2 %. A healthy camera has none. 48 correlations."""
-    assert not tone_block(_rendered(())).value.any()
-    study = _rendered((), tone_dn=0.6)
-    told, block = tone_block(study), neighbour_block(study)
+    assert not measure_noise_tones(_rendered(())).value.any()
+    dataset = _rendered((), tone_dn=0.6)
+    told, block = measure_noise_tones(dataset), measure_noise_neighbours(dataset)
     assert told.value == pytest.approx([0.198], rel=0.06)
     pulls = block.value / np.sqrt(np.diag(block.covariance))
     assert np.mean(np.square(pulls)) < 1.0 + 3.0 * np.sqrt(2.0 / len(pulls))
@@ -173,11 +173,11 @@ def test_tones_of_the_read_out_are_told_and_leave_no_correlation() -> None:
 )
 def test_what_sim_renders_is_predicted_and_named(one: Effect, cfa: str) -> None:
     """The prediction's chi2 as above; the name alone; and its size within 3.5 standard uncertainties."""
-    study = _rendered((one,), seed=8, cfa=cfa)
-    block = neighbour_block(study)
+    dataset = _rendered((one,), seed=8, cfa=cfa)
+    block = measure_noise_neighbours(dataset)
     residual = block.value - block.predict((one,)).mean
     assert float(np.mean(np.square(residual) / np.diag(block.covariance))) < 1.0 + 4.0 * np.sqrt(2.0 / len(residual))
-    verdict = _verdict(study)
+    verdict = _verdict(dataset)
     assert [c.effect.name for c in verdict.named] == [one.name]
     main = next(iter(type(one).quantities()))
     std = verdict.named[0].std[main]
@@ -209,8 +209,8 @@ def test_what_another_former_conceals_is_named(law: Law, name: str) -> None:
 def test_borders_that_move_between_colours_are_measured_by_their_means() -> None:
     """A loss of 6 % by borders alone is a mean exchange of 6 / 4 %: all three sizes within 3.5 standard
     uncertainties."""
-    study = _concealed(770041, (BrighterFatterLaw(6.0, 2),), cfa="RGGB")
-    verdict = _verdict(study)
+    dataset = _concealed(770041, (BrighterFatterLaw(6.0, 2),), cfa="RGGB")
+    verdict = _verdict(dataset)
     assert [c.told_name for c in verdict.named] == ["brighter_fatter"]
     found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std
     for name, truth in (("loss_percent", 6.0), ("shared_percent", 6.0), ("exchanged_percent", 1.5)):
@@ -256,17 +256,17 @@ def test_correlations_of_independent_pixels_in_small_frames_are_none(
     """What taking out the means of rows and columns does to independent pixels is exact: the mean of many sets is 0 and
     their covariance as stated."""
     rng = np.random.default_rng(8)
-    study = _concealed(1, cfa=cfa)
-    dark = study.recordings.captures("dark", "left")[:frames]
+    dataset = _concealed(1, cfa=cfa)
+    dark = dataset.recordings.captures("dark", "left")[:frames]
     captures = [dark[0].model_copy(update={"id": f"d{k}"}) for k in range(frames)]
     drawn: dict[str, np.ndarray] = {}
-    study.recordings.frame = lambda c: drawn[c.id]  # type: ignore[method-assign, assignment, return-value]
+    dataset.recordings.frame = lambda c: drawn[c.id]  # type: ignore[method-assign, assignment, return-value]
     found = []
     for _ in range(SETS):
         drawn.update({c.id: 1000.0 + 30.0 * rng.standard_normal(shape) for c in captures})
-        found.append(repeats_of(study, captures, False).correlation)
+        found.append(repeats_of(dataset, captures, False).correlation)
     value = np.array(found)
-    covariance = independent_correlations(shape, frames - 1, study.camera.cfa)[1]
+    covariance = independent_correlations(shape, frames - 1, dataset.camera.cfa)[1]
     std = np.sqrt(np.diag(covariance))
     # 6 means at 4.5 sigma
     assert np.all(np.abs(value.mean(0)) < 4.5 * std / np.sqrt(SETS))
@@ -281,7 +281,8 @@ def test_charge_that_moves_across_an_edge_is_no_blur(cfa: str) -> None:
     """Borders between unequal pixels move, so that a quarter of the variance's loss is exchanged: 5 % for 20 %. Edges
     alone tell it, within three standard deviations."""
     model = measured_model(
-        former(6201, BrighterFatterLaw(20.0, 2, 1), cfa=cfa, kinds=("dark", "flat", "slanted_edge")), edge_block
+        former(6201, BrighterFatterLaw(20.0, 2, 1), cfa=cfa, kinds=("dark", "flat", "slanted_edge")),
+        measure_slanted_edge,
     )
     fit = refit(
         model, (BrighterFatter(loss_percent=20.0, shared_percent=20.0, exchanged_percent=1.0),), DecisionPolicy()

@@ -21,14 +21,14 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.formats.recording_set import RecordingSet
-from lab.observables.charts.chart import chart_block
-from lab.observables.dataset import Study
-from lab.observables.edges.slanted_edge import edge_block
-from lab.observables.observable import Block, measurements
+from lab.observables.charts.chart import measure_chart
+from lab.observables.dataset import Dataset
+from lab.observables.edges.slanted_edge import measure_slanted_edge
+from lab.observables.observable import Observable, measurements
 from lab.observables.screens import pattern_fit
-from lab.observables.screens.cells import grid_block, screen_block
-from lab.observables.screens.lateral_colour import colour_block
-from lab.observables.screens.pattern_fit import cell_border_block, contrast_block, ghost_block, patterns
+from lab.observables.screens.cells import measure_screen, measure_screen_grid
+from lab.observables.screens.lateral_colour import measure_lateral_colour
+from lab.observables.screens.pattern_fit import measure_bernoulli, measure_cell_borders, measure_ghost, patterns
 from lab.observables.surroundings import Surroundings, harmonics
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
@@ -50,33 +50,33 @@ def recorded(*laws: Law, seed: int = 61, cfa: str = "GRBG", plan: Plan = PLAN) -
     return recordings_of(ConcealedCamera(seed, laws, cfa=cfa, f_number=2.8, rows=96, cols=128), plan)
 
 
-def study_of(recordings: RecordingSet) -> Study:
-    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+def dataset_of(recordings: RecordingSet) -> Dataset:
+    return Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
 @cache
-def shared_study(*laws: Law) -> Study:
+def shared_study(*laws: Law) -> Dataset:
     """Of the camera that most tests look at: its patterns are fitted once for each law."""
-    return study_of(recorded(*laws))
+    return dataset_of(recorded(*laws))
 
 
-def measured_model(study: Study, make: Callable[[Study], Block]) -> MeasurementModel:
-    return MeasurementModel((make(study),), study.camera)
+def measured_model(dataset: Dataset, make: Callable[[Dataset], Observable]) -> MeasurementModel:
+    return MeasurementModel((make(dataset),), dataset.camera)
 
 
-def verdict_of(study: Study) -> Verdict:
+def verdict_of(dataset: Dataset) -> Verdict:
     blocks = []
     for measurement in OF_SCREENS:
         try:
-            blocks.append(measurement.make(study))
+            blocks.append(measurement.make(dataset))
         except NotDetermined:
             continue
-    return decide(MeasurementModel(tuple(blocks), study.camera), np.random.default_rng(3), DecisionPolicy())
+    return decide(MeasurementModel(tuple(blocks), dataset.camera), np.random.default_rng(3), DecisionPolicy())
 
 
 @pytest.mark.parametrize(("seed", "cfa"), [(62, "MONO"), (63, "RGGB")])
 def test_a_healthy_camera_keeps_the_contrast_that_the_model_says(seed: int, cfa: str) -> None:
-    verdict = verdict_of(study_of(recorded(seed=seed, cfa=cfa)))
+    verdict = verdict_of(dataset_of(recorded(seed=seed, cfa=cfa)))
     assert not verdict.named
     assert not verdict.abstained
     assert not verdict.before
@@ -115,7 +115,7 @@ def test_what_a_screen_shows_is_named(law: Law, name: str) -> None:
 def test_a_screen_that_fills_the_frame_lights_dark_squares_from_beyond() -> None:
     """The former's screen continues beyond the frame; the uncertainty of its light is half of what an endless screen
     would add."""
-    found = measured_model(shared_study(), screen_block)
+    found = measured_model(shared_study(), measure_screen)
     gaussian = found.gaussian()
     away = (found.value - gaussian.mean) / np.sqrt(np.diag(gaussian.block_covariance(0)))
     assert np.all(np.abs(away) < 1.5)
@@ -123,7 +123,7 @@ def test_a_screen_that_fills_the_frame_lights_dark_squares_from_beyond() -> None
 
 def test_a_ghost_brightens_dark_squares() -> None:
     """A ghost: 1 % of the image rotated by 180 degrees. A dark square gets between 0 and 1 % of the brightest light."""
-    block = measured_model(shared_study(), screen_block).blocks[0]
+    block = measured_model(shared_study(), measure_screen).blocks[0]
     more = block.predict((Ghost(share_percent=1.0),)).mean - block.predict(()).mean
     assert np.all(more > 0.0)
     assert np.all(more < 0.011 * block.scale)
@@ -134,12 +134,12 @@ def test_lopsided_points_are_no_ghost(monkeypatch: pytest.MonkeyPatch) -> None:
     fits: list[tuple[Any, Any]] = []
     made = pattern_fit._LinearModel.of
 
-    def of(study: Study, canvas: Any, *rest: Any) -> Any:
-        fits.append((canvas, made(study, canvas, *rest)))
+    def of(dataset: Dataset, canvas: Any, *rest: Any) -> Any:
+        fits.append((canvas, made(dataset, canvas, *rest)))
         return fits[-1][1]
 
     monkeypatch.setattr(pattern_fit._LinearModel, "of", of)
-    pattern_fit.patterns(study_of(recorded(seed=64)))
+    pattern_fit.patterns(dataset_of(recorded(seed=64)))
     assert fits
     for canvas, fit in fits:
         fy, fx = canvas.frequencies
@@ -153,22 +153,22 @@ def test_lopsided_points_are_no_ghost(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_steep_gamma_over_wide_borders_is_predicted() -> None:
     """v^5 on borders of a standard deviation of 0.4 px: lit cells of 4 px lose a quarter of their width. Contrast comes
     out within noise, the borders' grey levels to 5 %."""
-    study = shared_study(STEEP_GAMMA)
+    dataset = shared_study(STEEP_GAMMA)
     effect = ScreenGamma(exponent=5.0, rim_px=0.4)
-    contrasts = MeasurementModel((contrast_block(study),), study.camera)
+    contrasts = MeasurementModel((measure_bernoulli(dataset),), dataset.camera)
     n, covariance = len(contrasts.value), contrasts.gaussian().covariance
     for effects, low, high in (((), 5.0, 1e9), ((effect,), 0.0, 1.0)):
         residual = contrasts.value - contrasts.mean(effects)
         chi2 = float(residual @ np.linalg.solve(covariance, residual))
         assert low * n < chi2 < high * n + 4 * np.sqrt(2 * n)  # 4 sigma of a chi2 of n numbers
-    borders = cell_border_block(study)
+    borders = measure_cell_borders(dataset)
     np.testing.assert_allclose(borders.predict((effect,)).mean, borders.value, rtol=0.05)
 
 
 def test_defocus_changes_the_contrast_as_predicted() -> None:
     """12 um: far out of the noise, and with the effect within it, levels and the screen's own blur free."""
-    study = study_of(recorded(concealed.DefocusLaw(12.0, 1)))
-    model = MeasurementModel((contrast_block(study),), study.camera)
+    dataset = dataset_of(recorded(concealed.DefocusLaw(12.0, 1)))
+    model = MeasurementModel((measure_bernoulli(dataset),), dataset.camera)
     for effects, low, high in (((), 5.0, 1e9), ((Defocus(defocus_um=12.0),), 0.0, 1.0)):
         gaussian = model.gaussian(effects)
         residual = model.value - gaussian.mean
@@ -187,8 +187,8 @@ def test_a_filter_is_predicted_on_a_screen_of_any_geometry(cell_px: float, turn_
     law = concealed.OpticalLowPassFilterLaw(1.9, 0)
     plan = Plan(kinds=("dark", "flat", "screen"), screen_cell_px=cell_px, screen_turn_deg=turn_deg)
     camera = ConcealedCamera(61, (law,), cfa="BGGR", f_number=5.6, rows=288, cols=384)
-    study = study_of(recordings_of(camera, plan))
-    model = measured_model(study, contrast_block)
+    dataset = dataset_of(recordings_of(camera, plan))
+    model = measured_model(dataset, measure_bernoulli)
     fits = {
         effect.name: refit(model, (effect,), DecisionPolicy())
         for effect in (
@@ -206,11 +206,11 @@ def test_a_filter_is_predicted_on_a_screen_of_any_geometry(cell_px: float, turn_
 
 
 def test_pattern_fits_are_freed_with_their_study() -> None:
-    """A study's fits are freed with it (30 MB a set): a service diagnoses one set after another."""
-    study = study_of(recorded())
-    contrast_block(study)
-    kept = weakref.ref(study)
-    del study
+    """A dataset's fits are freed with it (30 MB a set): a service diagnoses one set after another."""
+    dataset = dataset_of(recorded())
+    measure_bernoulli(dataset)
+    kept = weakref.ref(dataset)
+    del dataset
     gc.collect()
     assert kept() is None
 
@@ -218,7 +218,7 @@ def test_pattern_fits_are_freed_with_their_study() -> None:
 def test_a_colours_contrast_is_that_of_its_own_place() -> None:
     """Red and blue are displaced by half a pixel and more. Drawn at green's place, their contrast would be 2 to 4 % too
     low below 0.25 cy/px."""
-    plain, moved = (contrast_block(shared_study(*laws)) for laws in ((), (concealed.LateralColourLaw(4.0, 0, 5),)))
+    plain, moved = (measure_bernoulli(shared_study(*laws)) for laws in ((), (concealed.LateralColourLaw(4.0, 0, 5),)))
     kept = {(k.channel, k.condition, round(k.x, 2)): v for k, v in zip(plain.labels, plain.value, strict=True)}
     lost = [
         kept[key] - v
@@ -236,7 +236,7 @@ def test_lateral_colour_is_measured_along_the_radius_alone() -> None:
     from sim.effects.lateral_chromatic_aberration import LateralChromaticAberration
 
     law = LATERAL_COLOUR
-    block = colour_block(shared_study(law))
+    block = measure_lateral_colour(shared_study(law))
     expected = block.predict((LateralChromaticAberration(slope_um=law.signed_strength),)).mean
     std = np.sqrt(np.diag(block.covariance))
     assert np.abs(expected).max() > 8 * std.max()
@@ -245,21 +245,21 @@ def test_lateral_colour_is_measured_along_the_radius_alone() -> None:
 
 def test_the_screen_s_grid_is_seen_in_white_frames_alone() -> None:
     """Other lit screens don't show the screen's pixel grid, and a single channel doesn't show lateral colour."""
-    mono = study_of(recorded(cfa="MONO"))
-    assert abs(float(grid_block(mono).value[0])) < 4.0
+    mono = dataset_of(recorded(cfa="MONO"))
+    assert abs(float(measure_screen_grid(mono).value[0])) < 4.0
     with pytest.raises(NotDetermined, match="one channel"):
-        colour_block(mono)
+        measure_lateral_colour(mono)
     with pytest.raises(NotDetermined, match="no white captures"):
-        grid_block(study_of(recorded(plan=Plan(kinds=("dark", "flat")))))
+        measure_screen_grid(dataset_of(recorded(plan=Plan(kinds=("dark", "flat")))))
     with pytest.raises(NotDetermined, match="no bernoulli captures"):
-        ghost_block(study_of(recorded(plan=Plan(kinds=("dark", "flat")))))
+        measure_ghost(dataset_of(recorded(plan=Plan(kinds=("dark", "flat")))))
 
 
 @pytest.mark.parametrize("seed", [1000, 1004])
 def test_dark_squares_that_the_border_cuts_are_looked_at_inside_only(seed: int) -> None:
     """A screen that covers a frame of 64 px: beyond the border a lit square may follow. chi2 of n numbers, 5 sigma."""
     camera = ConcealedCamera(seed, cfa="RGGB", rows=64, cols=64)
-    block = screen_block(study_of(recordings_of(camera, PLAN)))
+    block = measure_screen(dataset_of(recordings_of(camera, PLAN)))
     away = block.value - block.predict(()).mean
     n = len(away)
     assert n == 6
@@ -273,8 +273,8 @@ def test_a_displaced_colour_before_an_aligned_screen_keeps_its_contrast() -> Non
     0.3) = 2 % up to 0.3 cy/px, and the noise of 1 %. Drawn anew once it was 8 %."""
     law = concealed.LateralColourLaw(3.5, 0, 7)
     plan = Plan(kinds=("dark", "flat", "screen"), screen_turn_deg=0.0)
-    study = study_of(recordings_of(ConcealedCamera(5, (law,), cfa="BGGR", rows=112, cols=144), plan))
-    for group in patterns(study):
+    dataset = dataset_of(recordings_of(ConcealedCamera(5, (law,), cfa="BGGR", rows=112, cols=144), plan))
+    for group in patterns(dataset):
         for one in group:
             left = np.abs(one.value[: len(one.bands)] - 1.0)
             assert np.all(left[[band.frequency < 0.3 for band in one.bands]] < 0.03), one.channel
@@ -301,7 +301,7 @@ def test_a_glare_has_its_name_whatever_its_reach(variant: int) -> None:
     """Evenly spread; half of it within a halo of a quarter of the frame; fading from the middle."""
     law = concealed.VeilingGlareLaw(2.0, variant, 9)
     recordings = former(104, law, cfa="RGGB", kinds=("dark", "flat", "chart", "slanted_edge", "screen"))
-    found = verdict(recordings, edge_block, chart_block, screen_block)
+    found = verdict(recordings, measure_slanted_edge, measure_chart, measure_screen)
     assert names(found) == ["veiling_glare"]
     # of what a lens spreads a halo's share is told apart only where there is one
     assert bool(halos(found.model.camera, (found.named[0].effect,))) == (variant == 1)
@@ -312,7 +312,7 @@ def test_wide_wings_light_dark_squares_as_predicted() -> None:
     the dark ones. Both repeats' numbers share their floor: chi2 of two lies below 9.2 in 99 % of draws."""
     law = concealed.SeeingLaw(8.0, 0, 9)
     recordings = recordings_of(ConcealedCamera(930, (law,), cfa="MONO", rows=192, cols=256), Plan(("screen",)))
-    block = screen_block(Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True)))
+    block = measure_screen(Dataset(recordings, "left", camera_model(recordings, "left", None, maker_curves=True)))
     away = [block.value - block.predict(effects).mean for effects in ((), (MoffatBlur(**law.library_parameters()),))]
     without, with_it = (float(left @ np.linalg.solve(block.covariance, left)) for left in away)
     assert with_it < 9.2 < without
