@@ -27,12 +27,12 @@ from sim.camera import CameraModel
 from sim.optics.filters import veil_otf
 from sim.optics.pupil import Wavefront, pupil_ratio
 from sim.sensor import mosaic
-from sim.sensor.amplifiers import AmplifierCrosstalk
+from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.electrons import NEIGHBOURS
 from sim.sensor.lines import LineGains, LineNoise
 from sim.sensor.particles import Particles
-from sim.sensor.reading_order import ReadingOrderNoise
+from sim.sensor.reading_order import OrderedNoise
 from sim.sensor.trails import Trails
 from sim.spectrum import FloatArray
 
@@ -582,12 +582,12 @@ class Signal(State):
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     gains: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     line_gains: tuple[LineGains, ...] = ()
-    amplifiers: tuple[AmplifierCrosstalk, ...] = ()
+    amplifiers: tuple[CoupledAmplifiers, ...] = ()
     offset_dn: tuple[Callable[[float, float | None], float], ...] = ()
     exposure_offset_dn: tuple[Callable[[float], float], ...] = ()
     noise_e2: tuple[Callable[[float], float], ...] = ()
     lines: tuple[LineNoise, ...] = ()
-    reading_order: tuple[ReadingOrderNoise, ...] = ()
+    reading_order: tuple[OrderedNoise, ...] = ()
     telegraph: tuple[Jumps, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     filters: tuple[FloatArray, ...] = ()

@@ -15,11 +15,11 @@ from sim.camera import CameraModel
 from sim.detection import collection_m2_sr, detect_light
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
-from sim.sensor.amplifiers import AmplifierCrosstalk
+from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineGains, LineNoise, Lines
 from sim.sensor.particles import Particles
-from sim.sensor.reading_order import ReadingOrderNoise
+from sim.sensor.reading_order import OrderedNoise
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
 
@@ -401,7 +401,7 @@ class Uniform:
         return self._signal.couple(np.ones(shape) if gains is None else gains)
 
     @property
-    def amplifiers(self) -> tuple[AmplifierCrosstalk, ...]:
+    def amplifiers(self) -> tuple[CoupledAmplifiers, ...]:
         """How areas that are read at the same time couple."""
         return self._signal.amplifiers
 
@@ -435,7 +435,7 @@ class Uniform:
         return self._signal.lines
 
     @property
-    def reading_order(self) -> tuple[ReadingOrderNoise, ...]:
+    def reading_order(self) -> tuple[OrderedNoise, ...]:
         """Noise in the order in which pixels are read."""
         return self._signal.reading_order
 

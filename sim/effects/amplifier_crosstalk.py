@@ -12,7 +12,7 @@ from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.parameters import Quantity
-from sim.sensor.amplifiers import AmplifierCrosstalk as Law
+from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.spectrum import FloatArray
 from sim.stages import PatternNoise, Signal
 
@@ -37,7 +37,6 @@ class AmplifierCrosstalk(Effect):
     """
 
     name: ClassVar[str] = "amplifier_crosstalk"
-    title: ClassVar[str] = "crosstalk of output amplifiers"
     family: ClassVar[Family] = Family.READ_OUT_AREAS
     reference: ClassVar[str] = "Fast method of crosstalk characterization for HxRG detectors, arXiv:1808.00790 (2018)"
     form_tolerance: ClassVar[float] = 0.2
@@ -123,7 +122,7 @@ class AmplifierCrosstalk(Effect):
     def on_signal(self, signal: Signal) -> Signal:
         if self.share_percent == 0.0 and self.excess_percent == 0.0:
             return signal
-        law = Law(self.coupling(), *LAYOUTS[self.layout], self.order == "turned", self.noise == "coupled")
+        law = CoupledAmplifiers(self.coupling(), *LAYOUTS[self.layout], self.order == "turned", self.noise == "coupled")
         signal = signal.add_laws(amplifiers=law)
         if self.pedestal_e != 0.0:
             dark = np.full((signal.camera.rows, signal.camera.cols), self.pedestal_e)

@@ -9,7 +9,7 @@ from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.parameters import Quantity
-from sim.sensor.reading_order import ReadingOrderNoise as Law
+from sim.sensor.reading_order import OrderedNoise
 from sim.stages import Signal
 
 #: Exponents that are tried first.
@@ -23,7 +23,7 @@ class ReadingOrderNoise(Effect):
     """
 
     name: ClassVar[str] = "reading_order_noise"
-    title: ClassVar[str] = "1/f noise in reading order"
+    title: ClassVar[str] = "reading-order noise"
     family: ClassVar[Family] = Family.READ_NOISE
     reference: ClassVar[str] = "B. J. Rauscher, Teledyne H1RG, H2RG, and H4RG noise generator, PASP 127 (2015) 1144"
     form_tolerance: ClassVar[float] = 0.1
@@ -92,4 +92,4 @@ class ReadingOrderNoise(Effect):
         if self.noise_e == 0.0 and self.alternating_e == 0.0:
             return signal
         knee = 10.0**-self.span_log10_px
-        return signal.add_laws(reading_order=Law(self.noise_e, self.alternating_e, self.exponent, knee))
+        return signal.add_laws(reading_order=OrderedNoise(self.noise_e, self.alternating_e, self.exponent, knee))

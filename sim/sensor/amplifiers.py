@@ -10,7 +10,7 @@ from sim.spectrum import FloatArray
 
 
 @dataclass(frozen=True)
-class AmplifierCrosstalk:
+class CoupledAmplifiers:
     """Each of `down` x `across` equal areas is read by an amplifier of its own, all at once, and takes over shares of
     what the others read at that moment.
 

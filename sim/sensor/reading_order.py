@@ -18,7 +18,7 @@ GRID = 2**17
 
 
 @dataclass(frozen=True)
-class Law:
+class PowerLaw:
     """Power (f^2 + knee^2)^(-exponent / 2), of mean 1 over -0.5..0.5 cy/px."""
 
     exponent: float
@@ -38,7 +38,7 @@ class Law:
 
 
 @dataclass(frozen=True)
-class ReadingOrderNoise:
+class OrderedNoise:
     """A stationary normal disturbance in the order of the pixels, row after row, a `Disturbance`: of power f^-exponent
     at f cycles a pixel, level below `knee_cy_per_px`, and standard deviation `noise_e`; and the same of `alternating_e`
     by two amplifiers that take turns, of even and of odd columns (an even number in all), each at its own pixels.
@@ -50,8 +50,8 @@ class ReadingOrderNoise:
     knee_cy_per_px: float = 1e-6
 
     @property
-    def _shape(self) -> Law:
-        return Law(self.exponent, self.knee_cy_per_px)
+    def _shape(self) -> PowerLaw:
+        return PowerLaw(self.exponent, self.knee_cy_per_px)
 
     def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         """Electrons (rows, cols) of one frame."""
@@ -191,7 +191,7 @@ def _dirichlet2(frequency_cy_per_px: FloatArray, count: int) -> FloatArray:
 
 
 @lru_cache(maxsize=8)
-def _averaged(count: int, law: Law) -> FloatArray:
+def _averaged(count: int, law: PowerLaw) -> FloatArray:
     """The power law at the frequencies of a line of `count` pixels, of mean 1 over all: that at 0 is the mean within
     half a cycle."""
     power = law.power(np.asarray(fft.rfftfreq(count), float))
@@ -206,7 +206,7 @@ NEAR, SLOW, FINE = 32, 16, 32
 
 
 @lru_cache(maxsize=64)
-def _leaking(shape: tuple[int, int], law: Law) -> FloatArray:
+def _leaking(shape: tuple[int, int], law: PowerLaw) -> FloatArray:
     """The power law about its pole as the rows of a frame show it at 0, 1, ... rows / 2 cycles a frame: with what its
     waves leak through the rows' Fejer kernel, F(x) = sin^2(pi rows x) / (rows sin^2(pi x))."""
     rows, cols = shape

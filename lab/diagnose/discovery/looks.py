@@ -14,7 +14,7 @@ from scipy.signal import savgol_coeffs
 from lab.diagnose.discovery.images import DarkImages, Image, dark_images, flat_images, noise_by_time
 from lab.diagnose.discovery.profile import Look, Profile
 from lab.errors import NotDetermined
-from lab.observables.codes.density import CodeCounts, counted, counted_in_all, prepared, widths
+from lab.observables.codes.density import CodeHistogram, counted, counted_in_all, prepared, widths
 from lab.observables.darks.frames import cell_means
 from lab.observables.darks.readout import dark_readout
 from lab.observables.dataset import Dataset
@@ -98,7 +98,7 @@ def _codes(dataset: Dataset, effects: Effects) -> Iterator[Look]:
         yield Look("codes", "code", found[False], found.get(True), shown_in=SHOWN_IN["codes"])
 
 
-def _code_profile(codes: CodeCounts, effects: Effects, dataset: Dataset) -> Profile:
+def _code_profile(codes: CodeHistogram, effects: Effects, dataset: Dataset) -> Profile:
     used, rough = np.flatnonzero(codes.used), codes.rough
     known = rough @ (codes.expected * (widths(codes, effects, dataset) - 1.0)) if acting(effects, CODES) else 0.0
     of_widths = sparse.coo_array((rough @ sparse.diags_array(codes.smooth))[used])

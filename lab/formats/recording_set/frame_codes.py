@@ -41,19 +41,14 @@ def _count(frame: NDArray[np.uint16], counts: NDArray[np.int64]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class CodeCounts:
-    """Numbers of pixels by code.
+    """Numbers of pixels by code, in the smallest unsigned integers that hold them.
 
-    lowest  the lowest code that counts, DN
-    number  pixels with the code `lowest` + i, (n,)
+    code_dn  the codes that come, ascending, (n,), DN
+    number   pixels with each of them, (n,)
     """
 
-    lowest: int
-    number: NDArray[np.int64]
-
-    @property
-    def code_dn(self) -> NDArray[np.int64]:
-        """The codes, (n,), DN."""
-        return self.lowest + np.arange(len(self.number))
+    code_dn: NDArray[np.uint16]
+    number: NDArray[np.unsignedinteger[Any]]
 
     @cached_property
     def pixels(self) -> int:
@@ -63,12 +58,12 @@ class CodeCounts:
     @property
     def highest_dn(self) -> int:
         """Highest code that comes, DN; 0 without pixels."""
-        return self.lowest + max(len(self.number) - 1, 0)
+        return int(self.code_dn[-1]) if self.code_dn.size else 0
 
     @cached_property
     def mean_dn(self) -> float:
         """Mean of the pixels, DN."""
-        return int(self.number @ self.code_dn) / self.pixels
+        return int(self.number.astype(np.int64) @ self.code_dn.astype(np.int64)) / self.pixels
 
     @cached_property
     def variance_dn2(self) -> float:
@@ -82,46 +77,48 @@ class CodeCounts:
 
     def share_from(self, code_dn: float) -> float:
         """Return the share of the pixels that have `code_dn` or a higher code."""
-        first = int(np.clip(np.ceil(code_dn) - self.lowest, 0, len(self.number)))
-        return int(self.number[first:].sum()) / self.pixels
+        return int(self.number[np.searchsorted(self.code_dn, code_dn) :].sum()) / self.pixels
 
     def quantiles(self, shares: Iterable[float]) -> NDArray[np.float64]:
         """Return the codes, DN, below which `shares` of the pixels lie: `numpy.quantile` of the pixels.
 
-        >>> CodeCounts(10, np.array([1, 0, 1])).quantiles([0.5]).tolist()
-        [11.0]
+        >>> CodeCounts.of(np.array([0, 0, 1, 0, 1])).quantiles([0.5]).tolist()
+        [3.0]
         """
-        below = np.cumsum(self.number)
+        below = np.cumsum(self.number, dtype=np.int64)
         place = np.asarray(list(shares)) * (self.pixels - 1)
         rank = np.floor(place)
-        low, high = (np.searchsorted(below, np.minimum(rank + k, self.pixels - 1), side="right") for k in (0, 1))
-        return np.asarray(self.lowest + low + (place - rank) * (high - low))
+        low, high = (
+            self.code_dn[np.searchsorted(below, np.minimum(rank + k, self.pixels - 1), side="right")].astype(float)
+            for k in (0, 1)
+        )
+        return np.asarray(low + (place - rank) * (high - low))
 
     def dense(self) -> NDArray[np.int64]:
         """Return the number of pixels by code from 0 on, (65536,)."""
         counts = np.zeros(CODES, np.int64)
-        counts[self.lowest : self.lowest + len(self.number)] = self.number
+        counts[self.code_dn] = self.number
         return counts
 
     @classmethod
     def total(cls, parts: Iterable[CodeCounts]) -> CodeCounts:
         """Return the counts of several parts together."""
-        own = [part for part in parts if len(part.number)]
-        if not own:
-            return cls(0, np.zeros(0, np.int64))
-        lowest = min(part.lowest for part in own)
-        number = np.zeros(max(part.highest_dn for part in own) - lowest + 1, np.int64)
-        for part in own:
-            number[part.lowest - lowest :][: len(part.number)] += part.number
-        return cls(lowest, number)
+        own = [cls.of(np.zeros(0, np.int64)), *parts]
+        codes, at = np.unique(np.concatenate([part.code_dn for part in own]), return_inverse=True)
+        number = np.zeros(len(codes), np.int64)
+        np.add.at(number, at, np.concatenate([part.number.astype(np.int64) for part in own]))
+        return cls(codes, _smallest(number))
 
     @classmethod
     def of(cls, dense: NDArray[np.int64]) -> CodeCounts:
-        """Return the counts (codes,) from code 0 on, without the codes at either end that don't come."""
-        there = np.flatnonzero(dense)
-        if there.size == 0:
-            return cls(0, np.zeros(0, np.int64))
-        return cls(int(there[0]), dense[there[0] : there[-1] + 1].copy())
+        """Return the counts (codes,) from code 0 on, without the codes that don't come."""
+        codes = np.flatnonzero(dense)
+        return cls(codes.astype(np.uint16), _smallest(dense[codes]))
+
+
+def _smallest(number: NDArray[np.int64]) -> NDArray[np.unsignedinteger[Any]]:
+    """Return a copy in the smallest unsigned integers: of hundreds of frames the counts are kept."""
+    return number.astype(np.min_scalar_type(int(number.max(initial=0))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,7 +56,7 @@ MARGIN = 64  # codes beyond those that are counted
 
 
 @dataclass(frozen=True)
-class CodeCounts:
+class CodeHistogram:
     """The histogram over the codes that can be tested; arrays are (codes,)."""
 
     first: int  # the lowest code
@@ -74,7 +74,7 @@ def measure_code_density(dataset: Dataset) -> Observable:
     counts = dataset.once(counted)
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
-    sets: dict[bool, tuple[CodeCounts, sparse.csr_array, list[_Part]]] = {}
+    sets: dict[bool, tuple[CodeHistogram, sparse.csr_array, list[_Part]]] = {}
     values, covariances, scales = [], [], []
     for held_out in (False, True):
         codes = prepared(dataset, counts[held_out])
@@ -230,7 +230,7 @@ def counted_in_all(dataset: Dataset) -> dict[bool, _Counts]:
     return found
 
 
-def prepared(dataset: Dataset, counts: _Counts) -> CodeCounts | None:
+def prepared(dataset: Dataset, counts: _Counts) -> CodeHistogram | None:
     """Return the histogram over the usable codes, None where they are too few."""
     level = np.arange(len(counts.count), dtype=float)
     noise = np.sqrt(np.maximum(dataset.noise.gain * (level - dataset.noise.black), 0.0) + dataset.noise.read_dn**2)
@@ -260,7 +260,7 @@ def prepared(dataset: Dataset, counts: _Counts) -> CodeCounts | None:
     used = inside & (smooth >= LEAST_COUNT)
     if used.sum() < LEAST_CODES:
         return None
-    return CodeCounts(first, count, expected, smooth, rough, noise, used)
+    return CodeHistogram(first, count, expected, smooth, rough, noise, used)
 
 
 @cache
@@ -271,7 +271,7 @@ def _smoothing(half: int) -> FloatArray:
     return np.asarray(np.linalg.pinv(np.vander(x, DEGREE + 1, increasing=True))[0])
 
 
-def _covariance(linear: FloatArray, codes: CodeCounts, counts: _Counts) -> FloatArray:
+def _covariance(linear: FloatArray, codes: CodeHistogram, counts: _Counts) -> FloatArray:
     """Covariance of `linear` (m, codes) @ counts. Each pixel has one code: the counts of a group's pixels are
     multinomial."""
     found = (linear * np.maximum(codes.expected, 1.0)) @ linear.T
@@ -284,7 +284,7 @@ def _covariance(linear: FloatArray, codes: CodeCounts, counts: _Counts) -> Float
     return np.asarray(found - np.transpose(means) @ np.array(means))
 
 
-def _combs(codes: CodeCounts) -> tuple[FloatArray, list[tuple[float, str]]]:
+def _combs(codes: CodeHistogram) -> tuple[FloatArray, list[tuple[float, str]]]:
     """Weights (combs, codes) of the counts that give the combs' amplitudes relative to the mean count, and (mean code,
     words) of each.
 
@@ -309,7 +309,7 @@ def _spacing(dataset: Dataset) -> int:
     return max(round(2.0**dataset.camera.bit_depth / PLACES), LEAST_SPACING)
 
 
-def _steps(dataset: Dataset, codes: CodeCounts) -> tuple[FloatArray, list[int]]:
+def _steps(dataset: Dataset, codes: CodeHistogram) -> tuple[FloatArray, list[int]]:
     """Weights of the counts that give how many codes' worth is missing about each of `PLACES` parts of the converter's
     range, and these codes.
 
@@ -361,7 +361,7 @@ class _Part:
         return float(np.sqrt(4.0 * excess / self.chi2_std))
 
 
-def _parts(codes: CodeCounts) -> list[_Part]:
+def _parts(codes: CodeHistogram) -> list[_Part]:
     """Return the parts with codes enough. Var(chi2) = 2 n sum_k r_k^2 with the residuals' autocorrelation r of the
     smoothing filter."""
     square = codes.rough.power(2)
@@ -383,7 +383,7 @@ def _parts(codes: CodeCounts) -> list[_Part]:
     return found
 
 
-def widths(codes: CodeCounts, effects: Effects, dataset: Dataset) -> FloatArray:
+def widths(codes: CodeHistogram, effects: Effects, dataset: Dataset) -> FloatArray:
     """Width (codes,) of each code: the interval of the converter's input that gives it, 1 for an ideal converter.
 
     The input is cut at the edges of the ideal converter's codes. Where the converter's law is straight over several of

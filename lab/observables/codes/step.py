@@ -84,7 +84,7 @@ def find_code_step(recordings: RecordingSet, side: Side) -> CodeStep:
     total = CodeCounts.total(parts)
     step_dn = step_of(total, has_one_mode=all(isinstance(capture, DarkCapture) for capture in chosen))
     coarser = {id: step for id, step in own.items() if step >= 2.0 * step_dn}
-    frequent_dn = total.lowest + int(np.argmax(total.number)) if total.number.size else 0
+    frequent_dn = int(total.code_dn[np.argmax(total.number)]) if total.number.size else 0
     offset_dn = frequent_dn % int(step_dn)
     return CodeStep(step_dn, offset_dn, tuple(coarser), max(coarser.values(), default=1.0))
 
@@ -111,11 +111,10 @@ def step_of(counts: CodeCounts, *, has_one_mode: bool = False) -> float:
     `has_one_mode`: the pixels' distribution has one mode, as that of a dark. Then a code between the most frequent and
     another is expected at least as often as that other, and none comes by a chance of exp(-count): three codes suffice.
     """
-    there = np.flatnonzero(counts.number)
-    there = there if has_one_mode else there[:-1]
-    if there.size < 2:
+    last = None if has_one_mode else -1
+    codes, number = (values[:last].astype(np.int64) for values in (counts.code_dn, counts.number))
+    if codes.size < 2:
         return 1.0
-    codes, number = counts.lowest + there, counts.number[there]
     frequent = np.argsort(-number, kind="stable")
     covered = np.cumsum(number[frequent])
     for share in CORE_SHARES:

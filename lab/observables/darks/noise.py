@@ -20,7 +20,7 @@ from lab.observables.noise.figures import CLIP
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import DARK_CURRENT, LAG, LINES, PARTICLES, acting
 from sim.effects.base import Effects
-from sim.sensor.reading_order import ReadingOrderNoise
+from sim.sensor.reading_order import OrderedNoise
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -106,7 +106,7 @@ def measure_dark_noise(dataset: Dataset) -> Observable:
     )  # fmt: skip
 
 
-def _slow_scatter_e2(dataset: Dataset, one: ReadingOrderNoise) -> float:
+def _slow_scatter_e2(dataset: Dataset, one: OrderedNoise) -> float:
     """Standard deviation of a frame's variance by the rows' few slow waves: sqrt(2 sum P^2) / pixels, P their power."""
     shape = dataset.camera.rows, dataset.camera.cols
     down = np.arange(1, shape[0]) / shape[0]

@@ -16,8 +16,8 @@ from lab.observables.observable import Label, Measurement, Observable, Predictio
 from lab.observables.reads import AMPLIFIERS
 from sim.effects.base import Effects
 from sim.sensor import mosaic
-from sim.sensor.amplifiers import AmplifierCrosstalk
-from sim.sensor.reading_order import ReadingOrderNoise
+from sim.sensor.amplifiers import CoupledAmplifiers
+from sim.sensor.reading_order import OrderedNoise
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
@@ -209,7 +209,7 @@ def _expected(rows: int, cols: int, period: int) -> FloatArray:
     return np.array(found)
 
 
-def _coupled(laws: Sequence[AmplifierCrosstalk]) -> FloatArray:
+def _coupled(laws: Sequence[CoupledAmplifiers]) -> FloatArray:
     """Correlation by `RELATIONS` of white noise after coupling: of a small frame, whose every pixel has noise of its
     own."""
     if not laws:
@@ -226,7 +226,7 @@ def _coupled(laws: Sequence[AmplifierCrosstalk]) -> FloatArray:
     return np.array(found)
 
 
-def _ordered(noise: ReadingOrderNoise, shape: tuple[int, int], period: int) -> FloatArray:
+def _ordered(noise: OrderedNoise, shape: tuple[int, int], period: int) -> FloatArray:
     """Covariance by `RELATIONS` of noise in reading order, e^2, of one amplifier for all: along a row. Rows far apart
     have none."""
     found = np.zeros(len(RELATIONS))

@@ -18,7 +18,7 @@ from lab.observables.darks.frames import dark_frames
 from lab.observables.dataset import Dataset, mean_frame
 from lab.observables.noise.figures import TemporalVariance
 
-SIDE_PX = 128
+SIDE_PX = 256  # the counts of codes, which are kept of every frame, take some 4 kB whatever its size
 BLACK_DN, READ_DN, GAIN = 64.0, 3.0, 0.4
 #: Kind, exposure (s) and signal (DN) of the settings.
 SETTINGS = [("dark", 0.01, 0.1), ("dark", 0.1, 1.0), ("dark", 1.0, 10.0)]

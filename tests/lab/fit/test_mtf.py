@@ -81,7 +81,7 @@ def recordings(frames, captures, cfa="RGGB"):
         camera=lambda side: camera,
         captures=lambda kind=None, side=None: captures,
         frame=lambda capture: frames[capture.id],
-        summarised=lambda key, make: make(),
+        once=lambda key, make, *, whatever_is_stated: make(),
     )
 
 

@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as hnp
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.errors import InputError, NotDetermined
-from lab.formats.recording_set import Manifest, RecordingError, RecordingSet, read, write
+from lab.formats.recording_set import Manifest, RecordingError, RecordingSet, Summaries, read, write
 from sim.spectrum import Spectrum
 from tests.lab.formats.damaged_sets import edit, only, problems
 
@@ -425,10 +425,23 @@ def test_a_summary_is_made_once_and_goes_with_frames_and_manifest(small_set: Cal
     for same in (pickle.loads(pickle.dumps(one)), one.for_one_of(2)):
         assert same.summaries == one.summaries
     for other in (one.under(one.manifest), one.without(["none"]), one.with_frames({})):
-        assert other.summaries == {}
+        assert other.summaries.of_manifest == {}
     other.keep(one.summaries)
     assert other.once(("mean", "left"), summary) == one.once(("mean", "left"), summary)
     assert len(made) == 1
+
+
+def test_a_summary_of_frames_alone_holds_whatever_is_stated(small_set: Callable[..., RecordingSet]) -> None:
+    one, made = small_set(), []
+
+    def summary(of: RecordingSet) -> float:
+        return of.once("frames", lambda: made.append(1) or 7.0, whatever_is_stated=True)
+
+    assert summary(one) == 7.0
+    for same in (one.under(one.manifest), one.without(["none"]), pickle.loads(pickle.dumps(one))):
+        assert summary(same) == 7.0
+    assert len(made) == 1
+    assert one.with_frames({}).summaries == Summaries()
 
 
 def test_a_summary_that_frames_do_not_determine_is_refused_again(small_set: Callable[..., RecordingSet]) -> None:
@@ -442,4 +455,4 @@ def test_a_summary_that_frames_do_not_determine_is_refused_again(small_set: Call
         with pytest.raises(NotDetermined, match="boards: no board in any frame"):
             one.once("boards", refused)
     assert len(tried) == 1
-    assert pickle.loads(pickle.dumps(one)).summaries == {}
+    assert pickle.loads(pickle.dumps(one)).summaries == Summaries()

@@ -10,7 +10,7 @@ import pytest
 from sim.effects.amplifier_crosstalk import LAYOUTS, AmplifierCrosstalk, Layout, Order
 from sim.frame import Exposure, moments
 from sim.scene.scenes import Darkness, UniformField
-from sim.sensor.amplifiers import AmplifierCrosstalk as Law
+from sim.sensor.amplifiers import CoupledAmplifiers
 from sim.stages import Signal, signal_of
 from sim.uniform import Uniform
 from tests.sim.effects.test_sensor_effects import CAMERA, LIGHT
@@ -61,7 +61,7 @@ def test_pixels_that_are_read_together_share_noise() -> None:
     """2 c / (1 + c^2) of white noise, 4 / sqrt(32768 pairs); and none in the form that couples light alone."""
     noise = np.random.default_rng(5).standard_normal((256, 256))
     for of_noise, stated in ((True, 0.1 / (1.0 + 0.05**2)), (False, 0.0)):
-        law = Law(np.array([[0.0, 0.05], [0.05, 0.0]]), 1, 2, turned=True, of_noise=of_noise)
+        law = CoupledAmplifiers(np.array([[0.0, 0.05], [0.05, 0.0]]), 1, 2, turned=True, of_noise=of_noise)
         coupled = signal_of(CAMERA, ()).add_laws(amplifiers=law).couple_noise(noise)
         left, right = coupled[:, :128], coupled[:, :127:-1]
         assert np.mean(left * right) / coupled.var() == pytest.approx(stated, abs=4.0 / np.sqrt(32768))

@@ -7,30 +7,30 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sim.effects.reading_order_noise import ReadingOrderNoise as Effect
-from sim.sensor.reading_order import ReadingOrderNoise
+from sim.effects.reading_order_noise import ReadingOrderNoise
+from sim.sensor.reading_order import OrderedNoise
 from sim.stages import Signal, signal_of
 from tests.sim.effects.test_sensor_effects import CAMERA
 
 SHAPE, FRAMES = (48, 64), 800
 #: Of one amplifier; of two that take turns; of both, less steep.
-NOISES = (ReadingOrderNoise(3.0), ReadingOrderNoise(0.0, 3.0), ReadingOrderNoise(3.0, 2.0, 0.6))
+NOISES = (OrderedNoise(3.0), OrderedNoise(0.0, 3.0), OrderedNoise(3.0, 2.0, 0.6))
 
 
 @cache
-def drawn(noise: ReadingOrderNoise) -> np.ndarray:
+def drawn(noise: OrderedNoise) -> np.ndarray:
     rng = np.random.default_rng(11)
     return np.array([noise.draw(SHAPE, rng) for _ in range(FRAMES)])
 
 
 @cache
-def periodogram(noise: ReadingOrderNoise) -> np.ndarray:
+def periodogram(noise: OrderedNoise) -> np.ndarray:
     frames = drawn(noise) - drawn(noise).mean((1, 2), keepdims=True)
     return np.asarray(np.mean(np.abs(np.fft.fft2(frames)) ** 2, axis=0) / (SHAPE[0] * SHAPE[1]))
 
 
 @pytest.mark.parametrize("noise", NOISES)
-def test_the_variance_is_that_of_a_pixel(noise: ReadingOrderNoise) -> None:
+def test_the_variance_is_that_of_a_pixel(noise: OrderedNoise) -> None:
     """Half of the power is slower than a frame: a few modes of each of 800 frames, 4 sqrt(2 / 1600) / 2 = 7 %."""
     assert drawn(noise).var() == pytest.approx(noise.variance_e2(SHAPE), rel=0.07)
     fine = np.geomspace(1e-9, 0.25, 40001)
@@ -39,7 +39,7 @@ def test_the_variance_is_that_of_a_pixel(noise: ReadingOrderNoise) -> None:
 
 
 @pytest.mark.parametrize("noise", NOISES)
-def test_rows_and_columns_have_the_stated_power(noise: ReadingOrderNoise) -> None:
+def test_rows_and_columns_have_the_stated_power(noise: OrderedNoise) -> None:
     """Means over 800 frames and several waves: 4 / sqrt(800 n), and 3 % that the ends of a frame leave."""
     rows, cols = SHAPE
     down, across = np.arange(rows) / rows, np.arange(cols) / cols
@@ -59,7 +59,7 @@ def test_rows_and_columns_have_the_stated_power(noise: ReadingOrderNoise) -> Non
 
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("period", [1, 2])
-def test_neighbours_have_the_stated_covariance(noise: ReadingOrderNoise, period: int) -> None:
+def test_neighbours_have_the_stated_covariance(noise: OrderedNoise, period: int) -> None:
     """After the means of rows and columns of each plane were taken out: 1 % of the variance by chance over 2.4 million
     pixels, of which slow waves are few, and 2 % that ends leave."""
     left = drawn(noise).copy()
@@ -84,8 +84,8 @@ def test_two_amplifiers_that_take_turns_share_nothing() -> None:
 
 
 def test_none_is_no_law_and_all_frames_have_others() -> None:
-    assert Effect().on_signal(Signal(CAMERA)) == Signal(CAMERA)
-    (law,) = signal_of(CAMERA, (Effect(noise_e=2.0),)).reading_order
+    assert ReadingOrderNoise().on_signal(Signal(CAMERA)) == Signal(CAMERA)
+    (law,) = signal_of(CAMERA, (ReadingOrderNoise(noise_e=2.0),)).reading_order
     rng = np.random.default_rng(1)
     first, second = law.draw(SHAPE, rng), law.draw(SHAPE, rng)
     assert np.abs(first - second).max() > 0.0
