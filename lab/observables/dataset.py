@@ -78,6 +78,8 @@ class Dataset:
         self.saturation_dn = min(camera.white_level_dn, saturation_dn or camera.white_level_dn)
         self.stated: DataSheet = recordings.camera(side)
         self.channels = camera.channels
+        #: Highest frequency, cy/px, up to which edges are measured; None: as far as they show contrast.
+        self.highest_cy_per_px: float | None = None
         self._levels: dict[str, Levels] = {}
         self._made: dict[Any, Any] = {}
         self._spectra: dict[str, Spectrum] = {}

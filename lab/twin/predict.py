@@ -455,6 +455,7 @@ def _numbers(
         name = block.measurement.name
         levels = np.array([label.x for label in block.labels])
         slope = np.zeros(len(levels))
+        bare = block.predict(()).mean if block.measurement is SLANTED_EDGE else None
         if block.measurement is NOISE:
             gains, step = np.full(len(levels), noise.gain), 0.01 * levels
             ends = [shot_variance(dataset, levels + sign * step, gains, effects) for sign in (1.0, -1.0)]
@@ -463,6 +464,8 @@ def _numbers(
             value, std = float(mean[at][k]), float(np.sqrt(covariance[at.start + k, at.start + k]))
             capture = dataset.recordings.capture(label.captures[0])
             update: dict[str, float | None] = {"fixed": value}
+            if bare is not None:
+                update |= {"without_effects": float(bare[k])}
             if block.measurement is NOISE:
                 update |= {"level_dn": float(levels[k]), "level_slope": float(slope[k])}
             elif block.measurement in (DARK, CHART, PHOTON_TRANSFER):

@@ -15,6 +15,8 @@ from lab.formats.camera_file import lens_cache, traced_table
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
 from lab.observables.dataset import Dataset
+from lab.observables.edges.slanted_edge import SLANTED_EDGE
+from lab.observables.edges.transfer import REAL_AT
 from lab.observables.flats.linearity import PHOTON_TRANSFER
 from lab.observables.gaussian import chi2
 from lab.observables.observable import Label, measurement_title
@@ -169,6 +171,9 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
         camera = _camera(sealed, side)
         dataset = Dataset(_with_curves(recordings, prediction, camera, side), side, camera)
         wanted = {number.quantity for number in prediction.numbers}
+        of_edges = [number.x for number in prediction.numbers if number.quantity == SLANTED_EDGE.name]
+        if of_edges:
+            dataset.highest_cy_per_px = min(of_edges) / REAL_AT[0]
         blocks, left_out = measured_blocks(dataset, tuple(m for m in SCORED if m.name in wanted))
         skipped += left_out
         measured = {
@@ -177,6 +182,12 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
             for v, label in zip(b.value, b.labels, strict=True)
             if is_predicted(b, label)
         }
+        bare = {
+            _key(b.measurement.name, label): float(v)
+            for b in blocks
+            if b.measurement is SLANTED_EDGE
+            for v, label in zip(b.predict(()).mean, b.labels, strict=True)
+        }
         here = [i for i, number in enumerate(prediction.numbers) if number.key in measured]
         missing += len(prediction.numbers) - len(here)
         if not here:
@@ -184,7 +195,7 @@ def score(sealed: SealedPrediction, recordings: RecordingSet) -> TwinScore:
                 f"{recordings.source}: none of the {side} camera's predicted numbers is measured there; give the "
                 "session that was predicted"
             )
-        moved = np.array([_moved(prediction.numbers[i], prediction, recordings, measured) for i in here])
+        moved = np.array([_moved(prediction.numbers[i], prediction, recordings, measured, bare) for i in here])
         seen = np.array([measured[prediction.numbers[i].key][0] for i in here])
         covariance = _square(prediction)[np.ix_(here, here)]
         whole += chi2(seen - moved, covariance)
@@ -281,8 +292,12 @@ def _moved(
     prediction: SidePrediction,
     recordings: RecordingSet,
     measured: dict[tuple[object, ...], tuple[float, float]],
+    bare: dict[tuple[object, ...], float],
 ) -> float:
-    """Return the prediction at the exposure, temperature and level that were really set."""
+    """Return the prediction at the exposure, temperature and level that were really set, and of an edge for the samples
+    that were really recorded."""
+    if number.without_effects is not None:
+        return number.predicted + bare[number.key] - number.without_effects
     if number.level_dn is not None:
         return number.predicted + number.level_slope * (measured[number.key][1] - number.level_dn)
     taken = recordings.capture(number.captures[0])

@@ -41,6 +41,8 @@ class PredictedNumber(TwinNumber):
     dark : the part by dark current, in proportion to the exposure, growing by exp(`warmth_per_c` x rise)
     level_dn, level_slope : of a variance: the mean signal above black that it is predicted for, and its derivative by
         that
+    without_effects : of an edge: the same of the camera without effects. The estimator follows the samples of the
+        recorded edge, so that the prediction moves by what this number is on the session's edge
     """
 
     fixed: float = 0.0
@@ -48,6 +50,7 @@ class PredictedNumber(TwinNumber):
     warmth_per_c: float = 0.0
     level_dn: float | None = None
     level_slope: float = 0.0
+    without_effects: float | None = None
 
     @property
     def key(self) -> tuple[object, ...]:

@@ -103,7 +103,7 @@ class PredictedEdges:
         self._numbers_of: dict[_Key, FloatArray] = {}
 
         reach = max(e.summary.reach_px for e in edges) + 3 * GRID_PX
-        highest = highest_frequency([e.summary for e in edges])
+        highest = dataset.highest_cy_per_px or highest_frequency([e.summary for e in edges])
         #: Frequencies (cy/px) of the real parts, then of the imaginary parts.
         self.frequencies = measured_at(highest)
         shapes = departure_shapes(highest, reach)
