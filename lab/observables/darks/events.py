@@ -21,7 +21,7 @@ BRIGHT, LEAST_STEPS = 12.0, 6.0
 #: Lower edges of the bins of brightness, over the least.
 EVENT_EDGES = 1.0, 3.0, 10.0, 30.0
 LEAST_FRAMES = 3  # repeats: of two, that without the event isn't known
-MOST_FRAMES = 12  # of a condition
+MOST_FRAMES, MOST_PIXELS = 12, 24e6  # of a condition; they are compared in memory
 #: Eight neighbours make one event.
 TOUCHING = np.ones((3, 3), bool)
 
@@ -47,7 +47,9 @@ def count_events(dataset: Dataset) -> list[_Events]:
     """
     found: list[_Events] = []
     for dark in dataset.once(dark_frames):
-        captures = dark.condition.captures[:MOST_FRAMES]
+        size = dataset.camera.rows * dataset.camera.cols
+        most = max(min(MOST_FRAMES, int(MOST_PIXELS / size)), LEAST_FRAMES)
+        captures = dark.condition.captures[:most]
         moving = next((part.pixel_dn2 for part in dark.changing.values()), None)
         if len(captures) < LEAST_FRAMES or moving is None:
             continue
