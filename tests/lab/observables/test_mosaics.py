@@ -94,6 +94,7 @@ def _pulls(block: Observable, effects: Effects) -> tuple[np.ndarray, np.ndarray]
     return pull, axes.T[use] @ pull / np.sqrt(size[use])
 
 
+@pytest.mark.extra  # all measurements of ten cameras
 @pytest.mark.parametrize("case", CASES)
 def test_numbers_scatter_about_the_true_law_in_every_order(case: Mosaic) -> None:
     """chi2 lies below its quantile of probability 1 - CHANCE over the number of measurements."""

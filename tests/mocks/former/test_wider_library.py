@@ -114,6 +114,7 @@ def test_a_strong_one_is_named_and_sized(law: Law) -> None:
             assert found.value == pytest.approx(truth, abs=4.0 * found.std)
 
 
+@pytest.mark.extra  # whole diagnoses
 @pytest.mark.parametrize(("cfa", "seed"), [("MONO", 930), ("RGGB", 931)])
 def test_healthy_cameras_have_none(cfa: str, seed: int) -> None:
     found = _diagnosed(None, cfa, seed)

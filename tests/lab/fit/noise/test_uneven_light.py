@@ -73,6 +73,7 @@ def test_gains_of_rows_and_columns_are_reported(session: MonoSession, line: str)
     assert sentence.startswith(f"the gains of {line}s differ by")
 
 
+@pytest.mark.extra  # whole diagnoses
 @pytest.mark.parametrize(
     ("session", "name", "percent"),
     [
