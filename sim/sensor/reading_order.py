@@ -94,8 +94,8 @@ class OrderedNoise:
         """
         cols = shape[1]
         across, down = np.broadcast_arrays(np.asarray(across_cy_per_px, float), np.asarray(down_cy_per_px, float))
-        waves = (down[..., None] + np.arange(cols)) / cols
-        kernel = _dirichlet2(across[..., None] - waves, cols)
+        make = _kept_row_waves if across.size * cols <= KEPT_WAVES else _row_waves
+        waves, kernel = make(across.tobytes(), down.tobytes(), across.shape, cols)
         return np.asarray(np.sum(kernel * self._shown(waves, shape), axis=-1))
 
     def _shown(self, waves_cy_per_px: FloatArray, shape: tuple[int, int]) -> FloatArray:
@@ -188,6 +188,19 @@ def _dirichlet2(frequency_cy_per_px: FloatArray, count: int) -> FloatArray:
     """Square of the mean of `count` waves exp(2 pi i f n)."""
     turn = np.pi * _from_whole(frequency_cy_per_px)
     return np.square(np.sinc(count * turn / np.pi) / np.sinc(turn / np.pi))
+
+
+def _row_waves(across: bytes, down: bytes, shape: tuple[int, ...], cols: int) -> tuple[FloatArray, FloatArray]:
+    """The waves of a row, cycles a pixel, and what a row shows of each (..., cols), at frequencies across the columns
+    and down the rows (`shape` of doubles): no parameter of the noise enters."""
+    at, to = (np.frombuffer(values).reshape(shape) for values in (across, down))
+    waves = (to[..., None] + np.arange(cols)) / cols
+    return waves, _dirichlet2(at[..., None] - waves, cols)
+
+
+#: Numbers of one result of `_row_waves` up to which it is kept.
+KEPT_WAVES = 200_000
+_kept_row_waves = lru_cache(maxsize=64)(_row_waves)
 
 
 @lru_cache(maxsize=8)
