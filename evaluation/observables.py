@@ -127,7 +127,8 @@ def table(found: Iterable[Calibrated]) -> str:
     """
     rows: dict[tuple[str, str], list[Calibrated]] = {}
     for one in found:
-        rows.setdefault((one.observable, one.source), []).append(one)
+        if one.n > 0:  # else wide nuisance parameters take all of its numbers
+            rows.setdefault((one.observable, one.source), []).append(one)
     order = [measurement.name for measurement in measurements()]
     keys = sorted(rows, key=lambda key: (order.index(key[0]) if key[0] in order else len(order), key[1]))
     p = {key: kstest([chdtr(one.n, one.chi2) for one in rows[key]], "uniform").pvalue for key in keys}

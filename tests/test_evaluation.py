@@ -25,6 +25,7 @@ def test_a_true_covariance_is_not_marked_and_wrong_ones_are() -> None:
     assert "| 1.0" in table(_drawn(1.0)) and "**" not in table(_drawn(1.0))
     assert "**0.8" in table(_drawn(0.9))
     assert "**1.2" in table(_drawn(1.1))
+    assert "black_level" not in table([*_drawn(1.0), Calibrated("own chain", 1, "black_level", 0.0, 0)])
 
 
 def test_nuisance_directions_are_projected_out_where_their_prior_is_wide() -> None:
