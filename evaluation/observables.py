@@ -1,7 +1,7 @@
 """Calibration of the observables: does each scatter about its prediction as its covariance says?
 
 On healthy cameras the residual r = y - m of an observable has the distribution N(0, S + J J'), J the Jacobian by the
-nuisance parameters per prior standard deviation. A parameter whose prior is wide beside the noise takes its direction
+nuisance parameters per prior standard deviation. A parameter whose prior is wide against the noise takes its direction
 out of r, whatever the truth is; these directions are projected out, and
 
     chi2 = r' C^-1 r ~ chi2_n

@@ -30,8 +30,8 @@ ORDERS: tuple[Order, ...] = ("alike", "turned")
 
 class AmplifierCrosstalk(Effect):
     """Each amplifier takes over a share c + d of what the one before it reads at the same moment, and c - d of the one
-    behind it, in the order of the areas; f times as much of those that aren't beside it: light, its noise, and the
-    level p at which dark pixels stand. The frame's mean stays. Temporal noise of light in pixels that are read together
+    behind it, in the order of the areas; f times as much of areas that aren't adjacent: light, its noise, and the level
+    p of dark pixels. The frame's mean stays. Temporal noise of light in pixels that are read together
     is correlated by about 2 c, areas' gains differ by d, and bright things have ghosts in the other areas. The
     amplifiers' own noise comes after; in another form of the law it is coupled, too.
     """
@@ -52,7 +52,7 @@ class AmplifierCrosstalk(Effect):
         float,
         Quantity(
             "%",
-            "share that an amplifier takes over from each one beside it, on average",
+            "share that an amplifier takes over from each adjacent one, on average",
             lower=-20.0,
             upper=20.0,
             prior=(0.0, 1.0),
@@ -75,7 +75,7 @@ class AmplifierCrosstalk(Effect):
         float,
         Quantity(
             "1",
-            "shares from amplifiers of areas that aren't beside it, over the others",
+            "shares from areas that aren't adjacent, over those from adjacent ones",
             lower=0.0,
             upper=2.0,
             prior=(0.5, 0.3),
@@ -97,7 +97,7 @@ class AmplifierCrosstalk(Effect):
     ] = 0.0
     layout: Annotated[Layout, Field(description="how the areas lie")] = "two columns"
     order: Annotated[
-        Order, Field(description="whether areas beside each other are read in the same direction, or in opposite ones")
+        Order, Field(description="whether adjacent areas are read in the same direction, or in opposite ones")
     ] = "alike"
     noise: Annotated[Literal["own", "coupled"], Field(description="whether read noise is coupled as light is")] = "own"
 

@@ -10,7 +10,7 @@ from sim.sensor.lines import Lines
 
 class ColumnGain(LineGain):
     """A normal factor on what is read of each column, the same in every frame, of mean 1 over the columns: signal and
-    noise grow with it, beside the pixels' own PRNU. Dark frames have none.
+    noise grow with it, in addition to the pixels' own PRNU. Dark frames have none.
     """
 
     name: ClassVar[str] = "column_gain"

@@ -10,7 +10,7 @@ from sim.sensor.lines import Lines
 
 class RowGain(LineGain):
     """A normal factor on what is read of each row, the same in every frame, of mean 1 over the rows: signal and
-    noise grow with it, beside the pixels' own PRNU. Dark frames have none.
+    noise grow with it, in addition to the pixels' own PRNU. Dark frames have none.
     """
 
     name: ClassVar[str] = "row_gain"

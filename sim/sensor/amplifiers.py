@@ -15,7 +15,7 @@ class CoupledAmplifiers:
     what the others read at that moment.
 
     `coupling` (areas, areas), row after row of areas: share that the first index takes over from the second, 0 on the
-    diagonal. `turned`: areas beside each other, and below each other, are read in opposite directions, so that places
+    diagonal. `turned`: adjacent areas, and below each other, are read in opposite directions, so that places
     are mirrored about their borders. `of_noise`: read noise is coupled as signals are. The frame's mean of even light
     stays, as it is part of the camera's gain. Lines that are left over at the end take part in nothing.
     """

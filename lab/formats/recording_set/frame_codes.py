@@ -31,12 +31,12 @@ def _count(frame: NDArray[np.uint16], counts: NDArray[np.int64]) -> None:
     """Add a frame (rows, cols) to `counts` (4, 65536), by cell."""
     rows, cols = frame.shape
     for i in range(rows):
-        here, beside = counts[2 * (i % 2)], counts[2 * (i % 2) + 1]
+        even, odd = counts[2 * (i % 2)], counts[2 * (i % 2) + 1]  # columns
         for j in range(0, cols - 1, 2):
-            here[frame[i, j]] += 1
-            beside[frame[i, j + 1]] += 1
+            even[frame[i, j]] += 1
+            odd[frame[i, j + 1]] += 1
         if cols % 2:
-            here[frame[i, cols - 1]] += 1
+            even[frame[i, cols - 1]] += 1
 
 
 @dataclass(frozen=True, eq=False)

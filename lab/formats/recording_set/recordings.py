@@ -194,7 +194,7 @@ class RecordingSet:
         """Return the summary of frames called `key`, made by `make` when it is first asked for. Where that raised
         NotDetermined, it is raised again.
 
-        A summary is small beside its frames: it outlives them (`let_go`), and goes with the set to other processes.
+        A summary is small against its frames: it outlives them (`let_go`), and goes with the set to other processes.
         `whatever_is_stated`: it holds for all sets of the same frames, as `key` holds all that it depends on, frames by
         their paths; else for sets under the same manifest.
         """

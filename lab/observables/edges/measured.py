@@ -14,7 +14,7 @@ import numpy as np
 
 from lab.capture_kinds.slanted_edge import EdgeCapture
 from lab.errors import NotDetermined
-from lab.formats.recording_set import CodeCounts, FrameCodes, RecordingSet
+from lab.formats.recording_set import CodeCounts, RecordingSet
 from lab.formats.results import NoiseFit
 from lab.observables.codes.step import step_of
 from lab.observables.edges.finding import Region, region_planes
@@ -62,7 +62,7 @@ def _summarise(
     """Summarise the edge in the mean of the captures' frames."""
     frames = [recordings.frame(c) for c in captures]
     mean = np.mean([f.astype(float) for f in frames], axis=0) if len(frames) > 1 else frames[0]
-    code = step_of(CodeCounts.total(FrameCodes.count(frame).every for frame in frames))
+    code = step_of(CodeCounts.total(recordings.codes(c).every for c in captures))
     return summarise_edge(region_planes(mean, region, cfa, channel), code=code, frames=len(frames))
 
 

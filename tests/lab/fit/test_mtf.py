@@ -11,6 +11,7 @@ import pytest
 
 from lab.errors import NotDetermined
 from lab.fit.mtf import edge_mtf, fit_mtf
+from lab.formats.recording_set import FrameCodes
 from lab.observables.edges.region import find_edges
 from tests.lab.observables.edges.drawn_edges import edge, gaussian_mtf50, squares
 
@@ -81,6 +82,7 @@ def recordings(frames, captures, cfa="RGGB"):
         camera=lambda side: camera,
         captures=lambda kind=None, side=None: captures,
         frame=lambda capture: frames[capture.id],
+        codes=lambda capture: FrameCodes.count(frames[capture.id]),
         once=lambda key, make, *, whatever_is_stated: make(),
     )
 
