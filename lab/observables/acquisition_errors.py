@@ -331,7 +331,7 @@ def alike_planes(recordings: RecordingSet, side: Side) -> AlikePlanes | None:
     captures, the brightest frame of each light that doesn't clip. None where they differ, or where no light is bright
     enough."""
     camera = recordings.camera(side)
-    if camera.cfa == "MONO":
+    if camera.cfa == "MONO" or min(camera.rows, camera.cols) < 2:  # a line has no four planes
         return None
     darks = recordings.captures(DarkCapture, side)
     black = recordings.codes(darks[0]).every.mean_dn if darks else (camera.black_level_dn or 0.0)

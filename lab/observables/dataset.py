@@ -305,8 +305,7 @@ def clipping_level_dn(dataset: Dataset) -> float:
     for kind in ("flat", "narrowband", "white"):
         for capture in dataset.recordings.captures(kind, dataset.side):
             codes = dataset.recordings.codes(capture)
-            for channel in dataset.channels:
-                counts = codes.of_channel(dataset.camera.cfa, channel)[0]
+            for counts, *_ in codes.channels(dataset.camera.cfa).values():
                 if counts.highest_dn < 0.25 * white:
                     continue
                 middle, high, top = counts.quantiles([0.97, 0.99, 0.999])

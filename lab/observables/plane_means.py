@@ -54,7 +54,7 @@ class ChannelMean:
 
     def clipped_share(self, saturation_dn: float) -> float:
         """Return the share of the pixels at `saturation_dn` or above, in the cell that has most of them."""
-        return max(cell.share_from(saturation_dn) for cell in self.cells if cell.pixels)
+        return max(cell.share_from(saturation_dn) for cell in self.cells)
 
 
 def central_codes(recordings: RecordingSet, capture: Capture) -> FrameCodes:
@@ -78,8 +78,8 @@ def central_part(shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 
 def channel_means(codes: FrameCodes, cfa: Cfa) -> dict[str, ChannelMean]:
-    """Return the channels of a stated mosaic, from the codes of its cells."""
-    return {channel: ChannelMean(codes.of_channel(cfa, channel)) for channel in phases(cfa)}
+    """Return the channels of a stated mosaic that have pixels, from the codes of its cells."""
+    return {channel: ChannelMean(cells) for channel, cells in codes.channels(cfa).items()}
 
 
 def channel_pixels(frame: NDArray[Any], cfa: Cfa, channel: str) -> FloatArray:

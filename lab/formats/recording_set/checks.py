@@ -17,7 +17,7 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import InputError
 from lab.formats.recording_set.files import Frame
-from lab.formats.recording_set.frame_codes import FrameCodes
+from lab.formats.recording_set.frame_codes import CodeCounts, FrameCodes
 from lab.formats.recording_set.manifest import DataSheet, Findings
 from lab.formats.recording_set.recordings import RecordingSet
 from sim.camera import CameraModel, Lens, Side
@@ -210,8 +210,8 @@ def clipped_share(codes: FrameCodes, camera: DataSheet) -> dict[str, float]:
     black = camera.black_level_dn or 0.0
     middle = black + (camera.saturation_dn - black) / 2
     shares = {}
-    for channel in camera.channels:
-        counts = codes.channel(camera.cfa, channel)
+    for channel, cells in codes.channels(camera.cfa).items():
+        counts = CodeCounts.total(cells)
         shares[channel] = counts.share_from(counts.highest_dn if counts.highest_dn > middle else camera.saturation_dn)
     return shares
 
@@ -231,7 +231,7 @@ def flat_level(recordings: RecordingSet, flat: FlatCapture, clipped: dict[str, f
     """Return the level of one flat. Raises InputError where its spectrum can't be used."""
     light, scale = _light(recordings, flat)
     camera, codes = recordings.camera(flat.side), recordings.codes(flat)
-    cells = {name: codes.of_channel(camera.cfa, name) for name in camera.channels}
+    cells = codes.channels(camera.cfa)
     mean_dn = {name: float(np.mean([one.mean_dn for one in own])) for name, own in cells.items()}
     scatter_dn = {name: float(np.mean([one.std_dn for one in own])) for name, own in cells.items()}
     where = f"{recordings.where(flat.frame)} (capture {flat.id})"

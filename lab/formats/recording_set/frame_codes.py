@@ -149,13 +149,14 @@ class FrameCodes:
         """Counts of all pixels."""
         return CodeCounts.total(self.cells)
 
-    def of_channel(self, cfa: Cfa, channel: str) -> tuple[CodeCounts, ...]:
-        """Return the counts of a channel's cells in a stated mosaic: of R, B or Y one, of G two, first that on the red
-        rows."""
+    def channels(self, cfa: Cfa) -> dict[str, tuple[CodeCounts, ...]]:
+        """Return the counts of the cells of every channel of a stated mosaic: of R, B or Y one, of G two, first that on
+        the red rows. A frame of one row or column has no pixels of some cells, and of some channels: they are left out.
+        """
         if cfa == "MONO":
-            return (self.every,)
-        return tuple(self.cells[CELLS.index(place)] for place in phases(cfa)[channel])
-
-    def channel(self, cfa: Cfa, channel: str) -> CodeCounts:
-        """Return the counts of all pixels of a channel (R, G, B, or Y) of a stated mosaic."""
-        return CodeCounts.total(self.of_channel(cfa, channel))
+            return {"Y": (self.every,)}
+        found = {
+            channel: tuple(cell for place in places if (cell := self.cells[CELLS.index(place)]).pixels)
+            for channel, places in phases(cfa).items()
+        }
+        return {channel: cells for channel, cells in found.items() if cells}

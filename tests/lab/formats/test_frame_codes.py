@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lab.capture_kinds.dark import DarkCapture
-from lab.formats.recording_set import CodeCounts, DataSheet, FrameCodes, Manifest, RecordingSet
+from lab.capture_kinds.flat import FlatCapture
+from lab.formats.recording_set import CodeCounts, DataSheet, FrameCodes, Manifest, RecordingSet, inspect
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases, step
 
@@ -45,7 +46,23 @@ def test_channels_are_those_of_the_mosaic(cfa: Cfa, frame: NDArray[np.uint16]) -
     codes, period = FrameCodes.count(frame), step(cfa)
     for channel, places in phases(cfa).items():
         pixels = np.concatenate([frame[row::period, col::period].ravel() for row, col in places])
-        assert np.array_equal(codes.channel(cfa, channel).dense(), np.bincount(pixels, minlength=65536))
+        assert np.array_equal(
+            CodeCounts.total(codes.channels(cfa)[channel]).dense(), np.bincount(pixels, minlength=65536)
+        )
+
+
+@pytest.mark.parametrize("shape", [(1, 8), (8, 1), (1, 1)])
+def test_frames_of_one_row_or_column_have_the_channels_that_they_hold(shape: tuple[int, int]) -> None:
+    """Of RGGB a first row holds R and G, a first column too; the set of such frames is checked and read."""
+    frame = np.full(shape, 500, np.uint16)
+    held = FrameCodes.count(frame).channels("RGGB")
+    assert set(held) == ({"R"} if shape == (1, 1) else {"R", "G"})
+    assert sum(cell.pixels for cells in held.values() for cell in cells) == frame.size
+    camera = DataSheet(rows=shape[0], cols=shape[1], cfa="RGGB", bit_depth=12)
+    flat = FlatCapture(id="f", kind="flat", side="left", frame="f.npy", exposure_s=1.0)
+    manifest = Manifest.model_validate({"name": "one", "cameras": {"left": camera}, "captures": [flat]})
+    problems, _ = inspect(RecordingSet(manifest, {"f.npy": frame}))
+    assert problems == []
 
 
 def test_equal_frames_have_equal_digests() -> None:
