@@ -49,6 +49,11 @@ MOVED_PX = 0.1  # a channel displaced by more is drawn anew; less may come from 
 BORDER, GHOST, CONSTANT, SHIFT_X, RADIAL, RADIAL3, ACROSS = 0, 1, 2, 3, 5, 6, 7
 
 
+#: Transfer with which the parts beyond the bands are drawn: of a good lens. Drawn with a strong blur they would have no
+#: term, and the other terms would take what the baseline or a weaker blur has of them.
+SHARP = ReferenceTransfer(1.5, 1.2, 0.9)
+
+
 @dataclass(frozen=True)
 class Band:
     """A band of frequency and orientation, and the nodes at which an effect's OTF is evaluated."""
@@ -132,7 +137,7 @@ class PlacedPattern:
         odd = np.array(self.odd_pieces(canvas, spectrum, mask))
         parts = self.beyond
         if canvas is not self.canvas:
-            parts = canvas.beyond(self.transfer, self.transfer.fill_factor)
+            parts = canvas.beyond(SHARP, SHARP.fill_factor)
         beyond = [np.sum([part.picture for part in together], axis=0) for together in parts]
         picture = (np.sum(pictures, axis=0) + np.sum(beyond, axis=0))[mask]
         across, down = (canvas.picture(2j * np.pi * f * spectrum)[mask] for f in (fx, fy))
@@ -171,7 +176,7 @@ class PlacedPattern:
     @cached_property
     def beyond(self) -> list[list[BeyondPart]]:
         """Return the parts of the pattern beyond the bands, as drawn for the reference pixels."""
-        return self.canvas.beyond(self.transfer, self.transfer.fill_factor)
+        return self.canvas.beyond(SHARP, SHARP.fill_factor)
 
     @cached_property
     def halves(self) -> list[NDArray[np.bool_]]:

@@ -25,6 +25,9 @@ from sim.spectrum import FloatArray
 
 OVERSAMPLE = 4  # samples a pixel, along rows and columns
 LARGEST_PX = 320  # largest side of the window that is fitted: enough for a band's contrast to 1e-3
+#: Weights by which samples half as wide are joined: of their mean, and of a filter that passes a tenth as much of what
+#: aliases. Cells that stand square and are a whole number of pixels alias alike all over the frame.
+PAIRS, TAPS = np.array([0.5, 0.5]), np.array([0.125, 0.375, 0.375, 0.125])
 MARGIN_PX = 12  # border of frame and window that isn't fitted, as the drawing lacks the light from outside
 MARGIN_CELLS = 2.0  # border of the pattern that isn't fitted
 #: Rings above 0.5 cy/px, by the larger of |fx| and fy, that alias. Each is one term of the fit and isn't reported. The
@@ -95,20 +98,23 @@ class Canvas:
     warp: ScreenWarp
     window: tuple[slice, slice]
     fine: FloatArray  # (OVERSAMPLE rows, OVERSAMPLE cols): 0 on dark cells, 1 on lit ones
+    smooth: FloatArray  # (OVERSAMPLE rows, OVERSAMPLE cols): the same by `TAPS`, without aliases
     inside: NDArray[np.bool_]  # (rows, cols): pixels inside the margins of pattern and window
 
     @staticmethod
     def of(target: FloatArray, warp: ScreenWarp, window: tuple[slice, slice]) -> Canvas:
         """Draw the cells `target` (rows, columns of the pattern), where `warp` places them."""
-        row, col = (w.start + (np.arange(OVERSAMPLE * (w.stop - w.start)) + 0.5) / OVERSAMPLE - 0.5 for w in window)
+        twice = 2 * OVERSAMPLE
+        row, col = (w.start + (np.arange(twice * (w.stop - w.start)) + 0.5) / twice - 0.5 for w in window)
         cell_x, cell_y = warp.cells_on(row, col)
         inside = np.ones((window[0].stop - window[0].start, window[1].stop - window[1].start), bool)
         for cell, count in ((cell_x, target.shape[1]), (cell_y, target.shape[0])):
-            middle = cell[OVERSAMPLE // 2 :: OVERSAMPLE, OVERSAMPLE // 2 :: OVERSAMPLE]
+            middle = cell[OVERSAMPLE::twice, OVERSAMPLE::twice]
             inside &= (middle > MARGIN_CELLS) & (middle < count - MARGIN_CELLS)
         inside[:MARGIN_PX] = inside[-MARGIN_PX:] = False
         inside[:, :MARGIN_PX] = inside[:, -MARGIN_PX:] = False
-        return Canvas(warp, window, np.asarray(draw_by_area(target, cell_x, cell_y), float), inside)
+        finest = np.asarray(draw_by_area(target, cell_x, cell_y), float)
+        return Canvas(warp, window, _halved(finest, PAIRS), _halved(finest, TAPS), inside)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -117,14 +123,23 @@ class Canvas:
 
     @cached_property
     def drawn(self) -> NDArray[np.complex128]:
-        """Fourier transform of `fine`, at all its frequencies."""
-        return np.asarray(fft.rfft2(self.fine))
+        """Fourier transform of the drawing, at all its frequencies."""
+        rows, cols = self.smooth.shape
+        fy, fx = fft.fftfreq(rows, 1.0 / OVERSAMPLE)[:, None], fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
+        # of `TAPS` over `PAIRS`, along both axes
+        response = np.square(np.cos(np.pi * fx / (2 * OVERSAMPLE)) * np.cos(np.pi * fy / (2 * OVERSAMPLE)))
+        return np.asarray(fft.rfft2(self.smooth) / response)
 
     @cached_property
     def low(self) -> NDArray[np.complex128]:
         """Fourier transform of the drawn pattern up to 0.5 cy/px, (rows, cols / 2 + 1), as of point samples at the
         pixels' centres."""
         return self._below(self.drawn)
+
+    def image(self, transfer: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
+        """Return the picture (rows, cols) of the drawn pattern behind a transfer function of fx and fy (cy/px), aliases
+        included."""
+        return self.sampled(self.whole.spectrum * transfer(self.whole.fx, self.whole.fy))
 
     def as_shown(self, effects: Effects, camera: CameraModel) -> NDArray[np.complex128]:
         """As `low`, for the pattern as a screen with effects shows it, over the lit screen with the same effects."""
@@ -266,3 +281,15 @@ def pixels_of(canvas: Canvas, seen: FloatArray, places: Sequence[tuple[int, int]
             "bernoulli", f"only {mask.sum()} pixels of one colour see the pattern, {LEAST_PIXELS} needed"
         )
     return mask
+
+
+def _halved(samples: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the weighted means of neighbouring samples, half as many along rows and columns. `weights`: an even
+    number, symmetric about the middle of each pair."""
+    out = samples
+    for axis in (0, 1):
+        beyond = len(weights) // 2 - 1
+        padded = np.pad(out, [(beyond, beyond) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
+        count = out.shape[axis] // 2
+        out = sum(weight * padded.take(range(k, k + 2 * count, 2), axis=axis) for k, weight in enumerate(weights))
+    return np.asarray(out)

@@ -12,7 +12,7 @@ from lab.observables.screens.patterns import joint_covariance, patterns, place_j
 from sim.effects.base import Effects
 from sim.uniform import Uniform
 
-BORDER_FLOOR = 0.0015  # standard deviation of the light at borders beside noise
+BORDER_FLOOR = 2e-4  # standard deviation of the light at borders beside noise: error of the drawing
 
 
 def measure_cell_borders(dataset: Dataset) -> Observable:

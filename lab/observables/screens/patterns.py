@@ -203,9 +203,10 @@ class _Baseline:
         def lens(radius: FloatArray) -> FloatArray:
             return gain * np.asarray(otf(np.minimum(radius, otf.x[-1])))
 
-        whole = canvas.whole
-        drawn = whole.spectrum * lens(np.hypot(whole.fx, whole.fy))
-        image = canvas.sampled(drawn * aperture_otf(whole.fx, whole.fy, camera.fill_factor))[mask]
+        def transfer(fx: FloatArray, fy: FloatArray) -> FloatArray:
+            return np.asarray(lens(np.hypot(fx, fy)) * aperture_otf(fx, fy, camera.fill_factor))
+
+        image = canvas.image(transfer)[mask]
         passed = canvas.passed(lens, camera.fill_factor)
         spectrum = canvas.low * passed
         fy, fx = canvas.frequencies

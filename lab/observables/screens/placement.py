@@ -29,6 +29,7 @@ REGISTERED_ORDER, REGISTERED_CY_PER_PX = 4, 1.5
 JUDGED_ORDER = 8  # of the change of the transfer beside which a displacement has to lower the residual
 PLACE_STD_PX = 0.03  # prior standard deviation of each term of the displacement: errors of the corners
 LEAST_ERROR_PX = 2e-4  # of a term of the displacement; less changes a contrast by less than 1e-4
+ERRORS_ORDER = 14  # of the change of the transfer that may be taken for a displacement
 REFINEMENTS = 3  # most Gauss-Newton steps of the registration
 BLUR_STEPS = 6  # most Gauss-Newton steps of the reference transfer
 BLUR_DIFFERENCE, MOST_BLUR_STEP = 0.02, 0.5  # changes of its parameters: for derivatives, and of a step
@@ -166,9 +167,11 @@ class _PlacedPattern:
 
     def _drawn(self, transfer: ReferenceTransfer) -> FloatArray:
         """Return the pattern's image (n,) behind a transfer and the pixel's aperture."""
-        whole = self.canvas.whole
-        lens = transfer(np.hypot(whole.fx, whole.fy)) * aperture_otf(whole.fx, whole.fy, transfer.fill_factor)
-        return np.asarray(self.canvas.sampled(whole.spectrum * lens)[self.mask])
+
+        def blurred(fx: FloatArray, fy: FloatArray) -> FloatArray:
+            return np.asarray(transfer(np.hypot(fx, fy)) * aperture_otf(fx, fy, transfer.fill_factor))
+
+        return np.asarray(self.canvas.image(blurred)[self.mask])
 
     def fit_blur(self) -> _PlacedPattern:
         """Fit the reference transfer: Gauss-Newton steps with free levels of dark and lit cells."""
@@ -211,13 +214,17 @@ class _PlacedPattern:
 
     @cached_property
     def smooth(self) -> FloatArray:
-        """Products (k, n) of even powers of the frequency and the transfer, by their order, and last a constant.
+        """Products (k, n) of even powers of the frequency, up to `JUDGED_ORDER`, and the transfer, and last a constant.
 
         A smooth change of the transfer is fitted with a displacement: with the phase of the cells on the pixels,
         aliases look like one."""
+        return self._smooth(JUDGED_ORDER)
+
+    def _smooth(self, order: int) -> FloatArray:
+        """Return such products up to an `order`."""
         whole = self.canvas.whole
         fx, fy = (np.clip(f, -REGISTERED_CY_PER_PX, REGISTERED_CY_PER_PX) for f in (whole.fx, whole.fy))
-        powers = even_powers(fx, fy, JUDGED_ORDER, REGISTERED_CY_PER_PX)
+        powers = even_powers(fx, fy, order, REGISTERED_CY_PER_PX)
         columns = [self.canvas.sampled(term * self._spectrum)[self.mask] for term in powers]
         return np.array([*columns, np.ones(len(columns[0]))])
 
@@ -228,12 +235,12 @@ class _PlacedPattern:
 
     def errors(self) -> FloatArray:
         """Return the independent errors of the displacement (directions, 2 terms), px, one standard deviation each:
-        with the smooth transfer of `JUDGED_ORDER` free, the prior of the corners, and the residual as noise.
+        with a smooth transfer of `ERRORS_ORDER` free, the prior of the corners, and the residual as noise.
 
         Where cells are a whole number of pixels and stand square, some displacements look like a change of the
         transfer, and are known no better than from the corners.
         """
-        columns = np.concatenate([self.slopes, self.smooth])
+        columns = np.concatenate([self.slopes, self._smooth(ERRORS_ORDER)])
         precision = columns @ columns.T / self.left_rms**2
         own = np.arange(len(self.slopes))
         precision[own, own] += PLACE_STD_PX**-2
