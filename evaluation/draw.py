@@ -114,7 +114,7 @@ FAULTS: tuple[CaseFault, ...] = (
 )
 
 
-# --- Sessions of the second image former as recording sets ------------------------------------------------------------
+# --- Sessions of the independent simulator as recording sets ----------------------------------------------------------
 
 
 def recordings_of(camera: ConcealedCamera, plan: Plan = WHOLE_SESSION) -> RecordingSet:

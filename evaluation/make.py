@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from evaluation.draw import draw
+from evaluation.draw_unlisted import draw_unlisted
 from evaluation.truth import SIZES, CaseTruth, Laws, Seals, Truths, digest, load, purpose_of, salted, seal, store
-from evaluation.unlisted import draw_unlisted
 from lab.errors import InputError
 from lab.formats import recording_set
 from lab.one_blas_thread import one_blas_thread

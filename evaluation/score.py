@@ -12,8 +12,8 @@ from typing import Literal
 
 from scipy.special import betaincinv
 
+from evaluation.case_run import CaseRun
 from evaluation.independent_simulator import OUTSIDE
-from evaluation.run import CaseRun
 from evaluation.truth import CaseTruth, Concealed, Purpose, Seals, Truths, digest, seal
 from lab.formats.results import DiagnosisResult
 from sim.effects.library import effects as library
@@ -50,6 +50,13 @@ class Rate(Frozen):
         low = 0.0 if count == 0 else float(betaincinv(count, of - count + 1, tail))
         high = 1.0 if count == of else float(betaincinv(count + 1, of - count, 1.0 - tail))
         return cls(count=count, of=of, share=count / of, low=low, high=high)
+
+
+def rate_words(rate: Rate) -> str:
+    """Return a count of cases with the interval of the share, for a table."""
+    if rate.share is None or rate.low is None or rate.high is None:
+        return "none"
+    return f"{rate.count} of {rate.of} ({100 * rate.low:.0f}..{100 * rate.high:.0f} %)"
 
 
 class Goal(Frozen):
@@ -158,7 +165,7 @@ class SealedScore(Frozen):
 
 
 class ChallengeScore(SealedScore):
-    """All scores of a challenge: what `calibench challenge score --json FILE` writes."""
+    """All scores of a challenge: what `python -m evaluation score --json FILE` writes."""
 
     format: Literal["calibench-challenge-score"] = "calibench-challenge-score"
     version: Literal[1] = 1
@@ -363,7 +370,7 @@ def _least_separability(truth: CaseTruth) -> float | None:
 
 
 def families_of(concealed: Concealed) -> frozenset[str]:
-    """Families that are right for a concealed law: its effect's, or those that the second former declares; empty where
+    """Families that are right for a concealed law: its effect's, or those that the simulator declares; empty where
     no family has it."""
     if concealed.effect is not None:
         return frozenset({library()[concealed.effect].family.value})

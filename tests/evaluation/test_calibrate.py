@@ -15,7 +15,7 @@ from evaluation.calibrate import (
     rule_table,
     tally,
 )
-from evaluation.run import CaseRun
+from evaluation.case_run import CaseRun
 from evaluation.score import ChallengeScore, score
 from evaluation.truth import Seals, Truths, salted, seal
 from lab.diagnose import DecisionPolicy

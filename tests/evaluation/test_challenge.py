@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from evaluation.__main__ import main
+from evaluation.blind import BlindProof
 from evaluation.calibrate import DEFAULT, answers
 from evaluation.draw import FAULTS, FOREIGN_BITS, FOREIGN_FRAMES, SHARES, DrawnFrame, draw, kind_of
 from evaluation.independent_simulator import LISTED, OUTSIDE
 from evaluation.make import make
-from evaluation.run import run_all
 from evaluation.score import broken_seals, score
 from evaluation.truth import (
     FIRST_PROOF_SEED,
@@ -173,14 +173,15 @@ def test_truths_beside_the_recordings_and_mixed_challenges_are_refused(
 def test_a_case_that_fails_does_not_end_the_run(copy: tuple[Path, Seals, Truths]) -> None:
     folder, seals, truths = copy
     (folder / "case-0001" / "manifest.json").write_text("{")
-    runs = run_all(folder, ("case-0001", "case-0002"), Workers())
+    proof = BlindProof(folder, ("case-0001", "case-0002"))
+    runs = proof.run(folder)
     assert runs["case-0001"].error is not None
     assert runs["case-0001"].diagnosis is None
     assert isinstance(runs["case-0002"].diagnosis, DiagnosisResult)
     assert runs["case-0002"].memory_mib > 50
     # results are kept: nothing is diagnosed a second time
     written = (folder / "results" / "case-0002.json").read_bytes()
-    assert run_all(folder, ("case-0001", "case-0002"), Workers()) == runs
+    assert proof.run(folder) == runs
     assert (folder / "results" / "case-0002.json").read_bytes() == written
     found = score(truths, seals, runs, broken_seals(folder, seals, truths))
     assert found.broken_seals == ("case-0001",)
@@ -203,7 +204,7 @@ def test_seeds_of_tuning_and_of_proofs_are_apart(tmp_path: Path, capsys: pytest.
 
 
 def test_a_scored_proof_seed_is_refused(tmp_path: Path) -> None:
-    from evaluation.proof import refuse_scored
+    from evaluation.page import refuse_scored
 
     page = tmp_path / "proof.md"
     page.write_text("| for | seed |\n| proof | 1000007 | 200 | medium | `ab` |\n")
