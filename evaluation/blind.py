@@ -11,7 +11,7 @@ import numpy as np
 from evaluation.case_run import CaseRun
 from evaluation.experiment import PagePicture, ScoredExperiment
 from evaluation.plots import ABSTAINED, RIGHT, WRONG, Axis, Cell, Panel, matrix_plot, power_plot
-from evaluation.score import STRONG, CaseScore, ChallengeScore, Rate, rate_words, score
+from evaluation.score import STRONG, BlindScore, CaseScore, Rate, rate_words, score
 from evaluation.sealed import SealedExperiment, about
 from evaluation.truth import Seals, Truths
 from lab.effect_titles import effect_title
@@ -24,16 +24,16 @@ UNNAMED = ("unexplained", "no_mismatch", "failed")
 
 
 @dataclass(frozen=True)
-class BlindProof(SealedExperiment[ChallengeScore]):
+class BlindProof(SealedExperiment[BlindScore]):
     """Cases of listed effects, scored by the names that they get."""
 
     def scored(
         self, truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequence[str]
-    ) -> ChallengeScore:  # fmt: skip
+    ) -> BlindScore:  # fmt: skip
         """Return all scores; cases with a broken seal are left out."""
         return score(truths, seals, runs, broken)
 
-    def outcome(self, scores: ChallengeScore) -> ScoredExperiment:
+    def outcome(self, scores: BlindScore) -> ScoredExperiment:
         """Return tables, the confusion matrix, and power curves where the oracle was computed."""
         introduction, seed_row = about(scores)
         pictures = [PagePicture(f"-{scores.purpose}", "What was said of what was concealed", confusion(scores))]
@@ -50,7 +50,7 @@ def _share(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.0f} %"
 
 
-def table(found: ChallengeScore) -> str:
+def table(found: BlindScore) -> str:
     """Return the scores as Markdown tables, with 95 % intervals (Clopper-Pearson)."""
     lines = ["| goal | wanted | reached | oracle | |", "| --- | --- | --- | --- | --- |"]
     lines += [
@@ -108,7 +108,7 @@ def table(found: ChallengeScore) -> str:
     return "\n".join(lines)
 
 
-def power_curves(scores: ChallengeScore) -> str:
+def power_curves(scores: BlindScore) -> str:
     """Return single effects and compounds as SVG: for each class of separability, at its geometric mean, the share of
     right diagnoses with its 95 % interval, and the mean share of the oracle on the same cases."""
     panels = []
@@ -132,7 +132,7 @@ def _by_class(cases: Sequence[CaseScore]) -> list[list[CaseScore]]:
     return [group for group in held if group]
 
 
-def confusion(scores: ChallengeScore) -> str:
+def confusion(scores: BlindScore) -> str:
     """Return the confusion matrix as SVG: numbers of cases by what was concealed (rows: single effects of
     non-centrality above 50, healthy, outside the library) and by the first name or the verdict (columns)."""
     shown = [

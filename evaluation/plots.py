@@ -101,7 +101,7 @@ def row_plot(title: str, axis: Axis, rows: Sequence[Row], legend: Sequence[tuple
     height = HEAD_PX + ROW_PX * len(rows) + 34 + 30 * bool(legend)
     bottom = HEAD_PX + ROW_PX * len(rows)
     picture = Plot(LABEL_PX + PLOT_PX + 90, height)
-    picture.text(LABEL_PX, 16, title)
+    picture.text(12, 16, title)
     for tick in axis.ticks:
         x = axis.x_px(tick)
         picture.path(f"M{x:.0f} {HEAD_PX - 8}V{bottom + 6}", LIMIT if tick == axis.limit else GRID)

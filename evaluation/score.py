@@ -147,7 +147,7 @@ class EffectScore(Frozen):
 
 
 class SealedScore(Frozen):
-    """What the scores of every sealed challenge begin with. `failed`: the error of each case that didn't end."""
+    """What the scores of all sealed cases begin with. `failed`: the error of each case that didn't end."""
 
     purpose: Purpose
     seed: int
@@ -164,8 +164,8 @@ class SealedScore(Frozen):
         return all(goal.met is not False for goal in self.goals)
 
 
-class ChallengeScore(SealedScore):
-    """All scores of a challenge: what `python -m evaluation score --json FILE` writes."""
+class BlindScore(SealedScore):
+    """All scores of the blind proof: what `python -m evaluation score --json FILE` writes."""
 
     format: Literal["calibench-challenge-score"] = "calibench-challenge-score"
     version: Literal[1] = 1
@@ -196,7 +196,7 @@ class ChallengeScore(SealedScore):
 
 
 def goals_of_run(seals: Seals, broken: Sequence[str], ran: int, cases: int) -> tuple[Goal, Goal]:
-    """Return the goals of every sealed challenge: that its seals hold, and that each of its `cases` ran."""
+    """Return the goals of all sealed cases: that their seals hold, and that each of the `cases` ran."""
     whole = len(seals.seals)
     return (
         Goal(
@@ -229,7 +229,7 @@ def seals_sha256(seals: Seals) -> str:
     ).hexdigest()
 
 
-def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequence[str] = ()) -> ChallengeScore:
+def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequence[str] = ()) -> BlindScore:
     """All scores. Cases with a broken seal are left out; cases that failed have no verdict and no name."""
     cases = [
         (case, truths.truths[case].truth, runs[case])
@@ -300,7 +300,7 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
         _limit("CPU time of a case", cpu, CPU_GOAL_S, " s"),
         _limit("memory of a case", memory, MEMORY_GOAL_MIB, " MiB"),
     )
-    return ChallengeScore(
+    return BlindScore(
         purpose=truths.purpose, seed=truths.seed, size=truths.size, cases=len(cases), seals_sha256=seals_sha256(seals),
         broken_seals=tuple(broken),
         failed={case: run.error for case, _, run in cases if run.error is not None}, singles=classes, fair=fair,

@@ -9,7 +9,7 @@ import pytest
 from evaluation.blind import BlindProof, confusion, table
 from evaluation.case_run import CaseRun
 from evaluation.independent_simulator import OUTSIDE
-from evaluation.score import ChallengeScore, Rate, score
+from evaluation.score import BlindScore, Rate, score
 from evaluation.truth import CaseTruth, Concealed, Kind, Seals, Truths, canonical, salted, seal
 from lab.formats.results import (
     DiagnosisResult,
@@ -87,7 +87,7 @@ CASES: tuple[tuple[CaseTruth, DiagnosisResult | None], ...] = (
 )
 
 
-def scored(broken: tuple[str, ...] = ()) -> ChallengeScore:
+def scored(broken: tuple[str, ...] = ()) -> BlindScore:
     names = [f"case-{i:04d}" for i in range(1, len(CASES) + 1)]
     kept = {name: salted(t) for name, (t, _) in zip(names, CASES, strict=True)}
     truths = Truths(purpose="tuning", seed=3, size="small", cases=len(CASES), truths=kept)
@@ -225,7 +225,7 @@ def with_strengths(truth_: CaseTruth, separability: tuple[float, ...], oracle_sh
     return truth_.model_copy(update={"concealed": concealed, "oracle_share": oracle_share})
 
 
-def fairly_scored() -> ChallengeScore:
+def fairly_scored() -> BlindScore:
     pair = truth("compound", ("defocus", 80.0), ("vignetting", 90.0))
     cases = (
         (with_strengths(truth("single", ("defocus", 80.0)), (70.0,), 1.0), named("defocus")),

@@ -140,7 +140,7 @@ def test_a_case_for_the_budget_alone_is_no_camera_of_the_transfers() -> None:
 
 
 def _fitted(truth: ConcealedCamera, std: dict[str, float], **wrong: float) -> CameraFile:
-    """The model of a camera of the second former as it is, but for what is `wrong`, with a posterior of `std`."""
+    """The model of a simulated camera as it is, but for what is `wrong`, with a posterior of `std`."""
     curves = {c: Spectrum.of(WAVELENGTH_NM, q) for c, q in truth.quantum_efficiency.items()}
     camera = CameraModel(
         rows=truth.rows, cols=truth.cols, pixel_pitch_um=truth.pitch_um, fill_factor=truth.fill_factor, cfa=truth.cfa,

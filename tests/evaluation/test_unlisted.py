@@ -428,7 +428,7 @@ def test_a_sealed_set_is_made_diagnosed_and_only_then_opened(tmp_path: Path, mon
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     assert main(["make", "--out", str(folder), *words]) == 0
     assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    # another kind of challenge can't go on there
+    # cases of another kind can't go on there
     assert main(["make", "--out", str(folder), *words[1:]]) != 0
 
     away = truths.rename(tmp_path / "away.json")

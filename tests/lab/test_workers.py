@@ -70,7 +70,7 @@ def test_a_scheduler_without_workers_is_said() -> None:
 
 
 @pytest.mark.slow
-def test_a_challenge_is_made_and_diagnosed_on_the_cluster(
+def test_sealed_cases_are_made_and_diagnosed_on_the_cluster(
     cluster: Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The same recordings as in this process, to the byte; and what a worker says of a set that can't be read."""

@@ -16,6 +16,7 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import InputError
+from lab.formats.plausible_range import STATED
 from lab.formats.recording_set.files import Frame
 from lab.formats.recording_set.frame_codes import CodeCounts, FrameCodes
 from lab.formats.recording_set.manifest import DataSheet, Findings
@@ -503,8 +504,6 @@ def _check_cameras(recordings: RecordingSet, found: Findings) -> None:
 
 def _improbable_squares(capture: Capture) -> Iterator[str]:
     """Say that the squares of a board are improbably small or large: as a rule, a length in another unit."""
-    from lab.formats.results.plausible import STATED  # here: its figures are those of recording sets' data sheets
-
     if isinstance(capture, CharucoCapture):
         line = STATED["square_mm"].sentence("square_mm", capture.square_mm, None, "mm")
         if line is not None:
