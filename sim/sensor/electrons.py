@@ -479,6 +479,8 @@ def solve_passed_share(correlation: FloatArray) -> FloatArray:
     sum is over the neighbours a and b that lie as far apart as the two pixels. Solved by fixed-point steps.
     """
     r = np.clip(np.asarray(correlation, float), -0.49, 0.49)
+    if not r.any():
+        return np.zeros(r.shape)
     counts = [len(places) for places in NEIGHBOURS]
     g = 0.5 * r
     for _ in range(SHARE_STEPS):
