@@ -59,11 +59,11 @@ from api.shared_answers import Shared, SharedAnswers
 from api.then import ThenRunner
 from api.upload import Inbox
 from api.waiting import QueueRunner
+from evaluation.kept import Challenges
 from lab.capture.recovery import Recovery
 from lab.capture.session import Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
-from lab.challenge.kept import Challenges
 from lab.errors import CannotWrite, InputError, one_line
 from lab.jobs import JobRunner
 from lab.quick_look.process import QuickLook

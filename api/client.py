@@ -67,13 +67,13 @@ from api.schemas import (
     StoredPrediction,
     StoredSession,
 )
+from evaluation.score import ChallengeScore
+from evaluation.truth import Truths
 from lab.calibration.life import BOARD_COLUMNS, CalibrationRecord, DriftBoard, History
 from lab.calibration.limits import CalibrationLimits
 from lab.capture.catalogue import PlanEstimate, SequenceDescription
 from lab.capture.plan import Parameters
 from lab.capture.session import Progress
-from lab.challenge.score import ChallengeScore
-from lab.challenge.truth import Truths
 from lab.diagnose.visibility import EffectDescription, ParameterDescription
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.quick_look.curves import Curves, FrameFigures

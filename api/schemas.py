@@ -22,6 +22,8 @@ from pydantic import (
 from api.keys import Permission
 from api.safety import StationSafety
 from api.strict_kinds import check_kind
+from evaluation.kept import ChallengeWork
+from evaluation.truth import SIZES
 from lab.calibration.camera_models import Kind as CameraModelKind
 from lab.calibration.camera_models import ModelOfCamera
 from lab.calibration.life import CalibrationRecord
@@ -33,8 +35,6 @@ from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
-from lab.challenge.kept import ChallengeWork
-from lab.challenge.truth import SIZES
 from lab.formats.importers import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ResolveJournal, ValidationResult
 from lab.formats.results.diagnosis import DiagnosisVerdict

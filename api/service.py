@@ -23,6 +23,7 @@ from api.security import Demand, Gate
 from api.then import ThenRunner
 from api.upload import Inbox
 from api.waiting import QueueRunner
+from evaluation.kept import Challenges
 from lab.calibration import camera_models
 from lab.calibration.camera_models import CameraModelRecord
 from lab.capture.questions import Question, question_of
@@ -30,7 +31,6 @@ from lab.capture.records import RunRecord, SessionInfo
 from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
 from lab.capture.store import Store
-from lab.challenge.kept import Challenges
 from lab.errors import InputError
 from lab.formats.results import ReportFile
 from lab.jobs import JobInfo, JobRunner

@@ -23,11 +23,11 @@ from urllib.parse import urlsplit
 import sqlalchemy as sa
 from pydantic import ConfigDict
 
+from evaluation.kept import WORK, ChallengeWork, carry_out
 from lab.capture.file_lock import Lock
 from lab.capture.records import JobState, now
 from lab.capture.store import Store
 from lab.capture.tables import JobRow
-from lab.challenge.kept import WORK, ChallengeWork, carry_out
 from lab.errors import Cancelled, CannotWrite, DeviceError, InputError, NoRoom, NotDetermined, failure_of_environment
 from lab.pipeline import (
     STEPS,

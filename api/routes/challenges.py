@@ -15,9 +15,9 @@ from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers, pag
 from api.routes.jobs import accepted
 from api.schemas import Challenge, ChallengeJobStart, ChallengeStart, Job
 from api.service import CALIBRATE, READ, ROOM, Here, HexId, Service
-from lab.challenge.kept import ChallengeWork, KeptChallenge
-from lab.challenge.score import ChallengeScore
-from lab.challenge.truth import Truths
+from evaluation.kept import ChallengeWork, KeptChallenge
+from evaluation.score import ChallengeScore
+from evaluation.truth import Truths
 from lab.errors import InputError
 
 router = APIRouter(tags=["challenges"])

@@ -16,7 +16,7 @@ from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart, WorkStep
 from api.security import REPORT_POLICY, Demand
 from api.service import ADMIN, CALIBRATE, HEX_ID, READ, SESSION_ID, Here, HexId, Service, SessionId, camera_model
-from lab.challenge.kept import WORK
+from evaluation.kept import WORK
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
 from lab.pipeline import STEPS, Goal, source_recordings

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typer.testing import CliRunner
 
-from lab.challenge.live import typical_spec
+from evaluation.live import typical_spec
 from mocks.bench import MARGIN_PX, OVERSAMPLE, SCREEN_OVERSAMPLE, Bench
 from mocks.command import commands
 from mocks.conceal import NOT_SHOWN, OF_THE_RADIOMETER, SIDES, ConcealError, _made, parse

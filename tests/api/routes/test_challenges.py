@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-import lab.challenge.make
-import lab.challenge.run
+import evaluation.make
+import evaluation.run
 import lab.jobs
 from api.client import ServiceClient, ServiceProblem
 from api.schemas import ChallengeStart
-from lab.challenge.kept import Challenges, carry_out
-from lab.challenge.run import CaseRun
-from lab.challenge.score import broken_seals
-from lab.challenge.truth import FIRST_FRESH_SEED, CaseTruth, Seals, Truths, digest, load, seal
+from evaluation.kept import Challenges, carry_out
+from evaluation.run import CaseRun
+from evaluation.score import broken_seals
+from evaluation.truth import FIRST_FRESH_SEED, CaseTruth, Seals, Truths, digest, load, seal
 from lab.formats import recording_set as recording
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult
@@ -33,7 +33,7 @@ def quick(monkeypatch: pytest.MonkeyPatch, little_set: RecordingSet) -> None:
     """A case is two darks, and a diagnosis finds nothing; all of it in this process."""
 
     def write(index: int, out: Path, *_: object) -> CaseTruth:
-        folder = out / lab.challenge.make.case_name(index)
+        folder = out / evaluation.make.case_name(index)
         recording.write(little_set, folder)
         return TRUTH.model_copy(update={"recordings_sha256": digest(folder)})
 
@@ -41,9 +41,9 @@ def quick(monkeypatch: pytest.MonkeyPatch, little_set: RecordingSet) -> None:
         found = DiagnosisResult(source=folder.name, verdict="no_mismatch")
         return CaseRun(case=folder.name, wall_s=1.0, cpu_s=1.0, memory_mib=1.0, diagnosis=found)
 
-    monkeypatch.setattr(lab.challenge.make, "_write_case", write)
-    monkeypatch.setattr(lab.challenge.run, "run_case", run)
-    monkeypatch.setattr("lab.challenge.kept._workers", lambda tick: Workers(1))
+    monkeypatch.setattr(evaluation.make, "_write_case", write)
+    monkeypatch.setattr(evaluation.run, "run_case", run)
+    monkeypatch.setattr("evaluation.kept._workers", lambda tick: Workers(1))
 
 
 def readable(running: Running, challenge_id: str) -> str:
@@ -111,7 +111,7 @@ def test_a_case_is_fetched_as_a_recording_set(running: Running, tmp_path: Path) 
 
 def test_what_is_not_made_is_not_scored(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     """A job that is cancelled after the first case leaves the rest to a job that goes on with the same seed."""
-    write, begun, go_on = lab.challenge.make._write_case, threading.Event(), threading.Event()
+    write, begun, go_on = evaluation.make._write_case, threading.Event(), threading.Event()
 
     def slow(index: int, *rest: object) -> CaseTruth:
         if index == 2:
@@ -119,7 +119,7 @@ def test_what_is_not_made_is_not_scored(running: Running, monkeypatch: pytest.Mo
             go_on.wait(30.0)
         return write(index, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(lab.challenge.make, "_write_case", slow)
+    monkeypatch.setattr(evaluation.make, "_write_case", slow)
     monkeypatch.setattr(lab.jobs, "_WRITE_EVERY_S", 0.0)
     with ServiceClient(running.url, running.keys["calibrate"]) as client:
         job = client.make_challenge(ChallengeStart(cases=3))

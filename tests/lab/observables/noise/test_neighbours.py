@@ -7,7 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator.laws import (
+    AnisotropicBrighterFatterLaw,
+    BrighterFatterLaw,
+    ColouredReadNoiseLaw,
+    InterPixelCapacitanceLaw,
+    OnChipSharpeningLaw,
+    OnChipSmoothingLaw,
+)
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
@@ -21,15 +30,6 @@ from lab.observables.flats.noise import measure_noise
 from lab.observables.noise.neighbours import correlations, measure_noise_neighbours, measure_noise_tones
 from lab.observables.noise.temporal import PAIRS, independent_correlations, repeats_of
 from lab.observables.observable import Observable
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import (
-    AnisotropicBrighterFatterLaw,
-    BrighterFatterLaw,
-    ColouredReadNoiseLaw,
-    InterPixelCapacitanceLaw,
-    OnChipSharpeningLaw,
-    OnChipSmoothingLaw,
-)
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.brighter_fatter import BrighterFatter
