@@ -98,10 +98,9 @@ class OrderedNoise:
         return self._mixed(_plane(self._shape, shape, across.tobytes(), down.tobytes(), across.shape))
 
     def along_rows_e2(self, shape: tuple[int, int], across_cy_per_px: FloatArray) -> FloatArray:
-        """Mean over all rows of their periodograms, at frequencies across the columns."""
-        rows, cols = shape
-        down = np.arange(min(rows, 64)) / min(rows, 64)
-        return np.asarray(self.plane_e2((min(rows, 64), cols), np.asarray(across_cy_per_px)[:, None], down).mean(-1))
+        """Mean over all rows of their expected periodograms, at frequencies across the columns: the transform of the
+        covariance in a row, of which 1 - |lag| / cols pairs are there."""
+        return self._mixed(_along_rows(self._shape, shape[1], np.asarray(across_cy_per_px, float).tobytes()))
 
     def along_columns_e2(self, shape: tuple[int, int], down_cy_per_px: FloatArray) -> FloatArray:
         """Mean over the waves across the columns, of 1 to cols / 2 cycles, of a frame's periodogram at frequencies down
@@ -157,6 +156,15 @@ def _plane(law: PowerLaw, frame: tuple[int, int], across: bytes, down: bytes, sh
     make = _kept_row_waves if size * cols <= KEPT_WAVES else _row_waves
     waves, kernel = make(across, down, shape, cols)
     return np.asarray(np.sum(kernel * _shown(law, waves, frame), axis=-1))
+
+
+@lru_cache(maxsize=256)
+def _along_rows(law: PowerLaw, cols: int, across: bytes) -> FloatArray:
+    lag = np.arange(1, cols)
+    covariances = _covariances(law)[:, :cols]
+    pairs = 2.0 * (1.0 - lag / cols) * covariances[:, 1:]
+    turn = np.cos(2.0 * np.pi * lag[:, None] * np.frombuffer(across))
+    return np.asarray(covariances[:, :1] + pairs @ turn)
 
 
 @lru_cache(maxsize=64)
