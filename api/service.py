@@ -23,7 +23,6 @@ from api.security import Demand, Gate
 from api.then import ThenRunner
 from api.upload import Inbox
 from api.waiting import QueueRunner
-from evaluation.kept import Challenges
 from lab.calibration import camera_models
 from lab.calibration.camera_models import CameraModelRecord
 from lab.capture.questions import Question, question_of
@@ -65,7 +64,6 @@ class Service:
     pictures: Pictures
     jobs: JobRunner
     inbox: Inbox
-    challenges: Challenges
     gate: Gate
     limits: Limits
     public: PublicText

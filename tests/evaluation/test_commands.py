@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -88,3 +90,13 @@ def test_a_case_that_there_is_not_is_said_in_one_line(
     assert main([command, "--out", str(tmp_path / "out"), option, "nonsense"]) == 2
     line = capsys.readouterr().err
     assert line.startswith(f"evaluation: {option} nonsense: ") and not (tmp_path / "out").exists()
+
+
+def test_the_product_runs_without_it() -> None:
+    """Modules of every package of the product are imported in a process that can't import the evaluation."""
+    code = (
+        "import sys, pkgutil, importlib; sys.modules['evaluation'] = None\n"
+        "import api, drivers, lab, mocks, sim, lab.jobs, lab.pipeline, lab.cli.entry, api.app, mocks.bench\n"
+        "lab.cli.entry.command_tree()"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
