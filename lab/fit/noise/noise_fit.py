@@ -53,8 +53,10 @@ from lab.observables.acquisition_errors import alike_planes, copied_frames, exch
 from lab.observables.codes.step import find_code_step, under_highest_code
 from lab.observables.darks.pixels import DarkPixels, read_noise_distribution, stack_of
 from lab.observables.flats.stated_light import StatedLight, lamps_of, light_of, most_frequent_gain_db, why_not
-from lab.observables.noise.levels import DEFECT_SIGMA, MeasuredLevel, PlaneStatistics, defective_pixels, rounded_c
+from lab.observables.noise.levels import MeasuredLevel, rounded_c
 from lab.observables.noise.repeats import find_drifts
+from lab.observables.noise.stack import PlaneStatistics
+from lab.observables.noise.surface import DEFECT_SIGMA, defective_pixels
 from lab.observables.weighted_lines import chi2_factor, root
 from sim.camera import Side
 

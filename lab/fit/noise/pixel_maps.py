@@ -15,7 +15,10 @@ from lab.formats.recording_set import RecordingSet
 from lab.observables.codes.rounding import QUANTISATION_DN2
 from lab.observables.codes.step import find_code_step
 from lab.observables.darks.pixels import stack_of
-from lab.observables.noise.levels import BoolArray, Stack, darks_near, defective_pixels, shading
+from lab.observables.noise.frame_sums import BoolArray
+from lab.observables.noise.levels import darks_near
+from lab.observables.noise.stack import Stack
+from lab.observables.noise.surface import defective_pixels, shading
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray

@@ -13,7 +13,8 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Defect, PixelDefects, ReadNoiseDistribution
 from lab.observables.codes.rounding import QUANTISATION_DN2
-from lab.observables.noise.levels import BoolArray, Float32Array, Stack
+from lab.observables.noise.frame_sums import BoolArray, Float32Array
+from lab.observables.noise.stack import Stack
 from lab.observables.weighted_lines import root
 from sim.camera import Cfa
 from sim.sensor.mosaic import planes

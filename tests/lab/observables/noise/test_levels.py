@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from lab.observables.darks.pixels import DarkPixels, read_noise_distribution
-from lab.observables.noise.levels import Stack, defective_pixels, level_statistics, shading
+from lab.observables.noise.stack import Stack, level_statistics
+from lab.observables.noise.surface import defective_pixels, shading
 from lab.observables.weighted_lines import dark_line, linearity
 
 
