@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from lab.errors import NotDetermined
 from lab.observables.darks.readout import OFFSETS_STD, dark_readout
 from lab.observables.dataset import Dataset
-from lab.observables.flats.field import LINE_FLOOR, collect_rows, flats, without_dark
+from lab.observables.flats.images import collect_rows, flats, without_dark
+from lab.observables.flats.lines import LINE_FLOOR
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import COLLECTED, acting
 from sim.effects.base import Effects
