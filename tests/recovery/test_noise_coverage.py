@@ -115,7 +115,9 @@ class Drawn:
             for t in truth.flats
         ]
         rows, cols = truth.shape
-        return noise_fit(darks, flats, DataSheet(rows=rows, cols=cols, cfa=truth.cfa, bit_depth=12), pixels=pixels)
+        return noise_fit(
+            darks, flats, DataSheet(rows=rows, cols=cols, cfa=truth.cfa, bit_depth=12), pixels=pixels.figures()
+        )
 
 
 def quadratic_sum(parts: tuple[float, ...]) -> float:

@@ -16,8 +16,8 @@ from lab.observables.darks.level import added_dark_dn
 from lab.observables.dataset import Dataset, held_out_flats
 from lab.observables.flats.row_light import ROW_LIGHT, row_light_variance
 from lab.observables.flats.stated_light import stated_light
-from lab.observables.noise.figures import RepeatedMeans, level_std, repeated_levels, steady, weighted_median
 from lab.observables.noise.line_means import LineMeans
+from lab.observables.noise.repeatability import RepeatedMeans, level_std, repeated_levels, steady, weighted_median
 from lab.observables.observable import LEVEL_REACH, Label, Measurement, Observable, Prediction
 from lab.observables.reads import DARK_CURRENT, LAG, LINES, acting
 from sim.effects.base import Effects
@@ -367,16 +367,12 @@ def _seen(dataset: Dataset) -> list[RepeatedMeans]:
 def _dark_scatter(dataset: Dataset) -> tuple[float, float]:
     """Variance of a dark frame's mean beside that by the noise of independent pixels, DN^2, and its standard deviation.
 
-    A variance v of f degrees of freedom stands for a true one of about v f / (f - 2), known to sqrt(2 / f) of it.
     Without repeated dark frames it may be as large as rows leave whose noise is that of their pixels.
     """
-    noise, camera = dataset.noise, dataset.camera
-    whole = noise.jitter_dn**2
-    if noise.jitter_freedom == 0.0:
-        return 0.0, max(whole, noise.read_dn**2 / camera.rows)
-    pixels = noise.read_dn**2 / (camera.rows * camera.cols)
-    free = noise.jitter_freedom
-    return max(whole - pixels, 0.0), whole * float(np.sqrt(2.0 / free)) * free / max(free - 2.0, 1.0)
+    noise = dataset.noise
+    if noise.jitter_dn2_std == 0.0:
+        return 0.0, max(noise.jitter_dn**2, noise.read_dn**2 / dataset.camera.rows)
+    return noise.jitter_dn**2, noise.jitter_dn2_std
 
 
 def _by_exposure(repeats: list[RepeatedMeans]) -> list[list[RepeatedMeans]]:

@@ -52,6 +52,36 @@ class MeasuredLevel:
         """Standard uncertainty of the mean by a drift of the repeats, DN."""
         return 0.0 if self.drift is None else self.drift.level_dn_std
 
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of a frame that count."""
+        return sum(plane.pixels for plane in self.plane.values())
+
+    @property
+    def mean_variance_dn2(self) -> float:
+        """Variance of a frame's mean by the noise of its pixels as recorded, DN^2: that of one pixel that is rounded
+        otherwise at least. NaN with a single frame."""
+        weights = [plane.pixels for plane in self.plane.values()]
+        variance = np.average([plane.temporal_variance for plane in self.plane.values()], weights=weights)
+        step_dn2 = next(iter(self.plane.values())).step_dn ** 2
+        return float(np.maximum(variance, step_dn2 / self.pixels)) / self.pixels
+
+    def frame_means(self, names: Sequence[str] = ()) -> FloatArray:
+        """Return the mean of each frame (n,) over the planes `names`, or all, DN."""
+        own = self._planes(names)
+        return np.average([plane.frame_means for plane in own], axis=0, weights=[plane.pixels for plane in own])
+
+    def pixel_variance_dn2(self, names: Sequence[str] = ()) -> float:
+        """Return the temporal variance of a pixel of the planes `names`, or all, DN^2: that of rounding at least. NaN
+        with a single frame."""
+        own = self._planes(names)
+        variance = np.average([plane.temporal_variance for plane in own], weights=[plane.pixels for plane in own])
+        least = QUANTISATION_DN2 * own[0].step_dn ** 2
+        return max(float(variance), least) if np.isfinite(variance) else float("nan")
+
+    def _planes(self, names: Sequence[str]) -> list[PlaneStatistics]:
+        return [self.plane[name] for name in names or self.plane]
+
     def scatter(self, frame_means: FloatArray) -> tuple[FloatArray, int]:
         """Return frame means (n,) less their mean and less the drift in proportion, and the degrees of freedom."""
         rest = frame_means - frame_means.mean()
