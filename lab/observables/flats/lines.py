@@ -9,6 +9,7 @@ from lab.errors import NotDetermined
 from lab.observables.darks.readout import OFFSETS_STD, dark_readout
 from lab.observables.dataset import Dataset
 from lab.observables.flats.images import even_lines, flats, without_dark
+from lab.observables.noise.robust import median_std
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import COLLECTED, GAINS, acting
 from sim.effects.base import Effects
@@ -107,8 +108,8 @@ def _steps(line: FloatArray, period: int, least: float) -> list[tuple[float, flo
     for b in at.values():
         far[max(b - 2 * width, 0) : max(b, 0) + 1] = False
     others = every[::period][far[::period]]
-    spread = 1.4826 * float(np.median(np.abs(others - np.median(others)))) if len(others) >= LEAST_PLACES else 0.0
-    std = max(spread, least * np.sqrt(size))
+    away = others - np.median(others) if len(others) >= LEAST_PLACES else np.zeros(0)
+    std = median_std(away, least * float(np.sqrt(size)), period / (2.0 * width))
     return [(share, float(every[b - width]), std, size) for share, b in at.items() if 0 <= b - width < len(every)]
 
 
@@ -121,8 +122,7 @@ def _stripes(line: FloatArray, period: int, least: float) -> tuple[float, float]
     # the light's slope from a line to the next of the plane
     slope = float(np.mean(line[-lag:] - line[:lag])) / (len(line) - lag) * period
     bend = line[2 * lag :] - 2.0 * line[lag:-lag] + line[: -2 * lag]
-    spread = 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6.0) if len(bend) >= LEAST_PLACES else 0.0
-    one = max(spread, least)
+    one = median_std(bend / np.sqrt(6.0) if len(bend) >= LEAST_PLACES else np.zeros(0), least)
     return value + slope, one * 2.0 / np.sqrt(len(line))
 
 

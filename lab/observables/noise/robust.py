@@ -7,10 +7,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sim.sensor.lines import Lines
+from sim.spectrum import FloatArray
 
 Image = NDArray[np.float32]
 
 CLIP = 4.5  # standard deviations at which pixels are clipped in robust statistics
+SIGNIFICANT = 3.0  # standard deviations from which on a spread isn't that by derived noise
 MEDIAN_OF = 5  # most frames whose median shows defective pixels
 SMOOTH_PX, LOCAL_PX = 9, 33  # sides of the boxes for the local mean and the local variance of a pixel's surroundings
 
@@ -37,6 +39,19 @@ def from_surroundings(frames: list[Image], step_dn: float = 1.0) -> tuple[Image,
         SMOOTH_PX**2 / (SMOOTH_PX**2 - 1.0)
     )
     return away, local
+
+
+def median_std(away: FloatArray, least: float, independent: float = 1.0) -> float:
+    """Return the standard deviation of departures (n,) from their median modulus, where that is significantly above
+    `least`, their standard deviation by derived noise; else `least`. `independent`: share of them that counts, where
+    neighbours have pixels in common.
+
+    The median modulus of n normal numbers has a relative standard deviation of 1.17 / sqrt(n), of which three count:
+    the larger of an estimate and its own expectation would be too large by 1.17 / sqrt(n) in half of all cases.
+    """
+    found = 1.4826 * float(np.median(np.abs(away))) if len(away) else 0.0
+    number = max(independent * len(away), 1.0)
+    return found if found > least * (1.0 + SIGNIFICANT * 1.17 / np.sqrt(number)) else least
 
 
 def robust_std(image: Image, step_dn: float = 1.0) -> float:
