@@ -9,7 +9,7 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.policy import DecisionPolicy
-from lab.observables.flats.linearity import measure_level_repeats
+from lab.observables.flats.level_repeats import measure_level_repeats
 from lab.observables.noise.repeatability import RepeatedMeans, level_repeatability, steady
 from lab.observables.observable import Observable
 from mocks.former.laws import ImageLagLaw, LightFlickerLaw, SourceInstabilityLaw
