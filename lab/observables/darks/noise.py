@@ -16,7 +16,7 @@ from lab.observables.darks.frames import (
 )
 from lab.observables.darks.level import added_dark_e_per_s
 from lab.observables.dataset import Dataset
-from lab.observables.noise.figures import CLIP
+from lab.observables.noise.robust import CLIP
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import DARK_CURRENT, LAG, LINES, PARTICLES, acting
 from sim.effects.base import Effects
