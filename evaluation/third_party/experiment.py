@@ -58,7 +58,7 @@ SOURCES: dict[str, Source] = {
     "brighter_fatter": Source("GalSim", by_galsim.Silicon.draw, "brighter_fatter"),
     "healthy_lens": Source("GalSim", by_galsim.airy, None),
     "moffat_blur": Source("GalSim", by_galsim.moffat, "moffat_blur"),
-    "seeing": Source("GalSim", by_galsim.kolmogorov, "moffat_blur"),
+    "turbulent_air": Source("GalSim", by_galsim.kolmogorov, "turbulent_air"),
     "defocus": Source("GalSim", by_galsim.defocus, "defocus"),
     "astigmatism": Source("GalSim", by_galsim.astigmatism, "astigmatism"),
     "coma": Source("GalSim", by_galsim.coma, "coma"),

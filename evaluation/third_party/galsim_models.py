@@ -22,6 +22,8 @@ MARGIN_PX = 8
 #: GalSim's image is good to this share.
 TRANSFORM_ERROR = 2e-3
 PUPIL_GRID = 512
+#: Full width at half maximum of Kolmogorov's spread over the wavelength by Fried's length.
+FRIED_WIDTH = 0.975863
 #: Grid of a drawn point: its Nyquist frequency is beyond the cut-off of diffraction on the widest pixel.
 POINT_PX, POINT_STEP_PX = 1280, 0.2
 LAMBDA_UM = WAVELENGTH_NM / 1000.0
@@ -149,7 +151,7 @@ def kolmogorov(rng: np.random.Generator, camera: DrawnCamera) -> Spread:
     def transfer(frequency: FloatArray) -> FloatArray:
         return np.asarray(_diffraction(frequency) * np.exp(-3.44 * (np.abs(frequency) * scale_um) ** (5.0 / 3.0)))
 
-    return Spread({}, profile, transfer, camera.pitch_um)
+    return Spread({"width_um": FRIED_WIDTH * scale_um}, profile, transfer, camera.pitch_um)
 
 
 def _aberrated(truth: Mapping[str, float], camera: DrawnCamera, waves: Any, **terms: float) -> Spread:
