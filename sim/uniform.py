@@ -366,9 +366,9 @@ class Uniform:
         return self._charge.multiplication(gain_db).skewness
 
     @property
-    def multiplies_electrons(self) -> bool:
-        """Return whether electrons are multiplied at random before read-out."""
-        return bool(self._charge.excess)
+    def changes_shot_noise(self) -> bool:
+        """Return whether the shot noise's variance isn't that of the electrons."""
+        return bool(self._charge.excess or self._charge.variance_e2)
 
     @property
     def particles(self) -> tuple[Particles, ...]:

@@ -82,9 +82,10 @@ def measure_dark_noise(dataset: Dataset) -> Observable:
             mean[i] += shot[i] - dark[i]
             mean[i] += _defect_variance(model, noise.gain, t, float(value[i])) + noise.gain**2 * lines
             mean[i] += _particle_variance(dataset, model, f.condition, out, float(value[i]))
-        if model.multiplies_electrons:
-            more = model.excess_factor(dataset.usual_gain_db) - 1.0
-            mean, shot = mean + more * shot, (1.0 + more) * shot
+        if model.changes_shot_noise:  # as flats have it, by which the gain is known
+            e = np.maximum(shot, 0.0) / noise.gain**2
+            kept = noise.gain**2 * model.shot_e2(e, dataset.usual_gain_db)
+            mean, shot = mean + kept - shot, kept
         jacobian = {
             "dark_read": np.full(len(points), 0.5 * shortest + 0.1),
             "dark": noise.gain * exposures * noise.dark_std,
@@ -105,7 +106,7 @@ def measure_dark_noise(dataset: Dataset) -> Observable:
         covariance=covariance,
         labels=tuple(Label(f.condition.exposure_s, "all", f.condition.name, captures_of(f, out), out) for f, out,
         _ in points),
-        reads=DEFECTS | DARK_CURRENT | LAG | LINES | PARTICLES | {"charge.excess"}, predict=predict, scale=value,
+        reads=DEFECTS | DARK_CURRENT | LAG | LINES | PARTICLES | {"charge.excess", "charge.variance_e2"}, predict=predict, scale=value,
     )  # fmt: skip
 
 
