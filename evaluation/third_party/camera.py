@@ -122,8 +122,8 @@ def record_sensor(name: str, camera: DrawnCamera, sensor: SimulatedSensor, rng: 
 
 
 def record_optics(name: str, camera: DrawnCamera, optics: SimulatedOptics, rng: np.random.Generator) -> RecordingSet:
-    """Take darks, flats, and slanted edges along rows and columns under light of 550 nm, through a lens at f/8 of 400 mm,
-    by which light falls off by less than 0.1 %."""
+    """Take darks, flats, and slanted edges along rows and columns under light of 550 nm, through a lens at f/8 of 400
+    mm, by which light falls off by less than 0.1 %."""
     session = _Session(camera, [], {})
     rows, cols = camera.rows, camera.cols
 

@@ -106,7 +106,8 @@ def measure_dark_noise(dataset: Dataset) -> Observable:
         covariance=covariance,
         labels=tuple(Label(f.condition.exposure_s, "all", f.condition.name, captures_of(f, out), out) for f, out,
         _ in points),
-        reads=DEFECTS | DARK_CURRENT | LAG | LINES | PARTICLES | {"charge.excess", "charge.variance_e2"}, predict=predict, scale=value,
+        reads=DEFECTS | DARK_CURRENT | LAG | LINES | PARTICLES | {"charge.excess", "charge.variance_e2"},
+        predict=predict, scale=value,
     )  # fmt: skip
 
 
