@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, TypeAdapter
 
-from api.certificate import Certificate
 from api.schemas import (
     CalibrationDetail,
     CameraModels,
@@ -77,6 +76,7 @@ from lab.challenge.truth import Truths
 from lab.diagnose.visibility import EffectDescription, ParameterDescription
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.quick_look.curves import Curves, FrameFigures
+from lab.report.certificate import Certificate
 from lab.report.findings import DiagnosisFindings
 from lab.twin.budget import BudgetResult
 from lab.twin.score import TwinScore
