@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from lab.errors import Cancelled, InputError
+from lab.shown import Shown
 from sim.memory import return_freed_memory
 
 if TYPE_CHECKING:
@@ -176,7 +177,7 @@ Capturer = Callable[[CaptureRequest, "Callable[[CaptureProgress], None]"], str]
 
 
 @dataclass(frozen=True)
-class PipelineResult:
+class PipelineResult(Shown):
     """What a pipeline found; None for what its goal doesn't need."""
 
     recordings: RecordingSet

@@ -111,7 +111,7 @@ def write_certificate(store: Store, one: CalibrationRecord, file: Path) -> Certi
     if one.certified is None:
         raise InputError(f"calibration {one.id}: is {one.state}, no certificate states it; certify it first")
     try:
-        runs = store.runs(one.session_id)
+        runs = tuple(store.runs(one.session_id))
     except InputError:  # the session was deleted
         runs = ()
     write_page(file, certificate_page(store, one, runs))
