@@ -179,7 +179,7 @@ def _id_of(source: Source) -> str:
 def _standing(of: SessionDetail | Job) -> tuple[str, float]:
     """Return what is under way, and the share of the work that is done."""
     if isinstance(of, Job):
-        return f"{of.kind} {of.message}".strip(), of.progress
+        return of.message or f"{of.kind} {of.state}", of.progress
     return f"session {of.state}", of.steps_done / max(of.steps, 1)
 
 

@@ -41,6 +41,7 @@ from lab.interface import (
 
 if TYPE_CHECKING:
     from api.client import ServiceClient, ServiceProblem, ServiceUnreachable, connect
+    from api.local_service import local_service
     from lab.calibration.limits import CalibrationLimits, Limit
     from lab.fit.mtf import edge_mtf
     from lab.fit.psf import estimate_kernel
@@ -66,6 +67,7 @@ if TYPE_CHECKING:
 #: Names that are imported when they are asked for, by their module.
 _LATER = {
     "api.client": ("ServiceClient", "ServiceProblem", "ServiceUnreachable", "connect"),
+    "api.local_service": ("local_service",),
     "lab.calibration.limits": ("CalibrationLimits", "Limit"),
     "lab.fit.mtf": ("edge_mtf",),
     "lab.fit.psf": ("estimate_kernel",),
@@ -126,6 +128,7 @@ __all__ = [
     "evaluate",
     "fit",
     "fitted_cameras",
+    "local_service",
     "mock_bench",
     "open_recordings",
     "open_seal",

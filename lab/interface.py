@@ -472,40 +472,33 @@ def write_result(result: BaseModel, file: str | Path) -> Path:
 def write_report(
     recordings: RecordingSet | str | Path,
     file: str | Path,
-    fit: FitResult | None = None,
+    fit: FitResult,
     validation: ValidationResult | None = None,
     diagnosis: DiagnosisResult | None = None,
     *,
-    progress: bool | None = None,
+    improved: Mapping[Side, CameraFile] | None = None,
 ) -> Path:
-    """Write the report of recordings as one page that needs nothing else.
+    """Write the report of results as one page that needs nothing else, data sheets after EMVA 1288 among it.
 
     recordings : a recording set, or what `open_recordings` opens
     file : the page, HTML
-    fit, validation, diagnosis : results that are there already; None: they are made
-    progress : show a bar; None: on a terminal and in a notebook
+    fit : the recordings' fit
+    validation, diagnosis : the other results; None: the page says that they were not made
+    improved : the cameras with the effects that the diagnosis found, by side (`evaluate(...).improved`)
 
-    Returns the page's path. Raises InputError.
+    Returns the page's path. `evaluate(recordings, report=file)` makes the results, too. Raises InputError.
 
     >>> import calibench
     >>> recordings = calibench.open_recordings("my-camera")
-    >>> found = calibench.evaluate(recordings, "diagnose")
-    >>> calibench.write_report(recordings, "report.html", found.fit, diagnosis=found.diagnosis).name
+    >>> calibench.write_report(recordings, "report.html", calibench.fit(recordings)).name
     'report.html'
     """
-    from lab.pipeline import PipelineRequest
+    from lab.predict.validate import predict_both
+    from lab.report import write_report as written
 
-    request = PipelineRequest(
-        "report",
-        recordings=_opened(recordings),
-        fit=fit,
-        validation=validation,
-        diagnosis=diagnosis,
-        report_file=Path(file),
-    )
-    written = _run(request, progress).report
-    assert written is not None
-    return written
+    opened = _opened(recordings)
+    both = predict_both(opened, fit, improved or {}, diagnosis)
+    return written(file, opened, fit, validation, diagnosis, both=both)
 
 
 # --- certificates, of stored sessions ---------------------------------------------------------------------------------

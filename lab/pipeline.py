@@ -176,7 +176,7 @@ Tell = Callable[[PipelineProgress], None]
 Capturer = Callable[[CaptureRequest, "Callable[[CaptureProgress], None]"], str]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)  # an IPython prompt prefers a dataclass's own text
 class PipelineResult(Shown):
     """What a pipeline found; None for what its goal doesn't need."""
 

@@ -24,10 +24,15 @@ def progress_bar(wanted: bool | None = None) -> Iterator[Callable[[str, float], 
     """
     shown = is_watched() if wanted is None else wanted
     with tqdm(total=1.0, bar_format=FORMAT, disable=not shown, leave=False, file=sys.stderr) as bar:
+        said = ("", -1.0)
 
         def advance(text: str, share: float) -> None:
-            bar.set_description_str(text, refresh=False)
-            bar.n = min(max(share, 0.0), 1.0)
-            bar.refresh()
+            nonlocal said
+            now = text, round(min(max(share, 0.0), 1.0), 2)
+            if now != said:  # a notebook keeps every line that a bar writes
+                said = now
+                bar.set_description_str(text, refresh=False)
+                bar.n = now[1]
+                bar.refresh()
 
         yield advance

@@ -104,7 +104,7 @@ class SimulationRecord(Frozen):
     versions: dict[str, str]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)  # an IPython prompt prefers a dataclass's own text
 class Simulation(Shown):
     """A simulated frame (rows, cols) in DN, its camera, the spectral radiance of the scene's white, and the record."""
 
