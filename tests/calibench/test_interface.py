@@ -246,7 +246,7 @@ def test_a_diagnosis_shows_effects_and_the_measurement_that_shows_them() -> None
     assert chart.what == "left slanted_edge" and chart.title.startswith("Transfer function of slanted edges, left, Y. ")
     ElementTree.fromstring(chart.to_svg())
     text = notebook.text(result)
-    assert "Defocus, left" in text and "29.2 ± 0.6 µm" in text
+    assert "Defocus, left" in text and "29.20 ± 0.60 µm" in text
     assert "Held-out captures: chi2 406.4 before, 25.5 after, of n = 34." in text
     columns = columns_of(result)
     assert columns["parameter"] == ["defocus_um"] and columns["value"] == [29.2] and columns["unit"] == ["um"]
