@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
+from lab.capture.data_folder import store_to_read
 from lab.cli.console import out, progress_bar, warn
-from lab.cli.sources import recordings_of, store_to_read
+from lab.cli.sources import recordings_of
 from lab.errors import InputError
 from lab.pipeline import session_recordings
 
