@@ -9,8 +9,8 @@ from sim.camera import Side
 
 #: Keys of a capture that don't belong to its setting.
 _NOT_OF_SETTING = {"id", "frame", "time", "temperature_c", "dummy_frames"}
-#: Of the captures of a setting, in time: one in so many is held out, the second of each such run, so that captures
-#: that are used lie on both sides of it.
+#: Of the captures of a setting, in time: the last of every so many is held out, so that among those that are used some
+#: follow another of their own setting.
 ONE_IN = 3
 
 
@@ -29,5 +29,5 @@ def held_out_ids(recordings: RecordingSet, side: Side) -> frozenset[str]:
         for group in settings.values()
         if len(group) >= ONE_IN
         for k, (_, _, name) in enumerate(sorted(group))
-        if k % ONE_IN == 1
+        if k % ONE_IN == ONE_IN - 1
     )

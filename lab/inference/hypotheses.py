@@ -2,27 +2,32 @@
 
 A hypothesis has parameters u. Each has one prior, in the coordinate in which it is fitted:
 
-- a size is 0 where the hypothesis isn't there. Its prior is Student's t with `DEGREES` degrees of freedom about 0, cut to
-  its bounds: heavy-tailed, as a camera at hand needn't be typical.
+- a size is 0 where the hypothesis isn't there. Its prior is Student's t with `DEGREES` degrees of freedom about 0, cut
+  to its bounds: heavy-tailed, as a camera at hand needn't be typical.
 - a shape (a step's code, a cut-off, a frequency) means nothing without a size. Its prior is normal, or flat between
   bounds."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import ndtr, stdtr
 
 from lab.inference.model import Point, State
+from sim.camera import CameraModel
+from sim.effects.base import Effect
+from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
 #: Degrees of freedom of a size's prior: the fewest with a finite variance.
 DEGREES = 3.0
 _CURVATURE = (DEGREES + 1.0) / DEGREES
+#: Student's t with 3 degrees of freedom at 0: 2 / (pi sqrt 3).
+_LOG_AT_ZERO = float(np.log(2.0 / (np.pi * np.sqrt(3.0))))
 
 
 @dataclass(frozen=True)
@@ -48,11 +53,9 @@ class Coordinate:
     def _log_norm(self) -> float:
         if not self.is_shape:
             low, high = ((b - self.centre) / self.scale for b in (self.lower, self.upper))
-            return float(np.log(self.scale * (student.cdf(high, DEGREES) - student.cdf(low, DEGREES))))
+            return float(np.log(self.scale * (stdtr(DEGREES, high) - stdtr(DEGREES, low))))
         if not np.isfinite(self.scale):
             return float(np.log(self.upper - self.lower))
-        from scipy.special import ndtr
-
         low, high = ((b - self.centre) / self.scale for b in (self.lower, self.upper))
         return float(np.log(self.scale * (ndtr(high) - ndtr(low))))
 
@@ -63,7 +66,7 @@ class Coordinate:
         t = (np.asarray(u, float) - self.centre) / self.scale
         if self.is_shape:
             return np.asarray(-0.5 * t * t - 0.5 * np.log(2.0 * np.pi) - self._log_norm)
-        return np.asarray(student.logpdf(t, DEGREES) - self._log_norm)
+        return np.asarray(_LOG_AT_ZERO - 0.5 * (DEGREES + 1.0) * np.log1p(t * t / DEGREES) - self._log_norm)
 
     def residual(self, u: float) -> tuple[float, float]:
         """Return r with -r^2 / 2 the log prior up to a constant, and its derivative."""
@@ -196,3 +199,105 @@ def moved(state: State, u: FloatArray) -> dict[str, Point]:
 def stacked(state: State) -> FloatArray:
     """All parameters of a state, one after the other."""
     return np.concatenate([p.u for p in state.values()]) if state else np.zeros(0)
+
+
+# --- Effects as hypotheses --------------------------------------------------------------------------------------------
+
+#: Step of finite differences, in prior scales of a size that acts linearly, and of one that acts by its square.
+_STEP, _STEP_SQUARE = 0.02, 0.001
+#: Change of a logarithm that is usual, and its least argument.
+_TYPICAL_LOG, _LEAST = 0.1, 1e-9
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """A parameter of an effect in the coordinate u in which predictions have a slope where it is absent: sign(p -
+    absent) |p - absent|^linear_power of a size; ln p where it is declared logarithmic; else p itself of a shape."""
+
+    name: str
+    quantity: Quantity
+    is_shape: bool
+
+    def to_u(self, value: float) -> float:
+        """u of a value."""
+        if self.quantity.logarithmic:
+            return float(np.log(max(value, _LEAST)))
+        if self.is_shape and self.quantity.linear_power == 1:
+            return value
+        away = value - (self.quantity.absent or 0.0)
+        return float(np.sign(away) * abs(away) ** self.quantity.linear_power)
+
+    def to_value(self, u: float) -> float:
+        """Return the value of u, within its bounds."""
+        q = self.quantity
+        if q.logarithmic:
+            value = float(np.exp(u))
+        elif self.is_shape and q.linear_power == 1:
+            value = u
+        else:
+            value = (q.absent or 0.0) + float(np.sign(u) * abs(u) ** (1.0 / q.linear_power))
+        return min(max(value, -np.inf if q.lower is None else q.lower), np.inf if q.upper is None else q.upper)
+
+    @property
+    def coordinate(self) -> Coordinate:
+        """u with its bounds and its prior, whose scale is the declared standard deviation's."""
+        q = self.quantity
+        low = -np.inf if q.lower is None else self.to_u(q.lower)
+        high = np.inf if q.upper is None else self.to_u(q.upper)
+        if q.prior is None:
+            step = max(0.002 * (high - low), q.smooth_over)
+            typical = _TYPICAL_LOG if q.logarithmic else 0.05 * (high - low)
+            return Coordinate(self.name, np.inf, low, high, is_shape=True, typical=typical, step=step)
+        centre, std = q.prior
+        if self.is_shape:
+            scale = std / centre if q.logarithmic else std**q.linear_power
+            return Coordinate(
+                self.name, scale, low, high, self.to_u(centre), is_shape=True, step=max(_STEP * scale, q.smooth_over)
+            )
+        scale = std**q.linear_power
+        step = (_STEP if q.linear_power == 1 else _STEP_SQUARE) * scale
+        typical = scale if q.linear_power == 1 else 0.05 * scale
+        return Coordinate(self.name, scale, low, high, typical=typical, step=max(step, q.smooth_over))
+
+
+def parameters_of(kind: type[Effect], camera: CameraModel) -> tuple[EffectParameter, ...]:
+    """Return an effect's parameters. Those that shape it, and those without a value that means absence, are shapes."""
+    return tuple(
+        EffectParameter(name, q, name in kind.shapes or q.absent is None or q.prior is None)
+        for name, q in kind.quantities_of(camera).items()
+    )
+
+
+def point_of(effect: Effect, camera: CameraModel) -> Point:
+    """Return an effect as a point of its hypothesis."""
+    return Point(
+        np.array([p.to_u(float(getattr(effect, p.name))) for p in parameters_of(type(effect), camera)]), effect
+    )
+
+
+def effect_at(point: Point, parameters: Sequence[EffectParameter]) -> Effect:
+    """Return the effect of a point: its template with the parameters of u."""
+    values = {p.name: p.to_value(float(u)) for p, u in zip(parameters, point.u, strict=True)}
+    template: Effect = point.template
+    return template.replace_fields(**values)
+
+
+def hypothesis_of(kind: type[Effect], camera: CameraModel) -> Hypothesis:
+    """Return an effect as a hypothesis: its prototypes are the alternatives, its choices equally probable."""
+    parameters = parameters_of(kind, camera)
+    coords = tuple(p.coordinate for p in parameters)
+    alternatives = []
+    choices = set()
+    for group in kind.prototypes(camera):
+        points = tuple(point_of(effect, camera) for effect in group)
+        choices |= {tuple(getattr(effect, n) for n in kind.choices()) for effect in group}
+        scales = []
+        for point in points:
+            sizes = [u / c.scale for u, c in zip(point.u, coords, strict=True) if not c.is_shape]
+            scales.append(1.0 / max(float(np.linalg.norm(sizes)), 1e-9) if any(sizes) else 1.0)
+        alternatives.append(Alternative(points, tuple(scales)))
+    cost = float(np.log(max(len(choices), 1)))
+    return Hypothesis(
+        kind.name, kind.family.value, coords, tuple(alternatives),
+        log_prior=lambda point: effect_at(point, parameters).log_prior() - cost,
+    )  # fmt: skip

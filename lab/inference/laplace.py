@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from scipy.special import log_ndtr, ndtr, ndtri
+from scipy.special import erfcx, log_ndtr, ndtr, ndtri
 from scipy.stats import qmc
 
 from lab.inference.hypotheses import Coordinate
@@ -22,6 +23,9 @@ from sim.spectrum import FloatArray
 
 #: A bound further than this from the mean, in standard deviations, cuts nothing.
 FAR = 6.0
+#: A coordinate at its bound is integrated by itself, the others where they are, where the slope is this many times the
+#: root of the curvature, and the mode within this many decay lengths of the bound.
+STEEP, AT_BOUND = 6.0, 0.5
 #: Precision of a coordinate that nothing determines, in squared ranges: its integral over the range is exact to 1e-4.
 _FLAT = 1e-4
 #: Points of Gauss-Legendre quadrature along one coordinate; of predictions along one.
@@ -46,30 +50,54 @@ def integrate(
     p = len(u)
     if p == 0:
         return Laplace(0.0, np.zeros(0), np.zeros((0, 0)))
-    slope, precision = np.array([c.slope_and_precision(float(x)) for c, x in zip(coords, u, strict=True)]).T
     low, high = bounds(coords)
-    width = np.array(
-        [c.unit if not np.isfinite(h - lo) else h - lo for c, lo, h in zip(coords, low, high, strict=True)]
+    slope, precision = np.array([c.slope_and_precision(float(x)) for c, x in zip(coords, u, strict=True)]).T
+    pull = b + slope
+    steep = np.sqrt(np.maximum(np.diag(a) + precision, 1e-300)) * STEEP
+    pinned = ((pull < -steep) & (u - low < AT_BOUND / np.maximum(-pull, 1e-300))) | (
+        (pull > steep) & (high - u < AT_BOUND / np.maximum(pull, 1e-300))
     )
+    free = np.flatnonzero(~pinned)
+    log_prior = sum(float(c.log_prior(float(x))) for c, x in zip(coords, u, strict=True))
+    curvature = np.diag(a)[pinned] + precision[pinned]
+    root = np.sqrt(2.0 * np.maximum(curvature, 1e-12 * np.square(pull[pinned])))
+    total = log_prior + float(np.log(np.sqrt(np.pi) / root * erfcx(np.abs(pull[pinned]) / root)).sum())
+    mean, covariance = np.zeros(p), np.diag(np.where(pinned, np.square(1.0 / np.where(pull == 0, 1.0, pull)), 0.0))
+    if len(free):
+        within, mean[free], covariance[np.ix_(free, free)] = _normal(
+            a[np.ix_(free, free)], pull[free], slope[free], precision[free], [coords[k] for k in free], u[free],
+            np.array([k in skip for k in free]),
+        )  # fmt: skip
+        total += within
+    return Laplace(total, mean, covariance)
+
+
+def _normal(
+    a: FloatArray, pull: FloatArray, slope: FloatArray, precision: FloatArray, coords: Sequence[Coordinate],
+    u: FloatArray, skip: FloatArray,
+) -> tuple[float, FloatArray, FloatArray]:  # fmt: skip
+    """Log of the integral over the bounds, without the prior's density at u; mean and covariance."""
+    low, high = bounds(coords)
+    p = len(u)
+    ranges = zip(coords, low, high, strict=True)
+    width = np.array([h - lo if np.isfinite(h - lo) else c.unit for c, lo, h in ranges])
     hessian = a + np.diag(precision)
     hessian[np.diag_indices(p)] = np.maximum(np.diag(hessian), _FLAT / width**2)
     size = np.sqrt(np.diag(hessian))
     inner = hessian / np.outer(size, size)
     inner[np.diag_indices(p)] += 1e-10
     inverse = np.linalg.inv(inner) / np.outer(size, size)
-    pull = b + slope
     mean = inverse @ pull
     log_det = float(np.linalg.slogdet(inner)[1]) + 2.0 * float(np.log(size).sum())
-    log_prior = sum(float(c.log_prior(float(x))) for c, x in zip(coords, u, strict=True))
-    total = log_prior + 0.5 * float(pull @ mean) + 0.5 * p * np.log(2.0 * np.pi) - 0.5 * log_det
+    total = 0.5 * float(pull @ mean) + 0.5 * p * np.log(2.0 * np.pi) - 0.5 * log_det
     total += log_box(mean, inverse, low - u, high - u)
     for k, c in enumerate(coords):
-        if c.is_shape or k in skip:
+        if c.is_shape or skip[k]:
             continue
         d, weight = _along(float(mean[k]), float(np.sqrt(inverse[k, k])), low[k] - u[k], high[k] - u[k])
         away = c.log_prior(u[k] + d) - c.log_prior(float(u[k])) - slope[k] * d + 0.5 * precision[k] * d * d
         total += float(np.log(np.sum(weight * np.exp(np.minimum(away, 50.0)))))
-    return Laplace(total, mean, inverse)
+    return total, mean, inverse
 
 
 def correct_along(
@@ -119,7 +147,7 @@ def _along(mean: float, std: float, low: float, high: float, points: int = _ALON
         begin, end = max(low, high - 2.0 * FAR * scale), high
     else:
         begin, end = max(low, mean - FAR * std), min(high, mean + FAR * std)
-    x, w = np.polynomial.legendre.leggauss(points)
+    x, w = _legendre(points)
     d = 0.5 * (begin + end) + 0.5 * (end - begin) * x
     density = -0.5 * np.square((d - mean) / std)
     weight = w * np.exp(density - density.max())
@@ -141,7 +169,7 @@ def log_box(mean: FloatArray, covariance: FloatArray, low: FloatArray, high: Flo
     inner = inner[np.ix_(order, order)]
     inner[np.diag_indices_from(inner)] += 1e-9
     lower = np.linalg.cholesky(inner)
-    points = np.clip(qmc.Sobol(len(cut), scramble=True, rng=0).random_base2(_LATTICE), 1e-9, 1.0 - 1e-9)
+    points = _sobol(len(cut))
     x = np.zeros_like(points)
     log_p = np.zeros(len(points))
     for k in range(len(cut)):
@@ -151,6 +179,18 @@ def log_box(mean: FloatArray, covariance: FloatArray, low: FloatArray, high: Flo
         x[:, k] = _between(lo, hi, points[:, k])
     top = log_p.max()
     return float(top + np.log(np.mean(np.exp(log_p - top))))
+
+
+@cache
+def _legendre(points: int) -> tuple[FloatArray, FloatArray]:
+    x, w = np.polynomial.legendre.leggauss(points)
+    return np.asarray(x), np.asarray(w)
+
+
+@cache
+def _sobol(dimensions: int) -> FloatArray:
+    points = qmc.Sobol(dimensions, scramble=True, rng=0).random_base2(_LATTICE)
+    return np.asarray(np.clip(points, 1e-9, 1.0 - 1e-9))
 
 
 def _log_between(low: FloatArray, high: FloatArray) -> FloatArray:

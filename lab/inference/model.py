@@ -13,13 +13,13 @@ cameras: `camera.py` binds it to a recording set, a test to a toy."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, eigh
 
 from lab.observables.gaussian import Gaussian
 from sim.spectrum import FloatArray
@@ -181,44 +181,80 @@ class ScaleIntegral:
             self._known[key] = 0.5 * float(b @ cho_solve(factor, b, check_finite=False)) - 0.5 * log_det
         return self._known[key]
 
-    def _swept(self, tau: FloatArray, which: Sequence[int], unlisted: frozenset[int]) -> FloatArray:
+    def profile(self, g: int, tau: FloatArray, points: FloatArray) -> FloatArray:
+        """Log marginal likelihood at these scales with tau_g at each of `points` (k,): one factorisation of the others'
+        part, and the eigenvalues of what they leave of group g's (Schur complement)."""
+        amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
+        ends = np.cumsum(self.group_sizes)
+        own = np.zeros(len(amplitude), bool)
+        own[ends[g] - self.group_sizes[g] : ends[g]] = True
+        rest = ~own
+        scale = amplitude[rest]
+        inner = scale[:, None] * self.gram[np.ix_(rest, rest)] * scale
+        inner[np.diag_indices_from(inner)] += np.concatenate(
+            [np.ones(int(rest.sum()) - len(self.precision)), self.precision]
+        )
+        across, b, b_own = (
+            scale[:, None] * self.gram[np.ix_(rest, own)],
+            scale * self.projected[rest],
+            self.projected[own],
+        )
+        square = self.gram[np.ix_(own, own)]
+        total = 0.0
+        if len(inner):
+            factor = cho_factor(inner, lower=True, check_finite=False)
+            solved = cho_solve(factor, np.column_stack([across, b]), check_finite=False)
+            square, b_own = square - across.T @ solved[:, :-1], b_own - across.T @ solved[:, -1]
+            total = 0.5 * float(b @ solved[:, -1]) - float(np.log(np.diag(factor[0])).sum())
+        size, vectors = eigh(square)
+        size, power = np.maximum(size, 0.0), np.square(vectors.T @ b_own)
+        t2 = np.square(points)[:, None]
+        return np.asarray(total + 0.5 * np.sum(t2 * power / (1.0 + t2 * size) - np.log1p(t2 * size), axis=1))
+
+    def _swept(self, tau: FloatArray, which: Iterable[int], unlisted: frozenset[int]) -> FloatArray:
         """Return the scales with each of `which` moved to its likeliest point, the others as they are."""
         tau = tau.copy()
         for g in which:
             points = self.groups[g].scales(g in unlisted)
-            tried = []
-            for t in points:
-                tau[g] = t
-                tried.append(self.log_likelihood(tau))
-            tau[g] = points[int(np.argmax(tried))]
+            tau[g] = points[int(np.argmax(self.profile(g, tau, points)))]
         return tau
 
     def integrated(self, tau: FloatArray, unlisted: frozenset[int]) -> float:
         """Log marginal likelihood with every tau integrated over its points, by one-dimensional integrals about
         `tau`, a mode along each coordinate."""
         at = self.log_likelihood(tau)
-        total = at
-        for g, group in enumerate(self.groups):
-            moved = tau.copy()
-            values = []
-            for t in group.scales(g in unlisted):
-                moved[g] = t
-                values.append(self.log_likelihood(moved))
-            total += _log_mean_exp(np.array(values)) - at
-        return total
+        points = [group.scales(g in unlisted) for g, group in enumerate(self.groups)]
+        return at + sum(_log_mean_exp(self.profile(g, tau, points[g])) - at for g in range(len(points)))
 
     @cached_property
-    def everyday(self) -> tuple[float, FloatArray]:
-        """Log marginal likelihood with all groups everyday, and the mode tau (G,)."""
+    def everyday_mode(self) -> FloatArray:
+        """The likeliest everyday scales (G,)."""
         tau = everyday_scales(self.groups)
         for _ in range(2):
             tau = self._swept(tau, range(len(self.groups)), frozenset())
-        return self.integrated(tau, frozenset()), tau
+        return tau
+
+    @cached_property
+    def everyday(self) -> float:
+        """Log marginal likelihood with all groups everyday."""
+        return self.integrated(self.everyday_mode, frozenset())
+
+    @cached_property
+    def quick(self) -> float:
+        """Log marginal likelihood over no and single flips, the scales of the others as without: a lower bound."""
+        tau, none = self.everyday_mode, frozenset[int]()
+        at, flips, everyday = self.log_likelihood(tau), [], self.log_likelihood(tau)
+        for g, group in enumerate(self.groups):
+            usual, other = group.scales(False), group.scales(True)
+            values = self.profile(g, tau, np.concatenate([usual, other]))
+            usual_log, other_log = _log_mean_exp(values[: len(usual)]), _log_mean_exp(values[len(usual) :])
+            everyday += usual_log - at
+            flips.append(other_log - usual_log + self.log_prior(frozenset((g,))))
+        return everyday + log_sum_exp([self.log_prior(none), *flips])
 
     def flipped(self, unlisted: frozenset[int]) -> float:
         """Log marginal likelihood with these groups unlisted, the scales of the others again at their mode."""
-        _, tau = self.everyday
-        tau = self._swept(tau, sorted(unlisted), unlisted)
+        tau = self._swept(self.everyday_mode, sorted(unlisted), unlisted)
         others = [g for g in range(len(self.groups)) if g not in unlisted]
         tau = self._swept(self._swept(tau, others, unlisted), sorted(unlisted), unlisted)
         return self.integrated(tau, unlisted)
@@ -232,7 +268,7 @@ class ScaleIntegral:
         """Log of p(y | A, u) p(u) of no, single and pair flips; pairs of groups that are within `least` of the best by
         themselves."""
         none: frozenset[int] = frozenset()
-        found = {none: self.everyday[0] + self.log_prior(none)}
+        found = {none: self.everyday + self.log_prior(none)}
         for g in range(len(self.groups)):
             one = frozenset((g,))
             found[one] = self.flipped(one) + self.log_prior(one)

@@ -1,9 +1,10 @@
 """The search: closed form about fitted sets, refits of the likeliest, and the table of sets with their probabilities.
 
-About a fitted set, with the whitened residual r and the whitened signatures G of all hypotheses, z = G'r and R = G'G give
-the evidence of every further set in closed form: all single hypotheses, all pairs, the best triples. The likeliest set that
-was never refitted is refitted next, until those that are left hold less than `LEFT` of the probability, or the budget is
-spent. Sets without one member of the likeliest are refitted, too; what promises most beside these is an exchange."""
+About a fitted set, with the whitened residual r and the whitened signatures G of all hypotheses, z = G'r and R = G'G
+give the evidence of every further set in closed form: all single hypotheses, all pairs, the best triples. The likeliest
+set that was never refitted is refitted next, until those that are left hold less than `LEFT` of the probability, or the
+budget is spent. Sets without one member of the likeliest are refitted, too; what promises most beside these is an
+exchange."""
 
 from __future__ import annotations
 
@@ -42,6 +43,11 @@ from sim.spectrum import FloatArray
 REFITS = 60
 #: Mass of sets that were never refitted, above which a result is undecided.
 LEFT = 0.01
+#: Log odds below the likeliest set at which the closed form is trusted to rule a set out, however large its error.
+HOPELESS = 50.0
+#: Gain of log evidence up to which the recordings say little of a set beyond its nearest refitted subset: the closed
+#: form is as good as a refit there.
+SILENT = 1.0
 #: P(any group is unlisted) of a camera.
 ANY_UNLISTED = 0.05
 #: Log odds below the likeliest set beyond which a set isn't made an origin of closed forms, and its scales aren't
@@ -88,19 +94,7 @@ class FittedSet:
     def quick(self) -> float:
         """Log p(y | A), no flip integrated with the others' scales at their new mode: a lower bound, near enough to
         rank sets."""
-        everyday, tau = self.scales.everyday
-        found = [everyday + self.scales.log_prior(frozenset())]
-        at = self.scales.log_likelihood(tau)
-        for g, group in enumerate(self.scales.groups):
-            values = []
-            for t in group.scales(True):
-                one = tau.copy()
-                one[g] = t
-                values.append(self.scales.log_likelihood(one))
-            found.append(
-                everyday - at + log_sum_exp(values) - np.log(len(values)) + self.scales.log_prior(frozenset((g,)))
-            )
-        return self.base - self.start_log + log_sum_exp(found)
+        return self.base - self.start_log + self.scales.quick
 
     @property
     def total(self) -> float:
@@ -110,12 +104,14 @@ class FittedSet:
 
 @dataclass(frozen=True)
 class Row:
-    """One set of the table: its members, the groups that are unlisted, its probability, and whether it was refitted."""
+    """One set of the table: its members, the groups that are unlisted, its probability, whether it was refitted, and
+    whether it had to be: the recordings change its probability (`SILENT`)."""
 
     members: frozenset[str]
     unlisted: frozenset[int]
     probability: float
     refitted: bool
+    is_closed_form_enough: bool = False
 
 
 @dataclass(frozen=True)
@@ -130,8 +126,13 @@ class Table:
 
     @property
     def left(self) -> float:
-        """Probability of the sets that were never refitted."""
-        return sum(r.probability for r in self.rows if not r.refitted)
+        """Probability of the sets that had to be refitted and never were."""
+        return sum(r.probability for r in self.rows if not r.refitted and not r.is_closed_form_enough)
+
+    @property
+    def closed_form(self) -> float:
+        """Probability of the sets of which the recordings say so little that the closed form is enough."""
+        return sum(r.probability for r in self.rows if not r.refitted and r.is_closed_form_enough)
 
     @property
     def is_undecided(self) -> bool:
@@ -164,6 +165,7 @@ class _Signature:
 @dataclass(frozen=True)
 class _Estimate:
     log_posterior: float
+    gain: float  # of log evidence over the origin
     origin: frozenset[str]
     alternatives: tuple[int, ...]  # signatures, by index
     coefficients: tuple[FloatArray, ...]
@@ -215,28 +217,46 @@ class Search:
         set without one member of the likeliest was."""
         best = max(self.fits.values(), key=self._log_posterior)
         less = [best.members - {name} for name in best.members]
-        missing = [key for key in less if key not in self.fits and key in self.estimates]
+        top = self._log_posterior(best)
+        missing = [
+            k for k in less if k not in self.fits and k in self.estimates
+            and self.estimates[k].log_posterior > top - HOPELESS
+        ]  # fmt: skip
         if missing:
             return max(missing, key=lambda key: self.estimates[key].log_posterior)
-        open_ = {key: e.log_posterior for key, e in self.estimates.items() if key not in self.fits}
+        open_ = {k: e.log_posterior for k, e in self.estimates.items() if k not in self.fits and e.gain > SILENT}
         if not open_:
             return None
         everything = [*open_.values(), *(self._log_posterior(f) for f in self.fits.values())]
         if log_sum_exp(list(open_.values())) < log_sum_exp(everything) + np.log(0.5 * LEFT):
             return None
-        return max(open_, key=lambda key: open_[key])
+        return self._first_part(max(open_, key=lambda key: open_[key]))
+
+    def _first_part(self, key: frozenset[str]) -> frozenset[str]:
+        """Return the part of a set that is refitted before it: one whose gain over the same origin is at least half of
+        its own. About a strong effect everything is linear again, about none it isn't."""
+        whole = self.estimates[key]
+        parts = [
+            part for name in key - whole.origin
+            if (part := key - {name}) not in self.fits and part in self.estimates
+            and self.estimates[part].origin == whole.origin and self.estimates[part].gain > 0.5 * whole.gain
+        ]  # fmt: skip
+        if not parts or whole.gain < HOPELESS:
+            return key
+        return self._first_part(max(parts, key=lambda part: self.estimates[part].log_posterior))
 
     def _refit_from(self, estimate: _Estimate) -> FittedSet:
         origin = self.fits[estimate.origin]
         starts = [self._start(origin, estimate.alternatives, estimate.coefficients)]
         signatures = self._signatures
+        alone = {name: self.fits.get(frozenset((name,))) for name in starts[0]}
+        if len(starts[0]) > 1 and all(alone.values()):
+            other: State = {name: f.state[name] for name, f in alone.items() if f is not None}
+            starts = [max((starts[0], other), key=self._log_density)]
         if len(estimate.alternatives) == 1:
             owner = signatures[estimate.alternatives[0]].owner
             for index, c in self._near_alternatives(origin, owner, estimate.alternatives[0]):
                 starts.append(self._start(origin, (index,), (c,)))
-        alone = {name: self.fits.get(frozenset((name,))) for name in starts[0]}
-        if len(starts[0]) > 1 and all(alone.values()):
-            starts.append({name: f.state[name] for name, f in alone.items() if f is not None})
         found = [self._fit_at(state) for state in starts]
         best = max(found, key=lambda f: f.base)
         modes: list[FittedSet] = []
@@ -264,13 +284,20 @@ class Search:
         std = np.sqrt(np.diag(fit.laplace.covariance))
         u = stacked(fit.state)
         sizes = [k for k, (owner, _, c) in enumerate(places) if owner == name and not c.is_shape]
-        if any(abs(u[k]) > NEAR * std[k] for k in sizes):
+        if not sizes or any(abs(u[k]) > NEAR * std[k] for k in sizes):
             return fit
         origin = self.fits[estimate.origin]
         gain = self.singles.get(estimate.origin, {}).get(name)
         if gain is None:
             return fit
         return FittedSet(**{**vars_of(fit), "base": origin.base + gain})
+
+    def _log_density(self, state: State) -> float:
+        """Log of p(y | u) p(u), everyday scales and form errors at their medians."""
+        forms = form_scales(self.model.has_form_error(state))
+        value = self._gaussian(state, forms[len(forms) // 2]).log_likelihood(self.model.value)
+        places = coordinates_of(self.hypotheses, state)
+        return value + sum(float(c.log_prior(float(u))) for (_, _, c), u in zip(places, stacked(state), strict=True))
 
     def _start(self, origin: FittedSet, which: Sequence[int], coefficients: Sequence[FloatArray]) -> State:
         state = dict(origin.state)
@@ -462,7 +489,7 @@ class Search:
         known = self.estimates.get(key)
         nearer = known is None or (len(origin.members), value) > (len(known.origin), known.log_posterior)
         if np.isfinite(value) and nearer:
-            self.estimates[key] = _Estimate(value, origin.members, which, c)
+            self.estimates[key] = _Estimate(value, gain, origin.members, which, c)
 
     def _pairs(
         self, origin: FittedSet, z: FloatArray, gram: FloatArray, single: Mapping[int, tuple[float, FloatArray]],
@@ -516,7 +543,9 @@ class Search:
     ) -> None:  # fmt: skip
         """Estimate the best pairs with the hypotheses that promise most beside them."""
         signatures = self._signatures
-        for _, name, other, one, two in pairs[:TRIPLES]:
+        for gain, name, other, one, two in pairs[:TRIPLES]:
+            if gain <= max(gains[name], gains[other]) + SILENT:
+                continue
             left = self._left(z, gram, [signatures[one], signatures[two]])
             promising = sorted((o for o in best if o not in (name, other)), key=lambda o: -left[best[o]])[:EXTENSIONS]
             for third in promising:
@@ -553,7 +582,8 @@ class Search:
                 log[key, frozenset()] = self._log_posterior(fit)
         log |= {(k, frozenset()): e.log_posterior for k, e in self.estimates.items() if k not in self.fits}
         total = log_sum_exp(list(log.values()))
-        rows = [Row(k, u, float(np.exp(v - total)), k in self.fits) for (k, u), v in log.items()]
+        enough = {k for k, e in self.estimates.items() if e.gain <= SILENT}
+        rows = [Row(k, u, float(np.exp(v - total)), k in self.fits, k in enough) for (k, u), v in log.items()]
         rows.sort(key=lambda r: -r.probability)
         return Table(tuple(rows), dict(self.fits), tuple(g.name for g in self.model.groups), total, len(self.fits))
 
