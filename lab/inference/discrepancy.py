@@ -110,11 +110,13 @@ GEOMETRY = GroupDeclaration(
 )
 
 
-def groups_of(model: MeasurementModel, dataset: Dataset) -> tuple[Group, ...]:
-    """Return the groups that move any number of a side, each with its strongest columns (`MOST_COLUMNS`)."""
-    gaussian = model.gaussian((), None, 0.0)
+def groups_of(model: MeasurementModel, dataset: Dataset, used: int) -> tuple[Group, ...]:
+    """Return the groups that move any number of a side, each with its strongest columns (`MOST_COLUMNS`).
+
+    `model`: of the captures that are used, whose numbers are the first `used`, and of those that are held out."""
+    where = np.arange(len(model.value)) < used
+    gaussian = model.gaussian((), where, 0.0)
     base = model.mean()
-    found = []
     declared: list[tuple[GroupDeclaration, FloatArray]] = [
         (group, np.column_stack([*_columns(model, base, processes(dataset))] or [np.zeros((len(base), 0))]))
         for group, processes in _ON_STATES.items()
@@ -125,10 +127,15 @@ def groups_of(model: MeasurementModel, dataset: Dataset) -> tuple[Group, ...]:
     for group in (*ON_OBSERVABLES, GEOMETRY):
         names = group.observables or on_boards
         declared.append((group, _on_observables(model, names)))
+    found = []
     for group, columns in declared:
-        kept = _strongest(gaussian.whiten(columns), columns, group.largest)
+        kept = _strongest(gaussian.whiten(columns[where]), columns, group.largest)
         if kept.shape[1]:
-            found.append(Group(group.name, kept, group.everyday, group.unit, group.source, group.largest))
+            found.append(
+                Group(
+                    group.name, kept[where], group.everyday, group.unit, group.source, group.largest, kept[~where]
+                )
+            )  # fmt: skip
     return tuple(found)
 
 
@@ -254,26 +261,34 @@ _ON_STATES: dict[GroupDeclaration, Callable[[Dataset], Iterator[_Process]]] = {
 
 
 def _on_observables(model: MeasurementModel, names: Sequence[str]) -> FloatArray:
-    """Columns of processes along the axes of these observables, each by itself."""
+    """Columns of processes along the axes of these observables, each by itself; one process for the numbers that are
+    used and those that are held out."""
     n = len(model.value)
     columns = []
-    for block, at in zip(model.blocks, model.slices, strict=True):
-        if block.measurement.name in names:
-            size, vectors = eigh(observable_kernel(block))
+    for name in names:
+        at = [k for k, block in enumerate(model.blocks) if block.measurement.name == name]
+        if at:
+            blocks = [model.blocks[k] for k in at]
+            size, vectors = eigh(observable_kernel(*blocks))
             kept = np.flatnonzero(size > 1e-3 * size[-1])[-3 * MOST_COLUMNS :]
             own = np.zeros((n, len(kept)))
-            own[at] = block.scale[:, None] * vectors[:, kept] * np.sqrt(size[kept])
+            scale = np.concatenate([b.scale for b in blocks])
+            where = np.concatenate([np.arange(n)[model.slices[k]] for k in at])
+            own[where] = scale[:, None] * vectors[:, kept] * np.sqrt(size[kept])
             columns.append(own)
     return np.concatenate(columns, axis=1) if columns else np.zeros((n, 0))
 
 
-def observable_kernel(block: Observable) -> FloatArray:
-    """Squared exponential along the axis, reduced between channels and between conditions."""
-    x = block.position.reshape(len(block.value), -1)
-    kernel = np.exp(-0.5 * np.square((x[:, None] - x) / block.reach).sum(-1))
-    channel = np.array([label.channel for label in block.labels])
-    condition = np.array([label.condition for label in block.labels])
+def observable_kernel(*blocks: Observable) -> FloatArray:
+    """Kernel over the numbers of blocks of one measurement: squared exponential along the axis, reduced between
+    channels and between conditions."""
+    first = blocks[0]
+    x = np.concatenate([b.position.reshape(len(b.value), -1) for b in blocks])
+    labels = [label for b in blocks for label in b.labels]
+    kernel = np.exp(-0.5 * np.square((x[:, None] - x) / first.reach).sum(-1))
+    channel = np.array([label.channel for label in labels])
+    condition = np.array([label.condition for label in labels])
     kernel = kernel * np.where(channel[:, None] == channel, 1.0, _BETWEEN)
-    if block.measurement.conditions:
+    if first.measurement.conditions:
         kernel = kernel * np.where(condition[:, None] == condition, 1.0, _BETWEEN)
     return np.asarray(kernel)

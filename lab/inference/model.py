@@ -77,6 +77,7 @@ class Group:
     unit: str = "1"
     source: str = ""
     largest: float = 1.0
+    held_out: FloatArray | None = None  # the same columns at the held-out numbers, (n*, r)
 
     def scales(self, unlisted: bool) -> FloatArray:
         """Return the points of tau at which it is integrated, equally probable a priori: midpoints of equal shares of
@@ -182,8 +183,12 @@ class ScaleIntegral:
         return self._known[key]
 
     def profile(self, g: int, tau: FloatArray, points: FloatArray) -> FloatArray:
-        """Log marginal likelihood at these scales with tau_g at each of `points` (k,): one factorisation of the others'
-        part, and the eigenvalues of what they leave of group g's (Schur complement)."""
+        """Log marginal likelihood at these scales with tau_g at each of `points` (k,)."""
+        return self.profiles(g, tau, points, self.projected[:, None])[:, 0]
+
+    def profiles(self, g: int, tau: FloatArray, points: FloatArray, projected: FloatArray) -> FloatArray:
+        """Return the same (k, m) for m residuals, given their W'r (R + p, m): one factorisation of the others' part,
+        and the eigenvalues of what they leave of group g's (Schur complement)."""
         amplitude = np.concatenate([np.repeat(tau, self.group_sizes), np.ones(len(self.precision))])
         ends = np.cumsum(self.group_sizes)
         own = np.zeros(len(amplitude), bool)
@@ -196,20 +201,21 @@ class ScaleIntegral:
         )
         across, b, b_own = (
             scale[:, None] * self.gram[np.ix_(rest, own)],
-            scale * self.projected[rest],
-            self.projected[own],
+            scale[:, None] * projected[rest],
+            projected[own],
         )
         square = self.gram[np.ix_(own, own)]
-        total = 0.0
+        total = np.zeros(projected.shape[1])
         if len(inner):
             factor = cho_factor(inner, lower=True, check_finite=False)
             solved = cho_solve(factor, np.column_stack([across, b]), check_finite=False)
-            square, b_own = square - across.T @ solved[:, :-1], b_own - across.T @ solved[:, -1]
-            total = 0.5 * float(b @ solved[:, -1]) - float(np.log(np.diag(factor[0])).sum())
+            left, right = solved[:, : across.shape[1]], solved[:, across.shape[1] :]
+            square, b_own = square - across.T @ left, b_own - across.T @ right
+            total = 0.5 * np.einsum("ij,ij->j", b, right) - float(np.log(np.diag(factor[0])).sum())
         size, vectors = eigh(square)
         size, power = np.maximum(size, 0.0), np.square(vectors.T @ b_own)
         t2 = np.square(points)[:, None]
-        return np.asarray(total + 0.5 * np.sum(t2 * power / (1.0 + t2 * size) - np.log1p(t2 * size), axis=1))
+        return np.asarray(total + 0.5 * ((t2 / (1.0 + t2 * size)) @ power - np.log1p(t2 * size).sum(1)[:, None]))
 
     def _swept(self, tau: FloatArray, which: Iterable[int], unlisted: frozenset[int]) -> FloatArray:
         """Return the scales with each of `which` moved to its likeliest point, the others as they are."""
@@ -252,12 +258,17 @@ class ScaleIntegral:
             flips.append(other_log - usual_log + self.log_prior(frozenset((g,))))
         return everyday + log_sum_exp([self.log_prior(none), *flips])
 
-    def flipped(self, unlisted: frozenset[int]) -> float:
-        """Log marginal likelihood with these groups unlisted, the scales of the others again at their mode."""
+    def mode(self, unlisted: frozenset[int]) -> FloatArray:
+        """The likeliest scales (G,) with these groups unlisted."""
+        if not unlisted:
+            return self.everyday_mode
         tau = self._swept(self.everyday_mode, sorted(unlisted), unlisted)
         others = [g for g in range(len(self.groups)) if g not in unlisted]
-        tau = self._swept(self._swept(tau, others, unlisted), sorted(unlisted), unlisted)
-        return self.integrated(tau, unlisted)
+        return self._swept(self._swept(tau, others, unlisted), sorted(unlisted), unlisted)
+
+    def flipped(self, unlisted: frozenset[int]) -> float:
+        """Log marginal likelihood with these groups unlisted, the scales of the others again at their mode."""
+        return self.integrated(self.mode(unlisted), unlisted)
 
     def log_prior(self, unlisted: frozenset[int]) -> float:
         """Log prior probability of exactly these groups being unlisted."""

@@ -5,7 +5,7 @@ The forward model is the diagnosis' measurement model: m and J by the chain of l
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,9 +24,9 @@ from lab.inference.model import Group, State
 from lab.inference.search import Search, Table
 from lab.observables.dataset import Dataset
 from lab.observables.gaussian import Gaussian
-from lab.observables.observable import Observable, measurements
+from lab.observables.observable import Observable, Prediction, measurements
 from sim.camera import Side
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Effects
 from sim.effects.library import candidates
 from sim.effects.other_f_number import OtherFNumber
 from sim.spectrum import FloatArray
@@ -103,6 +103,38 @@ class SideProblem:
     held_out: tuple[Observable, ...]
     misstated: tuple[Misstatement, ...]
     skipped: tuple[Skipped, ...]
+
+    @cached_property
+    def whole(self) -> MeasurementModel:
+        """The model of the numbers that are used, and after them of those that are held out. They share the nuisance
+        parameters that several observables share; of others, held-out captures have their own."""
+        names = self.measured.nuisance_jacobian()
+        own = {n for n in names if sum(bool(c.any()) for c in self._by_block(names[n])) == 1}
+        others = tuple(replace(b, predict=_with_own(b.predict, own)) for b in self.held_out)
+        return replace(
+            self.measured, blocks=(*self.measured.blocks, *others), unstated_jacobian={}, _predictions={},
+            _covariances={}, _numbers={},
+        )  # fmt: skip
+
+    def _by_block(self, column: FloatArray) -> list[FloatArray]:
+        return [column[at] for at in self.measured.slices]
+
+    @cached_property
+    def groups(self) -> tuple[Group, ...]:
+        """The groups of small physics."""
+        return groups_of(self.whole, self.dataset, len(self.measured.value))
+
+
+def _with_own(predict: Callable[[Effects], Prediction], own: set[str]) -> Callable[[Effects], Prediction]:
+    """Return a prediction whose nuisance parameters `own` have names of their own."""
+
+    def renamed(effects: Effects) -> Prediction:
+        made = predict(effects)
+        return Prediction(
+            made.mean, lambda: {f"held out: {n}" if n in own else n: c for n, c in made.jacobian.items()}
+        )  # fmt: skip
+
+    return renamed
 
 
 def measure_side(
@@ -184,7 +216,7 @@ def hypotheses_of(measured: MeasurementModel) -> dict[str, Hypothesis]:
 def search_side(problem: SideProblem, report: Callable[[str], None] = lambda text: None) -> tuple[Search, Table]:
     """Run the search on one side."""
     hypotheses = hypotheses_of(problem.measured)
-    model = SideModel(problem.measured, groups_of(problem.measured, problem.dataset))
+    model = SideModel(problem.measured, problem.groups)
     prior = SetPrior({name: h.family for name, h in hypotheses.items()})
     search = Search(model, hypotheses, prior, report=report)
     return search, search.run()

@@ -9,7 +9,7 @@ exchange."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -45,6 +45,8 @@ REFITS = 60
 LEFT = 0.01
 #: Log odds below the likeliest set at which the closed form is trusted to rule a set out, however large its error.
 HOPELESS = 50.0
+#: Refits of sets that the closed form about a set far below the likeliest promises: about such a set it isn't linear.
+DOUBTFUL = 8
 #: Gain of log evidence up to which the recordings say little of a set beyond its nearest refitted subset: the closed
 #: form is as good as a refit there.
 SILENT = 1.0
@@ -59,6 +61,8 @@ EVALUATIONS = (8, 4)
 PAIRS, TRIPLES, EXTENSIONS = 120, 12, 10
 #: Standard deviations from its bound below which an amplitude's evidence is taken by quadrature.
 NEAR = 3.0
+#: Gain of log evidence up to which a size may be near 0, where shapes vanish.
+WEAK = 6.0
 #: Log evidence within which two alternatives of one hypothesis are both refitted, and the most that are.
 ALTERNATIVES_NEAR, MOST_ALTERNATIVES = 4.0, 2
 
@@ -184,6 +188,7 @@ class Search:
     fits: dict[frozenset[str], FittedSet] = field(default_factory=dict)
     estimates: dict[frozenset[str], _Estimate] = field(default_factory=dict)
     singles: dict[frozenset[str], dict[str, float]] = field(default_factory=dict)
+    _doubtful: int = 0  # refits of sets whose closed form is about a set that fits far worse
 
     @cached_property
     def _everyday(self) -> FloatArray:
@@ -224,13 +229,20 @@ class Search:
         ]  # fmt: skip
         if missing:
             return max(missing, key=lambda key: self.estimates[key].log_posterior)
-        open_ = {k: e.log_posterior for k, e in self.estimates.items() if k not in self.fits and e.gain > SILENT}
-        if not open_:
-            return None
-        everything = [*open_.values(), *(self._log_posterior(f) for f in self.fits.values())]
-        if log_sum_exp(list(open_.values())) < log_sum_exp(everything) + np.log(0.5 * LEFT):
-            return None
-        return self._first_part(max(open_, key=lambda key: open_[key]))
+        speaking = {k: e for k, e in self.estimates.items() if k not in self.fits and e.gain > SILENT}
+        near = {k: e.log_posterior for k, e in speaking.items() if self._is_near(e)}
+        everything = [*near.values(), *(self._log_posterior(f) for f in self.fits.values())]
+        if near and log_sum_exp(list(near.values())) > log_sum_exp(everything) + np.log(0.5 * LEFT):
+            return self._first_part(max(near, key=lambda key: near[key]))
+        far = {k: e.log_posterior for k, e in speaking.items() if k not in near and e.log_posterior > top - HOPELESS}
+        if far and self._doubtful < DOUBTFUL:
+            self._doubtful += 1
+            return self._first_part(max(far, key=lambda key: far[key]))
+        return None
+
+    def _is_near(self, estimate: _Estimate) -> bool:
+        """Whether an estimate's origin is near enough the likeliest set for its closed form to be believed."""
+        return self._log_posterior(self.fits[estimate.origin]) > self._top() - HOPELESS
 
     def _first_part(self, key: frozenset[str]) -> frozenset[str]:
         """Return the part of a set that is refitted before it: one whose gain over the same origin is at least half of
@@ -280,15 +292,11 @@ class Search:
         (name,) = joined
         if not any(c.is_shape for c in self.hypotheses[name].coordinates):
             return fit
-        places = coordinates_of(self.hypotheses, fit.state)
-        std = np.sqrt(np.diag(fit.laplace.covariance))
-        u = stacked(fit.state)
-        sizes = [k for k, (owner, _, c) in enumerate(places) if owner == name and not c.is_shape]
-        if not sizes or any(abs(u[k]) > NEAR * std[k] for k in sizes):
+        if all(c.is_shape for c in self.hypotheses[name].coordinates):
             return fit
         origin = self.fits[estimate.origin]
         gain = self.singles.get(estimate.origin, {}).get(name)
-        if gain is None:
+        if gain is None or max(gain, fit.base - origin.base) > WEAK:
             return fit
         return FittedSet(**{**vars_of(fit), "base": origin.base + gain})
 
@@ -437,10 +445,15 @@ class Search:
             return np.zeros((len(self.model.value), 0))
         return np.concatenate([s.raw for s in self._signatures], axis=1)
 
-    def _linear(self, origin: FittedSet) -> tuple[FloatArray, FloatArray]:
-        """Return z and R about a fitted set, its own parameters marginalised."""
+    def _linear(self, origin: FittedSet, unlisted: frozenset[int]) -> tuple[FloatArray, FloatArray]:
+        """Return z and R about a fitted set, its own parameters marginalised, with these groups unlisted."""
         forms = form_scales(self.model.has_form_error(origin.state))
-        gaussian = self._gaussian(origin.state, forms[len(forms) // 2])
+        groups = self.model.groups
+        tau = origin.scales.mode(unlisted)
+        gaussian = with_columns(
+            self.model.gaussian(origin.state, forms[len(forms) // 2]),
+            scaled_columns(groups, tau, len(self.model.value)),
+        )
         residual = self.model.value - gaussian.mean
         if len(origin.precision):
             gaussian = with_columns(gaussian, origin.jacobian / np.sqrt(origin.precision))
@@ -462,8 +475,18 @@ class Search:
         return {}
 
     def _linearise(self, origin: FittedSet) -> None:
-        """Estimate all sets with one, two or three members more than a fitted one."""
-        z, gram = self._linear(origin)
+        """Estimate all sets with one, two or three members more than a fitted one: with all groups everyday, and with
+        the likeliest of them unlisted where that matters."""
+        weights = origin.by_groups
+        none: frozenset[int] = frozenset()
+        best = max(weights, key=lambda u: weights[u])
+        for unlisted in dict.fromkeys((none, best)):
+            if weights[unlisted] > weights[best] - FAR_BELOW or unlisted == none:
+                self._linearise_with(origin, unlisted)
+
+    def _linearise_with(self, origin: FittedSet, unlisted: frozenset[int]) -> None:
+        z, gram = self._linear(origin, unlisted)
+        weight = origin.by_groups[unlisted]
         signatures = self._signatures
         single: dict[int, tuple[float, FloatArray]] = {}
         owners: dict[str, list[int]] = {}
@@ -471,29 +494,42 @@ class Search:
             if s.owner not in origin.state:
                 single[i] = _set_integral(z, gram, [s])
                 owners.setdefault(s.owner, []).append(i)
-        self._by_alternative[origin.members] = single
-        gains = {o: log_sum_exp([single[i][0] for i in own]) - np.log(len(own)) for o, own in owners.items()}
-        self.singles[origin.members] = gains
+        gains = {o: log_sum_exp([single[i][0] for i in own]) - float(np.log(len(own))) for o, own in owners.items()}
+        if not unlisted:
+            self._by_alternative[origin.members] = single
+            self.singles[origin.members] = gains
         best = {o: max(own, key=lambda i: single[i][0]) for o, own in owners.items()}
         shared = {o: gains[o] - single[best[o]][0] for o in owners}  # of all alternatives over the best
         for o, gain in gains.items():
-            self._estimate(origin, {o}, gain, (best[o],), (single[best[o]][1],))
-        pairs = self._pairs(origin, z, gram, single, owners, shared)
-        self._triples(origin, z, gram, pairs, best, gains, shared)
+            self._estimate(origin, weight, {o}, gain, (best[o],), (single[best[o]][1],))
+        pairs = self._pairs(origin, weight, z, gram, single, owners, shared)
+        self._triples(origin, weight, z, gram, pairs, best, gains, shared)
 
     def _estimate(
-        self, origin: FittedSet, more: set[str], gain: float, which: tuple[int, ...], c: tuple[FloatArray, ...]
-    ) -> None:
+        self, origin: FittedSet, weight: float, more: set[str], gain: float, which: tuple[int, ...],
+        c: tuple[FloatArray, ...],
+    ) -> None:  # fmt: skip
+        """Note a set's log posterior with `weight` the log p(y | A, u) p(u) of its origin. The estimate about the
+        largest origin counts, of several the likeliest; those of one origin by other groups are summed."""
         key = origin.members | more
-        value = origin.quick + gain + self.prior.log(key)
+        value = weight + gain + self.prior.log(key)
         known = self.estimates.get(key)
-        nearer = known is None or (len(origin.members), value) > (len(known.origin), known.log_posterior)
-        if np.isfinite(value) and nearer:
+        if not np.isfinite(value):
+            return
+        if known is not None and known.origin == origin.members:
+            total = float(np.logaddexp(value, known.log_posterior))
+            first = known if known.log_posterior > value else _Estimate(total, gain, origin.members, which, c)
+            self.estimates[key] = replace(first, log_posterior=total)
+        elif known is None or self._is_nearer(origin, known):
             self.estimates[key] = _Estimate(value, gain, origin.members, which, c)
 
+    def _is_nearer(self, origin: FittedSet, known: _Estimate) -> bool:
+        other = self.fits[known.origin]
+        return (len(origin.members), self._log_posterior(origin)) > (len(other.members), self._log_posterior(other))
+
     def _pairs(
-        self, origin: FittedSet, z: FloatArray, gram: FloatArray, single: Mapping[int, tuple[float, FloatArray]],
-        owners: Mapping[str, list[int]], shared: Mapping[str, float],
+        self, origin: FittedSet, weight: float, z: FloatArray, gram: FloatArray,
+        single: Mapping[int, tuple[float, FloatArray]], owners: Mapping[str, list[int]], shared: Mapping[str, float],
     ) -> list[tuple[float, str, str, int, int]]:  # fmt: skip
         """Estimate all pairs, the best of them one by one; return these, likeliest first."""
         signatures = self._signatures
@@ -534,12 +570,12 @@ class Search:
                 cut = len(signatures[one].coordinates)
                 c = (both[:cut], both[cut:])
                 exact.append((value, name, other, one, two_))
-            self._estimate(origin, {name, other}, value, (one, two_), c)
+            self._estimate(origin, weight, {name, other}, value, (one, two_), c)
         return sorted(exact, key=lambda t: -(t[0] + prior[t[1]] + prior[t[2]]))
 
     def _triples(
-        self, origin: FittedSet, z: FloatArray, gram: FloatArray, pairs: Sequence[tuple[float, str, str, int, int]],
-        best: Mapping[str, int], gains: Mapping[str, float], shared: Mapping[str, float],
+        self, origin: FittedSet, weight: float, z: FloatArray, gram: FloatArray,
+        pairs: Sequence[tuple[float, str, str, int, int]], best: Mapping[str, int], gains: Mapping[str, float], shared: Mapping[str, float],
     ) -> None:  # fmt: skip
         """Estimate the best pairs with the hypotheses that promise most beside them."""
         signatures = self._signatures
@@ -554,7 +590,7 @@ class Search:
                 cuts = np.cumsum([len(s.coordinates) for s in three])[:-1]
                 value += sum(shared[o] for o in (name, other, third))
                 self._estimate(
-                    origin, {name, other, third}, value, (one, two, best[third]), tuple(np.split(c, cuts))
+                    origin, weight, {name, other, third}, value, (one, two, best[third]), tuple(np.split(c, cuts))
                 )  # fmt: skip
 
     def _left(self, z: FloatArray, gram: FloatArray, members: Sequence[_Signature]) -> FloatArray:
@@ -568,6 +604,50 @@ class Search:
         taken = np.square(np.where(two, rest, np.maximum(rest, 0.0))) / np.maximum(square, 1e-300)
         return np.array([taken[list(s.columns)].max() for s in self._signatures])
 
+    def healthy_draws(self, draws: int, rng: np.random.Generator) -> FloatArray:
+        """Return p(no effect, nothing unlisted) of draws without either, (draws,), by single effects and flips."""
+        groups = self.model.groups
+        gaussian = self.model.gaussian({}, 0.0)
+        sizes = [g.columns.shape[1] for g in groups]
+        white = gaussian.whiten(np.concatenate([*(g.columns for g in groups), self._stack], axis=1))
+        r = rng.standard_normal((len(white), draws))
+        at = 0
+        for g, size in zip(groups, sizes, strict=True):
+            tau = g.everyday * np.abs(rng.standard_normal(draws))
+            r += white[:, at : at + size] @ (rng.standard_normal((size, draws)) * tau)
+            at += size
+        gram, projected = white.T @ white, white.T @ r
+        none = np.zeros(0)
+        empty = np.zeros((len(white), 0))
+        scales = ScaleIntegral.of(gaussian, np.zeros(len(white)), groups, empty, none, none, self.any_unlisted)
+        tau = everyday_scales(groups)
+        odds = np.zeros((0, draws))
+        for g, group in enumerate(groups):
+            usual, other = group.scales(False), group.scales(True)
+            values = scales.profiles(g, tau, np.concatenate([usual, other]), projected[:at])
+            top = values.max(axis=0)
+            usual_mean, other_mean = (
+                np.mean(np.exp(part - top), axis=0) for part in (values[: len(usual)], values[len(usual) :])
+            )
+            prior = scales.log_prior(frozenset((g,))) - scales.log_prior(frozenset())
+            odds = np.vstack([odds, np.exp(prior) * other_mean / np.maximum(usual_mean, 1e-300)])
+        amplitude = np.repeat(tau, sizes)
+        inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
+        across = amplitude[:, None] * gram[:at, at:]
+        solved = np.linalg.solve(inner, np.column_stack([across, amplitude[:, None] * projected[:at]]))
+        count = gram.shape[1] - at
+        square = np.diag(gram)[at:] - np.einsum("ij,ij->j", across, solved[:, :count])
+        z = projected[at:] - across.T @ solved[:, count:]
+        none_log = self.prior.log(frozenset())
+        alternatives = {name: sum(s.owner == name for s in self._signatures) for name in self.hypotheses}
+        for s in self._signatures:
+            share = np.exp(self.prior.log(frozenset((s.owner,))) - none_log) / alternatives[s.owner]
+            best = np.max(
+                [_amplitude_odds(z[k], square[k], c) for k, c in zip(s.columns, s.coordinates, strict=True)], axis=0
+            )
+            odds = np.vstack([odds, share * best])
+        return np.asarray(1.0 / (1.0 + odds.sum(axis=0)))
+
     # --- the table ---------------------------------------------------------------------------------------------------
 
     def table(self) -> Table:
@@ -580,7 +660,8 @@ class Search:
                 log |= {(key, u): w + prior for u, w in fit.by_groups.items()}
             else:
                 log[key, frozenset()] = self._log_posterior(fit)
-        log |= {(k, frozenset()): e.log_posterior for k, e in self.estimates.items() if k not in self.fits}
+        open_ = {k: e for k, e in self.estimates.items() if k not in self.fits and self._is_near(e)}
+        log |= {(k, frozenset()): e.log_posterior for k, e in open_.items()}
         total = log_sum_exp(list(log.values()))
         enough = {k for k, e in self.estimates.items() if e.gain <= SILENT}
         rows = [Row(k, u, float(np.exp(v - total)), k in self.fits, k in enough) for (k, u), v in log.items()]
@@ -661,3 +742,15 @@ def _set_integral(z: FloatArray, gram: FloatArray, members: Sequence[_Signature]
     slope = b - a @ c
     found = integrate(a, slope, coords, c)
     return float(b @ c - 0.5 * c @ a @ c) + found.log_integral, c
+
+
+def _amplitude_odds(z: FloatArray, square: float, coordinate: Coordinate) -> FloatArray:
+    """Return the evidence ratio of one amplitude for each of z (m,): integral of exp(z c - square c^2 / 2) p(c)."""
+    width = min(coordinate.scale, 1.0 / np.sqrt(max(square, 1e-300)))
+    reach = 12.0 * width + float(np.abs(z).max()) / max(square, coordinate.scale**-2)
+    c = np.linspace(0.0 if coordinate.lower == 0.0 else -reach, reach, 241)
+    density = np.exp(coordinate.log_prior(c)) * (c[1] - c[0])
+    if coordinate.lower == 0.0:
+        density[0] *= 0.5
+    exponent = np.minimum(z[:, None] * c - 0.5 * square * c**2, 700.0)
+    return np.asarray(np.exp(exponent) @ density)
