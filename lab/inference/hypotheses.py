@@ -68,6 +68,16 @@ class Coordinate:
             return np.asarray(-0.5 * t * t - 0.5 * np.log(2.0 * np.pi) - self._log_norm)
         return np.asarray(_LOG_AT_ZERO - 0.5 * (DEGREES + 1.0) * np.log1p(t * t / DEGREES) - self._log_norm)
 
+    def draw(self, rng: np.random.Generator) -> float:
+        """Draw u from its prior."""
+        if self.is_shape and not np.isfinite(self.scale):
+            return float(rng.uniform(self.lower, self.upper))
+        while True:
+            t = rng.standard_normal() if self.is_shape else rng.standard_t(DEGREES)
+            u = self.centre + self.scale * float(t)
+            if self.lower <= u <= self.upper:
+                return u
+
     def residual(self, u: float) -> tuple[float, float]:
         """Return r with -r^2 / 2 the log prior up to a constant, and its derivative."""
         if not np.isfinite(self.scale):

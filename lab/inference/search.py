@@ -200,14 +200,26 @@ class Search:
         """Fill the table."""
         self._linearise(self.fit({}))
         while len(self.fits) < self.refits:
-            key = self._next()
-            if key is None:
+            less = self._without_one()
+            key = self._next() if less is None else None
+            if less is None and key is None:
                 break
-            estimate = self.estimates[key]
-            fit = self._refit_from(estimate)
+            fit = self.fit(less) if less is not None else self._refit_from(self.estimates[key or frozenset()])
+            self.report(", ".join(sorted(fit.members)) or "none")
             if self._log_posterior(fit) > self._top() - FAR_BELOW:
                 self._linearise(fit)
         return self.table()
+
+    def refit(self, members: frozenset[str]) -> FittedSet:
+        """Return the fit of a set, made if it wasn't: after those of its members by themselves, about the empty set.
+
+        Raises KeyError for a set that the closed form about the empty one has no estimate of."""
+        if frozenset[str]() not in self.fits:
+            self._linearise(self.fit({}))
+        for key in (*(frozenset((name,)) for name in members), members):
+            if key not in self.fits:
+                self._refit_from(self.estimates[key])
+        return self.fits[members]
 
     # --- what is refitted next ---------------------------------------------------------------------------------------
 
@@ -217,18 +229,26 @@ class Search:
     def _top(self) -> float:
         return max(self._log_posterior(f) for f in self.fits.values())
 
-    def _next(self) -> frozenset[str] | None:
-        """Return the likeliest set that was never refitted; None where these hold less than `LEFT` together, and every
-        set without one member of the likeliest was."""
+    def _without_one(self) -> State | None:
+        """Return the likeliest set without one of its members, from where it stands, if that was never refitted: of all
+        members the one nearest to 0, unless even that is excluded."""
         best = max(self.fits.values(), key=self._log_posterior)
-        less = [best.members - {name} for name in best.members]
-        top = self._log_posterior(best)
-        missing = [
-            k for k in less if k not in self.fits and k in self.estimates
-            and self.estimates[k].log_posterior > top - HOPELESS
-        ]  # fmt: skip
-        if missing:
-            return max(missing, key=lambda key: self.estimates[key].log_posterior)
+        places = coordinates_of(self.hypotheses, best.state)
+        losses: list[tuple[float, str]] = []
+        for name in best.state:
+            own = [k for k, (owner, _, c) in enumerate(places) if owner == name and not c.is_shape]
+            if not own or best.members - {name} in self.fits:
+                continue
+            away = stacked(best.state)[own]
+            covariance = best.laplace.covariance[np.ix_(own, own)] + 1e-12 * np.diag(np.square(away) + 1e-300)
+            losses.append((0.5 * float(away @ np.linalg.pinv(covariance) @ away), name))
+        if not losses or min(losses)[0] > HOPELESS:
+            return None
+        return {name: point for name, point in best.state.items() if name != min(losses)[1]}
+
+    def _next(self) -> frozenset[str] | None:
+        """Return the likeliest set that was never refitted; None where these hold less than `LEFT` together."""
+        top = self._top()
         speaking = {k: e for k, e in self.estimates.items() if k not in self.fits and e.gain > SILENT}
         near = {k: e.log_posterior for k, e in speaking.items() if self._is_near(e)}
         everything = [*near.values(), *(self._log_posterior(f) for f in self.fits.values())]
@@ -279,7 +299,6 @@ class Search:
         merged = FittedSet(**{**vars_of(best), "base": total, "others": tuple(modes[1:])})
         merged = self._by_grid_where_weak(merged, estimate)
         self.fits[merged.members] = merged
-        self.report(", ".join(sorted(merged.members)))
         return merged
 
     def _by_grid_where_weak(self, fit: FittedSet, estimate: _Estimate) -> FittedSet:
@@ -575,7 +594,8 @@ class Search:
 
     def _triples(
         self, origin: FittedSet, weight: float, z: FloatArray, gram: FloatArray,
-        pairs: Sequence[tuple[float, str, str, int, int]], best: Mapping[str, int], gains: Mapping[str, float], shared: Mapping[str, float],
+        pairs: Sequence[tuple[float, str, str, int, int]], best: Mapping[str, int],
+        gains: Mapping[str, float], shared: Mapping[str, float],
     ) -> None:  # fmt: skip
         """Estimate the best pairs with the hypotheses that promise most beside them."""
         signatures = self._signatures
