@@ -630,43 +630,35 @@ class Search:
         gaussian = self.model.gaussian({}, 0.0)
         sizes = [g.columns.shape[1] for g in groups]
         white = gaussian.whiten(np.concatenate([*(g.columns for g in groups), self._stack], axis=1))
-        r = rng.standard_normal((len(white), draws))
-        at = 0
-        for g, size in zip(groups, sizes, strict=True):
-            tau = g.everyday * np.abs(rng.standard_normal(draws))
-            r += white[:, at : at + size] @ (rng.standard_normal((size, draws)) * tau)
-            at += size
-        gram, projected = white.T @ white, white.T @ r
-        none = np.zeros(0)
+        gram, at, none = white.T @ white, sum(sizes), np.zeros(0)
         empty = np.zeros((len(white), 0))
         scales = ScaleIntegral.of(gaussian, np.zeros(len(white)), groups, empty, none, none, self.any_unlisted)
-        tau = everyday_scales(groups)
-        odds = np.zeros((0, draws))
-        for g, group in enumerate(groups):
-            usual, other = group.scales(False), group.scales(True)
-            values = scales.profiles(g, tau, np.concatenate([usual, other]), projected[:at])
-            top = values.max(axis=0)
-            usual_mean, other_mean = (
-                np.mean(np.exp(part - top), axis=0) for part in (values[: len(usual)], values[len(usual) :])
-            )
-            prior = scales.log_prior(frozenset((g,))) - scales.log_prior(frozenset())
-            odds = np.vstack([odds, np.exp(prior) * other_mean / np.maximum(usual_mean, 1e-300)])
-        amplitude = np.repeat(tau, sizes)
+        found = []
+        for _ in range(draws):
+            tau = np.array([g.everyday * abs(rng.standard_normal()) for g in groups])
+            r = rng.standard_normal(len(white)) + white[:, :at] @ (np.repeat(tau, sizes) * rng.standard_normal(at))
+            projected = white.T @ r
+            one = replace(scales, projected=projected[:at], _known={})
+            found.append(self._nothing(one, gram, projected, at))
+        return np.array(found)
+
+    def _nothing(self, scales: ScaleIntegral, gram: FloatArray, projected: FloatArray, at: int) -> float:
+        """Return p(nothing) of one draw, of which `gram` and `projected` are M and W'r, groups first."""
+        none: frozenset[int] = frozenset()
+        amplitude = np.repeat(scales.everyday_mode, scales.group_sizes)
         inner = np.eye(at) + amplitude[:, None] * gram[:at, :at] * amplitude
         across = amplitude[:, None] * gram[:at, at:]
-        solved = np.linalg.solve(inner, np.column_stack([across, amplitude[:, None] * projected[:at]]))
-        count = gram.shape[1] - at
-        square = np.diag(gram)[at:] - np.einsum("ij,ij->j", across, solved[:, :count])
-        z = projected[at:] - across.T @ solved[:, count:]
-        none_log = self.prior.log(frozenset())
+        solved = np.linalg.solve(inner, np.column_stack([across, amplitude * projected[:at]]))
+        square = np.diag(gram)[at:] - np.einsum("ij,ij->j", across, solved[:, :-1])
+        z = projected[at:] - across.T @ solved[:, -1]
+        log = [scales.quick]  # of the empty set, with and without flips
+        empty = self.prior.log(frozenset())
         alternatives = {name: sum(s.owner == name for s in self._signatures) for name in self.hypotheses}
         for s in self._signatures:
-            share = np.exp(self.prior.log(frozenset((s.owner,))) - none_log) / alternatives[s.owner]
-            best = np.max(
-                [_amplitude_odds(z[k], square[k], c) for k, c in zip(s.columns, s.coordinates, strict=True)], axis=0
-            )
-            odds = np.vstack([odds, share * best])
-        return np.asarray(1.0 / (1.0 + odds.sum(axis=0)))
+            share = self.prior.log(frozenset((s.owner,))) - empty - np.log(alternatives[s.owner])
+            each = zip(s.columns, s.coordinates, strict=True)
+            log.append(scales.quick + share + max(_amplitude_log_odds(z[k], square[k], c) for k, c in each))
+        return float(np.exp(scales.everyday + scales.log_prior(none) - log_sum_exp(log)))
 
     # --- the table ---------------------------------------------------------------------------------------------------
 
@@ -764,13 +756,16 @@ def _set_integral(z: FloatArray, gram: FloatArray, members: Sequence[_Signature]
     return float(b @ c - 0.5 * c @ a @ c) + found.log_integral, c
 
 
-def _amplitude_odds(z: FloatArray, square: float, coordinate: Coordinate) -> FloatArray:
-    """Return the evidence ratio of one amplitude for each of z (m,): integral of exp(z c - square c^2 / 2) p(c)."""
-    width = min(coordinate.scale, 1.0 / np.sqrt(max(square, 1e-300)))
-    reach = 12.0 * width + float(np.abs(z).max()) / max(square, coordinate.scale**-2)
-    c = np.linspace(0.0 if coordinate.lower == 0.0 else -reach, reach, 241)
-    density = np.exp(coordinate.log_prior(c)) * (c[1] - c[0])
-    if coordinate.lower == 0.0:
-        density[0] *= 0.5
-    exponent = np.minimum(z[:, None] * c - 0.5 * square * c**2, 700.0)
-    return np.asarray(np.exp(exponent) @ density)
+def _amplitude_log_odds(z: float, square: float, coordinate: Coordinate) -> float:
+    """Return the log evidence ratio of one amplitude: log integral of exp(z c - square c^2 / 2) p(c)."""
+    size = abs(z) / max(square, coordinate.scale**-2)
+    if size < 8.0 * coordinate.scale and z * size < 40.0:
+        width = min(coordinate.scale, 1.0 / np.sqrt(max(square, 1e-300)))
+        c = np.linspace(0.0 if coordinate.lower == 0.0 else -1.0, 1.0, 161) * (12.0 * width + size)
+        density = np.exp(coordinate.log_prior(c)) * (c[1] - c[0])
+        if coordinate.lower == 0.0:
+            density[0] *= 0.5
+        return float(np.log(np.exp(z * c - 0.5 * square * c**2) @ density))
+    u = np.array([max(z / max(square, 1e-300), coordinate.lower)])
+    found = integrate(np.array([[square]]), np.array([z - square * u[0]]), [coordinate], u)
+    return found.log_integral + float(z * u[0] - 0.5 * square * u[0] ** 2)

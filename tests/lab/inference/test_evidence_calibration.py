@@ -92,6 +92,24 @@ def test_statements_are_as_often_true_as_they_say() -> None:
     _assert_reliable(_reliability(20, 11))
 
 
+def test_the_threshold_of_no_mismatch_is_that_of_whole_searches_of_healthy_draws() -> None:
+    """The p(nothing) of 20 draws without effects and everyday delta: their median by single effects and flips, in
+    closed form, agrees with that by whole searches, 40 other draws, to 0.1 (the medians' standard error is 1.25 times
+    the spread of 0.15 over sqrt(20))."""
+    rng = np.random.default_rng(4)
+    whole = []
+    for _ in range(20):
+        value = rng.standard_normal(POINTS) + 2.0 * rng.standard_normal()
+        for group in GROUPS:
+            tau = group.everyday * abs(rng.standard_normal())
+            value = value + tau * group.columns @ rng.standard_normal(group.columns.shape[1])
+        search = Search(Toy(value, CHANGES, 2.0 * np.ones((POINTS, 1)), GROUPS), HYPOTHESES, PRIOR)
+        whole.append(read_table(search.run(), HYPOTHESES).nothing)
+    quick = search.healthy_draws(40, rng)
+    print(np.sort(whole).round(2), np.sort(quick).round(2))
+    assert np.median(quick) == pytest.approx(np.median(whole), abs=0.1)
+
+
 @pytest.mark.slow
 def test_statements_of_many_draws_are_as_often_true_as_they_say() -> None:
     """1,000 draws."""
