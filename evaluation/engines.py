@@ -85,7 +85,7 @@ def lines(outcome: Outcome) -> Iterator[str]:
         words = [
             f"{s.parameter} {s.mean:.4g} +- {s.std:.2g}" + " (not determined)" * (not s.is_determined) for s in sizes
         ]
-        yield f"    size of {name}, in u: {', '.join(words)}"
+        yield f"    size of {name}: {', '.join(words)}"
     total, count = sum(c.chi2 for c in outcome.checked), sum(c.n for c in outcome.checked)
     against = ", ".join(f"{c.measurement} chi2 {c.chi2:.1f} of {c.n}" for c in outcome.checked if c.contradicts)
     yield f"    held out: chi2 {total:.0f} of {count}; contradicted by: {against or 'none'}"

@@ -10,7 +10,7 @@ A hypothesis has parameters u. Each has one prior, in the coordinate in which it
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -33,7 +33,7 @@ _LOG_AT_ZERO = float(np.log(2.0 / (np.pi * np.sqrt(3.0))))
 @dataclass(frozen=True)
 class Coordinate:
     """One parameter u: its bounds, and its prior of this centre and scale. A shape of infinite scale has a flat prior.
-    `step`: of finite differences; `typical`: a usual change."""
+    `step`: of finite differences; `typical`: a usual change; `to_value`: the parameter in its own unit, None for u."""
 
     name: str
     scale: float
@@ -43,6 +43,7 @@ class Coordinate:
     is_shape: bool = False
     typical: float = 0.0
     step: float = 0.0
+    to_value: Callable[[float], float] | None = None
 
     @property
     def unit(self) -> float:
@@ -251,6 +252,10 @@ class EffectParameter:
     @property
     def coordinate(self) -> Coordinate:
         """u with its bounds and its prior, whose scale is the declared standard deviation's."""
+        return replace(self._coordinate, to_value=self.to_value)
+
+    @property
+    def _coordinate(self) -> Coordinate:
         q = self.quantity
         low = -np.inf if q.lower is None else self.to_u(q.lower)
         high = np.inf if q.upper is None else self.to_u(q.upper)

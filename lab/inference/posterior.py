@@ -91,7 +91,7 @@ def read_table(table: Table, hypotheses: Mapping[str, Hypothesis]) -> Posterior:
 
 
 def sizes_of(table: Table, hypotheses: Mapping[str, Hypothesis], name: str) -> tuple[Size, ...]:
-    """Return an effect's parameters in the coordinate u, as mixtures over the refitted sets that hold it."""
+    """Return an effect's parameters in their own units, as mixtures over the refitted sets that hold it."""
     rng = np.random.default_rng(0)
     weights: dict[frozenset[str], float] = {}
     for row in table.rows:
@@ -121,7 +121,11 @@ def sizes_of(table: Table, hypotheses: Mapping[str, Hypothesis], name: str) -> t
         u = np.clip(every[:, k], c.lower, c.upper)
         low, high = np.quantile(u, [0.025, 0.975])
         determined = c.is_shape or not low <= 0.0 <= high
-        found.append(Size(c.name, float(u.mean()), float(u.std()), (float(low), float(high)), determined))
+        value = u if c.to_value is None else np.array([c.to_value(float(x)) for x in u])
+        interval = np.quantile(value, [0.025, 0.975])
+        found.append(
+            Size(c.name, float(value.mean()), float(value.std()), (float(interval[0]), float(interval[1])), determined)
+        )
     return tuple(found)
 
 

@@ -45,6 +45,8 @@ REFITS = 60
 LEFT = 0.01
 #: Log odds below the likeliest set at which the closed form is trusted to rule a set out, however large its error.
 HOPELESS = 50.0
+#: The most single hypotheses that are refitted first where the best gains more than `HOPELESS`.
+SINGLES = 8
 #: Refits of sets that the closed form about a set far below the likeliest promises: about such a set it isn't linear.
 DOUBTFUL = 8
 #: Gain of log evidence up to which the recordings say little of a set beyond its nearest refitted subset: the closed
@@ -199,6 +201,7 @@ class Search:
     def run(self) -> Table:
         """Fill the table."""
         self._linearise(self.fit({}))
+        self._refit_strong_singles()
         while len(self.fits) < self.refits:
             less = self._without_one()
             key = self._next() if less is None else None
@@ -228,6 +231,20 @@ class Search:
 
     def _top(self) -> float:
         return max(self._log_posterior(f) for f in self.fits.values())
+
+    def _refit_strong_singles(self) -> None:
+        """Refit the single hypotheses that promise half of what the best does, where that is so much that the closed
+        form about the empty set isn't linear; make the closed form again about those that are likely."""
+        singles = self.singles[frozenset()]
+        top = max(singles.values(), default=0.0)
+        if top < HOPELESS:
+            return
+        strong = sorted((n for n, gain in singles.items() if gain > 0.5 * top), key=lambda n: -singles[n])
+        for name in strong[:SINGLES]:
+            self._refit_from(self.estimates[frozenset((name,))])
+            self.report(name)
+        for fit in [f for f in self.fits.values() if f.state and self._log_posterior(f) > self._top() - FAR_BELOW]:
+            self._linearise(fit)
 
     def _without_one(self) -> State | None:
         """Return the likeliest set without one of its members, from where it stands, if that was never refitted: of all

@@ -1,4 +1,4 @@
-"""A departure of the transfer function that differs by direction or by wavelength, and that no effect of the list has."""
+"""A departure of the transfer function by direction or by wavelength that no effect of the list has."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ MIDDLE_NM, REACH_NM = 550.0, 150.0
 class TransferDiscrepancy(Effect):
     """A factor 1 + strength c(f) s on the transfer function: c linear between `at`, held beyond, 0 at frequency 0.
 
-    s is cos 2 phi (`astigmatic`: rows against columns), sin 2 phi (`diagonal`), with phi the direction of the frequency,
-    or (wavelength - 550 nm) / 150 nm (`chromatic`). It describes; it names no cause, so that a diagnosis never looks
+    s is cos 2 phi (`astigmatic`: rows against columns), sin 2 phi (`diagonal`), phi the direction of the frequency, or
+    (wavelength - 550 nm) / 150 nm (`chromatic`). It describes; it names no cause, so that a diagnosis never looks
     for it."""
 
     name: ClassVar[str] = "transfer_discrepancy"
@@ -36,7 +36,9 @@ class TransferDiscrepancy(Effect):
     )
 
     shape: Annotated[Shape, Field(description="how it differs by direction or wavelength")] = "astigmatic"
-    at: Annotated[tuple[float, ...], Field(min_length=2, description="frequencies, ascending from 0, cycles per um")] = (
+    at: Annotated[
+        tuple[float, ...], Field(min_length=2, description="frequencies, ascending from 0, cycles per um")
+    ] = (
         0.0,
         0.1,
     )
