@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import chdtrc
@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from lab.inference.recordings import SideProblem
     from lab.inference.search import Row, Search, Table
 
-#: Keys of a capture that don't belong to its setting.
-_NOT_OF_SETTING = {"id", "frame", "time", "temperature_c", "dummy_frames"}
+#: Keys of a capture that don't belong to its setting: which frame it is, and the readings of its light.
+_NOT_OF_SETTING: dict[str, Any] = dict.fromkeys(
+    ("id", "frame", "time", "temperature_c", "dummy_frames", "radiance", "light_radiance", "dark_radiance"), True
+) | {"screen": {"radiance": True}}
 #: Of the captures of a setting, in time: the last of every so many is held out, so that among those that are used some
 #: follow another of their own setting.
 ONE_IN = 3
@@ -32,8 +34,8 @@ ONE_IN = 3
 def held_out_ids(recordings: RecordingSet, side: Side) -> frozenset[str]:
     """Return the ids of one side's captures that are held out: every third in time of each setting with three or more.
 
-    A setting is all that a capture states but its time, its temperature and its frame. Where captures have no time, the
-    manifest's order stands for it."""
+    A setting is all that a capture states but its time, its temperature, its frame and the readings of its light. Where
+    captures have no time, the manifest's order stands for it."""
     settings: dict[str, list[tuple[float, int, str]]] = {}
     for order, capture in enumerate(recordings.captures(side=side)):
         setting = capture.model_dump_json(exclude=_NOT_OF_SETTING)

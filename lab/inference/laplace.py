@@ -65,7 +65,7 @@ def integrate(
     mean, covariance = np.zeros(p), np.diag(np.where(pinned, np.square(1.0 / np.where(pull == 0, 1.0, pull)), 0.0))
     if len(free):
         within, mean[free], covariance[np.ix_(free, free)] = _normal(
-            a[np.ix_(free, free)], pull[free], slope[free], precision[free], [coords[k] for k in free], u[free],
+            a[np.ix_(free, free)], pull[free], slope[free], precision[free], [coords[int(k)] for k in free], u[free],
             np.array([k in skip for k in free]),
         )  # fmt: skip
         total += within

@@ -45,7 +45,7 @@ REFITS = 60
 LEFT = 0.01
 #: Log odds below the likeliest set at which the closed form is trusted to rule a set out, however large its error.
 HOPELESS = 50.0
-#: The most single hypotheses that are refitted first where the best gains more than `HOPELESS`.
+#: The most hypotheses that are tried beside the likeliest set where the best gains more than `HOPELESS`.
 SINGLES = 8
 #: Refits of sets that the closed form about a set far below the likeliest promises: about such a set it isn't linear.
 DOUBTFUL = 8
@@ -201,7 +201,7 @@ class Search:
     def run(self) -> Table:
         """Fill the table."""
         self._linearise(self.fit({}))
-        self._refit_strong_singles()
+        self._add_strong()
         while len(self.fits) < self.refits:
             less = self._without_one()
             key = self._next() if less is None else None
@@ -232,19 +232,26 @@ class Search:
     def _top(self) -> float:
         return max(self._log_posterior(f) for f in self.fits.values())
 
-    def _refit_strong_singles(self) -> None:
-        """Refit the single hypotheses that promise half of what the best does, where that is so much that the closed
-        form about the empty set isn't linear; make the closed form again about those that are likely."""
-        singles = self.singles[frozenset()]
-        top = max(singles.values(), default=0.0)
-        if top < HOPELESS:
-            return
-        strong = sorted((n for n, gain in singles.items() if gain > 0.5 * top), key=lambda n: -singles[n])
-        for name in strong[:SINGLES]:
-            self._refit_from(self.estimates[frozenset((name,))])
-            self.report(name)
-        for fit in [f for f in self.fits.values() if f.state and self._log_posterior(f) > self._top() - FAR_BELOW]:
-            self._linearise(fit)
+    def _add_strong(self) -> None:
+        """While one more hypothesis promises so much that the closed form isn't linear, refit the likeliest set with
+        each of those that promise half of what the best does."""
+        while True:
+            origin = max(self.fits.values(), key=self._log_posterior)
+            if origin.members not in self.singles:
+                self._linearise(origin)
+            gains = self.singles[origin.members]
+            top = max(gains.values(), default=0.0)
+            if top < HOPELESS:
+                return
+            strong = sorted((n for n, gain in gains.items() if gain > 0.5 * top), key=lambda n: -gains[n])[:SINGLES]
+            keys = [origin.members | {name} for name in strong]
+            for key in keys:
+                estimate = self.estimates.get(key)
+                if key not in self.fits and estimate is not None and len(self.fits) < self.refits:
+                    self._refit_from(estimate)
+                    self.report(", ".join(sorted(key)))
+            if max(self.fits.values(), key=self._log_posterior) is origin:
+                return
 
     def _without_one(self) -> State | None:
         """Return the likeliest set without one of its members, from where it stands, if that was never refitted: of all
@@ -313,7 +320,7 @@ class Search:
             if all(_differ(one, m) for m in modes):
                 modes.append(one)
         total = log_sum_exp([m.base for m in modes])
-        merged = FittedSet(**{**vars_of(best), "base": total, "others": tuple(modes[1:])})
+        merged = replace(best, base=total, others=tuple(modes[1:]))
         merged = self._by_grid_where_weak(merged, estimate)
         self.fits[merged.members] = merged
         return merged
@@ -334,7 +341,7 @@ class Search:
         gain = self.singles.get(estimate.origin, {}).get(name)
         if gain is None or max(gain, fit.base - origin.base) > WEAK:
             return fit
-        return FittedSet(**{**vars_of(fit), "base": origin.base + gain})
+        return replace(fit, base=origin.base + gain)
 
     def _log_density(self, state: State) -> float:
         """Log of p(y | u) p(u), everyday scales and form errors at their medians."""
@@ -590,7 +597,7 @@ class Search:
         for a, name in enumerate(names):
             for other in names[:a]:
                 part = bound[np.ix_(columns[name], columns[other])]
-                i, j = np.unravel_index(int(np.argmax(part)), part.shape)
+                i, j = divmod(int(np.argmax(part)), part.shape[1])
                 one, two_ = int(of_column[columns[name][i]]), int(of_column[columns[other][j]])
                 gain = 0.5 * float(part[i, j]) + min(occam[one], 0.0) + min(occam[two_], 0.0)
                 gain += shared[name] + shared[other]
@@ -696,11 +703,6 @@ class Search:
         rows = [Row(k, u, float(np.exp(v - total)), k in self.fits, k in enough) for (k, u), v in log.items()]
         rows.sort(key=lambda r: -r.probability)
         return Table(tuple(rows), dict(self.fits), tuple(g.name for g in self.model.groups), total, len(self.fits))
-
-
-def vars_of(fit: FittedSet) -> dict[str, object]:
-    """Fields of a fit, to make another of."""
-    return {name: getattr(fit, name) for name in FittedSet.__dataclass_fields__}
 
 
 def _differ(one: FittedSet, other: FittedSet) -> bool:
