@@ -273,6 +273,26 @@ def third_party_command(
         page.write_text(placed(page.read_text(encoding="utf-8"), "third-party", text), encoding="utf-8")
 
 
+@app.command("engines")
+def engines_command(
+    sets: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SET...", help="folders, own:SEED, former:healthy:SEED or former:LAW:VARIANT:STRENGTH:SEED"
+        ),
+    ],
+    beside: Annotated[bool, typer.Option("--beside", help="also run today's diagnosis")] = False,
+) -> None:
+    """Print what the evidence engine reports of recordings.
+
+    Example: python -m evaluation engines own:1 --beside
+    """
+    from evaluation.engines import compare
+
+    for line in compare(sets, beside=beside):
+        print(line, flush=True)
+
+
 @app.command("live")
 def live_command(
     out: Results,

@@ -143,7 +143,7 @@ def test_declares_what_the_diagnosis_reads(kind: type[Effect]) -> None:
     assert kind.invariances <= {"f_number", "exposure", "wavelength", "field", "level", "orientation", "time"}
     # a known part of a camera, the diagnosis' own term for what has no name, and a misstated f-number
     assert kind.is_candidate == (
-        kind.name not in {"cover_glass", "empirical_law", "model_discrepancy", "other_f_number"}
+        kind.name not in {"cover_glass", "empirical_law", "model_discrepancy", "other_f_number", "transfer_discrepancy"}
     )
     assert kind.quantities()
     assert kind.shapes <= set(kind.quantities())
