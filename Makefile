@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium ci-extra peers names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
+.PHONY: aravis chromium ci-extra peers third-party names soak kills halts faults setup run test serve bench proof proof-live proof-unlisted twin real slow lint clean
 
 setup: $(STAMP)
 
@@ -50,6 +50,11 @@ aravis:
 # emulated cameras, the driver of the browser, a database server. Tests that need them skip without them.
 peers: $(STAMP)
 	scripts/install-peers $(BIN)/python
+
+# Simulators of third parties, for `python -m evaluation third-party`; tests that need them skip without them.
+third-party: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[third-party]'
+	rm -rf calibench.egg-info  # as above
 
 # The browser in which the tests drive the operator's page, from the distribution.
 chromium:

@@ -6,6 +6,7 @@ import json as json_text
 import os
 import random
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -227,6 +228,61 @@ def observables_command(
     print(table(found))
     if page is not None:
         page.write_text(placed(page.read_text(encoding="utf-8"), "observables", table(found)), encoding="utf-8")
+
+
+@app.command("third-party")
+def third_party_command(
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="file of the results, one line a set; it is continued there")
+    ],
+    sets: Annotated[int, typer.Option("--sets", min=1, metavar="N", help="sets of each model")] = 20,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option("--effect", metavar="NAME", help="this model, by its effect's name (without: every one)"),
+    ] = None,
+    page: Page = None,
+) -> None:
+    """Diagnose sets of third parties' simulators: are their effects named and sized?
+
+    Example: python -m evaluation third-party --out third-party.jsonl --sets 2
+    """
+    from evaluation.page import placed
+
+    missing = [package for package in ("pyxel", "galsim") if find_spec(package) is None]
+    if missing:
+        raise InputError(f"{' and '.join(missing)}: not installed; `make third-party` installs what is needed")
+    from evaluation.third_party import experiment  # needs the simulators
+    from evaluation.third_party.score import table
+
+    check_writable(out)
+    check_writable(page)
+    unknown = sorted(set(effect or ()) - set(experiment.SOURCES))
+    if unknown:
+        raise InputError(f"--effect {unknown[0]}: no such model; there are {', '.join(experiment.SOURCES)}")
+    text = table(experiment.diagnose_sets(out, sets, tuple(effect or experiment.SOURCES)))
+    print(text)
+    if page is not None:
+        page.write_text(placed(page.read_text(encoding="utf-8"), "third-party", text), encoding="utf-8")
+
+
+@app.command("engines")
+def engines_command(
+    sets: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SET...", help="folders, own:SEED, former:healthy:SEED or former:LAW:VARIANT:STRENGTH:SEED"
+        ),
+    ],
+    beside: Annotated[bool, typer.Option("--beside", help="also run today's diagnosis")] = False,
+) -> None:
+    """Print what the evidence engine reports of recordings.
+
+    Example: python -m evaluation engines own:1 --beside
+    """
+    from evaluation.engines import compare
+
+    for line in compare(sets, beside=beside):
+        print(line, flush=True)
 
 
 @app.command("live")

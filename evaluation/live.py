@@ -200,6 +200,7 @@ SIZES: dict[str, str] = {
     "stray_light": "both:share_percent=0.6",
     "taps": "left:gain_percent=1,offset_e=3",
     "trefoil": "left:w333_x_um=0.2",
+    "turbulent_air": "left:width_um=1.5",
     "veiling_glare": "left:share_percent=3",
     "vibration_blur": "both:amplitude_x_um=1.5",
     "vignetting": "left:corner_loss_percent=6",

@@ -14,7 +14,10 @@ ROOT = Path(__file__).parents[1]
 ROOMS = ("sim", "drivers", "mocks", "lab", "api", "evaluation", "tests", "docs", "benchmarks")
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
 SOURCES = sorted(
-    [ROOT / "Makefile", *(p for room in ROOMS for p in (ROOT / room).rglob("*.py") if p != Path(__file__).resolve())]
+    [
+        ROOT / "Makefile",
+        *(p for room in (*ROOMS, "calibench") for p in (ROOT / room).rglob("*.py") if p != Path(__file__).resolve()),
+    ]
 )
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"`([^`\n]+)`")

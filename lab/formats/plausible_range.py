@@ -54,6 +54,10 @@ STATED: dict[str, Plausible] = {
     "focal_length_mm": Plausible(0.1, 2e4, LENGTH_UNIT, LENGTH_UNIT),
     # boards of 25 to 150 mm a square in metres: 0.025 to 0.15; finer ones are targets of microscopes; walls: 1 m
     "square_mm": Plausible(0.2, 1e3, LENGTH_UNIT, LENGTH_UNIT),
+    # liquid helium: -269. Above 70 a dark current hides the signal of silicon; 77 to 125 are usual in kelvin
+    "temperature_c": Plausible(
+        -273.15, 70.0, "no temperature in degree C is lower; correct it", "a temperature in kelvin? give it in degree C"
+    ),
     # share of the codes of bit_depth: converters reach most of their codes
     "white_level_dn over the highest code": Plausible(
         0.4, 1.0, "bit_depth may be that of the file, not of the converter; correct it", "correct bit_depth"

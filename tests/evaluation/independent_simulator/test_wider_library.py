@@ -17,6 +17,7 @@ from evaluation.independent_simulator.laws import (
     ColouredLineNoiseLaw,
     CosmicRaysLaw,
     CoverGlassFringeLaw,
+    ExcessNoiseLaw,
     ImageLagLaw,
     LeakyShutterLaw,
     LineGainLaw,
@@ -73,7 +74,8 @@ STRONG: tuple[Law, ...] = (
     MicrolensAngleLaw(6.0, 2, 9),
     ChargeTransferLaw(400.0, 0, 9),
     ChargeTransferLaw(400.0, 1, 9),
-    # ExcessNoiseLaw(60.0, 0, 9) is named at 0.86 and sized 25 +- 8 %: the dark noise holds the gain to 5 %
+    ExcessNoiseLaw(60.0, 0, 9),
+    ExcessNoiseLaw(60.0, 1, 9),
     CosmicRaysLaw(600.0, 0, 9),
     CosmicRaysLaw(600.0, 1, 9),
     # the likest laws of persistence and of microlenses
@@ -91,7 +93,8 @@ def _diagnosed(law: Law | None, cfa: str = "MONO", seed: int = 930) -> Diagnosis
     remembers = law is None or law.effect in {"persistence", "image_lag"}
     edges = law is not None and law.effect == "charge_transfer_inefficiency"
     kinds = ("dark", "flat", "slanted_edge" if edges else "narrowband")
-    plan = Plan(kinds=kinds, dark_again=remembers)
+    repeats = 12 if law is not None and law.effect == "excess_noise" else 3  # a third moment needs many numbers
+    plan = Plan(kinds=kinds, repeats=repeats, dark_again=remembers)
     return diagnose(recordings_of(camera, plan), at_once=False)
 
 

@@ -24,13 +24,13 @@ import lab.diagnose
 import lab.fit
 from lab import cli
 from lab.capture.by_hand import HandChange, LeftByHand
+from lab.capture.data_folder import open_store
 from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession
 from lab.capture_kinds.dark import DarkSequence
 from lab.cli import bench_process, capturing, diagnosis, entry, fitting
 from lab.cli.console import EXIT_INPUT
 from lab.cli.help import help_and_example
-from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
 from lab.diagnose.visibility import EffectList, effect_list
 from lab.errors import DeviceError

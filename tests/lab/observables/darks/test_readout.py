@@ -19,8 +19,8 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.observables.darks.readout import DarkReadOut
-from lab.observables.flats.field import measure_flat_lines
-from lab.observables.flats.linearity import measure_level_repeats
+from lab.observables.flats.level_repeats import measure_level_repeats
+from lab.observables.flats.lines import measure_flat_lines
 from lab.observables.flats.rows import measure_flat_rows
 from sim.camera import Shutter
 from sim.effects.light_flicker import LightFlicker

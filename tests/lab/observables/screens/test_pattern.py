@@ -26,8 +26,9 @@ from lab.errors import NotDetermined
 from lab.formats.camera_model import camera_model
 from lab.observables.dataset import Dataset
 from lab.observables.flats import green_balance
-from lab.observables.flats.field import flats, measure_flat_lines
 from lab.observables.flats.green_balance import measure_green_balance
+from lab.observables.flats.images import flats
+from lab.observables.flats.lines import measure_flat_lines
 from lab.observables.observable import Observable
 from lab.observables.spectra.narrowband import measure_narrowband
 

@@ -17,7 +17,9 @@ from lab.calibration.limits import Figure, Judgement
 from lab.calibration.overview import verdict_of
 from lab.capture.records import RunRecord
 from lab.capture.store import Store
+from lab.errors import InputError
 from lab.formats.results.words import measured
+from lab.report import write_page
 from lab.report.words import VERDICTS
 from sim.parameters import Frozen
 
@@ -95,7 +97,22 @@ def _band(band: tuple[float | None, float | None]) -> str:
 
 @functools.cache
 def _template() -> jinja2.Template:
-    loader = jinja2.FileSystemLoader(Path(__file__).parent / "pages")
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters |= {"value": _value, "band": _band}
     return environment.get_template("certificate.html")
+
+
+def write_certificate(store: Store, one: CalibrationRecord, file: Path) -> Certificate:
+    """Write the page of a calibration that was certified as `file` (HTML): completely, or not at all.
+
+    Returns what the page states, with its hashes. Raises InputError where the calibration isn't certified or the file
+    can't be written."""
+    if one.certified is None:
+        raise InputError(f"calibration {one.id}: is {one.state}, no certificate states it; certify it first")
+    try:
+        runs = tuple(store.runs(one.session_id))
+    except InputError:  # the session was deleted
+        runs = ()
+    write_page(file, certificate_page(store, one, runs))
+    return certificate(store, one)
