@@ -8,7 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Law, Plan
+from evaluation.independent_simulator.laws import (
+    AbsorptionBandLaw,
+    CoverGlassFringeLaw,
+    ExposureOffsetLaw,
+    NonlinearityLaw,
+    RedLeakLaw,
+    SourceBandwidthLaw,
+    SourceDriftLaw,
+    StrayLightLaw,
+    WavelengthOffsetLaw,
+)
 from lab.diagnose.inference.side_model import measurement_model
 from lab.observables.codes.rounding import rounding_std_dn
 from lab.observables.darks.frames import cell_means
@@ -25,18 +37,6 @@ from lab.observables.spectra.light_readings import (
     sample_std,
 )
 from lab.observables.spectra.narrowband import measure_narrowband
-from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import (
-    AbsorptionBandLaw,
-    CoverGlassFringeLaw,
-    ExposureOffsetLaw,
-    NonlinearityLaw,
-    RedLeakLaw,
-    SourceBandwidthLaw,
-    SourceDriftLaw,
-    StrayLightLaw,
-    WavelengthOffsetLaw,
-)
 from sim.effects.amplifier_glow import AmplifierGlow
 from sim.effects.image_lag import ImageLag
 from sim.effects.persistence import Persistence

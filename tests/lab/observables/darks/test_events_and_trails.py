@@ -8,15 +8,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lab.challenge.draw import recordings_of
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
+from evaluation.independent_simulator.laws import PersistenceLaw
 from lab.errors import NotDetermined
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet
 from lab.observables.darks.events import measure_dark_events
 from lab.observables.darks.trails import measure_dark_trails
 from lab.observables.noise.skewness import measure_noise_skewness
-from mocks.former import ConcealedCamera, Plan
-from mocks.former.laws import PersistenceLaw
 from sim.effects.base import Effect
 from sim.effects.charge_transfer_inefficiency import ChargeTransferInefficiency
 from sim.effects.cosmic_rays import CosmicRays

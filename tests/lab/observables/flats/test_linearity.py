@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evaluation.independent_simulator.laws import ImageLagLaw, LightFlickerLaw, SourceInstabilityLaw
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -12,7 +13,6 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.observables.flats.level_repeats import measure_level_repeats
 from lab.observables.noise.repeatability import RepeatedMeans, level_repeatability, steady
 from lab.observables.observable import Observable
-from mocks.former.laws import ImageLagLaw, LightFlickerLaw, SourceInstabilityLaw
 from sim.effects.base import Effects
 from sim.effects.image_lag import ImageLag
 from sim.effects.light_flicker import LightFlicker
