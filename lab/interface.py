@@ -70,7 +70,7 @@ def open_recordings(
     (240, 320)
     """
     from lab.capture.data_folder import existing_store
-    from lab.formats.importers import KINDS, read_foreign
+    from lab.formats.importers import importers, read_foreign
     from lab.formats.importers.single_picture import ImportOptions
     from lab.formats.recording_set import RecordingError, inspect
     from lab.pipeline import source_recordings
@@ -79,7 +79,7 @@ def open_recordings(
     kind = _kind_of(place) if kind is None else kind
     if kind is None:
         if stated:
-            raise InputError(f"{path}: takes none of {', '.join(stated)}; state kind, one of {', '.join(KINDS)}")
+            raise InputError(f"{path}: takes none of {', '.join(stated)}; state kind, one of {', '.join(importers())}")
         return source_recordings(str(path), lambda: existing_store(None if data is None else Path(data)))
     try:
         options = ImportOptions(**_as_paths(stated))
@@ -281,14 +281,15 @@ def predict(
     plan : recordings whose captures are planned again
     change : what differs: `f_number`, `temperature_c`, `lamp`, `lens`, `distance_mm`, `exposure_factor`, `gain_db`,
         `radiance_factor`
-    fitted : the recordings of the fit; levels of flats are predicted relative to theirs
+    fitted : the recordings of the fit; levels of flats are predicted relative to theirs, which needs their photon
+        numbers or radiance
 
     Returns the prediction; `seal` writes it with its hash, `score` compares it with the session. Raises InputError.
 
     >>> import calibench
     >>> recordings = calibench.open_recordings("my-camera")
     >>> cameras = calibench.fitted_cameras(recordings, calibench.fit(recordings))
-    >>> prediction = calibench.predict(cameras, recordings, {"exposure_factor": 0.5}, fitted=recordings)
+    >>> prediction = calibench.predict(cameras, recordings, {"exposure_factor": 0.5})
     >>> "noise" in {number.quantity for number in prediction.sides["left"].numbers}
     True
     """
@@ -315,7 +316,7 @@ def score(prediction: SealedPrediction, recordings: RecordingSet | str | Path) -
     >>> import calibench
     >>> recordings = calibench.open_recordings("my-camera")
     >>> cameras = calibench.fitted_cameras(recordings, calibench.fit(recordings))
-    >>> found = calibench.score(calibench.predict(cameras, recordings, fitted=recordings), recordings)
+    >>> found = calibench.score(calibench.predict(cameras, recordings), recordings)
     >>> found.n == len(found.numbers)
     True
     """

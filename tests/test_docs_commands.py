@@ -51,6 +51,7 @@ NOT_RUN = {
     "docs/how-to/use-from-python.md": "tests/calibench/test_examples.py and tests/deploy/test_wheel.py",
     "docs/how-to/use-a-cluster.md": "a cluster; tests/lab/test_workers.py starts one",
     "docs/how-to/use-my-recordings.md": "minutes; tests/lab/formats/importers/test_raw_folder.py",
+    "docs/how-to/write-an-extension.md": "installs a package; tests/lab/test_extensions.py",
     "docs/proof-twin.md": "hours: make twin",
     "docs/proof-unlisted.md": "hours: make proof-unlisted; tests/lab/challenge/test_unlisted.py makes two cases",
     "docs/proof.md": "hours: make proof; tests/lab/challenge/test_challenge.py makes and scores a few",
