@@ -32,9 +32,6 @@ from api.schemas import (
     CalibrationDetail,
     CameraModels,
     Certify,
-    Challenge,
-    ChallengeJobStart,
-    ChallengeStart,
     Comparison,
     ConnectedDevice,
     DeviceCheck,
@@ -76,8 +73,6 @@ from lab.calibration.limits import CalibrationLimits
 from lab.capture.catalogue import PlanEstimate, SequenceDescription
 from lab.capture.plan import Parameters
 from lab.capture.session import Progress
-from lab.challenge.score import ChallengeScore
-from lab.challenge.truth import Truths
 from lab.diagnose.visibility import EffectDescription, ParameterDescription
 from lab.errors import InputError, one_line
 from lab.formats.recording_set import RecordingSet, archive, read
@@ -677,40 +672,6 @@ class ServiceClient:
     def report(self, job_id: str) -> str:
         """Return the page of a job of the kind `report` or `pipeline`."""
         return self.request("GET", f"/jobs/{job_id}/report").text
-
-    # --- challenges ---------------------------------------------------------------------------------------------------
-
-    def make_challenge(self, start: ChallengeStart) -> Job:
-        """Make a challenge; the job's `challenge_id` is the challenge."""
-        return self._post(Job, "/challenges", start)
-
-    def start_challenge_job(self, kind: Literal["make", "score"], challenge_id: str) -> Job:
-        """Go on making a challenge, or score it."""
-        return self._post(Job, f"/challenges/{challenge_id}/jobs", ChallengeJobStart(kind=kind))
-
-    def challenges(self) -> Iterator[Challenge]:
-        """All challenges, the newest first."""
-        return self._pages(Challenge, "/challenges")
-
-    def challenge(self, challenge_id: str) -> Challenge:
-        """One challenge."""
-        return self._get(Challenge, f"/challenges/{challenge_id}")
-
-    def fetch_case(self, challenge_id: str, case: str, file: Path) -> Path:
-        """Write the recordings of a case to `file`, a .zip or .tar of a recording set."""
-        return self._fetched(f"/challenges/{challenge_id}/cases/{case}/archive", file)
-
-    def challenge_score(self, challenge_id: str) -> ChallengeScore:
-        """Return the score of a challenge that is scored."""
-        return self._get(ChallengeScore, f"/challenges/{challenge_id}/score")
-
-    def challenge_truths(self, challenge_id: str) -> Truths:
-        """Return the truths of a challenge that is scored."""
-        return self._get(Truths, f"/challenges/{challenge_id}/truths")
-
-    def delete_challenge(self, challenge_id: str) -> None:
-        """Delete a challenge for ever."""
-        self.request("DELETE", f"/challenges/{challenge_id}")
 
     # --- calibrations -------------------------------------------------------------------------------------------------
 

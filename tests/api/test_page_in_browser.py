@@ -79,7 +79,6 @@ VIEWS = {
     "/stations/fakes": "#devices tr:nth-child(5)",
     "/jobs": "#no-jobs",
     "/models": "#models tr",
-    "/challenges": "#no-challenges",
     "/nothing": "#view-none a",
 }
 
@@ -828,27 +827,6 @@ def test_what_waits_is_edited_and_copied_with_what_follows(browser: Any, lab: Ru
     for name in ("for the next night", "once more"):
         page.click(f"#queue tr:has-text('{name}') button:has-text('Remove')")
         page.wait_for_selector(f"#queue tr:has-text('{name}')", state="detached")
-    watched.close()
-
-
-def test_a_challenge_is_made_and_deleted(browser: Any, lab: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The drawing itself is a stand-in that ends at once, with no case made."""
-    monkeypatch.setattr("lab.jobs.carry_out", lambda *_: None)
-    watched = Watched(browser, lab)
-    watched.log_in(lab, "calibrate")
-    page = watched.page
-    watched.go("/challenges", "#challenge-form:not([hidden])")
-    page.fill("#challenge-form input[name=name]", "since the upgrade")
-    page.fill("#challenge-form input[name=cases]", "2")
-    page.press("#challenge-form input[name=cases]", "Enter")
-    page.wait_for_selector("#challenges tr:has-text('since the upgrade'):has-text('0/2')")
-    page.wait_for_selector("#challenges .state:has-text('unfinished')")
-    watched.go("/jobs", "#jobs tr:has-text('make challenge'):has-text('since the upgrade') .state.done")
-    watched.go("/challenges", "#challenges button:has-text('Delete'):not([disabled])")
-    assert watched.faults() == []
-    page.on("dialog", lambda asked: asked.accept())
-    page.click("#challenges button:has-text('Delete'):not([disabled])")
-    page.wait_for_selector("#challenges tr", state="detached")
     watched.close()
 
 

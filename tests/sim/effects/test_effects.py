@@ -63,7 +63,7 @@ def test_declares_what_the_diagnosis_reads(kind: type[Effect]) -> None:
     assert kind.name == kind.__module__.rsplit(".", 1)[-1]  # one effect, one file
     # a known part of a camera, the diagnosis' own term for what has no name, and a misstated f-number
     assert kind.is_candidate == (
-        kind.name not in {"cover_glass", "empirical_law", "model_discrepancy", "other_f_number"}
+        kind.name not in {"cover_glass", "empirical_law", "model_discrepancy", "other_f_number", "transfer_discrepancy"}
     )
 
 
@@ -75,6 +75,14 @@ def test_slope_at_zero_is_finite_and_not_nil(kind: type[Effect]) -> None:
 @pytest.mark.parametrize("kind", ALL, ids=lambda k: k.name)
 def test_prototypes_change_something_and_stay_in_bounds(kind: type[Effect]) -> None:
     assert list(prototype_complaints(kind)) == []
+
+
+@pytest.mark.parametrize("kind", ALL, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("pitch_um", [0.7, 30.0])
+def test_cameras_of_any_pitch_have_prototypes(pitch_um: float, kind: type[Effect]) -> None:
+    """From a telephone's pixels to an astronomer's: a prototype out of its bounds would end every diagnosis."""
+    camera = CAMERA.model_copy(update={"pixel_pitch_um": pitch_um})
+    assert all(isinstance(one, kind) for places in kind.prototypes(camera) for one in places)
 
 
 def _blurs() -> list[Effect]:
