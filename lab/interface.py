@@ -265,6 +265,40 @@ def fitted_cameras(recordings: RecordingSet | str | Path, fit: FitResult) -> dic
     return cameras
 
 
+def read_camera(file: str | Path) -> CameraFile:
+    """Read a camera file.
+
+    file : TOML, as `write_camera` or `calibench fit --write-cameras` writes it
+
+    Returns the camera model with its effects. Raises InputError, with the key that can't be used.
+
+    >>> import calibench
+    >>> calibench.read_camera(calibench.write_camera(calibench.default_camera(), "camera.toml")).camera.cols
+    1280
+    """
+    from lab.formats.camera_file import read_camera as read
+
+    return read(Path(file))
+
+
+def write_camera(camera: CameraFile, file: str | Path) -> Path:
+    """Write a camera file that `read_camera` reads back to exactly the same camera.
+
+    camera : as of `fitted_cameras`, `default_camera` or `evaluate(...).improved`
+    file : the file, TOML
+
+    Returns the file. Raises InputError where it can't be written.
+
+    >>> import calibench
+    >>> calibench.write_camera(calibench.default_camera(), "camera.toml").name
+    'camera.toml'
+    """
+    from lab.formats.camera_file import write_camera as write
+
+    write(Path(file), camera)
+    return Path(file)
+
+
 # --- predict and simulate ---------------------------------------------------------------------------------------------
 
 
@@ -303,6 +337,45 @@ def predict(
         model=", ".join(one.name for one in cameras.values()),
         fitted=None if fitted is None else _opened(fitted),
     )
+
+
+def seal(prediction: SealedPrediction, file: str | Path) -> str:
+    """Write a prediction, and its SHA-256 beside it, before the session is captured.
+
+    prediction : as of `predict`
+    file : the sealed prediction, JSON; FILE.sha256 gets the hash
+
+    Returns the hash (hexadecimal). Raises InputError where the files can't be written.
+
+    >>> import calibench
+    >>> recordings = calibench.open_recordings("my-camera")
+    >>> cameras = calibench.fitted_cameras(recordings, calibench.fit(recordings))
+    >>> hashed = calibench.seal(calibench.predict(cameras, recordings), "sealed.json")
+    >>> calibench.open_seal("sealed.json", hashed).plan
+    'my-camera'
+    """
+    from lab.twin.sealed import seal as sealed
+
+    return sealed(prediction, Path(file))
+
+
+def open_seal(file: str | Path, sha256: str | None = None) -> SealedPrediction:
+    """Read a sealed prediction, and compare it with its hash.
+
+    file : as of `seal`
+    sha256 : the hash; None: that of FILE.sha256
+
+    Returns the prediction. Raises InputError where the file isn't the one that was sealed.
+
+    >>> import calibench
+    >>> calibench.open_seal("nothing.json")
+    Traceback (most recent call last):
+        ...
+    lab.errors.InputError: nothing.json: it or its hash nothing.json.sha256 can't be read; give both files
+    """
+    from lab.twin.sealed import open_seal as opened
+
+    return opened(Path(file), sha256)
 
 
 def score(prediction: SealedPrediction, recordings: RecordingSet | str | Path) -> TwinScore:
