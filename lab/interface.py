@@ -312,7 +312,8 @@ def predict(
     """Predict the measured numbers of a session before it is captured, with their standard deviations.
 
     cameras : camera models by side, as of `fitted_cameras` or of `evaluate(...).improved`
-    plan : recordings whose captures are planned again
+    plan : recordings whose captures are planned again; flats state their radiance or photons, edges their region and
+        angle
     change : what differs: `f_number`, `temperature_c`, `lamp`, `lens`, `distance_mm`, `exposure_factor`, `gain_db`,
         `radiance_factor`
     fitted : the recordings of the fit; levels of flats are predicted relative to theirs, which needs their photon
@@ -323,9 +324,10 @@ def predict(
     >>> import calibench
     >>> recordings = calibench.open_recordings("my-camera")
     >>> cameras = calibench.fitted_cameras(recordings, calibench.fit(recordings))
-    >>> prediction = calibench.predict(cameras, recordings, {"exposure_factor": 0.5})
-    >>> "noise" in {number.quantity for number in prediction.sides["left"].numbers}
-    True
+    >>> darks = recordings.without({one.id for one in recordings.captures() if one.kind != "dark"})
+    >>> prediction = calibench.predict(cameras, darks, {"exposure_factor": 0.5})
+    >>> {number.quantity for number in prediction.sides["left"].numbers}
+    {'dark'}
     """
     from lab.twin.changes import checked_changes
     from lab.twin.predict import predict as predicted
@@ -350,7 +352,8 @@ def seal(prediction: SealedPrediction, file: str | Path) -> str:
     >>> import calibench
     >>> recordings = calibench.open_recordings("my-camera")
     >>> cameras = calibench.fitted_cameras(recordings, calibench.fit(recordings))
-    >>> hashed = calibench.seal(calibench.predict(cameras, recordings), "sealed.json")
+    >>> darks = recordings.without({one.id for one in recordings.captures() if one.kind != "dark"})
+    >>> hashed = calibench.seal(calibench.predict(cameras, darks), "sealed.json")
     >>> calibench.open_seal("sealed.json", hashed).plan
     'my-camera'
     """
@@ -389,7 +392,8 @@ def score(prediction: SealedPrediction, recordings: RecordingSet | str | Path) -
     >>> import calibench
     >>> recordings = calibench.open_recordings("my-camera")
     >>> cameras = calibench.fitted_cameras(recordings, calibench.fit(recordings))
-    >>> found = calibench.score(calibench.predict(cameras, recordings), recordings)
+    >>> darks = recordings.without({one.id for one in recordings.captures() if one.kind != "dark"})
+    >>> found = calibench.score(calibench.predict(cameras, darks), darks)
     >>> found.n == len(found.numbers)
     True
     """
