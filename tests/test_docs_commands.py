@@ -49,7 +49,6 @@ NOT_RUN = {
     "docs/how-to/run-in-ci.md": "minutes; tests/deploy/test_wheel.py and api/pytest_plugin.py's own tests",
     "docs/how-to/settle-a-doubt.md": "minutes; tests/lab/test_resolve.py",
     "docs/how-to/soak-a-bench.md": "hours: make soak",
-    "docs/how-to/use-from-python.md": "tests/calibench/test_examples.py and tests/deploy/test_wheel.py",
     "docs/how-to/use-a-cluster.md": "a cluster; tests/lab/test_workers.py starts one",
     "docs/how-to/use-my-recordings.md": "minutes; tests/lab/formats/importers/test_raw_folder.py",
     "docs/how-to/write-an-extension.md": "installs a package; tests/lab/test_extensions.py",
