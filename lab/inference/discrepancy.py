@@ -176,7 +176,9 @@ def _columns(model: MeasurementModel, base: FloatArray, processes: Iterator[_Pro
             yield table @ np.linalg.cholesky(kernel)
 
 
-def _curve(stage: Stage, along: Along, of: Of, at: Sequence[float], unit: float = 1.0, first: int = 0) -> _Process:
+def _curve(
+    stage: Stage, along: Along, of: Of, at: Sequence[float] | FloatArray, unit: float = 1.0, first: int = 0
+) -> _Process:
     """Return the process of a curve of `EmpiricalLaw` with its points at `at`."""
     none = PLACES[stage, along, of][1]
     points = tuple(float(x) for x in at)
