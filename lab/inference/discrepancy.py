@@ -249,7 +249,7 @@ def _offset(dataset: Dataset) -> Iterator[_Process]:
     yield _curve("signal", "time", "mean", _times_s(dataset), unit)
     yield _curve("signal", "radius", "mean", np.linspace(0.0, corner_um, 4), unit)
     for line in ("row", "column"):
-        yield _curve("signal", line, "mean", np.linspace(0.0, 1.0, 6), unit)  # type: ignore[arg-type]
+        yield _curve("signal", line, "mean", np.linspace(0.0, 1.0, 6), unit)
 
 
 def _shot(dataset: Dataset) -> Iterator[_Process]:
