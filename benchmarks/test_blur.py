@@ -22,14 +22,12 @@ from threadpoolctl import threadpool_limits
 from benchmarks.peers.iso12233 import iso12233_mtf
 from benchmarks.peers.mosleh import mosleh_kernel
 from benchmarks.table import Row, show
-from lab.capture_kinds.bernoulli import BernoulliCapture
-from lab.capture_kinds.screen import ScreenState
 from lab.fit.mtf import edge_mtf
 from lab.fit.psf import estimate_kernel
 from lab.fit.psf.kernel import displace, normal_equations
 from lab.fit.psf.photograph import estimate_from_photograph
 from lab.fit.psf.screen_kernel import measure_field
-from lab.observables.screens.registration import ScreenPictures
+from lab.observables.screens.placement import place_pattern
 from sim.camera import CameraModel, Lens
 from sim.frame import Exposure, expected_electrons
 from sim.optics.imaging import MeasuredPsf
@@ -312,12 +310,9 @@ def simulated_camera() -> tuple[np.ndarray, np.ndarray]:
         frames[name] = np.mean([sample_from(electrons * rate, camera, rng, pixels) for _ in range(4)], axis=0)
     contrast = frames["white"] - frames["black"]
     contrast[contrast < 0.2 * np.quantile(contrast, 0.98)] = np.nan
-    first = BernoulliCapture(
-        id="noise", kind="bernoulli", side="left", frame="noise.npy", exposure_s=1.0,
-        screen=ScreenState(pose="p", cell_camera_px=3.8), target="noise.npy",
-    )  # fmt: skip
-    levelled = [(frames[name] - frames["black"]) / contrast for name in ("board", "noise")]
-    found = measure_field(ScreenPictures(first, *levelled, board, pattern), "MONO", 9, patches=0).kernels["Y"].kernel
+    checkerboard, picture = ((frames[name] - frames["black"]) / contrast for name in ("board", "noise"))
+    place = place_pattern(checkerboard, picture, board, pattern, 3.8, "MONO")
+    found = measure_field(picture, pattern, place.warp, "MONO", 9, patches=0).kernels["Y"].kernel
     return found, kernel(camera, "Y", light, len(found))
 
 

@@ -14,8 +14,8 @@ import pytest
 from distributed import LocalCluster
 
 from benchmarks.table import Row, show
-from lab.challenge.draw import kind_of
-from lab.challenge.make import make
+from evaluation.draw import kind_of
+from evaluation.make import make
 from lab.workers import Workers
 from sim.optics.traced_table import TableSettings, lens_table
 from sim.optics.zmx import read_zmx

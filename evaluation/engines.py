@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import LISTED, OUTSIDE, ConcealedCamera, Law
 from evaluation.own_chain import healthy_session
-from lab.challenge.draw import recordings_of
 from lab.diagnose import diagnose
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet, read
@@ -18,7 +19,6 @@ from lab.inference.check import Checked, check_held_out, passes
 from lab.inference.posterior import Posterior, Verdict, healthy_nothing, read_table, verdict
 from lab.inference.recordings import measure_side, search_side
 from lab.inference.search import Table
-from mocks.former import LISTED, OUTSIDE, ConcealedCamera, Law
 from sim.camera import Side
 
 #: Draws behind the threshold of `no_mismatch`, and the share of healthy cameras below it.

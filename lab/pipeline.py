@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from lab.errors import Cancelled, InputError
+from lab.shown import Shown
 from sim.memory import return_freed_memory
 
 if TYPE_CHECKING:
@@ -175,8 +176,8 @@ Tell = Callable[[PipelineProgress], None]
 Capturer = Callable[[CaptureRequest, "Callable[[CaptureProgress], None]"], str]
 
 
-@dataclass(frozen=True)
-class PipelineResult:
+@dataclass(frozen=True, repr=False)  # an IPython prompt prefers a dataclass's own text
+class PipelineResult(Shown):
     """What a pipeline found; None for what its goal doesn't need."""
 
     recordings: RecordingSet

@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 from distributed import LocalCluster
 
-from lab.challenge.draw import recordings_of
-from lab.challenge.make import make
-from lab.challenge.run import run_all
-from lab.challenge.truth import FIRST_FRESH_SEED
-from lab.cli import main
+from evaluation.__main__ import main
+from evaluation.draw import recordings_of
+from evaluation.independent_simulator import ConcealedCamera, Plan
+from evaluation.make import make
+from evaluation.run import run_all
+from evaluation.truth import FIRST_FRESH_SEED
 from lab.diagnose.inference.bootstrap import healthy_draws
 from lab.diagnose.inference.side_model import measurement_model
 from lab.errors import Cancelled, InputError
 from lab.formats import recording_set
 from lab.workers import Workers
-from mocks.former import ConcealedCamera, Plan
 from sim.optics.traced_table import TableSettings, lens_table
 from sim.optics.zmx import read_zmx
 
@@ -80,7 +80,7 @@ def test_a_challenge_is_made_and_diagnosed_on_the_cluster(
     seed, address = FIRST_FRESH_SEED + 5, str(cluster.scheduler)
     monkeypatch.chdir(tmp_path)
     words = ["--cases", "1", "--seed", str(seed), "--size", "small", "--cfa", "MONO"]
-    assert main(["challenge", "make", "--out", "there", "--scheduler", address, *words]) == 0
+    assert main(["make", "--out", "there", "--scheduler", address, *words]) == 0
     assert "1 cases" in capsys.readouterr().out
     here = make(tmp_path / "here", 1, seed, tmp_path / "here.json", "small", Workers(), cfa="MONO")
     there = make(tmp_path / "there", 1, seed, tmp_path / "there.truths.json", "small", Workers(), cfa="MONO")

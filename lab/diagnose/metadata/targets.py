@@ -17,9 +17,10 @@ from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.observables.boards.detection import as_grey, luminance
 from lab.observables.boards.residuals import BOARDS
-from lab.observables.screens.pattern_fit import BERNOULLI
-from lab.observables.screens.registration import ScreenPictures, reference_pixels, register, screen_pictures
-from sim.camera import Cfa, Side
+from lab.observables.screens.contrast import BERNOULLI
+from lab.observables.screens.placement import pattern_place
+from lab.observables.screens.poses import ScreenPictures, ScreenPose, refuse_saturated, screen_poses
+from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]
 Grey = NDArray[np.uint8]
@@ -299,14 +300,14 @@ def misstated_cell_size(
     The registration finds the size by itself: the stated one is only its start.
     """
     try:
-        pictures = [one for one in screen_pictures(recordings, side) if one.first.screen.cell_camera_px is not None]
+        poses = screen_poses(recordings, side, "psf")
     except NotDetermined:
         return None
     sizes: dict[float, float] = {}
-    for one in pictures:
-        stated = one.first.screen.cell_camera_px
+    for pose in poses:
+        stated = pose.pattern[0].screen.cell_camera_px
         if stated is not None and stated not in sizes:
-            measured = _cell_px(one, stated, recordings.camera(side).cfa)
+            measured = _cell_px(recordings, pose)
             if measured is not None:
                 sizes[stated] = measured
     off = {stated: size for stated, size in sizes.items() if abs(size / stated - 1.0) > policy.cell_size_tolerance}
@@ -337,21 +338,17 @@ def misstated_cell_size(
     )
 
 
-def _cell_px(pictures: ScreenPictures, stated: float, cfa: Cfa) -> float | None:
+def _cell_px(recordings: RecordingSet, pose: ScreenPose) -> float | None:
     """Side of a cell in camera px: the square root of its area in the middle of the pattern; None where the pattern
     isn't found."""
+    camera = recordings.camera(pose.pattern[0].side)
     try:
-        warp = register(
-            pictures.checkerboard,
-            pictures.bernoulli,
-            pictures.checkerboard_target,
-            pictures.bernoulli_target,
-            stated,
-            reference_pixels(pictures.checkerboard.shape, cfa),
-        )
+        refuse_saturated(recordings, pose, camera.saturation_dn, "psf")
+        pictures = ScreenPictures.of(recordings, pose)
+        warp = pattern_place(recordings, pictures, pictures.levelled(recordings, pose.pattern), camera.cfa).warp
     except NotDetermined:
         return None
-    rows, cols = np.nonzero(np.isfinite(pictures.checkerboard))
+    rows, cols = np.nonzero(np.isfinite(pictures.contrast))
     corner = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     cells = warp.cells(corner + np.array([cols.mean(), rows.mean()]))
     (ax, ay), (bx, by) = cells[1] - cells[0], cells[2] - cells[0]

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from scipy import special
 
 from lab.errors import NotDetermined
-from lab.fit.psf.screen_kernel import ScreenKernel, measure_field
+from lab.fit.psf.screen_kernel import ScreenField, ScreenKernel, measure_field
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import PsfKernel, PsfSymmetry
-from lab.observables.screens.registration import screen_pictures
+from lab.observables.screens.placement import pattern_place
+from lab.observables.screens.poses import ScreenPictures, ScreenPose, refuse_saturated, screen_poses
 from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]
@@ -119,14 +120,15 @@ def fit_psf_field(recordings: RecordingSet, side: Side, patches: int = 3) -> Psf
     parts: list[PsfKernel] = []
     measured: list[ScreenKernel] = []
     reason = ""
-    for pictures in screen_pictures(recordings, side):
+    for pose in screen_poses(recordings, side, "psf"):
+        first = pose.pattern[0].id
         try:
-            field = measure_field(pictures, camera.cfa, patches=patches)
+            field = _field_of(recordings, camera, pose, patches)
         except NotDetermined as refused:
-            reason = f"{pictures.first.id}: {refused.reason}"
+            reason = f"{first}: {refused.reason}"
             continue
-        kernels += [_result(camera, pictures.first.id, found) for found in field.kernels.values()]
-        parts += [_result(camera, pictures.first.id, found) for found in field.parts]
+        kernels += [_result(camera, first, found) for found in field.kernels.values()]
+        parts += [_result(camera, first, found) for found in field.parts]
         measured += field.parts
     if not kernels:
         raise NotDetermined("psf", reason)
@@ -135,6 +137,17 @@ def fit_psf_field(recordings: RecordingSet, side: Side, patches: int = 3) -> Psf
     except NotDetermined:
         symmetry = None
     return PsfFit(tuple(kernels), tuple(parts), symmetry)
+
+
+def _field_of(recordings: RecordingSet, camera: DataSheet, pose: ScreenPose, patches: int) -> ScreenField:
+    """Measure the kernels of one pose, and of `patches` x `patches` parts of its pattern."""
+    refuse_saturated(recordings, pose, camera.saturation_dn, "psf")
+    pictures = ScreenPictures.of(recordings, pose)
+    picture = pictures.levelled(recordings, pose.pattern)
+    place = pattern_place(recordings, pictures, picture, camera.cfa)
+    first = pose.pattern[0]
+    shares = pictures.shares(picture, first, camera.black_level_dn or 0.0)
+    return measure_field(shares, recordings.target(first.target), place.warp, camera.cfa, patches=patches)
 
 
 def _result(camera: DataSheet, capture: str, found: ScreenKernel) -> PsfKernel:

@@ -16,11 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.interpolate import RectBivariateSpline
 
 from lab.errors import NotDetermined
 from lab.fit.psf.kernel import KernelEstimate, NormalEquations, on_simplex, solve_kernel
-from lab.observables.screens.registration import ScreenPictures, ScreenWarp, draw_by_area, reference_pixels, register
+from lab.observables.screens.registration import ScreenWarp, draw_by_area
 from lab.one_blas_thread import one_blas_thread
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases
@@ -28,7 +27,6 @@ from sim.sensor.mosaic import step as period
 
 Array = NDArray[np.floating[Any]]
 
-REGISTRATION_STEPS = 3
 RIM_SHARE = 0.04  # of a kernel in its outermost pixels, above which the support is doubled
 GRID_STD = 5e-4  # of the maximum of the kernel: error of five taps on half pixels for a diffraction-limited kernel
 SHIFT_STD_PX = 0.005  # common to all corners, beside their noise: shading differs between neighbouring squares
@@ -112,11 +110,8 @@ class DrawnPattern:
         """
         rows, cols = seen.shape
         target = pattern.astype(float)
-        # The map is smooth: on a coarse grid, interpolated by cubic splines
-        y, x = np.arange(-8.0, rows + 16.0, 8.0), np.arange(-8.0, cols + 16.0, 8.0)
-        at = warp.cells(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
-        fine_y, fine_x = np.arange(oversample * rows) / oversample, np.arange(oversample * cols) / oversample
-        cell_x, cell_y = (RectBivariateSpline(y, x, at[:, :, k])(fine_y, fine_x) for k in (0, 1))
+        fine_row, fine_col = np.arange(oversample * rows) / oversample, np.arange(oversample * cols) / oversample
+        cell_x, cell_y = warp.cells_on(fine_row, fine_col)
         picture = draw_by_area(target, cell_x, cell_y)
         # Take out the squares of the drawing and of the grid of the kernel, a sample each
         taps = symmetric_taps(lambda f: np.sinc(f / oversample) ** -2, 0.6, oversample, 2)
@@ -125,8 +120,8 @@ class DrawnPattern:
         wide = oversample * support_px
         surroundings = cv2.GaussianBlur(picture, (6 * wide + 1,) * 2, wide, borderType=cv2.BORDER_REPLICATE)
 
-        coarse = np.gradient(at[:, :, 0])
-        margin = (support_px / 2.0 + 2.0) * float(np.hypot(coarse[0].mean(), coarse[1].mean())) / 8.0  # cells
+        down, across = (np.mean(np.gradient(cell_x[::8, ::8], 8.0 / oversample, axis=axis)) for axis in (0, 1))
+        margin = (support_px / 2.0 + 2.0) * float(np.hypot(down, across))  # cells
         inside = (
             (cell_x > margin)
             & (cell_x < target.shape[1] - margin)
@@ -252,48 +247,44 @@ class ScreenField:
 
 @one_blas_thread
 def measure_field(
-    pictures: ScreenPictures, cfa: Cfa, support_px: int = 9, oversample: int = 2, patches: int = 3
+    picture: Array,
+    pattern: NDArray[np.uint8],
+    warp: ScreenWarp,
+    cfa: Cfa,
+    support_px: int = 9,
+    oversample: int = 2,
+    patches: int = 3,
 ) -> ScreenField:
     """Measure the kernels of all channels of one pose, `support_px` (odd) wide, and of parts of the pattern.
 
-    The support is doubled once where a kernel doesn't fit. The registration from the corners is refined with the
-    kernel, except a common shift, by Gauss-Newton on the residual: first on the green (or only) channel, then on each.
-    `oversample` samples per pixel (2 or 4) resolve the kernel: 4 is worth its time where the cells of the target are
-    about a quarter of a pixel, or the noise is low. With `patches` > 1, `patches` x `patches` parts of the pattern
-    have a kernel each, of the green (or only) channel, with the registration and the prior of the whole. Raises
-    `NotDetermined` where the pattern can't be registered, ValueError for another `oversample`.
+    `picture` (rows, cols): the levelled picture of the `pattern` (cells), 0 dark .. 1 lit, NaN where the screen isn't;
+    `warp`: where green (or all) pixels see the pattern (`lab.observables.screens.placement`). The place of red and blue
+    is refined with the kernel, except a common shift, by Gauss-Newton on the residual. The support is doubled once
+    where a kernel doesn't fit. `oversample` samples per pixel (2 or 4) resolve the kernel: 4 is worth its time where
+    the cells of the target are about a quarter of a pixel, or the noise is low. With `patches` > 1, `patches` x
+    `patches` parts of the pattern have a kernel each, of the green (or only) channel, with the prior of the whole.
+    Raises `NotDetermined` where too few pixels see the pattern, ValueError for another `oversample`.
     """
     if oversample not in (2, 4):
         raise ValueError(f"oversample = {oversample} must be 2 or 4 samples a pixel")
-    cell = pictures.first.screen.cell_camera_px
-    warp = register(
-        pictures.checkerboard,
-        pictures.bernoulli,
-        pictures.checkerboard_target,
-        pictures.bernoulli_target,
-        cell,
-        reference_pixels(pictures.checkerboard.shape, cfa),
-    )
     places, step = phases(cfa), period(cfa)
     reference = "Y" if cfa == "MONO" else "G"
     found: dict[str, ScreenKernel] = {}
     local: list[ScreenKernel] = []
     size = support_px
 
-    def draw_for(channel: str) -> DrawnPattern:
-        return DrawnPattern.of(
-            pictures.bernoulli, pictures.bernoulli_target, warp, places[channel], step, size, oversample
-        )
+    def draw_for(channel: str, place: ScreenWarp) -> DrawnPattern:
+        return DrawnPattern.of(picture, pattern, place, places[channel], step, size, oversample)
 
     for channel in (reference, *(name for name in places if name != reference)):
-        for _ in range(REGISTRATION_STEPS if channel == reference else 1):
-            drawn = draw_for(channel)
+        drawn = draw_for(channel, warp)
+        estimate = solve_kernel(drawn.normal(), drawn.support, outside=True, rounds=1)
+        if size == support_px and _rim_share(estimate.kernel, oversample) > RIM_SHARE:
+            size = 2 * support_px - 1
+            drawn = draw_for(channel, warp)
             estimate = solve_kernel(drawn.normal(), drawn.support, outside=True, rounds=1)
-            if size == support_px and _rim_share(estimate.kernel, oversample) > RIM_SHARE:
-                size = 2 * support_px - 1
-                continue
-            warp = drawn.refine_warp(estimate)
-        drawn = draw_for(channel)
+        if channel != reference:
+            drawn = draw_for(channel, drawn.refine_warp(estimate))
         whole = solve_kernel(drawn.normal(), drawn.support, outside=True)
         found[channel] = screen_kernel(drawn, channel, whole)
         if channel == reference and patches > 1:

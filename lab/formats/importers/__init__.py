@@ -38,6 +38,10 @@ __all__ = [
 ]
 
 
+#: Endings of archives, which are unpacked before an import.
+ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".7z", ".rar")
+
+
 @dataclass(frozen=True)
 class Importer:
     """A format: how it is read, which options it takes, and whether it is one file, or a folder and nothing else."""
@@ -107,7 +111,9 @@ def read_foreign(kind: str, path: Path, options: ImportOptions | None = None) ->
     if path.is_dir() and importer.of_a_file:
         raise InputError(f"{path}: is a folder; give one picture")
     if path.is_file() and importer.of_a_folder:
-        raise InputError(f"{path}: is a file; give the folder that it is in")
+        is_archive = path.name.lower().endswith(ARCHIVES)
+        remedy = "unpack it, and give the folder" if is_archive else "give the folder that it is in"
+        raise InputError(f"{path}: is a file; {remedy}")
     alien = [name for name in options.stated() if name not in importer.takes]
     if alien:
         takes = ", ".join(sorted(importer.takes)) or "none"

@@ -137,6 +137,10 @@ FIGURES: dict[str, Plausible] = {
     "principal point y over the height": Plausible(0.25, 0.75, _CROPPED, _CROPPED),
     # pairs of one module: some mm; pairs on vehicles: a few m
     "baseline_mm": Plausible(1.0, 1e4, _SQUARES, _SQUARES),
+    # light only adds up: a point-spread function without negative values has its highest modulation at frequency 0
+    "mtf": Plausible(
+        None, 1.0, above="the camera may sharpen, or codes may follow a tone curve; switch processing off"
+    ),
     # the upper limit is that of the pixel's aperture and of diffraction
     "mtf50_cy_per_px": Plausible(
         None, 1.0,
@@ -154,6 +158,10 @@ STATED: dict[str, Plausible] = {
     "focal_length_mm": Plausible(0.1, 2e4, _LENGTH, _LENGTH),
     # boards of 25 to 150 mm a square in metres: 0.025 to 0.15; finer ones are targets of microscopes; walls: 1 m
     "square_mm": Plausible(0.2, 1e3, _LENGTH, _LENGTH),
+    # liquid helium: -269. Above 70 a dark current hides the signal of silicon; 77 to 125 are usual in kelvin
+    "temperature_c": Plausible(
+        -273.15, 70.0, "no temperature in degree C is lower; correct it", "a temperature in kelvin? give it in degree C"
+    ),
     # share of the codes of bit_depth: converters reach most of their codes
     "white_level_dn over the highest code": Plausible(
         0.4, 1.0, "bit_depth may be that of the file, not of the converter; correct it", "correct bit_depth"
@@ -251,12 +259,26 @@ def _of_edges(curves: Sequence[MtfCurve], sheet: DataSheet) -> Iterator[str]:
                 limit = highest_mtf50_cy_per_px(sheet, curve.angle_deg)
                 std = math.hypot(curve.mtf50_cy_per_px_std or 0.0, ESTIMATE_ERROR * limit)
                 found.append(((curve.mtf50_cy_per_px - limit) / std, curve.capture, curve.mtf50_cy_per_px, std, limit))
+        peaks = [_peak_over_one(curve) for curve in curves if curve.channel == channel and curve.mtf]
+        if peaks:
+            _, capture, value, std = median_low(peaks)
+            if line := FIGURES["mtf"].sentence(f"highest MTF {channel} of {capture}", value, std):
+                yield line
         if not found:
             continue
         _, capture, value, std, limit = median_low(found)
         limits = replace(FIGURES["mtf50_cy_per_px"], upper=min(limit, 1.0))
         if line := limits.sentence(f"{plain_name('mtf50_cy_per_px')} {channel} of {capture}", value, std, "cy/px"):
             yield line
+
+
+def _peak_over_one(curve: MtfCurve) -> tuple[float, str, float, float]:
+    """Return by how many standard deviations the highest modulation of an edge up to Nyquist's frequency is above 1,
+    its capture, the modulation, and its standard deviation."""
+    below = np.array(curve.frequency_cy_per_px) <= 0.5
+    value, std = np.array(curve.mtf)[below], np.hypot(np.array(curve.mtf_std)[below], ESTIMATE_ERROR)
+    at = int(np.argmax((value - 1.0) / std))
+    return float((value[at] - 1.0) / std[at]), curve.capture, float(value[at]), float(std[at])
 
 
 def highest_mtf50_cy_per_px(sheet: DataSheet, angle_deg: float = 0.0) -> float:

@@ -19,7 +19,7 @@ from lab.observables.boards.pairs import SIDES, StereoPair, board_pairs, needs_b
 from lab.observables.dataset import Dataset
 from lab.observables.flats.row_light import ROW_LIGHT, nuisances, row_light_variance
 from lab.observables.observable import Label, Measurement, Observable, Prediction
-from lab.observables.screens.cells import measure_screen
+from lab.observables.screens.dark_squares import measure_screen
 from sim.camera import Side
 from sim.effects.base import Effects
 from sim.effects.veiling_glare import VeilingGlare

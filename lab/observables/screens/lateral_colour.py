@@ -9,8 +9,10 @@ from lab.observables.colour_shift import COLOUR_FLOOR_PX, colour_shift_px
 from lab.observables.dataset import Dataset
 from lab.observables.observable import Label, Measurement, Observable, Prediction
 from lab.observables.reads import SHIFT
-from lab.observables.screens.pattern_fit import ACROSS, RADIAL, RADIAL3, Pattern, patterns
+from lab.observables.screens.bands import ACROSS, RADIAL, RADIAL3
+from lab.observables.screens.patterns import Pattern, patterns, place_jacobian
 from sim.effects.base import Effects
+from sim.spectrum import FloatArray
 
 
 def measure_lateral_colour(dataset: Dataset) -> Observable:
@@ -21,21 +23,24 @@ def measure_lateral_colour(dataset: Dataset) -> Observable:
     """
     if "G" not in dataset.channels:
         raise NotDetermined("lateral_colour", "one channel: nothing to hold it against")
-    points: list[tuple[Pattern, Pattern]] = []
-    for group in patterns(dataset):
+    points: list[tuple[int, Pattern, Pattern]] = []
+    for number, group in enumerate(patterns(dataset)):
         for p in group:
             if p.channel != "G":
                 green = next(q for q in group if q.channel == "G" and q.held_out == p.held_out)
-                points.append((p, green))
-    values, labels, places = [], [], []
+                points.append((number, p, green))
+    values, labels, places, expected = [], [], [], []
+    displaced: list[tuple[int, FloatArray]] = []
     n = len(points)
     covariance = np.zeros((3 * n, 3 * n))
-    for i, (p, green) in enumerate(points):
+    for i, (number, p, green) in enumerate(points):
         near, far = 0.5 * p.reach, p.reach
         table = np.array([[near, near**3, 0.0], [far, far**3, 0.0], [0.0, 0.0, far]])
         at = np.array([len(p.bands) + k for k in (RADIAL, RADIAL3, ACROSS)])
         values.append(table @ (p.value[at] - green.value[at]))
-        for j, (q, other) in enumerate(points):
+        displaced += [(number, row) for row in table @ (p.by_place[at] - green.by_place[at])]
+        expected.append(table @ (p.baseline[at] - green.baseline[at]))
+        for j, (_, q, other) in enumerate(points):
             if p.channel != q.channel or p.light is not q.light:
                 continue
             # only these coefficients: channels may have different numbers of parts beyond the bands
@@ -48,13 +53,15 @@ def measure_lateral_colour(dataset: Dataset) -> Observable:
             labels.append(Label(distance, p.channel, way, p.captures, p.held_out))
             places.append((p, distance, k < 2))
 
+    by_place = place_jacobian(displaced)
+
     def predict(effects: Effects) -> Prediction:
-        mean = np.zeros(len(places))
+        mean = np.concatenate(expected)
         if effects:
             for k, (p, distance, outwards) in enumerate(places):
                 if outwards:
-                    mean[k] = colour_shift_px(dataset, p.channel, distance, p.light, effects)
-        return Prediction(mean, {})
+                    mean[k] += colour_shift_px(dataset, p.channel, distance, p.light, effects)
+        return Prediction(mean, by_place)
 
     return Observable(
         measurement=LATERAL_COLOUR, reach=0.5, value=np.concatenate(values),

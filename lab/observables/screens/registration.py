@@ -1,7 +1,6 @@
-"""The pictures of a screen, levelled between black and white, and where a pattern on it lies in the frame of the
-camera.
+"""Where a pattern on a screen lies in the frame of the camera, by the corners of a checkerboard.
 
-The corners of the checkerboard are found and fitted in the levelled mosaic (`lab.fit.geometry`). They are
+The corners are found and fitted in the levelled mosaic (`poses`). They are
 numbered by growing a grid from one of them, and matched to the target by the Bernoulli pattern, which unlike a
 checkerboard fits in one place only. The map from camera px to target cells is a homography H after a smooth
 displacement D, cubic in the position, good to a few thousandths of a pixel:
@@ -13,7 +12,6 @@ Points are (x, y), x along columns; the cell (i, j) of the target covers j..j+1 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,98 +19,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, spatial
+from scipy.interpolate import RectBivariateSpline
 
-from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.errors import NotDetermined
-from lab.formats.recording_set import RecordingSet
 from lab.observables.boards.corner_fits import fit_corners
-from sim.camera import Cfa, Side
-from sim.sensor.mosaic import phases, planes
+from sim.camera import Cfa
+from sim.sensor.mosaic import phases
 from sim.sensor.mosaic import step as period
 
 Array = NDArray[np.floating[Any]]
 
 ORDER = 3  # of the displacement, in x and y together
 MIN_CORNERS = 12
+COARSE_PX = 8.0  # step of the grid on which the map is computed
 LEAST_RADIUS_PX = 4.0  # of a corner's window, in which green pixels alone, 25 of them, tell its nine parameters
 LEAST_CORRELATION = 0.5  # of the levelled picture with the pattern; below it, the picture shows another one
-
-
-@dataclass(frozen=True)
-class ScreenPictures:
-    """Pictures of one pose of the screen, repeats averaged: 0 as black, 1 as white, NaN where the screen isn't.
-
-    `first` is the first of the Bernoulli captures; `checkerboard`, `bernoulli` are (rows, cols) of the frame, their
-    targets (rows, cols) of cells.
-    """
-
-    first: BernoulliCapture
-    checkerboard: Array
-    bernoulli: Array
-    checkerboard_target: NDArray[np.uint8]
-    bernoulli_target: NDArray[np.uint8]
-
-
-def screen_pictures(recordings: RecordingSet, side: Side) -> list[ScreenPictures]:
-    """Level the pictures, (p - black) / (white - black), for every pose and Bernoulli target of `side`.
-
-    A pose that lacks one of the four kinds of captures is left out. Raises `NotDetermined` where none is left.
-    """
-    shown: dict[str, dict[tuple[str, str], list[Any]]] = {}
-    for kind in ("white", "black", "checkerboard", "bernoulli"):
-        for capture in recordings.captures(kind, side):
-            key = (kind, getattr(capture, "target", ""))
-            shown.setdefault(capture.screen.pose, {}).setdefault(key, []).append(capture)
-    if not any(kind == "bernoulli" for kinds in shown.values() for kind, _ in kinds):
-        raise NotDetermined("psf", "no bernoulli captures")
-    found, reason = [], ""
-    for pose, kinds in shown.items():
-        present = {kind for kind, _ in kinds}
-        if "bernoulli" not in present:
-            continue
-        missing = [kind for kind in ("white", "black", "checkerboard") if kind not in present]
-        if missing:
-            reason = f"pose {pose} lacks a {' and a '.join(missing)} capture: take it before the screen moves"
-            continue
-        boards = next(key for key in kinds if key[0] == "checkerboard")
-        for key in [key for key in kinds if key[0] == "bernoulli"]:
-            try:
-                white, black, board, pattern = (
-                    _mean_rate(recordings, kinds[name]) for name in (("white", ""), ("black", ""), boards, key)
-                )
-            except NotDetermined as refused:
-                reason = refused.reason
-                continue
-            contrast = white - black
-            for plane in planes(contrast, recordings.camera(side).cfa).values():
-                plane[plane < 0.2 * np.quantile(plane, 0.98)] = np.nan
-            found.append(
-                ScreenPictures(
-                    first=kinds[key][0],
-                    checkerboard=(board - black) / contrast,
-                    bernoulli=(pattern - black) / contrast,
-                    checkerboard_target=recordings.target(boards[1]),
-                    bernoulli_target=recordings.target(key[1]),
-                )
-            )
-    if not found:
-        raise NotDetermined("psf", reason)
-    return found
-
-
-def _mean_rate(recordings: RecordingSet, captures: Sequence[Any]) -> Array:
-    """Average the frames above black, DN/s. Raises `NotDetermined` where one is saturated."""
-    camera = recordings.camera(captures[0].side)
-    total = np.zeros((camera.rows, camera.cols))
-    for capture in captures:
-        frame = recordings.frame(capture)
-        saturated = float(np.mean(frame >= camera.saturation_dn))
-        if saturated > 0.001:
-            raise NotDetermined(
-                "psf", f"{capture.id}: {100 * saturated:.1f} % of the frame is saturated; expose it shorter"
-            )
-        total += (frame.astype(float) - (camera.black_level_dn or 0.0)) / max(capture.exposure_s, 1e-12)
-    return total / len(captures)
 
 
 @dataclass(frozen=True)
@@ -149,6 +70,15 @@ class ScreenWarp:
         """Map points (n, 2) in px to cells (n, 2), (x, y)."""
         moved = points + (self.displacement @ self.basis(points)).T
         return np.asarray(cv2.perspectiveTransform(moved[:, None, :].astype(np.float64), self.homography)[:, 0])
+
+    def cells_on(self, row: Array, col: Array) -> tuple[Array, Array]:
+        """Map the points of a grid of rows (m,) and columns (n,), px, to cells x and y, (m, n) each.
+
+        The map is smooth: it is computed every `COARSE_PX` and interpolated by cubic splines."""
+        y, x = (np.arange(at[0] - 2.0 * COARSE_PX, at[-1] + 3.0 * COARSE_PX, COARSE_PX) for at in (row, col))
+        at = self.cells(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
+        across, down = (RectBivariateSpline(y, x, at[:, :, k])(row, col) for k in (0, 1))
+        return np.asarray(across), np.asarray(down)
 
     def shift_origin(self, origin: Array) -> ScreenWarp:
         """Return the same map for a picture of which this one is the part that begins at `origin`, (x, y)."""

@@ -172,6 +172,14 @@ def test_prototypes_change_something_and_stay_in_bounds(kind: type[Effect]) -> N
             assert np.abs(_everything((one,)) - base).max() > 0
 
 
+@pytest.mark.parametrize("kind", ALL, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("pitch_um", [0.7, 30.0])
+def test_cameras_of_any_pitch_have_prototypes(pitch_um: float, kind: type[Effect]) -> None:
+    """From a telephone's pixels to an astronomer's: a prototype out of its bounds would end every diagnosis."""
+    camera = CAMERA.model_copy(update={"pixel_pitch_um": pitch_um})
+    assert all(isinstance(one, kind) for places in kind.prototypes(camera) for one in places)
+
+
 def _blurs() -> list[Effect]:
     return [p for kind in ALL if may_change(kind) & TRANSFER for p in kind.prototypes(CAMERA)[0]]
 

@@ -20,7 +20,9 @@ from lab.fit.psf import recordings
 from lab.fit.psf.recordings import PsfFit, fit_psf_field, radial_symmetry
 from lab.fit.psf.screen_kernel import ScreenField, ScreenKernel, measure_field
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
-from lab.observables.screens.registration import ScreenPictures, register, screen_pictures, target_corners
+from lab.observables.screens.placement import place_pattern
+from lab.observables.screens.poses import ScreenPictures, screen_poses
+from lab.observables.screens.registration import register, target_corners
 from tests.lab.fit.psf.drawn_targets import (
     gaussian,
 )
@@ -109,9 +111,11 @@ def screen() -> RecordingSet:
 
 
 @pytest.fixture(scope="module")
-def pictures(screen) -> ScreenPictures:
-    """The levelled pictures of `screen`."""
-    return screen_pictures(screen, "left")[0]
+def pictures(screen):
+    """The levelled pictures of `screen`: of the checkerboard, and of the pattern."""
+    (pose,) = screen_poses(screen, "left", "psf")
+    found = ScreenPictures.of(screen, pose)
+    return found.levelled(screen, pose.checkerboard), found.levelled(screen, pose.pattern)
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +143,7 @@ def pixel_gaussian(sigma_px, support):
 
 
 def test_registration_finds_the_screen_to_a_hundredth_of_a_pixel(pictures):
-    warp = register(
-        pictures.checkerboard, pictures.bernoulli, BOARD, PATTERN, 4.0, np.ones(pictures.checkerboard.shape, bool)
-    )
+    warp = register(*pictures, BOARD, PATTERN, 4.0, np.ones(pictures[0].shape, bool))
     row, col = np.meshgrid(np.arange(40, 160, 10.0), np.arange(40, 210, 10.0), indexing="ij")
     found = warp.cells(np.column_stack([col.ravel(), row.ravel()]))
     y, x = cells(row.ravel(), col.ravel())
@@ -152,8 +154,8 @@ def test_registration_finds_the_screen_to_a_hundredth_of_a_pixel(pictures):
 
 def test_registration_works_where_the_screen_is_larger_than_the_frame(pictures):
     part = np.s_[40:170, 50:230]
-    checkerboard = pictures.checkerboard[part]
-    warp = register(checkerboard, pictures.bernoulli[part], BOARD, PATTERN, 4.0, np.ones(checkerboard.shape, bool))
+    checkerboard, pattern = (picture[part] for picture in pictures)
+    warp = register(checkerboard, pattern, BOARD, PATTERN, 4.0, np.ones(checkerboard.shape, bool))
     y, x = cells(100.0, 140.0)
     found = warp.cells(np.array([[90.0, 60.0]]))[0]
     assert np.abs(found - [x, y]).max() * CELL_PX < 0.03
@@ -210,12 +212,16 @@ def test_parts_of_the_pattern_have_kernels_of_their_own(fitted):
 
 @pytest.mark.slow
 def test_a_finer_grid_gives_the_same_kernel(pictures):
-    two, four = (measure_field(pictures, "GRBG", 5, oversample, patches=0).kernels["G"] for oversample in (2, 4))
+    warp = place_pattern(*pictures, BOARD, PATTERN, 4.0, "GRBG").warp
+    two, four = (
+        measure_field(pictures[1], PATTERN, warp, "GRBG", 5, oversample, patches=0).kernels["G"]
+        for oversample in (2, 4)
+    )
     assert four.fine.kernel.shape == (21, 21)
     # the two differ by what the noise and the grids make: 1 % each
     assert np.linalg.norm(four.kernel - two.kernel) / np.linalg.norm(two.kernel) < 0.02
     with pytest.raises(ValueError, match="oversample"):
-        measure_field(pictures, "GRBG", 5, 3)
+        measure_field(pictures[1], PATTERN, warp, "GRBG", 5, 3)
 
 
 def test_missing_captures_are_named():

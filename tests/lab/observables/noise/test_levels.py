@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.observables.darks.pixels import DarkPixels, read_noise_distribution
-from lab.observables.noise.levels import Stack, defective_pixels, level_statistics, shading
+from lab.observables.darks.pixels import DarkPixels
+from lab.observables.noise.stack import Stack, level_statistics
+from lab.observables.noise.surface import defective_pixels, shading
 from lab.observables.weighted_lines import dark_line, linearity
 
 
@@ -73,7 +74,7 @@ def spread_of(read_dn: np.ndarray, repeats: int) -> DarkPixels:
 
 
 def test_pixels_that_are_alike_have_no_spread() -> None:
-    found = read_noise_distribution(spread_of(np.full((120, 160), 3.0), 4), 0.5)
+    found = spread_of(np.full((120, 160), 3.0), 4).figures().at_gain(0.5).noise
     assert found is not None
     assert found.rms_e == pytest.approx(6.0, rel=0.01)  # sigma / sqrt(2 x 3 x 19200) = 0.3 %, three of these
     assert found.spread_percent <= 2.0 * found.spread_percent_std
@@ -85,7 +86,7 @@ def test_the_spread_of_read_noise_is_told_from_the_few_repeats_own() -> None:
     rng = np.random.default_rng(3)
     variance = 9.0 * np.clip(1.0 + 0.25 * rng.standard_normal((120, 160)), 0.1, None)
     variance[3, 4] = 2500.0
-    found = read_noise_distribution(spread_of(np.sqrt(variance), 6), 0.5)
+    found = spread_of(np.sqrt(variance), 6).figures().at_gain(0.5).noise
     assert found is not None
     assert abs(found.spread_percent - 25.0) < 3.5 * found.spread_percent_std
     assert found.noisy_pixels >= 1
