@@ -98,8 +98,9 @@ class PlaneStatistics:
     covariance of a pixel with one of its four neighbours along rows and columns, and across corners, on the mosaic (of
     any plane). `shading_rows`, `shading_columns`: mean of the smooth surface over the first and the last tenth of the
     rows (columns), over `mean`, dark included. `shading_span`: highest less lowest value of that surface, DN, and its
-    standard deviation by the pixels' scatter. `step_dn`: step of the codes. `row_variance`: the part of
-    `temporal_variance` that the pixels of a row share.
+    standard deviation by the pixels' scatter. `step_dn`: step of the codes. `mean_frame_variance`: of the mean frame
+    over its pixels, temporal share included. `row_variance`: the part of `temporal_variance` that the
+    pixels of a row share.
     """
 
     pixels: int
@@ -128,6 +129,7 @@ class PlaneStatistics:
     shading_columns: tuple[float, float] = (1.0, 1.0)
     shading_span: tuple[float, float] = (0.0, 0.0)
     step_dn: float = 1.0
+    mean_frame_variance: float = 0.0
     row_variance: float = 0.0
 
     @property
@@ -146,8 +148,9 @@ class PlaneStatistics:
     @property
     def spread(self) -> float:
         """Variance of single values over pixels and repeats, DN^2; it dithers the rounding."""
-        spatial = self.spatial_variance if self.spatial_variance > 0 else 0.0
-        return spatial + (self.temporal_variance if np.isfinite(self.temporal_variance) else 0.0)
+        if not np.isfinite(self.temporal_variance):  # of one frame, whose values hold noise and pattern
+            return self.mean_frame_variance
+        return max(self.spatial_variance, 0.0) + self.temporal_variance
 
     @property
     def mean_rounding_std(self) -> float:
@@ -354,6 +357,7 @@ class Stack:
             ),
             shading_span=span,
             step_dn=self.step_dn,
+            mean_frame_variance=spatial,
             row_variance=self._row_variance(phase, variance, rows, cols),
         )
 
