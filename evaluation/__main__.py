@@ -246,7 +246,7 @@ def third_party_command(
 
     Example: python -m evaluation third-party --out third-party.jsonl --sets 2
     """
-    from evaluation.proof import placed
+    from evaluation.page import placed
 
     missing = [package for package in ("pyxel", "galsim") if find_spec(package) is None]
     if missing:
