@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 
 from lab.formats.recording_set import RecordingSet
 from lab.inference.hypotheses import coordinates_of, moved, stacked
-from lab.inference.model import form_scales, scaled_columns, with_columns
+from lab.inference.model import scaled_columns, with_columns
 from lab.observables.gaussian import BlockCovariance
 from sim.camera import Side
 from sim.spectrum import FloatArray
@@ -121,9 +121,8 @@ def _predict(problem: SideProblem, search: Search, row: Row, table: Table) -> tu
     model = SideModel(problem.whole, problem.groups)
     used = len(problem.measured.value)
     value = problem.whole.value
-    forms = form_scales(model.has_form_error(fit.state))
-    gaussian = model.gaussian(fit.state, forms[len(forms) // 2])
-    tau = fit.scales.mode(row.unlisted)
+    gaussian = model.gaussian(fit.state, fit.likeliest.form)
+    tau = fit.likeliest.scales.mode(row.unlisted)
     disturbances = np.vstack(
         [
             scaled_columns(problem.groups, tau, used),

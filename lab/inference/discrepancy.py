@@ -176,7 +176,9 @@ def _columns(model: MeasurementModel, base: FloatArray, processes: Iterator[_Pro
             yield table @ np.linalg.cholesky(kernel)
 
 
-def _curve(stage: Stage, along: Along, of: Of, at: Sequence[float], unit: float = 1.0, first: int = 0) -> _Process:
+def _curve(
+    stage: Stage, along: Along, of: Of, at: Sequence[float] | FloatArray, unit: float = 1.0, first: int = 0
+) -> _Process:
     """Return the process of a curve of `EmpiricalLaw` with its points at `at`."""
     none = PLACES[stage, along, of][1]
     points = tuple(float(x) for x in at)
@@ -247,7 +249,7 @@ def _offset(dataset: Dataset) -> Iterator[_Process]:
     yield _curve("signal", "time", "mean", _times_s(dataset), unit)
     yield _curve("signal", "radius", "mean", np.linspace(0.0, corner_um, 4), unit)
     for line in ("row", "column"):
-        yield _curve("signal", line, "mean", np.linspace(0.0, 1.0, 6), unit)  # type: ignore[arg-type]
+        yield _curve("signal", line, "mean", np.linspace(0.0, 1.0, 6), unit)
 
 
 def _shot(dataset: Dataset) -> Iterator[_Process]:

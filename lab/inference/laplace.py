@@ -117,9 +117,8 @@ def correct_along(
     ratio = []
     for one in d:
         vector = found.mean + found.covariance[:, k] * (one - found.mean[k]) / std**2
-        vector = np.clip(vector, low - u, high - u)
         vector[k] = one
-        ratio.append(exact(vector) - approximate(vector))
+        ratio.append(exact(np.clip(vector, low - u, high - u)) - approximate(vector))
     top = max(ratio)
     return top + float(np.log(np.sum(weight * np.exp(np.array(ratio) - top))))
 

@@ -199,7 +199,8 @@ def hypotheses_of(measured: MeasurementModel) -> dict[str, Hypothesis]:
     noise. Of others the probability stays that of the prior."""
     base, gaussian = measured.mean(), measured.gaussian((), None, 0.0)
     found = {}
-    for kind in (*candidates(), OtherFNumber):
+    kinds: list[type[Effect]] = [*candidates(), OtherFNumber]
+    for kind in kinds:
         if not measured.affected(kind).any():
             continue
         one = hypothesis_of(kind, measured.camera)

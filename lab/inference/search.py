@@ -48,7 +48,7 @@ HOPELESS = 50.0
 #: The most hypotheses that are tried beside the likeliest set where the best gains more than `HOPELESS`.
 SINGLES = 8
 #: Refits of sets that the closed form about a set far below the likeliest promises: about such a set it isn't linear.
-DOUBTFUL = 8
+DOUBTFUL = 3
 #: Gain of log evidence up to which the recordings say little of a set beyond its nearest refitted subset: the closed
 #: form is as good as a refit there.
 SILENT = 1.0
@@ -70,37 +70,71 @@ ALTERNATIVES_NEAR, MOST_ALTERNATIVES = 4.0, 2
 
 
 @dataclass(frozen=True)
-class FittedSet:
-    """A refitted set: its mode, and log p(y | A) with the everyday groups at their median scales (`base`). `scales`
-    changes these. `jacobian` (n, p) of m by u at the mode; `others`: further modes of the posterior."""
+class FormFit:
+    """A fitted set with the form errors of its laws at one scale: log p(y | A) with the groups at their median everyday
+    scales (`base`), and the marginal likelihood of these scales, `start_log` there."""
 
-    state: State
-    coordinates: tuple[Coordinate, ...]
+    form: float
     base: float
     scales: ScaleIntegral
     start_log: float
+
+    @cached_property
+    def quick(self) -> float:
+        """Log p(y | A), flips with the scales of the others as without: a lower bound, near enough to rank sets."""
+        return self.base - self.start_log + self.scales.quick
+
+    @cached_property
+    def by_groups(self) -> Mapping[frozenset[int], float]:
+        """Log p(y | A, u) p(u), by which groups are unlisted: all single flips and the best pairs."""
+        return {u: self.base + w - self.start_log for u, w in self.scales.weights().items()}
+
+
+@dataclass(frozen=True)
+class FittedSet:
+    """A refitted set at its mode, for each scale of form errors (equally probable). `jacobian` (n, p) of m by u at the
+    mode; `others`: further modes of the posterior, which `shift` adds to the evidence of this one."""
+
+    state: State
+    coordinates: tuple[Coordinate, ...]
+    forms: tuple[FormFit, ...]
     laplace: Laplace
     jacobian: FloatArray
     precision: FloatArray
     pull: FloatArray
     others: tuple[FittedSet, ...] = ()
+    shift: float = 0.0
 
     @property
     def members(self) -> frozenset[str]:
         """Names of the active hypotheses."""
         return frozenset(self.state)
 
-    @cached_property
-    def by_groups(self) -> Mapping[frozenset[int], float]:
-        """Log p(y | A, u) p(u), by which groups are unlisted: all single flips and the best pairs."""
-        weights = self.scales.weights()
-        return {u: self.base + w - self.start_log for u, w in weights.items()}
+    @property
+    def base(self) -> float:
+        """Log p(y | A) with the groups at their median everyday scales."""
+        return self.shift + log_sum_exp([f.base for f in self.forms]) - float(np.log(len(self.forms)))
 
     @cached_property
     def quick(self) -> float:
-        """Log p(y | A), no flip integrated with the others' scales at their new mode: a lower bound, near enough to
-        rank sets."""
-        return self.base - self.start_log + self.scales.quick
+        """Log p(y | A), near enough to rank sets (`FormFit.quick`)."""
+        return self.shift + log_sum_exp([f.quick for f in self.forms]) - float(np.log(len(self.forms)))
+
+    @cached_property
+    def likeliest(self) -> FormFit:
+        """The likeliest scale of form errors."""
+        return max(self.forms, key=lambda f: f.quick)
+
+    @cached_property
+    def by_groups(self) -> Mapping[frozenset[int], float]:
+        """Log p(y | A, u) p(u), by which groups are unlisted, summed over the scales of form errors; those far below
+        the likeliest count for nothing."""
+        near = [f for f in self.forms if f.quick > self.likeliest.quick - FAR_BELOW]
+        sums: dict[frozenset[int], list[float]] = {}
+        for form in near:
+            for u, value in form.by_groups.items():
+                sums.setdefault(u, []).append(value)
+        return {u: self.shift + log_sum_exp(v) - float(np.log(len(self.forms))) for u, v in sums.items()}
 
     @property
     def total(self) -> float:
@@ -320,7 +354,7 @@ class Search:
             if all(_differ(one, m) for m in modes):
                 modes.append(one)
         total = log_sum_exp([m.base for m in modes])
-        merged = replace(best, base=total, others=tuple(modes[1:]))
+        merged = replace(best, shift=total - best.base, others=tuple(modes[1:]))
         merged = self._by_grid_where_weak(merged, estimate)
         self.fits[merged.members] = merged
         return merged
@@ -341,7 +375,7 @@ class Search:
         gain = self.singles.get(estimate.origin, {}).get(name)
         if gain is None or max(gain, fit.base - origin.base) > WEAK:
             return fit
-        return replace(fit, base=origin.base + gain)
+        return replace(fit, shift=fit.shift + origin.base + gain - fit.base)
 
     def _log_density(self, state: State) -> float:
         """Log of p(y | u) p(u), everyday scales and form errors at their medians."""
@@ -386,22 +420,22 @@ class Search:
         mean = self.model.mean(state)
         jacobian = self._jacobian(state, coords, u, mean)
         own = sum(self.hypotheses[name].log_prior(point) for name, point in state.items())
-        values, found = [], None
+        precision, pull = _normal_prior(coords, u)
+        fits, found = [], None
         for form in forms:
-            gaussian = self._gaussian(state, form)
+            bare = self.model.gaussian(state, form)
+            gaussian = with_columns(bare, self._everyday)
             white = gaussian.whiten(np.column_stack([jacobian, y - mean]))
             table, r = white[:, :-1], white[:, -1]
             laplace = self._integral(state, coords, u, gaussian, table, r)
             if form == middle:
                 found = laplace
-            values.append(gaussian.log_likelihood(y) + laplace.log_integral)
+            scales = ScaleIntegral.of(bare, y - mean, self.model.groups, jacobian, precision, pull, self.any_unlisted)
+            start_log = scales.log_likelihood(everyday_scales(self.model.groups))
+            base = own + gaussian.log_likelihood(y) + laplace.log_integral
+            fits.append(FormFit(form, base, scales, start_log))
         assert found is not None
-        precision, pull = _normal_prior(coords, u)
-        bare = self.model.gaussian(state, middle)
-        scales = ScaleIntegral.of(bare, y - mean, self.model.groups, jacobian, precision, pull, self.any_unlisted)
-        start_log = scales.log_likelihood(everyday_scales(self.model.groups))
-        base = own + log_sum_exp(values) - float(np.log(len(values)))
-        return FittedSet(state, tuple(coords), base, scales, start_log, found, jacobian, precision, pull)
+        return FittedSet(state, tuple(coords), tuple(fits), found, jacobian, precision, pull)
 
     def _mode(
         self, state: State, coords: Sequence[Coordinate], u: FloatArray, gaussian: Gaussian, most: int
@@ -490,11 +524,10 @@ class Search:
 
     def _linear(self, origin: FittedSet, unlisted: frozenset[int]) -> tuple[FloatArray, FloatArray]:
         """Return z and R about a fitted set, its own parameters marginalised, with these groups unlisted."""
-        forms = form_scales(self.model.has_form_error(origin.state))
         groups = self.model.groups
-        tau = origin.scales.mode(unlisted)
+        tau = origin.likeliest.scales.mode(unlisted)
         gaussian = with_columns(
-            self.model.gaussian(origin.state, forms[len(forms) // 2]),
+            self.model.gaussian(origin.state, origin.likeliest.form),
             scaled_columns(groups, tau, len(self.model.value)),
         )
         residual = self.model.value - gaussian.mean
