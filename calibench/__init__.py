@@ -28,11 +28,15 @@ from lab.interface import (
     fitted_cameras,
     mock_bench,
     open_recordings,
+    open_seal,
     predict,
+    read_camera,
     read_result,
     score,
+    seal,
     simulate,
     validate,
+    write_camera,
     write_certificate,
     write_frame,
     write_report,
@@ -46,7 +50,7 @@ if TYPE_CHECKING:
     from lab.fit.mtf import edge_mtf
     from lab.fit.psf import estimate_kernel
     from lab.fit.spectral import estimate_sensitivity
-    from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
+    from lab.formats.camera_file import CameraFile, default_camera
     from lab.formats.results import (
         CameraFit,
         ComparisonResult,
@@ -62,7 +66,7 @@ if TYPE_CHECKING:
     from lab.recording import RecordingSet, read, write
     from lab.report.plots import Chart, charts_of, plot
     from lab.twin.score import TwinScore
-    from lab.twin.sealed import SealedPrediction, open_seal, seal
+    from lab.twin.sealed import SealedPrediction
 
 #: Names that are imported when they are asked for, by their module.
 _LATER = {
@@ -72,7 +76,7 @@ _LATER = {
     "lab.fit.mtf": ("edge_mtf",),
     "lab.fit.psf": ("estimate_kernel",),
     "lab.fit.spectral": ("estimate_sensitivity",),
-    "lab.formats.camera_file": ("CameraFile", "default_camera", "read_camera", "write_camera"),
+    "lab.formats.camera_file": ("CameraFile", "default_camera"),
     "lab.formats.results": (
         "CameraFit",
         "ComparisonResult",
@@ -88,7 +92,7 @@ _LATER = {
     "lab.recording": ("RecordingSet", "read", "write"),
     "lab.report.plots": ("Chart", "charts_of", "plot"),
     "lab.twin.score": ("TwinScore",),
-    "lab.twin.sealed": ("SealedPrediction", "open_seal", "seal"),
+    "lab.twin.sealed": ("SealedPrediction",),
 }
 
 __all__ = [

@@ -90,7 +90,7 @@ def make_command(
     Example: python -m evaluation make --out cases --cases 20 --seed 1
     """
     from evaluation.make import make
-    from evaluation.proof import refuse_scored
+    from evaluation.page import refuse_scored
     from evaluation.truth import FIRST_FRESH_SEED, FIRST_PROOF_SEED, purpose_of
 
     if seed is None:
@@ -132,32 +132,25 @@ def score_command(
 
     Example: python -m evaluation score cases --truths cases.truths.json
     """
-    from evaluation import proof, score, unlisted_score
-    from evaluation.run import run_all
-    from evaluation.truth import Seals, Truths, load, store
+    from evaluation.blind import BlindProof
+    from evaluation.sealed import sealed_cases
+    from evaluation.truth import Truths, load, store
+    from evaluation.unlisted import UnlistedProof
 
     check_writable(json)
     check_writable(page)
-    seals = load(Seals, folder / "seals.json")
-    cases = tuple(case for case in sorted(seals.seals) if (folder / case).is_dir())
-    runs = run_all(folder, cases, _workers(jobs, scheduler), _show_progress)
-    opened = load(Truths, truths)  # only now that all diagnoses are written
-    broken = score.broken_seals(folder, seals, opened)
-    scored: score.ChallengeScore | unlisted_score.UnlistedScore
-    if opened.laws == "unlisted":
-        scored = unlisted_score.score(opened, seals, runs, broken)
-        table = unlisted_score.table(scored)
-        if page is not None:
-            unlisted_score.write_page(scored, page)
-    else:
-        scored = score.score(opened, seals, runs, broken)
-        table = proof.table(scored)
-        if page is not None:
-            proof.write_page(scored, page)
+    proof: BlindProof | UnlistedProof = BlindProof(folder, sealed_cases(folder), truths)
+    runs = proof.run(folder, workers=_workers(jobs, scheduler), progress=_show_progress)
+    if load(Truths, truths).laws == "unlisted":  # opened only now that all diagnoses are written
+        proof = UnlistedProof(folder, proof.cases, truths)
+    scores = proof.opened(runs)
+    outcome = proof.outcome(scores)  # type: ignore[arg-type]
+    if page is not None:
+        outcome.write(page)
     if json is not None and str(json) != "-":
-        store(scored, json)
-    print(scored.model_dump_json(indent=1) if str(json) == "-" else table)
-    if not scored.reached:
+        store(scores, json)
+    print(scores.model_dump_json(indent=1) if str(json) == "-" else outcome.text)
+    if not outcome.reached:
         raise typer.Exit(EXIT_CHECK)
 
 
@@ -179,21 +172,22 @@ def calibrate_command(
 
     Example: python -m evaluation calibrate cases --truths cases.truths.json --each
     """
+    from evaluation.blind import BlindProof
     from evaluation.calibrate import answers, changed_policy, comparison, policies_without, refuse_proof, rule_table
-    from evaluation.run import run_all
-    from evaluation.score import broken_seals, score
+    from evaluation.score import broken_seals
+    from evaluation.sealed import sealed_cases
     from evaluation.truth import Seals, Truths, load
 
     if each == bool(rules):
         raise InputError("give either --each or --rule NAME=VALUE")
-    seals, opened = load(Seals, folder / "seals.json"), load(Truths, truths)
+    opened = load(Truths, truths)
     refuse_proof(opened)
     if opened.laws == "unlisted":
         raise InputError(f"{truths}: conceals laws that no list has; rules are calibrated on cases of listed ones")
-    cases = tuple(case for case in sorted(seals.seals) if (folder / case).is_dir())
-    broken = broken_seals(folder, seals, opened)
+    cases = sealed_cases(folder)
     workers = _workers(jobs, scheduler)
     if each:
+        broken = broken_seals(folder, load(Seals, folder / "seals.json"), opened)
         whole = [case for case in cases if case not in broken]
         folders, by_case = [folder.resolve() / case for case in whole], {}
         for number, answer in workers.done(answers, folders, policies_without()):
@@ -201,11 +195,9 @@ def calibrate_command(
             _show_progress(f"{len(by_case)} of {len(whole)} cases", len(by_case) / len(whole))
         print(rule_table({case: opened.truths[case].truth for case in whole}, by_case))
         return
-    policies = {"results": None, f"results {' '.join(sorted(rules or ()))}": changed_policy(rules or ())}
-    scores = [
-        score(opened, seals, run_all(folder, cases, workers, _show_progress, policy=policy, results=where), broken)
-        for where, policy in policies.items()
-    ]
+    under = {"results": None, f"results {' '.join(sorted(rules or ()))}": changed_policy(rules or ())}
+    proofs = [BlindProof(folder, cases, truths, policy, results) for results, policy in under.items()]
+    scores = [proof.opened(proof.run(folder, workers=workers, progress=_show_progress)) for proof in proofs]
     print(comparison(*scores))
 
 
@@ -225,7 +217,7 @@ def observables_command(
     Example: python -m evaluation observables --out observables.jsonl --sets 24
     """
     from evaluation.observables import SOURCES, calibrate, table
-    from evaluation.proof import placed
+    from evaluation.page import placed
 
     check_writable(out)
     check_writable(page)
@@ -254,7 +246,7 @@ def third_party_command(
 
     Example: python -m evaluation third-party --out third-party.jsonl --sets 2
     """
-    from evaluation.proof import placed
+    from evaluation.page import placed
 
     missing = [package for package in ("pyxel", "galsim") if find_spec(package) is None]
     if missing:
@@ -307,13 +299,13 @@ def live_command(
 
     Example: python -m evaluation live --out live --only defocus
     """
-    from evaluation.live import cases_of, prove
+    from evaluation.live import IsotropicProof, LiveProof
 
-    every = cases_of(isotropic)
+    proof = IsotropicProof() if isotropic else LiveProof()
     if cases:
-        print(json_text.dumps({name: case.concealed for name, case in every.items()}, indent=1))
+        print(json_text.dumps({name: case.concealed for name, case in proof.draw().items()}, indent=1))
         return
-    prove(every, out, only, page, isotropic)
+    proof.prove(out, only, page)
 
 
 @app.command("names")
@@ -330,9 +322,9 @@ def names_command(
 
     Example: python -m evaluation names --out names --only bench --most 5
     """
-    from evaluation.names import prove
+    from evaluation.names import NamesExperiment
 
-    if not prove(out, only, most):
+    if not NamesExperiment.of(only, most).prove(out).reached:
         raise typer.Exit(EXIT_CHECK)
 
 
@@ -352,9 +344,9 @@ def twin_command(
 
     Example: python -m evaluation twin --out twin --only double-3
     """
-    from evaluation.transfers import SEED, prove
+    from evaluation.twin import SEED, TwinProof
 
-    prove(out, SEED if seed is None else seed, only, page)
+    TwinProof(SEED if seed is None else seed).prove(out, only, page)
 
 
 def command_tree() -> Any:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from evaluation.score import ChallengeScore, families_of
+from evaluation.score import BlindScore, families_of
 from evaluation.truth import CaseTruth, Truths
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.side_model import measurement_model
@@ -51,7 +51,7 @@ def refuse_proof(truths: Truths) -> None:
         )
 
 
-def comparison(default: ChallengeScore, changed: ChallengeScore) -> str:
+def comparison(default: BlindScore, changed: BlindScore) -> str:
     """Every goal under both policies, and the cases whose verdict or names differ, as text."""
     wide = max(len(goal.name) for goal in default.goals)
     lines = [f"{'':{wide}}  {'wanted':>10}  {'default':>24}  {'changed':>24}"]
@@ -93,8 +93,8 @@ def policies_without() -> dict[str, DecisionPolicy]:
 
 @one_blas_thread
 def answers(folder: Path, policies: Mapping[str, DecisionPolicy]) -> dict[str, Answer]:
-    """Return what each policy says of one recording set, whose measurements are made once. Without a fit, as a
-    challenge is diagnosed."""
+    """Return what each policy says of one recording set, whose measurements are made once. Without a fit, as
+    sealed cases are diagnosed."""
     recordings = recording_set.read(folder)
     models = [measurement_model(recordings, side, None)[0] for side in recordings.sides]
     found: dict[str, Answer] = {}

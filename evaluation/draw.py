@@ -1,4 +1,4 @@
-"""The cases of a challenge: drawn cameras, the laws that they conceal, at which strength, and faults of metadata or
+"""Cases of the blind proof: drawn cameras, the laws that they conceal, at which strength, and faults of metadata or
 rig."""
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ FAULTS: tuple[CaseFault, ...] = (
 )
 
 
-# --- Sessions of the second image former as recording sets ------------------------------------------------------------
+# --- Sessions of the independent simulator as recording sets ----------------------------------------------------------
 
 
 def recordings_of(camera: ConcealedCamera, plan: Plan = WHOLE_SESSION) -> RecordingSet:
@@ -189,7 +189,7 @@ def draw(
     seed: int, index: int, size: str = "medium", *, cfa: str | None = None, kind: Kind | None = None,
     law: type[Law] | None = None, sizing: Sizing = "aimed"
 ) -> Case:  # fmt: skip
-    """Case number `index` of a challenge; the same arguments give the same case.
+    """Return case number `index` of a seed; the same arguments give the same case.
 
     cfa, kind, law    None: drawn
     sizing            "aimed": laws get the strength that gives a drawn non-centrality. "strong": the same of one draw

@@ -15,12 +15,11 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Literal
 
-from evaluation.proof import ABSTAINED, RIGHT, WRONG, placed
-from evaluation.truth import load, store
+from evaluation.experiment import CaseResult, Experiment, PagePicture, ScoredExperiment
+from evaluation.plots import ABSTAINED, RIGHT, WRONG, Axis, Mark, Row, row_plot
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.cli.bench_process import mock_bench
 from lab.diagnose.visibility import visibility
@@ -32,23 +31,12 @@ from sim.effects.library import effects as library
 from sim.effects.library import typical
 from sim.parameters import Frozen
 
-# --- live page -------------------------------------------------------------------------------------------------------
-# The page on the live proof: a table of concealed and named effects, and a picture of their parameters.
+# --- the page: concealed and named effects, and their parameters ------------------------------------------------------
 
 
-ROW_PX, LABEL_PX, PLOT_PX, HEAD_PX = 18, 400, 380, 40
-#: Found over true, at the plot's ends.
-LOW, HIGH = 0.0, 2.0
+#: Parameters found over concealed ones.
+RATIO = Axis(0.0, 2.0, (0.0, 0.5, 1.0, 1.5, 2.0), 1.0)
 COLOURS = {"named": RIGHT, "healthy": RIGHT, "among rivals": ABSTAINED, "not named": ABSTAINED}
-
-
-def write_page(runs: Mapping[str, LiveRun], page: Path) -> None:
-    """Write the section into the page, and its picture beside the page."""
-    text = page.read_text(encoding="utf-8") if page.is_file() else "# Proof\n"
-    picture = page.with_name(f"{page.stem}-live.svg")
-    section = f"{summary(runs)}\n\n{table(runs)}\n\n![Parameters found over concealed ones]({picture.name})"
-    picture.write_text(drawing(runs), encoding="utf-8")
-    page.write_text(placed(text, "live", section), encoding="utf-8")
 
 
 def summary(runs: Mapping[str, LiveRun]) -> str:
@@ -115,52 +103,33 @@ def _words(parameter: FoundParameter) -> str:
 
 
 def drawing(runs: Mapping[str, LiveRun]) -> str:
-    """SVG: the parameters of singles and pairs, found over concealed, with two standard deviations; grey or red where
-    it wasn't named."""
-    rows: list[tuple[str, str, FoundParameter | None]] = []
+    """Return the parameters of singles and pairs as SVG, found over concealed, with two standard deviations or the
+    interval; grey or red where the effect wasn't named."""
+    rows = []
     for run in runs.values():
         if run.case.resolve or not run.case.concealed:
             continue
         colour = COLOURS.get(run.outcome, WRONG)
         sized = [p for p in run.parameters if library()[p.effect].quantities()[p.parameter].absent != p.truth]
         words = " + ".join(effect_title(effect) for effect in run.case.effects)
-        rows += [(f"{words}: {p.parameter.replace('_', ' ')}", colour, p) for p in sized] or [(words, colour, None)]
-    width, height = LABEL_PX + PLOT_PX + 30, HEAD_PX + ROW_PX * len(rows) + 30
-    parts = [
-        (
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif" '
-            'font-size="11">'
-        ),
-        f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
-        f'<text x="{LABEL_PX}" y="16" fill="#222">found / concealed, two standard deviations</text>',
-    ]
-
-    def x_of(ratio: float) -> float:
-        return LABEL_PX + PLOT_PX * (min(max(ratio, LOW), HIGH) - LOW) / (HIGH - LOW)
-
-    for ratio in (0.0, 0.5, 1.0, 1.5, 2.0):
-        x, ink = x_of(ratio), "#888" if ratio == 1.0 else "#ddd"
-        parts.append(f'<path d="M{x:.0f} {HEAD_PX - 8}V{height - 20}" stroke="{ink}"/>')
-        parts.append(f'<text x="{x:.0f}" y="{height - 6}" text-anchor="middle" fill="#222">{ratio:g}</text>')
-    for k, (label, colour, parameter) in enumerate(rows):
-        y = HEAD_PX + ROW_PX * (k + 0.5)
-        parts.append(f'<text x="{LABEL_PX - 8}" y="{y + 4:.0f}" text-anchor="end" fill="#222">{escape(label)}</text>')
-        if parameter is None:
-            parts.append(f'<text x="{LABEL_PX + 6}" y="{y + 4:.0f}" fill="{colour}">no value</text>')
-            continue
-        ratio, half = parameter.value / parameter.truth, 2.0 * (parameter.std or 0.0) / abs(parameter.truth)
-        ends = ratio - half, ratio + half
-        if parameter.interval is not None:
-            ends = parameter.interval[0] / parameter.truth, parameter.interval[1] / parameter.truth
-        parts.append(f'<path d="M{x_of(ends[0]):.1f} {y:.1f}H{x_of(ends[1]):.1f}" stroke="{colour}" stroke-width="2"/>')
-        parts.append(f'<circle cx="{x_of(ratio):.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"/>')
-    return "\n".join([*parts, "</svg>\n"])
+        rows += [Row(f"{words}: {p.parameter.replace('_', ' ')}", (_mark(p, colour),)) for p in sized]
+        if not sized:
+            rows.append(Row(words, note="no value", note_colour=colour))
+    return row_plot("found / concealed, two standard deviations", RATIO, rows)
 
 
-# --- live ------------------------------------------------------------
+def _mark(parameter: FoundParameter, colour: str) -> Mark:
+    ratio, half = parameter.value / parameter.truth, 2.0 * (parameter.std or 0.0) / abs(parameter.truth)
+    ends = ratio - half, ratio + half
+    if parameter.interval is not None:
+        ends = parameter.interval[0] / parameter.truth, parameter.interval[1] / parameter.truth
+    return Mark(ratio, colour, ends)
 
 
-Outcome = Literal["named", "among rivals", "not named", "wrong name", "healthy", "failed"]
+# --- the cases --------------------------------------------------------------------------------------------------------
+
+
+Ending = Literal["named", "among rivals", "not named", "wrong name", "healthy", "failed"]
 
 #: Sizes of effects at which a quick session shows them, on the left camera or on the rig. Effects that aren't here are
 #: concealed at `sim.effects.library.typical`.
@@ -230,6 +199,9 @@ SIZES: dict[str, str] = {
     "stereo_gain_mismatch": "both:gain_percent=5",
     "stray_light": "both:share_percent=0.6",
     "taps": "left:gain_percent=1,offset_e=3",
+    "secondary_astigmatism": "left:cos_um=0.2",
+    "secondary_coma": "left:cos_um=0.2",
+    "tetrafoil": "left:cos_um=0.25",
     "trefoil": "left:w333_x_um=0.2",
     "turbulent_air": "left:width_um=1.5",
     "veiling_glare": "left:share_percent=3",
@@ -334,13 +306,12 @@ class ResolvedStage(Frozen):
     lab_s: float
 
 
-class LiveRun(Frozen):
+class LiveRun(CaseResult):
     """The outcome of a case. `named`: effects with their sides; `first_named`, `first_rivals`: names and rivals before
-    `--resolve` took its `captures`. `commit`: of the code, abbreviated; empty outside a checkout."""
+    `--resolve` took its `captures`."""
 
     case: LiveCase
-    outcome: Outcome
-    commit: str = ""
+    outcome: Ending
     verdict: str = ""
     named: dict[str, tuple[Side, ...]] = {}
     rivals: dict[str, tuple[str, ...]] = {}
@@ -592,7 +563,7 @@ def _outcome(
     rivals: dict[str, tuple[str, ...]],
     wanted: dict[str, frozenset[Side]],
     verdict: str,
-) -> Outcome:
+) -> Ending:
     if not wanted:
         return "healthy" if not named and verdict == "no_mismatch" else "wrong name" if named else "not named"
     right = {name: names_of(name) for name in wanted}
@@ -622,54 +593,40 @@ def _reaches(name: str, sides: tuple[Side, ...], wanted: dict[str, frozenset[Sid
     return name not in wanted or set(sides) <= wanted[name]
 
 
-def commit() -> str:
-    """Abbreviated hash of the checkout's commit, with `+` where files differ from it; empty where there is no
-    checkout."""
-    command = ["git", "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty=+"]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
-    return done.stdout.strip()
+class LiveProof(Experiment[LiveCase, LiveRun]):
+    """Every effect concealed on the mock bench, captured over the wire, and diagnosed."""
+
+    result = LiveRun
+
+    def draw(self) -> dict[str, LiveCase]:
+        """Return singles, pairs, healthy cameras, and benches to resolve."""
+        return every_case()
+
+    def diagnose(self, case: LiveCase, folder: Path) -> LiveRun:
+        """Run the session of a case, and its diagnosis."""
+        return run_case(case, folder)
+
+    def is_current(self, kept: LiveRun, case: LiveCase) -> bool:
+        """Return whether a result is of this case, and not a failure."""
+        return kept.case == case and kept.outcome != "failed"
+
+    def describe(self, run: LiveRun) -> str:
+        """Return how a case ended, and in what time."""
+        return f"{run.outcome}, {run.wall_s:.0f} s"
+
+    def score(self, runs: Mapping[str, LiveRun]) -> ScoredExperiment:
+        """Return what is named of what is concealed."""
+        picture = PagePicture("-live", "Parameters found over concealed ones", drawing(runs))
+        return ScoredExperiment("live", f"{summary(runs)}\n\n{table(runs)}", pictures=[picture])
 
 
-def run_all(cases: dict[str, LiveCase], out: Path) -> dict[str, LiveRun]:
-    """Case -> result: from OUT/results where it exists, else run now, in order."""
-    runs, now = {}, commit()
-    for name, case in cases.items():
-        file = out / "results" / f"{name}.json"
-        if file.exists():
-            kept = load(LiveRun, file)
-            if kept.case == case and kept.outcome != "failed":
-                runs[name] = kept
-                continue
-        runs[name] = run_case(case, out / "session" / name).model_copy(update={"commit": now})
-        store(runs[name], file)
-        print(f"{name}: {runs[name].outcome}, {runs[name].wall_s:.0f} s", flush=True)
-    return runs
+class IsotropicProof(LiveProof):
+    """Weak losses of contrast that are alike in all directions, resolved by further captures."""
 
+    def draw(self) -> dict[str, LiveCase]:
+        """Return cameras with one such loss each."""
+        return isotropic_cases()
 
-def cases_of(isotropic: bool) -> dict[str, LiveCase]:
-    """Return the cases by name: those of the weak isotropic losses of contrast, or all others."""
-    return isotropic_cases() if isotropic else every_case()
-
-
-def prove(
-    every: dict[str, LiveCase], out: Path, only: Sequence[str] | None, page: Path | None, isotropic: bool
-) -> None:
-    """Run the cases `only` (None: all) of `every`, print how many are right, and write the page.
-
-    Results are kept in OUT/results. Raises InputError for a case that there is not.
-    """
-    unknown = sorted(set(only or ()) - set(every))
-    if unknown:
-        raise InputError(f"--only {unknown[0]}: no such case; there are {', '.join(every)}")
-    runs = run_all({name: case for name, case in every.items() if not only or name in only}, out)
-    if isotropic:
-        print(isotropic_table(runs))
-    if page is not None:  # with the results of earlier runs
-        there = {name: out / "results" / f"{name}.json" for name in every}
-        found = {name: load(LiveRun, file) for name, file in there.items() if file.exists()}
-        if isotropic:
-            page.write_text(placed(page.read_text(encoding="utf-8"), "isotropic", isotropic_table(found)), "utf-8")
-        else:
-            write_page(found, page)
-    right = sum(run.outcome in ("named", "healthy") for run in runs.values())
-    print(f"{right} of {len(runs)} right; results in {out / 'results'}")
+    def score(self, runs: Mapping[str, LiveRun]) -> ScoredExperiment:
+        """Return how many are named after each capture."""
+        return ScoredExperiment("isotropic", isotropic_table(runs))

@@ -1,4 +1,4 @@
-"""Write a challenge: sealed recording sets in a folder, and their truths outside it."""
+"""Write sealed cases: recording sets in a folder, and their truths outside it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from evaluation.draw import draw
+from evaluation.draw_unlisted import draw_unlisted
 from evaluation.truth import SIZES, CaseTruth, Laws, Seals, Truths, digest, load, purpose_of, salted, seal, store
-from evaluation.unlisted import draw_unlisted
 from lab.errors import InputError
 from lab.formats import recording_set
 from lab.one_blas_thread import one_blas_thread
 from lab.workers import Workers
 
-#: Modification time of all files of a challenge, s since 1970, so that times reveal nothing.
+#: Modification time of all files of the cases, s since 1970, so that times reveal nothing.
 FILE_TIME_S = 1_772_442_000
 
 
@@ -40,14 +40,14 @@ def make(
     out: Path, cases: int, seed: int, truths_file: Path, size: str, workers: Workers, *, cfa: str | None = None,
     laws: Laws = "listed", progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> Truths:  # fmt: skip
-    """Write the missing cases of a challenge.
+    """Write the cases that are missing.
 
-    Raises InputError where the truths would lie among the recordings, or where a challenge of another seed, size or
-    number, or of other laws, exists there.
+    Raises InputError where the truths would lie among the recordings, or where cases of another seed, size or
+    number, or of other laws, exist there.
     """
     out, truths_file = out.resolve(), truths_file.resolve()
     if out in truths_file.parents or truths_file == out:
-        raise InputError(f"{truths_file}: lies within the challenge's folder {out}; give a file outside it")
+        raise InputError(f"{truths_file}: lies within the folder of the cases {out}; give a file outside it")
     if size not in SIZES:
         raise InputError(f"size {size!r}: there is none; take one of {', '.join(SIZES)}")
     held = Truths(purpose=purpose_of(seed), seed=seed, size=size, cases=cases, laws=laws)
@@ -55,7 +55,7 @@ def make(
         there = load(Truths, truths_file)
         if (there.seed, there.size, there.cases, there.laws) != (seed, size, cases, laws):
             raise InputError(
-                f"{truths_file}: holds a challenge of {there.cases} cases of size {there.size} with {there.laws} laws, "
+                f"{truths_file}: holds the truths of {there.cases} cases of size {there.size} with {there.laws} laws, "
                 "of another seed, size, number or other laws than asked for; give another file, or remove it"
             )
         held = there

@@ -3,40 +3,35 @@
 `python -m evaluation names --out DIR`. Four classes of cameras, each with seeds of its own:
 
 - `bench`: quick sessions of the default mock bench over the wire, with another pair of cameras each. Its two filters
-  and the column
-  offsets of both cameras are there, and nothing else.
-- `healthy`: cameras of the second image former that do what their data sheet says.
-- `strong`: cameras of the former with one strong effect, its law varied, and nothing else. What the nearest law of the
-  library lacks
-  beside it is no second effect.
-- `blur`: cameras of the former with a low-pass filter of 0.4 to 1.0 px, charge diffusion, or a smaller aperture: is it
-  an anti-alias
-  filter?
+  and the column offsets of both cameras are there, and nothing else.
+- `healthy`: cameras of the independent simulator that do what their data sheet says.
+- `strong`: cameras of the simulator with one strong effect, its law varied, and nothing else. What the nearest law of
+  the library lacks beside it is no second effect.
+- `blur`: cameras of the simulator with a low-pass filter of 0.4 to 1.0 px, charge diffusion, or a smaller aperture: is
+  it an anti-alias filter?
 
 Each case leaves DIR/results/CASE.json; a case whose result is there is not run again.
 """
 
 from __future__ import annotations
 
-import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from evaluation.draw import DrawnFrame, draw, recordings_of
+from evaluation.experiment import CaseResult, Experiment, ScoredExperiment
 from evaluation.independent_simulator import LISTED, ConcealedCamera, Law, Plan
-from evaluation.live import commit, session_of
+from evaluation.live import session_of
 from evaluation.score import Rate, families_of
-from evaluation.truth import load, store
 from lab.errors import InputError
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult
 from sim.effects.library import effects as library
-from sim.parameters import Frozen
 
 Kind = Literal["bench", "healthy", "strong", "blur"]
 #: Non-centrality from which on a concealed effect has to be named.
@@ -46,7 +41,7 @@ LEAST_VISIBLE = 1000.0
 COUNTS: dict[Kind, int] = {"bench": 60, "healthy": 150, "strong": 150, "blur": 60}
 MOST_FALSE: dict[Kind, int] = {"bench": 0, "healthy": 1, "strong": 1, "blur": 0}
 LEAST_RIGHT_BLUR = 0.95
-#: Seed of the former's cameras here: one of tuning, as no strength is fitted to it.
+#: Seed of the simulator's cameras here: one of tuning, as no strength is fitted to it.
 SEED = 7341
 #: Name and side of what the default bench conceals.
 OF_THE_BENCH = frozenset(
@@ -62,7 +57,7 @@ FILTER_PX, DRIFT_PX, SIDE_CHANGE = (0.4, 1.0), (0.15, 0.4), (0.1, 0.35)
 BLUR_ROWS, BLUR_COLS = 192, 256
 
 
-class NameRun(Frozen):
+class NameRun(CaseResult):
     """The names of one case. `false`: names, with the side, that nothing concealed gives; `missing`: what is concealed
     and has no name; `noncentrality`: of what is concealed, where it was measured (some laws can't be made strong enough
     for a small frame)."""
@@ -74,7 +69,6 @@ class NameRun(Frozen):
     false: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     noncentrality: float | None = None
-    commit: str = ""
     cpu_s: float = 0.0
     wall_s: float = 0.0
 
@@ -91,7 +85,7 @@ def run_case(kind: Kind, number: int, folder: Path) -> NameRun:
         made = MADE[kind](number)
         run = _judged(diagnose(made.recordings, at_once=False), made.wanted, made.right_besides)
         run = run.model_copy(update={"noncentrality": made.noncentrality})
-    used = {"wall_s": time.monotonic() - began_s, "cpu_s": time.process_time() - cpu_s, "commit": commit()}
+    used = {"wall_s": time.monotonic() - began_s, "cpu_s": time.process_time() - cpu_s}
     return run.model_copy(update={"case": case_name(kind, number)} | used)
 
 
@@ -177,34 +171,7 @@ def _blur(number: int) -> Made:
 MADE: dict[Kind, Callable[[int], Made]] = {"healthy": _healthy, "strong": _strong, "blur": _blur}
 
 
-def run_all(out: Path, kinds: tuple[Kind, ...], most: int | None) -> dict[str, NameRun]:
-    """Case -> result, the classes in turn: from OUT/results where it exists, else run now."""
-    runs: dict[str, NameRun] = {}
-    for number in range(1, max(COUNTS.values()) + 1):
-        for kind in kinds:
-            if number > min(COUNTS[kind], most or COUNTS[kind]):
-                continue
-            name = case_name(kind, number)
-            file = out / "results" / f"{name}.json"
-            if file.exists():
-                runs[name] = load(NameRun, file)
-                continue
-            folder = out / "session" / name
-            try:
-                runs[name] = run_case(kind, number, folder)
-            finally:
-                shutil.rmtree(folder, ignore_errors=True)
-            store(runs[name], file)
-            one = runs[name]
-            said = f"false: {', '.join(one.false)}" if one.false else "no false name"
-            print(
-                f"{name}: {one.verdict}, {said}, missing {', '.join(one.missing) or 'none'}, {one.cpu_s:.0f} s",
-                flush=True,
-            )
-    return runs
-
-
-def table(runs: dict[str, NameRun]) -> str:
+def table(runs: Mapping[str, NameRun]) -> str:
     """Return the outcome by class as a Markdown table, with every false name below it."""
     lines = [
         "| class | cases | with a false name | most | all that is concealed named |",
@@ -224,16 +191,45 @@ def table(runs: dict[str, NameRun]) -> str:
     return "\n".join(lines)
 
 
-def prove(out: Path, only: Sequence[str] | None, most: int | None) -> bool:
-    """Count false names on the classes `only` (None: all), with `most` cases of each at most, and print a table.
+@dataclass(frozen=True)
+class NamesExperiment(Experiment[tuple[Kind, int], NameRun]):
+    """False names on cameras of the classes `kinds`, `most` of each at most."""
 
-    Returns whether no class has too many. Raises InputError for a class that there is not.
-    """
-    unknown = sorted(set(only or ()) - set(get_args(Kind)))
-    if unknown:
-        raise InputError(f"--only {unknown[0]}: no such class; there are {', '.join(get_args(Kind))}")
-    kinds = tuple(kind for kind in COUNTS if not only or kind in only)
-    runs = run_all(out, kinds, most)
-    print(table(runs))
-    counts = {kind: sum(bool(r.false) for n, r in runs.items() if n.startswith(f"{kind}-")) for kind in kinds}
-    return all(counts[kind] <= MOST_FALSE[kind] for kind in kinds)
+    result = NameRun
+
+    kinds: tuple[Kind, ...] = tuple(COUNTS)
+    most: int | None = None
+
+    @classmethod
+    def of(cls, only: Sequence[str] | None, most: int | None) -> NamesExperiment:
+        """Return that on the classes of these names, all without any. Raises InputError for one that there is not."""
+        unknown = sorted(set(only or ()) - set(COUNTS))
+        if unknown:
+            raise InputError(f"--only {unknown[0]}: no such class; there are {', '.join(COUNTS)}")
+        return cls(tuple(kind for kind in COUNTS if not only or kind in only), most)
+
+    def draw(self) -> dict[str, tuple[Kind, int]]:
+        """Return class and number of each case, the classes in turn."""
+        counts = {kind: min(COUNTS[kind], self.most or COUNTS[kind]) for kind in self.kinds}
+        numbers = range(1, max(counts.values()) + 1)
+        return {
+            case_name(kind, number): (kind, number)
+            for number in numbers
+            for kind in self.kinds
+            if number <= counts[kind]
+        }
+
+    def diagnose(self, case: tuple[Kind, int], folder: Path) -> NameRun:
+        """Record and diagnose a camera."""
+        return run_case(*case, folder)
+
+    def describe(self, run: NameRun) -> str:
+        """Return the false and the missing names of a case."""
+        false = f"false: {', '.join(run.false)}" if run.false else "no false name"
+        return f"{run.verdict}, {false}, missing {', '.join(run.missing) or 'none'}, {run.cpu_s:.0f} s"
+
+    def score(self, runs: Mapping[str, NameRun]) -> ScoredExperiment:
+        """Return the false names by class; reached where no class has too many."""
+        counts = {kind: sum(bool(r.false) for n, r in runs.items() if n.startswith(f"{kind}-")) for kind in self.kinds}
+        reached = all(count <= MOST_FALSE[kind] for kind, count in counts.items())
+        return ScoredExperiment("names", table(runs), reached=reached)

@@ -12,8 +12,8 @@ from typing import Literal
 
 from scipy.special import betaincinv
 
+from evaluation.case_run import CaseRun
 from evaluation.independent_simulator import OUTSIDE
-from evaluation.run import CaseRun
 from evaluation.truth import CaseTruth, Concealed, Purpose, Seals, Truths, digest, seal
 from lab.formats.results import DiagnosisResult
 from sim.effects.library import effects as library
@@ -50,6 +50,13 @@ class Rate(Frozen):
         low = 0.0 if count == 0 else float(betaincinv(count, of - count + 1, tail))
         high = 1.0 if count == of else float(betaincinv(count + 1, of - count, 1.0 - tail))
         return cls(count=count, of=of, share=count / of, low=low, high=high)
+
+
+def rate_words(rate: Rate) -> str:
+    """Return a count of cases with the interval of the share, for a table."""
+    if rate.share is None or rate.low is None or rate.high is None:
+        return "none"
+    return f"{rate.count} of {rate.of} ({100 * rate.low:.0f}..{100 * rate.high:.0f} %)"
 
 
 class Goal(Frozen):
@@ -140,7 +147,7 @@ class EffectScore(Frozen):
 
 
 class SealedScore(Frozen):
-    """What the scores of every sealed challenge begin with. `failed`: the error of each case that didn't end."""
+    """What the scores of all sealed cases begin with. `failed`: the error of each case that didn't end."""
 
     purpose: Purpose
     seed: int
@@ -157,8 +164,8 @@ class SealedScore(Frozen):
         return all(goal.met is not False for goal in self.goals)
 
 
-class ChallengeScore(SealedScore):
-    """All scores of a challenge: what `calibench challenge score --json FILE` writes."""
+class BlindScore(SealedScore):
+    """All scores of the blind proof: what `python -m evaluation score --json FILE` writes."""
 
     format: Literal["calibench-challenge-score"] = "calibench-challenge-score"
     version: Literal[1] = 1
@@ -189,7 +196,7 @@ class ChallengeScore(SealedScore):
 
 
 def goals_of_run(seals: Seals, broken: Sequence[str], ran: int, cases: int) -> tuple[Goal, Goal]:
-    """Return the goals of every sealed challenge: that its seals hold, and that each of its `cases` ran."""
+    """Return the goals of all sealed cases: that their seals hold, and that each of the `cases` ran."""
     whole = len(seals.seals)
     return (
         Goal(
@@ -222,7 +229,7 @@ def seals_sha256(seals: Seals) -> str:
     ).hexdigest()
 
 
-def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequence[str] = ()) -> ChallengeScore:
+def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequence[str] = ()) -> BlindScore:
     """All scores. Cases with a broken seal are left out; cases that failed have no verdict and no name."""
     cases = [
         (case, truths.truths[case].truth, runs[case])
@@ -293,7 +300,7 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
         _limit("CPU time of a case", cpu, CPU_GOAL_S, " s"),
         _limit("memory of a case", memory, MEMORY_GOAL_MIB, " MiB"),
     )
-    return ChallengeScore(
+    return BlindScore(
         purpose=truths.purpose, seed=truths.seed, size=truths.size, cases=len(cases), seals_sha256=seals_sha256(seals),
         broken_seals=tuple(broken),
         failed={case: run.error for case, _, run in cases if run.error is not None}, singles=classes, fair=fair,
@@ -363,7 +370,7 @@ def _least_separability(truth: CaseTruth) -> float | None:
 
 
 def families_of(concealed: Concealed) -> frozenset[str]:
-    """Families that are right for a concealed law: its effect's, or those that the second former declares; empty where
+    """Families that are right for a concealed law: its effect's, or those that the simulator declares; empty where
     no family has it."""
     if concealed.effect is not None:
         return frozenset({library()[concealed.effect].family.value})

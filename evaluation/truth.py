@@ -1,4 +1,4 @@
-"""The truth of a challenge's case, and its seal: a salted hash that fixes the truth before the diagnosis."""
+"""The truth of a case, and its seal: a salted hash that fixes the truth before the diagnosis."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class SaltedTruth(Frozen):
 
 
 class Truths(Frozen):
-    """The truths of a challenge, kept apart from the recordings."""
+    """The truths of all cases, kept apart from the recordings."""
 
     format: Literal["calibench-truths"] = "calibench-truths"
     version: Literal[1] = 1
@@ -99,7 +99,7 @@ class Seals(Frozen):
 
 def canonical(truth: CaseTruth) -> str:
     """JSON with sorted keys and no blanks, the same text for the same truth. Measures of strength that are None are
-    left out, so that seals of older challenges, which had none, still hold."""
+    left out, so that seals of older cases, which had none, still hold."""
     content = truth.model_dump(mode="json")
     for part in (content, *content["concealed"]):
         for name in ("oracle_share", "conditional", "separability", "nearest_rival"):
@@ -137,15 +137,11 @@ def load(model: type[Model], file: Path) -> Model:
     try:
         return model.model_validate_json(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(
-            f"{file}: can't be read ({error.strerror}); give the file that `challenge make` wrote"
-        ) from error
+        raise InputError(f"{file}: can't be read ({error.strerror}); give the file that `make` wrote") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(
-            f"{file}: {where or 'the text'}: {first['msg']}; take the file that `challenge make` wrote"
-        ) from error
+        raise InputError(f"{file}: {where or 'the text'}: {first['msg']}; take the file that `make` wrote") from error
 
 
 def store(model: BaseModel, file: Path, *, mode: int = 0o644) -> None:

@@ -70,7 +70,7 @@ def open_recordings(
     (240, 320)
     """
     from lab.capture.data_folder import existing_store
-    from lab.formats.importers import KINDS, read_foreign
+    from lab.formats.importers import importers, read_foreign
     from lab.formats.importers.single_picture import ImportOptions
     from lab.formats.recording_set import RecordingError, inspect
     from lab.pipeline import source_recordings
@@ -79,7 +79,7 @@ def open_recordings(
     kind = _kind_of(place) if kind is None else kind
     if kind is None:
         if stated:
-            raise InputError(f"{path}: takes none of {', '.join(stated)}; state kind, one of {', '.join(KINDS)}")
+            raise InputError(f"{path}: takes none of {', '.join(stated)}; state kind, one of {', '.join(importers())}")
         return source_recordings(str(path), lambda: existing_store(None if data is None else Path(data)))
     try:
         options = ImportOptions(**_as_paths(stated))
@@ -265,6 +265,40 @@ def fitted_cameras(recordings: RecordingSet | str | Path, fit: FitResult) -> dic
     return cameras
 
 
+def read_camera(file: str | Path) -> CameraFile:
+    """Read a camera file.
+
+    file : TOML, as `write_camera` or `calibench fit --write-cameras` writes it
+
+    Returns the camera model with its effects. Raises InputError, with the key that can't be used.
+
+    >>> import calibench
+    >>> calibench.read_camera(calibench.write_camera(calibench.default_camera(), "camera.toml")).camera.cols
+    1280
+    """
+    from lab.formats.camera_file import read_camera as read
+
+    return read(Path(file))
+
+
+def write_camera(camera: CameraFile, file: str | Path) -> Path:
+    """Write a camera file that `read_camera` reads back to exactly the same camera.
+
+    camera : as of `fitted_cameras`, `default_camera` or `evaluate(...).improved`
+    file : the file, TOML
+
+    Returns the file. Raises InputError where it can't be written.
+
+    >>> import calibench
+    >>> calibench.write_camera(calibench.default_camera(), "camera.toml").name
+    'camera.toml'
+    """
+    from lab.formats.camera_file import write_camera as write
+
+    write(Path(file), camera)
+    return Path(file)
+
+
 # --- predict and simulate ---------------------------------------------------------------------------------------------
 
 
@@ -278,19 +312,22 @@ def predict(
     """Predict the measured numbers of a session before it is captured, with their standard deviations.
 
     cameras : camera models by side, as of `fitted_cameras` or of `evaluate(...).improved`
-    plan : recordings whose captures are planned again
+    plan : recordings whose captures are planned again; flats state their radiance or photons, edges their region and
+        angle
     change : what differs: `f_number`, `temperature_c`, `lamp`, `lens`, `distance_mm`, `exposure_factor`, `gain_db`,
         `radiance_factor`
-    fitted : the recordings of the fit; levels of flats are predicted relative to theirs
+    fitted : the recordings of the fit; levels of flats are predicted relative to theirs, which needs their photon
+        numbers or radiance
 
     Returns the prediction; `seal` writes it with its hash, `score` compares it with the session. Raises InputError.
 
     >>> import calibench
     >>> recordings = calibench.open_recordings("my-camera")
     >>> cameras = calibench.fitted_cameras(recordings, calibench.fit(recordings))
-    >>> prediction = calibench.predict(cameras, recordings, {"exposure_factor": 0.5}, fitted=recordings)
-    >>> "noise" in {number.quantity for number in prediction.sides["left"].numbers}
-    True
+    >>> darks = recordings.without({one.id for one in recordings.captures() if one.kind != "dark"})
+    >>> prediction = calibench.predict(cameras, darks, {"exposure_factor": 0.5})
+    >>> {number.quantity for number in prediction.sides["left"].numbers}
+    {'dark'}
     """
     from lab.twin.changes import checked_changes
     from lab.twin.predict import predict as predicted
@@ -304,6 +341,46 @@ def predict(
     )
 
 
+def seal(prediction: SealedPrediction, file: str | Path) -> str:
+    """Write a prediction, and its SHA-256 beside it, before the session is captured.
+
+    prediction : as of `predict`
+    file : the sealed prediction, JSON; FILE.sha256 gets the hash
+
+    Returns the hash (hexadecimal). Raises InputError where the files can't be written.
+
+    >>> import calibench
+    >>> recordings = calibench.open_recordings("my-camera")
+    >>> cameras = calibench.fitted_cameras(recordings, calibench.fit(recordings))
+    >>> darks = recordings.without({one.id for one in recordings.captures() if one.kind != "dark"})
+    >>> hashed = calibench.seal(calibench.predict(cameras, darks), "sealed.json")
+    >>> calibench.open_seal("sealed.json", hashed).plan
+    'my-camera'
+    """
+    from lab.twin.sealed import seal as sealed
+
+    return sealed(prediction, Path(file))
+
+
+def open_seal(file: str | Path, sha256: str | None = None) -> SealedPrediction:
+    """Read a sealed prediction, and compare it with its hash.
+
+    file : as of `seal`
+    sha256 : the hash; None: that of FILE.sha256
+
+    Returns the prediction. Raises InputError where the file isn't the one that was sealed.
+
+    >>> import calibench
+    >>> calibench.open_seal("nothing.json")
+    Traceback (most recent call last):
+        ...
+    lab.errors.InputError: nothing.json: it or its hash nothing.json.sha256 can't be read; give both files
+    """
+    from lab.twin.sealed import open_seal as opened
+
+    return opened(Path(file), sha256)
+
+
 def score(prediction: SealedPrediction, recordings: RecordingSet | str | Path) -> TwinScore:
     """Compare a prediction with the session that it is of.
 
@@ -315,7 +392,8 @@ def score(prediction: SealedPrediction, recordings: RecordingSet | str | Path) -
     >>> import calibench
     >>> recordings = calibench.open_recordings("my-camera")
     >>> cameras = calibench.fitted_cameras(recordings, calibench.fit(recordings))
-    >>> found = calibench.score(calibench.predict(cameras, recordings, fitted=recordings), recordings)
+    >>> darks = recordings.without({one.id for one in recordings.captures() if one.kind != "dark"})
+    >>> found = calibench.score(calibench.predict(cameras, darks), darks)
     >>> found.n == len(found.numbers)
     True
     """

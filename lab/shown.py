@@ -45,7 +45,7 @@ class Shown:
         printer.text(repr(self) if _load is None or cycle else _load().text(self))
 
 
-class Table(Shown):
+class Tabular(Shown):
     """Base of what is a table, too."""
 
     def to_dataframe(self) -> pd.DataFrame:

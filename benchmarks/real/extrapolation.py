@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from evaluation.proof import placed
+from evaluation.page import placed
 from lab.capture_kinds.base import Capture
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture

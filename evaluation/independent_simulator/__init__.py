@@ -1,4 +1,4 @@
-"""A second lab's camera: an image former of its own, which conceals physics in recordings.
+"""An independent simulator: a second lab's camera, which conceals physics in recordings.
 
 It shares no stage and no code with `sim`: an error of `sim` can't cancel against the same error here. `law` and `laws`
 hold the concealed physics, `camera` the sensor and its frames, `transfer` the lens, `scenes` the targets, `session` the

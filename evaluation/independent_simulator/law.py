@@ -1,17 +1,16 @@
-"""The base class of the concealed laws, and the grid of wavelengths on which the former draws and integrates
+"""The base class of the concealed laws, and the grid of wavelengths on which the simulator draws and integrates
 spectra."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .camera import ConcealedCamera
 
 Array = Any
 WAVELENGTH_NM: NDArray[np.float64] = np.arange(380.0, 781.0)
@@ -32,6 +31,33 @@ class FrameTaken:
     exposure_s: float
     elapsed_s: float
     temperature_c: float
+
+
+class CameraProperties(Protocol):
+    """What laws and lens read of the camera that they are built into (`ConcealedCamera`)."""
+
+    seed: int
+    rows: int
+    cols: int
+    cfa: str
+    pitch_um: float
+    fill_factor: float
+    f_number: float
+    working_f_number: float
+    open_pupil: float
+    full_code_dn: int
+    gain_dn_per_e: float
+    read_noise_e: float
+    black_level_dn: float
+    full_well_e: float
+    quantum_efficiency: dict[str, Array]
+    filter_transmittance: dict[str, Array]
+    field_position: tuple[Array, Array]
+    laws: tuple[Law, ...]
+
+    @property
+    def half_diagonal_px(self) -> float:
+        """From the frame's centre to its corner."""
 
 
 class Law:
@@ -66,11 +92,11 @@ class Law:
         self.signed_strength = self.strength * self.sign
         #: Uniform random numbers 0..1 for directions, positions, phases and periods.
         self.uniform = rng.random(8)
-        self.camera: ConcealedCamera
+        self.camera: CameraProperties
         #: The frame that is exposed now.
         self.frame: FrameTaken
 
-    def bind(self, camera: ConcealedCamera) -> None:
+    def bind(self, camera: CameraProperties) -> None:
         """Tell the law which camera it is built into."""
         self.camera = camera
 

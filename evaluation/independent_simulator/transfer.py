@@ -6,15 +6,11 @@ Spectra are integrated at 1 nm, the overlap of the pupils by Gauss-Legendre quad
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import CubicSpline, RegularGridInterpolator
 
-from evaluation.independent_simulator.law import WAVELENGTH_NM, Array
-
-if TYPE_CHECKING:
-    from evaluation.independent_simulator.camera import ConcealedCamera
+from evaluation.independent_simulator.law import WAVELENGTH_NM, Array, CameraProperties
 
 NODES_NM = np.arange(384.0, 781.0, 9.0)  # at which transfer functions are formed
 QUADRATURE = np.polynomial.legendre.leggauss(20)
@@ -24,7 +20,7 @@ HIGHEST_CY_PX = 3.2  # of the tables; the lens transmits nothing beyond
 class Transfer:
     """Transfer functions of one camera."""
 
-    def __init__(self, camera: ConcealedCamera) -> None:
+    def __init__(self, camera: CameraProperties) -> None:
         self.camera = camera
         self._tables: dict[float, Array] = {}
 

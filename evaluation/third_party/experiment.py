@@ -63,6 +63,8 @@ SOURCES: dict[str, Source] = {
     "astigmatism": Source("GalSim", by_galsim.astigmatism, "astigmatism"),
     "coma": Source("GalSim", by_galsim.coma, "coma"),
     "trefoil": Source("GalSim", by_galsim.trefoil, "trefoil"),
+    "secondary_coma": Source("GalSim", by_galsim.secondary_coma, "secondary_coma"),
+    "tetrafoil": Source("GalSim", by_galsim.tetrafoil, "tetrafoil"),
 }
 
 

@@ -154,7 +154,7 @@ def kolmogorov(rng: np.random.Generator, camera: DrawnCamera) -> Spread:
     return Spread({"width_um": FRIED_WIDTH * scale_um}, profile, transfer, camera.pitch_um)
 
 
-def _aberrated(truth: Mapping[str, float], camera: DrawnCamera, waves: Any, **terms: float) -> Spread:
+def _aberrated(truth: Mapping[str, float], camera: DrawnCamera, waves: Any, **terms: Any) -> Spread:
     def profile(pitch_um: float) -> Any:
         return galsim.OpticalPSF(
             lam_over_diam=LAMBDA_UM * F_NUMBER / pitch_um, oversampling=2.0, pad_factor=2.0, **terms
@@ -171,22 +171,48 @@ def defocus(rng: np.random.Generator, camera: DrawnCamera) -> Spread:
 
 
 def astigmatism(rng: np.random.Generator, camera: DrawnCamera) -> Spread:
-    """Noll's sixth term, sqrt 6 (x^2 - y^2)."""
+    """Noll's sixth term, sqrt 6 (x^2 - y^2), with a part of the fourth: foci at unequal distances, as edges along rows
+    and columns don't tell equal ones from a defocus."""
     c = float(rng.uniform(0.05, 0.12))
-    size_um = 8.0 * F_NUMBER**2 * np.sqrt(6.0) * c * LAMBDA_UM
-    truth = {"defocus_x_um": size_um, "defocus_y_um": size_um}
-    return _aberrated(truth, camera, lambda x, y: c * np.sqrt(6.0) * (x * x - y * y), astig2=c)
+    d = float(rng.uniform(0.2, 0.5)) * c
+    along, both = np.sqrt(6.0) * c, 2.0 * np.sqrt(3.0) * d
+    focus_um = 8.0 * F_NUMBER**2 * LAMBDA_UM
+    truth = {"defocus_x_um": focus_um * (along + both), "defocus_y_um": focus_um * (along - both)}
+    return _aberrated(
+        truth, camera, lambda x, y: along * (x * x - y * y) + both * (x * x + y * y - 0.5), astig2=c, defocus=d
+    )
 
 
 def coma(rng: np.random.Generator, camera: DrawnCamera) -> Spread:
-    """Noll's eighth term, sqrt 8 (3 r^3 - 2 r) cos."""
+    """Noll's eighth term, sqrt 8 (3 r^3 - 2 r) cos; GalSim counts paths the other way."""
     c = float(rng.uniform(0.05, 0.12))
-    truth = {"w131_x_um": 3.0 * np.sqrt(8.0) * c * LAMBDA_UM}
+    truth = {"w131_x_um": -3.0 * np.sqrt(8.0) * c * LAMBDA_UM}
     return _aberrated(truth, camera, lambda x, y: c * np.sqrt(8.0) * (3.0 * (x * x + y * y) - 2.0) * x, coma2=c)
 
 
 def trefoil(rng: np.random.Generator, camera: DrawnCamera) -> Spread:
-    """Noll's tenth term, sqrt 8 r^3 cos of three times the angle."""
+    """Noll's tenth term, sqrt 8 r^3 cos of three times the angle; GalSim counts paths the other way."""
     c = float(rng.uniform(0.06, 0.14))
-    truth = {"w333_x_um": np.sqrt(8.0) * c * LAMBDA_UM}
+    truth = {"w333_x_um": -np.sqrt(8.0) * c * LAMBDA_UM}
     return _aberrated(truth, camera, lambda x, y: c * np.sqrt(8.0) * (x**3 - 3.0 * x * y * y), trefoil2=c)
+
+
+def secondary_coma(rng: np.random.Generator, camera: DrawnCamera) -> Spread:
+    """Noll's sixteenth term, sqrt 12 (10 r^5 - 12 r^3 + 3 r) cos; GalSim counts paths the other way."""
+    c = float(rng.uniform(0.06, 0.12))
+
+    def waves(x: FloatArray, y: FloatArray) -> FloatArray:
+        square = x * x + y * y
+        return np.asarray(c * np.sqrt(12.0) * (10.0 * square**2 - 12.0 * square + 3.0) * x)
+
+    return _aberrated({"cos_um": -np.sqrt(12.0) * c * LAMBDA_UM}, camera, waves, aberrations=[0.0] * 16 + [c])
+
+
+def tetrafoil(rng: np.random.Generator, camera: DrawnCamera) -> Spread:
+    """Noll's fourteenth term, sqrt 10 r^4 cos of four times the angle."""
+    c = float(rng.uniform(0.08, 0.14))
+
+    def waves(x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.asarray(c * np.sqrt(10.0) * np.real((x + 1j * y) ** 4))
+
+    return _aberrated({"cos_um": np.sqrt(10.0) * c * LAMBDA_UM}, camera, waves, aberrations=[0.0] * 14 + [c])

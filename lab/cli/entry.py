@@ -33,6 +33,7 @@ app = typer.Typer(
 for _group in (capturing, fitting, diagnosis, recordings, backups, simulation):
     app.registered_commands += _group.commands.registered_commands
 app.add_typer(effects.commands)
+app.add_typer(effects.check_command)
 app.add_typer(twin)
 app.add_typer(calibrations.calibrations)
 app.add_typer(devices.devices)

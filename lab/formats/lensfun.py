@@ -30,7 +30,8 @@ from sim.effects.base import Effect
 from sim.effects.distortion import Distortion
 from sim.effects.lateral_chromatic_aberration import REFERENCE_NM, LateralChromaticAberration
 from sim.effects.vignetting import Vignetting
-from sim.optics.illumination import RadialIllumination, optical_axis_px, relative_illumination
+from sim.optics.fall_off import RadialIllumination
+from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.scene.warp import distort
 from sim.spectrum import FloatArray
 

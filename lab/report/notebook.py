@@ -34,7 +34,7 @@ FRAME_PX = 200
 
 
 @dataclass(frozen=True)
-class Summary:
+class ShownSummary:
     """What is shown of a result.
 
     headline : in a sentence
@@ -102,20 +102,20 @@ def _skipped(items: Sequence[Skipped]) -> tuple[str, ...]:
 
 
 @singledispatch
-def summary(result: object) -> Summary:
+def summary(result: object) -> ShownSummary:
     """Return what is shown of a result."""
-    return Summary(repr(result))
+    return ShownSummary(repr(result))
 
 
 @summary.register
-def _(result: FitResult) -> Summary:
+def _(result: FitResult) -> ShownSummary:
     sides = tuple(result.cameras)
     rows = [
         (name, *(found[side].text if side in found else "–" for side in sides)) for name, found in by_side(result, {})
     ]
     for one in stereo_figures(result.stereo) if result.stereo is not None else ():
         rows.append((one.name, one.text, *[""] * (len(sides) - 1)))
-    return Summary(
+    return ShownSummary(
         f"Fit of {result.source}",
         ("quantity", *(f"{side} (± one standard deviation)" for side in sides)),
         tuple(rows),
@@ -126,7 +126,7 @@ def _(result: FitResult) -> Summary:
 
 
 @summary.register
-def _(result: ValidationResult) -> Summary:
+def _(result: ValidationResult) -> ShownSummary:
     passed = sum(check.passed for check in result.checks)
     rows = tuple(
         (
@@ -140,7 +140,7 @@ def _(result: ValidationResult) -> Summary:
         )
         for one in result.checks
     )
-    return Summary(
+    return ShownSummary(
         f"Validation of {result.source}: {passed} of {len(result.checks)} checks passed "
         "(chi2 within its 99.9 % quantile)",
         ("side", "check", "capture", "chi2", "n", "rms difference", "result"),
@@ -152,7 +152,7 @@ def _(result: ValidationResult) -> Summary:
 
 
 @summary.register
-def _(result: DiagnosisResult) -> Summary:
+def _(result: DiagnosisResult) -> ShownSummary:
     badge, _, sentence = words.headline(result)
     rows = tuple(
         (answers.effect_line(effect), f"{effect.probability:.3g}", ", ".join(_rivals(effect.alternatives)) or "none")
@@ -169,7 +169,7 @@ def _(result: DiagnosisResult) -> Summary:
         )
     if result.next_capture:
         lines.append(f"Next capture: {result.next_capture}")
-    return Summary(
+    return ShownSummary(
         f"Diagnosis of {result.source}: {badge}. {sentence}",
         ("effect", "probability", "alternatives"),
         rows,
@@ -184,7 +184,7 @@ def _rivals(names: Sequence[str]) -> Iterator[str]:
 
 
 @summary.register
-def _(result: ComparisonResult) -> Summary:
+def _(result: ComparisonResult) -> ShownSummary:
     ordered = sorted(result.changes, key=lambda row: -row.significance_sigma)
     rows = tuple(
         (
@@ -198,7 +198,7 @@ def _(result: ComparisonResult) -> Summary:
         for one in ordered
     )
     changed = sum(one.changed for one in result.changes) + sum(one.changed for one in result.projection)
-    return Summary(
+    return ShownSummary(
         f"{result.a} and {result.b}: {changed} of {len(result.changes) + len(result.projection)} figures changed "
         f"beyond {result.threshold_sigma:.1f} sigma (false-alarm rate {100 * result.false_alarm_rate:g} %)",
         ("side", "quantity", "A", "B", "difference, sigma", ""),
@@ -209,7 +209,7 @@ def _(result: ComparisonResult) -> Summary:
 
 
 @summary.register
-def _(result: RecordingSet) -> Summary:
+def _(result: RecordingSet) -> ShownSummary:
     counted = Counter((capture.kind, capture.side) for capture in result.captures())
     first = {(capture.kind, capture.side): capture for capture in reversed(result.captures())}
 
@@ -222,7 +222,7 @@ def _(result: RecordingSet) -> Summary:
             for one, uri in zip(shown, uris, strict=True)
         )
 
-    return Summary(
+    return ShownSummary(
         f"Recording set {result.manifest.name or result.source}: {len(result.captures())} captures of "
         f"{', '.join(result.sides)}",
         ("kind", "side", "captures"),
@@ -233,7 +233,7 @@ def _(result: RecordingSet) -> Summary:
 
 
 @summary.register
-def _(result: Simulation) -> Summary:
+def _(result: Simulation) -> ShownSummary:
     record = result.record
     found, rows, cols = record.summary, *result.frame.shape
 
@@ -241,7 +241,7 @@ def _(result: Simulation) -> Summary:
         uri = photograph_data_uri(preview(result.frame, result.camera, result.white))
         return f'<img alt="{escape(record.options.scene, quote=True)}" style="max-width:480px" src="{uri}">'
 
-    return Summary(
+    return ShownSummary(
         f"Simulated frame of {record.options.scene} under {record.options.illuminant}: {cols} x {rows} px, "
         f"{record.camera['cfa']}",
         ("quantity", "value"),
@@ -257,9 +257,9 @@ def _(result: Simulation) -> Summary:
 
 
 @summary.register
-def _(result: History) -> Summary:
+def _(result: History) -> ShownSummary:
     drifted = sum(point.drifted for point in result.points)
-    return Summary(
+    return ShownSummary(
         f"{result.title or result.figure} of {result.camera} over {len(result.points)} calibrations: {drifted} drifted",
         ("calibration", "created (UTC)", "value", "difference, sigma", ""),
         tuple(
@@ -277,17 +277,17 @@ def _(result: History) -> Summary:
 
 
 @summary.register
-def _(result: SealedPrediction) -> Summary:
+def _(result: SealedPrediction) -> ShownSummary:
     counted = Counter((side, number.quantity) for side, one in result.sides.items() for number in one.numbers)
     skipped = tuple(line for one in result.sides.values() for line in _skipped(one.skipped))
     rows = tuple((side, title(quantity), str(number)) for (side, quantity), number in counted.items())
-    return Summary(f"Prediction of {result.plan}", ("side", "quantity", "numbers"), rows, skipped=skipped)
+    return ShownSummary(f"Prediction of {result.plan}", ("side", "quantity", "numbers"), rows, skipped=skipped)
 
 
 @summary.register
-def _(result: TwinScore) -> Summary:
+def _(result: TwinScore) -> ShownSummary:
     sides = dict.fromkeys(effect.side for effect in result.effects)
-    return Summary(
+    return ShownSummary(
         f"Prediction against {result.source}: chi2 {result.chi2:.4g} of n = {result.n}",
         ("quantity", "n", "median deviation", "in 95 % intervals", "chi2 / n"),
         tuple(
@@ -306,10 +306,10 @@ def _(result: TwinScore) -> Summary:
 
 
 @summary.register
-def _(result: PipelineResult) -> Summary:
+def _(result: PipelineResult) -> ShownSummary:
     parts = [summary(part) for part in (result.fit, result.validation, result.diagnosis) if part is not None]
     first = parts[0] if parts else summary(result.recordings)
-    return Summary(
+    return ShownSummary(
         ". ".join(part.headline for part in parts[::-1]) or first.headline,
         first.headings,
         first.rows,

@@ -19,7 +19,18 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "how-to" / "use-from-python.md"
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 #: Examples without a fit, a diagnosis or a process of their own.
-QUICK = {"certify", "connect", "open_recordings", "plot", "simulate", "write_certificate", "write_frame"}
+QUICK = {
+    "certify",
+    "connect",
+    "open_recordings",
+    "open_seal",
+    "plot",
+    "read_camera",
+    "simulate",
+    "write_camera",
+    "write_certificate",
+    "write_frame",
+}
 
 
 def documented() -> list[str]:

@@ -15,8 +15,8 @@ from evaluation.calibrate import (
     rule_table,
     tally,
 )
-from evaluation.run import CaseRun
-from evaluation.score import ChallengeScore, score
+from evaluation.case_run import CaseRun
+from evaluation.score import BlindScore, score
 from evaluation.truth import Seals, Truths, salted, seal
 from lab.diagnose import DecisionPolicy
 from lab.diagnose.policy import TUNED
@@ -31,7 +31,7 @@ TRUTHS = Truths(
 SEALS = Seals(seals={name: seal(one) for name, one in TRUTHS.truths.items()})
 
 
-def _scored(first: DiagnosisResult) -> ChallengeScore:
+def _scored(first: DiagnosisResult) -> BlindScore:
     found = {"case-1": first, "case-2": HEALTHY}
     runs = {
         name: CaseRun(case=name, wall_s=1.0, cpu_s=1.0, memory_mib=100.0, diagnosis=diagnosis)

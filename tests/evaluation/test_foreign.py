@@ -1,4 +1,4 @@
-"""Diagnosis of recordings that a second image former made, and of the two foreign sets beside the project."""
+"""Diagnosis of recordings of the independent simulator, and of the two foreign sets beside the project."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _shared(name: str) -> DiagnosisResult:
 
 
 @pytest.mark.extra  # a whole diagnosis
-def test_healthy_camera_of_another_image_former_is_believed() -> None:
+def test_a_healthy_camera_of_the_independent_simulator_has_no_mismatch() -> None:
     result = _shared("foreign_healthy")
     assert result.verdict == "no_mismatch"
     assert not result.effects
@@ -40,7 +40,7 @@ def test_healthy_camera_of_another_image_former_is_believed() -> None:
 
 
 @pytest.mark.slow  # the main job and the fresh cases find both every day
-def test_two_effects_of_another_image_former_are_named() -> None:
+def test_two_effects_of_the_independent_simulator_are_named() -> None:
     """Truth: 1.9 um along rows and columns, cut at 652 nm; wanted within 5 % and 3 nm."""
     result = _shared("foreign_two_effects")
     assert result.verdict == "explained"
@@ -54,7 +54,7 @@ def test_two_effects_of_another_image_former_are_named() -> None:
     assert result.held_out.chi2_after < 1.3 * result.held_out.n
 
 
-@pytest.mark.slow  # half a minute; a screen of the second former is placed likewise in tests of the measurement
+@pytest.mark.slow  # half a minute; a screen of the independent simulator is placed likewise in tests of the measurement
 def test_a_filter_before_an_aligned_screen_is_named() -> None:
     """Truth: 1.9 um along rows and columns; the screen stands within 0.04 degrees, its cells are 4.0 px."""
     result = _shared("foreign_screen_aligned")

@@ -12,14 +12,13 @@ import pytest
 
 from evaluation.live import (
     HEALTHY_SEEDS,
-    HIGH,
-    LABEL_PX,
-    LOW,
     NOT_SHOWN_BY_BENCH,
     PAIRS,
-    PLOT_PX,
+    RATIO,
     SIZES,
+    IsotropicProof,
     LiveCase,
+    LiveProof,
     LiveRun,
     drawing,
     drawn,
@@ -27,13 +26,10 @@ from evaluation.live import (
     isotropic_cases,
     isotropic_table,
     judged,
-    prove,
-    run_all,
     run_case,
     summary,
     table,
     typical_spec,
-    write_page,
 )
 from evaluation.truth import store
 from lab.formats.results import DiagnosisResult, NamedEffect, ParameterValue, Rival
@@ -151,10 +147,11 @@ def test_results_that_are_there_are_not_run_again(tmp_path: Path) -> None:
     case = every_case()["defocus"]
     kept = judged(case, result("explained", ("defocus", ("left",), {"defocus_um": 21.0}, ())))
     store(kept, tmp_path / "results" / "defocus.json")
-    runs = run_all({"defocus": case}, tmp_path)
+    proof = LiveProof()
+    runs = proof.run(tmp_path, ["defocus"])
     assert runs == {"defocus": kept}
-    write_page(runs, tmp_path / "page.md")
-    write_page(runs, tmp_path / "page.md")
+    for _ in range(2):
+        proof.prove(tmp_path, ["defocus"], tmp_path / "page.md")
     text = (tmp_path / "page.md").read_text()
     assert text.count("| defocus defocus_um=22 | named | defocus (left) |") == 1
     assert "defocus_um 21 ± 0.1 um, 22" in table(runs)
@@ -176,7 +173,7 @@ def test_the_isotropic_cases_that_have_run_go_into_the_page(tmp_path: Path) -> N
     page = tmp_path / "page.md"
     page.write_text("# Proof\n")
     for _ in range(2):
-        prove(cases, tmp_path, list(cases)[:1], page, isotropic=True)
+        IsotropicProof().prove(tmp_path, list(cases)[:1], page)
     text = page.read_text()
     assert text.startswith("# Proof\n") and text.count("3 of 40 cases run.") == 1
     assert "Run at commit abcdef0." in text
@@ -199,10 +196,7 @@ def test_a_size_with_an_interval_is_drawn_and_told_with_it() -> None:
     told = effect.model_copy(update={"parameters": {"defocus_um": size}})
     runs = {"defocus": judged(case, found.model_copy(update={"effects": (told,)}))}
     assert "defocus_um 21 (20 to 27) um, 22" in table(runs)
-    start, end = (
-        LABEL_PX + PLOT_PX * (20.0 / 22.0 - LOW) / (HIGH - LOW),
-        LABEL_PX + PLOT_PX * (27.0 / 22.0 - LOW) / (HIGH - LOW),
-    )
+    start, end = RATIO.x_px(20.0 / 22.0), RATIO.x_px(27.0 / 22.0)
     assert f"M{start:.1f} " in drawing(runs) and f"H{end:.1f}" in drawing(runs)
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from evaluation.blind import BlindProof, confusion, table
+from evaluation.case_run import CaseRun
 from evaluation.independent_simulator import OUTSIDE
-from evaluation.proof import confusion, table, write_page
-from evaluation.run import CaseRun
-from evaluation.score import ChallengeScore, Rate, score
+from evaluation.score import BlindScore, Rate, score
 from evaluation.truth import CaseTruth, Concealed, Kind, Seals, Truths, canonical, salted, seal
 from lab.formats.results import (
     DiagnosisResult,
@@ -87,7 +87,7 @@ CASES: tuple[tuple[CaseTruth, DiagnosisResult | None], ...] = (
 )
 
 
-def scored(broken: tuple[str, ...] = ()) -> ChallengeScore:
+def scored(broken: tuple[str, ...] = ()) -> BlindScore:
     names = [f"case-{i:04d}" for i in range(1, len(CASES) + 1)]
     kept = {name: salted(t) for name, (t, _) in zip(names, CASES, strict=True)}
     truths = Truths(purpose="tuning", seed=3, size="small", cases=len(CASES), truths=kept)
@@ -203,8 +203,8 @@ def test_the_page_gets_tables_picture_and_seed_once(tmp_path: Path) -> None:
     page = tmp_path / "proof.md"
     page.write_text("# Proof\n\nWords.\n")
     found = scored()
-    write_page(found, page)
-    write_page(found, page)
+    for _ in range(2):
+        BlindProof(tmp_path, ()).outcome(found).write(page)
     text = page.read_text()
     assert text.startswith("# Proof\n\nWords.\n")
     assert text.count(table(found)) == 1
@@ -225,7 +225,7 @@ def with_strengths(truth_: CaseTruth, separability: tuple[float, ...], oracle_sh
     return truth_.model_copy(update={"concealed": concealed, "oracle_share": oracle_share})
 
 
-def fairly_scored() -> ChallengeScore:
+def fairly_scored() -> BlindScore:
     pair = truth("compound", ("defocus", 80.0), ("vignetting", 90.0))
     cases = (
         (with_strengths(truth("single", ("defocus", 80.0)), (70.0,), 1.0), named("defocus")),
@@ -265,13 +265,13 @@ def test_every_share_stands_beside_the_oracle_s() -> None:
 
 def test_the_page_shows_both_curves(tmp_path: Path) -> None:
     page = tmp_path / "proof.md"
-    write_page(fairly_scored(), page)
+    BlindProof(tmp_path, ()).outcome(fairly_scored()).write(page)
     assert "![Right answers over separability" in page.read_text(encoding="utf-8")
     drawing = (tmp_path / "proof-tuning-oracle.svg").read_text(encoding="utf-8")
     # two panels, each with the oracle's curve and the diagnosis's; a point a class
-    assert drawing.count("<polyline") == 4
+    assert drawing.count('stroke-width="2"') == 4
     assert drawing.count("<circle") == 3
-    write_page(scored(), tmp_path / "other.md")
+    BlindProof(tmp_path, ()).outcome(scored()).write(tmp_path / "other.md")
     assert not (tmp_path / "other-tuning-oracle.svg").exists()
 
 

@@ -100,7 +100,7 @@ from evaluation.independent_simulator.laws.transmission import (
     VignettingLaw,
 )
 
-#: Laws that the list of effects has, in the order in which a challenge deals them.
+#: Laws that the list of effects has, in the order in which the cases get them.
 LISTED: tuple[type[Law], ...] = (
     OpticalLowPassFilterLaw,
     DefocusLaw,
@@ -167,8 +167,8 @@ LISTED: tuple[type[Law], ...] = (
     SeeingLaw,
 )
 
-#: Listed laws that only an earlier calibration, a second camera or darks after light can show: a challenge of single
-#: cameras has none of them.
+#: Listed laws that only an earlier calibration, a second camera or darks after light can show: sessions of single
+#: cameras have none of them.
 BESIDE: tuple[type[Law], ...] = (
     LensDistortionLaw,
     LensDecentreLaw,

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.ndimage import convolve
 
-from evaluation.independent_simulator.law import DARK, OPTICAL, Array, Law
-
-if TYPE_CHECKING:
-    from evaluation.independent_simulator.camera import ConcealedCamera
+from evaluation.independent_simulator.law import DARK, OPTICAL, Array, CameraProperties, Law
 
 
 class ChargeDiffusionLaw(Law):
@@ -288,7 +283,7 @@ class PersistenceLaw(Law):
     name = effect = "persistence"
     variants, unit, nominal, limits, shown_by = 3, "%", 1.0, (0.01, 20.0), DARK
 
-    def bind(self, camera: ConcealedCamera) -> None:
+    def bind(self, camera: CameraProperties) -> None:
         super().bind(camera)
         #: Occupied traps (rows, cols) of each kind, when the last exposure ended (s).
         self._occupied: list[Array] = [0.0, 0.0]

@@ -532,6 +532,7 @@ def _level(row: TableRow, camera: DataSheet) -> tuple[Setting, PlaneStatistics]:
         clipped_share=1.0 if is_clipped else 0.0, piled_share=0.0, zero_share=0.0, highest=mean, shape=(side, side),
         mean_of_all=mean,
         temporal_variance_of_all=variance,
+        mean_frame_variance=variance / repeats,
     )  # fmt: skip
     setting = (
         kind,

@@ -16,6 +16,7 @@ from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import InputError
+from lab.formats.plausible_range import STATED
 from lab.formats.recording_set.files import Frame
 from lab.formats.recording_set.frame_codes import CodeCounts, FrameCodes
 from lab.formats.recording_set.manifest import DataSheet, Findings
@@ -504,8 +505,6 @@ def _check_cameras(recordings: RecordingSet, found: Findings) -> None:
 def _improbable_values(capture: Capture) -> Iterator[str]:
     """Yield a line for squares of a board that are improbably small or large, and for an improbable temperature: as a
     rule, they are in another unit."""
-    from lab.formats.results.plausible import STATED  # here: its figures are those of recording sets' data sheets
-
     stated = {"temperature_c": (capture.temperature_c, "C")}
     if isinstance(capture, CharucoCapture):
         stated["square_mm"] = (capture.square_mm, "mm")

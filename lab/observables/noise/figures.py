@@ -209,7 +209,7 @@ def _transfer_points(dataset: Dataset, black: float) -> tuple[list[float], list[
             if any(dataset.levels(capture).mean[name[0]] is None for capture in group):
                 continue
             signal.append(plane.mean - black)
-            variance.append(plane.temporal_variance)
+            variance.append(plane.temporal_variance - plane.row_variance)  # without flicker of the light
             if 0.3 < signal[-1] / (dataset.saturation_dn - black) < 0.8:
                 prnu = float(np.sqrt(max(plane.pattern_variance, 0.0)) / signal[-1])
     return signal, variance, prnu

@@ -63,11 +63,13 @@ def add_frame(
     count: int,
     products: FloatArray,
     pairs: NDArray[np.int64],
+    row_squares: FloatArray,
 ) -> None:
     """Add frame number `count` (from 2) to `mean` and `squares`, by Welford's recursion.
 
     `shift` (phases,): by how much the mean of each phase lies above that of `mean`. `products`, `pairs` (2, phases):
-    sums of products of adjacent and of diagonal neighbours, and their numbers.
+    sums of products of adjacent and of diagonal neighbours, and their numbers. `row_squares` (phases,): sums over the
+    rows of the squared sum of a row over its number of pixels.
     """
     rows, cols = frame.shape
     share, inverse = np.float32((count - 1) / count), np.float32(1.0 / count)
@@ -87,6 +89,10 @@ def add_frame(
             for j in range(offset, cols - 1, period):
                 beside += row[j] * row[j + 1]
             number = len(range(offset, cols - 1, period))
+            total = 0.0
+            for j in range(offset, cols, period):
+                total += row[j]
+            row_squares[here] += share * total * total / len(range(offset, cols, period))
             for p in (here, there):
                 products[0, p] += share * beside
                 pairs[0, p] += number

@@ -98,7 +98,9 @@ class PlaneStatistics:
     covariance of a pixel with one of its four neighbours along rows and columns, and across corners, on the mosaic (of
     any plane). `shading_rows`, `shading_columns`: mean of the smooth surface over the first and the last tenth of the
     rows (columns), over `mean`, dark included. `shading_span`: highest less lowest value of that surface, DN, and its
-    standard deviation by the pixels' scatter. `step_dn`: step of the codes.
+    standard deviation by the pixels' scatter. `step_dn`: step of the codes. `mean_frame_variance`: of the mean frame
+    over its pixels, temporal share included. `row_variance`: the part of `temporal_variance` that the
+    pixels of a row share.
     """
 
     pixels: int
@@ -127,6 +129,8 @@ class PlaneStatistics:
     shading_columns: tuple[float, float] = (1.0, 1.0)
     shading_span: tuple[float, float] = (0.0, 0.0)
     step_dn: float = 1.0
+    mean_frame_variance: float = 0.0
+    row_variance: float = 0.0
 
     @property
     def repeats(self) -> int:
@@ -144,8 +148,9 @@ class PlaneStatistics:
     @property
     def spread(self) -> float:
         """Variance of single values over pixels and repeats, DN^2; it dithers the rounding."""
-        spatial = self.spatial_variance if self.spatial_variance > 0 else 0.0
-        return spatial + (self.temporal_variance if np.isfinite(self.temporal_variance) else 0.0)
+        if not np.isfinite(self.temporal_variance):  # of one frame, whose values hold noise and pattern
+            return self.mean_frame_variance
+        return max(self.spatial_variance, 0.0) + self.temporal_variance
 
     @property
     def mean_rounding_std(self) -> float:
@@ -191,6 +196,7 @@ class Stack:
             self._good = self._sizes + counts[3]
             self.products = np.zeros((2, self.period**2))
             self.pairs = np.zeros((2, self.period**2), np.int64)
+            self.row_squares = np.zeros(self.period**2)
         means = sums[1] / np.maximum(self._good, 1)
         highest, top, zero = counts[0].astype(float), counts[1] / self._sizes, counts[2] / self._sizes
         self._shares.append(
@@ -213,7 +219,18 @@ class Stack:
             self.squares = np.zeros_like(self.mean)
         # The mean frame keeps the plane means of the first: only its pattern is used
         shift = means - self._frame_means[0]
-        add_frame(frame, self.mean, self.squares, shift, bad, self.period, self.count, self.products, self.pairs)
+        add_frame(
+            frame,
+            self.mean,
+            self.squares,
+            shift,
+            bad,
+            self.period,
+            self.count,
+            self.products,
+            self.pairs,
+            self.row_squares,
+        )
 
     def image(self) -> Float32Array:
         """Mean of the repeats (rows, cols), DN."""
@@ -340,7 +357,16 @@ class Stack:
             ),
             shading_span=span,
             step_dn=self.step_dn,
+            mean_frame_variance=spatial,
+            row_variance=self._row_variance(phase, variance, rows, cols),
         )
+
+    def _row_variance(self, phase: int, variance: float, rows: int, cols: int) -> float:
+        """Return the variance that pixels of a row share: the mean square of the sum of n pixels is n s^2 + n^2 r^2,
+        with s^2 of single pixels, r^2 shared, and s^2 + r^2 the temporal `variance`."""
+        if self.count < 2:
+            return 0.0
+        return float((self.row_squares[phase] / rows / (self.count - 1) - variance) / (cols - 1))
 
     def _covariances(self, phase: int, variance: float) -> tuple[float, float, float]:
         """Adjacent and diagonal temporal covariance of the pixels of a phase, and the standard deviation of either."""

@@ -1,4 +1,4 @@
-"""The second image former against analytic limits, so that its truths are right."""
+"""The independent simulator against analytic limits, so that its truths are right."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from evaluation.independent_simulator.laws import (
 from evaluation.independent_simulator.scenes import edge, pattern
 from lab.fit.mtf import edge_mtf
 
-LINE = np.where(WAVELENGTH_NM == 555.0, 1.0, 0.0)  # W sr^-1 m^-2 in one nm, at a node of the former's wavelengths
+LINE = np.where(WAVELENGTH_NM == 555.0, 1.0, 0.0)  # W sr^-1 m^-2 in one nm, at a node of the simulator's wavelengths
 LAMP = np.full_like(WAVELENGTH_NM, 0.02)
 FREQUENCY = np.linspace(0.0, 1.0, 21)
 

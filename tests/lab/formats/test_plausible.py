@@ -11,16 +11,10 @@ import pytest
 from lab.diagnose import diagnose
 from lab.fit import fit_recording_set
 from lab.formats.camera_file import fitted_camera, read_camera, write_camera
+from lab.formats.plausible_range import OUTSIDE_SIGMA, STATED, Plausible
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, SpectralFit, StereoFit
-from lab.formats.results.plausible import (
-    FIGURES,
-    OUTSIDE_SIGMA,
-    STATED,
-    Plausible,
-    highest_mtf50_cy_per_px,
-    implausible_figures,
-)
+from lab.formats.results.plausible import FIGURES, highest_mtf50_cy_per_px, implausible_figures
 from tests.lab.mono_session import MonoSession
 
 SHEET = DataSheet(rows=480, cols=640, cfa="MONO", bit_depth=12, black_level_dn=100.0)

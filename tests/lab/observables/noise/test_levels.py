@@ -9,6 +9,7 @@ from lab.observables.darks.pixels import DarkPixels
 from lab.observables.noise.stack import Stack, level_statistics
 from lab.observables.noise.surface import defective_pixels, shading
 from lab.observables.weighted_lines import dark_line, linearity
+from sim.camera import Cfa
 
 
 def test_statistics_agree_with_their_definitions() -> None:
@@ -144,3 +145,20 @@ def test_the_linearity_errors_uncertainty_holds_what_noise_adds(
         # differ by a sixth
         stated = np.sqrt(np.mean([each.error_noise_percent**2 for each in found]))
         assert stated == pytest.approx(error.std(), rel=1 / 6 + 3.0 / np.sqrt(2 * draws))
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "GBRG"])
+def test_what_pixels_of_a_row_share_is_told_from_their_own_noise(cfa: Cfa) -> None:
+    """Noise of 3 DN of single pixels and of 1 DN of rows, 6 repeats: of each plane 5 contrasts of r rows, whose
+    variance is known to sqrt(2 / (5 r)); three of these."""
+    rng, rows = np.random.default_rng(8), 160
+    stack = Stack(cfa, 4095, None)
+    for _ in range(6):
+        noise = 3.0 * rng.standard_normal((rows, 200)) + rng.standard_normal((rows, 1))
+        stack.add(np.rint(500.0 + noise).astype(np.uint16))
+    planes = stack.statistics()
+    for plane in planes.values():
+        assert plane.row_variance == pytest.approx(1.0, rel=3.0 * np.sqrt(2.0 / (5 * plane.shape[0])) * 1.1)
+        # one of 12 of a code by rounding
+        own = plane.temporal_variance - plane.row_variance
+        assert own == pytest.approx(9.0 + 1.0 / 12.0, rel=3.0 * np.sqrt(2.0 / (5 * plane.pixels)))

@@ -1,5 +1,4 @@
-"""Diagnosis of the cases of a challenge, each by itself: existing results are kept, and a case that fails doesn't end
-the run."""
+"""The diagnosis of one case: a case that fails is a result, too."""
 
 from __future__ import annotations
 
@@ -7,17 +6,14 @@ import contextlib
 import resource
 import time
 import traceback
-from collections.abc import Callable
 from pathlib import Path
 
-from evaluation.truth import load, store
+from evaluation.experiment import CaseResult
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import DiagnosisResult
-from lab.workers import Workers
-from sim.parameters import Frozen
 
 
-class CaseRun(Frozen):
+class CaseRun(CaseResult):
     """The diagnosis of one case, without its curves, and its cost; `error`: why there is none. `memory_mib`: peak of
     the process."""
 
@@ -57,28 +53,3 @@ def run_case(folder: Path, policy: DecisionPolicy | None = None) -> CaseRun:
         case=folder.name, wall_s=time.perf_counter() - wall, cpu_s=time.process_time() - cpu, memory_mib=_peak_mib(),
         error=error, diagnosis=found
     )  # fmt: skip
-
-
-def run_all(
-    folder: Path,
-    cases: tuple[str, ...],
-    workers: Workers,
-    progress: Callable[[str, float], None] = lambda _text, _share: None,
-    *,
-    policy: DecisionPolicy | None = None,
-    results: str = "results",
-) -> dict[str, CaseRun]:
-    """Case -> result: from FOLDER/RESULTS/CASE.json where it exists, else diagnosed now and written there."""
-    file = {case: folder / results / f"{case}.json" for case in cases}
-    runs = {case: load(CaseRun, file[case]) for case in cases if file[case].exists()}
-    missing = [case for case in cases if case not in runs]
-
-    def keep(result: CaseRun) -> None:
-        store(result, file[result.case])
-        runs[result.case] = result
-        progress(f"{len(runs)} of {len(cases)} cases", len(runs) / len(cases))
-
-    # workers elsewhere know the folder by its whole path
-    for _, result in workers.done(run_case, [folder.resolve() / case for case in missing], policy):
-        keep(result)
-    return runs

@@ -1,4 +1,4 @@
-"""Sealed challenges: nothing in a set reveals its truth, seals can't be changed, a run can be resumed, seeds are kept
+"""Sealed cases: nothing in a set reveals its truth, seals can't be changed, a run can be resumed, seeds are kept
 apart."""
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from evaluation.__main__ import main
+from evaluation.blind import BlindProof
 from evaluation.calibrate import DEFAULT, answers
 from evaluation.draw import FAULTS, FOREIGN_BITS, FOREIGN_FRAMES, SHARES, DrawnFrame, draw, kind_of
 from evaluation.independent_simulator import LISTED, OUTSIDE
 from evaluation.make import make
-from evaluation.run import run_all
 from evaluation.score import broken_seals, score
 from evaluation.truth import (
     FIRST_PROOF_SEED,
@@ -41,8 +41,8 @@ SEED = next(s for s in range(1000) if (kind_of(s, 1), kind_of(s, 2)) == ("health
 
 
 @pytest.fixture(scope="module")
-def challenge(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    root = tmp_path_factory.mktemp("challenge")
+def sealed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    root = tmp_path_factory.mktemp("sealed")
     folder, truths = root / "sets", root / "truths.json"
     options = {"--cases": 2, "--seed": SEED, "--truths": truths, "--size": "small", "--jobs": 1, "--cfa": "MONO"}
     words = [str(word) for option in options.items() for word in option]
@@ -51,9 +51,9 @@ def challenge(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 @pytest.fixture
-def copy(challenge: tuple[Path, Path], tmp_path: Path) -> tuple[Path, Seals, Truths]:
-    shutil.copytree(challenge[0], tmp_path / "sets")
-    return tmp_path / "sets", load(Seals, tmp_path / "sets" / "seals.json"), load(Truths, challenge[1])
+def copy(sealed: tuple[Path, Path], tmp_path: Path) -> tuple[Path, Seals, Truths]:
+    shutil.copytree(sealed[0], tmp_path / "sets")
+    return tmp_path / "sets", load(Seals, tmp_path / "sets" / "seals.json"), load(Truths, sealed[1])
 
 
 def test_seals_hold_and_break_when_anything_is_changed(copy: tuple[Path, Seals, Truths]) -> None:
@@ -82,8 +82,8 @@ def test_a_seal_needs_its_salt() -> None:
     assert seal(one) == seal(SaltedTruth(salt=one.salt, truth=CaseTruth.model_validate_json(canonical(truth))))
 
 
-def test_nothing_in_a_set_betrays_its_truth(challenge: tuple[Path, Path]) -> None:
-    folder, _ = challenge
+def test_nothing_in_a_set_betrays_its_truth(sealed: tuple[Path, Path]) -> None:
+    folder, _ = sealed
     words = {kind.name for kind in (*LISTED, *OUTSIDE)} | {fault.name for fault in FAULTS}
     words |= {"healthy", "single", "compound", "outside", "seed", "salt", "truth", "variant", "noncentrality"}
     paths = sorted(folder.rglob("*"))
@@ -124,7 +124,7 @@ def test_a_case_is_drawn_again_alike() -> None:
     assert all(
         np.array_equal(one.recordings.frame(c), two.recordings.frame(c)) for c in one.recordings.captures()[::20]
     )
-    # the former's own figure of how much it shows: a split of 1.5 um can't be missed on edges
+    # the simulator's own figure of how much it shows: a split of 1.5 um can't be missed on edges
     assert one.truth.concealed[0].noncentrality > 25.0
 
 
@@ -156,10 +156,8 @@ def test_an_interrupted_one_goes_on(copy: tuple[Path, Seals, Truths], tmp_path: 
     assert load(Seals, folder / "seals.json").seals["case-0001"] == seals.seals["case-0001"]
 
 
-def test_truths_beside_the_recordings_and_mixed_challenges_are_refused(
-    challenge: tuple[Path, Path], tmp_path: Path
-) -> None:
-    folder, file = challenge
+def test_truths_beside_the_recordings_and_mixed_cases_are_refused(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    folder, file = sealed
     with pytest.raises(InputError, match="outside it"):
         make(tmp_path / "a", 1, 1, tmp_path / "a" / "truths.json", "small", Workers())
     with pytest.raises(InputError, match="another seed"):
@@ -173,14 +171,15 @@ def test_truths_beside_the_recordings_and_mixed_challenges_are_refused(
 def test_a_case_that_fails_does_not_end_the_run(copy: tuple[Path, Seals, Truths]) -> None:
     folder, seals, truths = copy
     (folder / "case-0001" / "manifest.json").write_text("{")
-    runs = run_all(folder, ("case-0001", "case-0002"), Workers())
+    proof = BlindProof(folder, ("case-0001", "case-0002"))
+    runs = proof.run(folder)
     assert runs["case-0001"].error is not None
     assert runs["case-0001"].diagnosis is None
     assert isinstance(runs["case-0002"].diagnosis, DiagnosisResult)
     assert runs["case-0002"].memory_mib > 50
     # results are kept: nothing is diagnosed a second time
     written = (folder / "results" / "case-0002.json").read_bytes()
-    assert run_all(folder, ("case-0001", "case-0002"), Workers()) == runs
+    assert proof.run(folder) == runs
     assert (folder / "results" / "case-0002.json").read_bytes() == written
     found = score(truths, seals, runs, broken_seals(folder, seals, truths))
     assert found.broken_seals == ("case-0001",)
@@ -203,7 +202,7 @@ def test_seeds_of_tuning_and_of_proofs_are_apart(tmp_path: Path, capsys: pytest.
 
 
 def test_a_scored_proof_seed_is_refused(tmp_path: Path) -> None:
-    from evaluation.proof import refuse_scored
+    from evaluation.page import refuse_scored
 
     page = tmp_path / "proof.md"
     page.write_text("| for | seed |\n| proof | 1000007 | 200 | medium | `ab` |\n")

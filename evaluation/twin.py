@@ -1,5 +1,5 @@
-"""Predictions in configurations that a model was never fitted in: 24 concealed cameras of the second image former, each
-fitted and diagnosed at one configuration, and predicted in others.
+"""Predictions in configurations that a model was never fitted in: 24 concealed cameras of the independent simulator,
+each fitted and diagnosed at one configuration, and predicted in others.
 
 `python -m evaluation twin --out DIR`. Eight cameras are healthy, eight conceal one effect, eight two. Eight
 more conceal one weak blur, which a session at one aperture may tell as a family only. The dark current of all doubles
@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from html import escape
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,10 +22,9 @@ import numpy as np
 
 from evaluation.budgets import BudgetCheck, budget_lines, check_budget
 from evaluation.draw import recordings_of
+from evaluation.experiment import CaseResult, Experiment, PagePicture, ScoredExperiment
 from evaluation.independent_simulator import LISTED, ConcealedCamera, Law, Plan
-from evaluation.live import commit
-from evaluation.proof import ABSTAINED, RIGHT, WRONG, placed
-from evaluation.truth import load, store
+from evaluation.plots import ABSTAINED, RIGHT, WRONG, Axis, Mark, Row, row_plot
 from lab.diagnose import examine
 from lab.errors import InputError
 from lab.fit import fit_recording_set
@@ -162,7 +160,7 @@ class TransferRun(Frozen):
     n: int
 
 
-class CameraRun(Frozen):
+class CameraRun(CaseResult):
     """One concealed camera. `told`: names of the diagnosis; `tested`: what all transfers together made of them;
     `budget`: of each use, beside the truth; `failed`: of transfers, why there is no score."""
 
@@ -174,7 +172,6 @@ class CameraRun(Frozen):
     transfers: dict[str, TransferRun] = {}
     budget: tuple[BudgetCheck, ...] = ()
     failed: dict[str, str] = {}
-    commit: str = ""
     cpu_s: float = 0.0
 
 
@@ -262,7 +259,7 @@ def run_case(case: str, seed: int = SEED) -> CameraRun:
     lenses.cleanup()
     return CameraRun(
         case=case, seed=seed, concealed=tuple(law.name for law in laws), told=tuple(e.name for e in
-        found.result.effects), tested=together(tests), transfers=runs, budget=budget, failed=failed, commit=commit(),
+        found.result.effects), tested=together(tests), transfers=runs, budget=budget, failed=failed,
         cpu_s=time.process_time() - began_s,
     )  # fmt: skip
 
@@ -290,24 +287,6 @@ def _run(found: TwinScore) -> TransferRun:
     )  # fmt: skip
 
 
-def run_all(out: Path, cases: Sequence[str], seed: int) -> dict[str, CameraRun]:
-    """Case -> result: from OUT/results where it exists, else run now, in order. Raises InputError for results of
-    another seed."""
-    runs = {}
-    for case in cases:
-        file = out / "results" / f"{case}.json"
-        if file.exists():
-            runs[case] = load(CameraRun, file)
-            if runs[case].seed != seed:
-                raise InputError(f"{file}: is of seed {runs[case].seed}, not {seed}; give that seed, or another --out")
-            continue
-        runs[case] = one = run_case(case, seed)
-        store(one, file)
-        print(f"{case}: conceals {', '.join(one.concealed) or 'nothing'}, told {', '.join(one.told) or 'nothing'}; "
-              f"{'; '.join(test.words for test in one.tested)}; {one.cpu_s:.0f} s", flush=True)  # fmt: skip
-    return runs
-
-
 # --- the page --------------------------------------------------------------------------------------------------------
 
 
@@ -333,7 +312,7 @@ def _row(name: str, runs: Sequence[TransferRun], quantity: str) -> str | None:
     return f"| {name} | {title(quantity)} | {len(away)} | {' | '.join(cells)} |"
 
 
-def section(runs: dict[str, CameraRun]) -> str:
+def section(runs: Mapping[str, CameraRun]) -> str:
     """Return the outcome as Markdown."""
     budgets = budget_lines([run.budget for run in runs.values() if run.budget])
     runs = {case: run for case, run in runs.items() if case in case_names()}
@@ -365,7 +344,7 @@ def section(runs: dict[str, CameraRun]) -> str:
     return "\n".join(lines)
 
 
-def _of(runs: dict[str, CameraRun], transfer: str) -> list[TransferRun]:
+def _of(runs: Mapping[str, CameraRun], transfer: str) -> list[TransferRun]:
     return [camera.transfers[transfer] for camera in runs.values() if transfer in camera.transfers]
 
 
@@ -375,7 +354,7 @@ def _excess(run: TransferRun) -> float | None:
     return None if before < 3.0 * np.sqrt(2.0 * run.n) else max(run.chi2 - run.n, 0.0) / before
 
 
-def _chi2_lines(runs: dict[str, CameraRun]) -> list[str]:
+def _chi2_lines(runs: Mapping[str, CameraRun]) -> list[str]:
     lines = ["| transfer | chi2 / n, median | excess chi2, diagnosed over not, median | a fifth or less |"]
     lines.append("| --- | --- | --- | --- |")
     for name in TRANSFERS:
@@ -390,7 +369,7 @@ def _chi2_lines(runs: dict[str, CameraRun]) -> list[str]:
     return lines
 
 
-def _name_lines(runs: dict[str, CameraRun]) -> list[str]:
+def _name_lines(runs: Mapping[str, CameraRun]) -> list[str]:
     lines = ["| camera | concealed | named at f/4 | after the transfers |", "| --- | --- | --- | --- |"]
     for case, run in runs.items():
         is_right = wrong_names(run)
@@ -423,63 +402,57 @@ def _effects_of(run: CameraRun) -> set[str | None]:
     return {law.effect for law in LISTED if law.name in (*run.concealed, DARK_LAW.name)}
 
 
-LABEL_PX, PLOT_PX, ROW_PX, HEAD_PX = 350, 420, 20, 46
+#: Deviations over what is wanted of 95 % of all.
+DEVIATION = Axis(0.01, 10.0, (0.01, 0.1, 1.0, 10.0), 1.0, is_logarithmic=True)
 
 
-def drawing(runs: dict[str, CameraRun]) -> str:
-    """SVG: the deviations of each transfer and quantity over what is wanted of 95 % of all: median, 95 % and 99 %."""
-    rows = [(t, q) for t in TRANSFERS for q in WANTED if len(_pooled(_of(runs, t), q)[0])]
-    width, height = LABEL_PX + PLOT_PX + 90, HEAD_PX + ROW_PX * len(rows) + 34
-    low, high = 0.01, 10.0
-
-    def x_of(value: float) -> float:
-        share = np.log(min(max(value, low), high) / low) / np.log(high / low)
-        return LABEL_PX + PLOT_PX * float(share)
-
-    head = "deviation over what is wanted of 95 % of all: dot the median, bar to 95 % of all"
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif"',
-        f'font-size="11"><rect width="{width}" height="{height}" fill="#ffffff"/>',
-        f'<text x="{LABEL_PX}" y="16" fill="#222">{head}</text>',
-        f'<text x="{LABEL_PX + PLOT_PX + 8}" y="32" fill="#222">in interval</text>',
-    ]
-    for tick in (0.01, 0.1, 1.0, 10.0):
-        ink = "#555" if tick == 1.0 else "#ddd"
-        parts.append(f'<path d="M{x_of(tick):.0f} {HEAD_PX - 8}V{height - 24}" stroke="{ink}"/>')
-        parts.append(f'<text x="{x_of(tick):.0f}" y="{height - 8}" text-anchor="middle" fill="#222">{tick:g}</text>')
-    for k, (transfer, quantity) in enumerate(rows):
-        away, inside = _pooled(_of(runs, transfer), quantity)
-        median, most = np.median(away) / WANTED[quantity][1], np.quantile(away, 0.95) / WANTED[quantity][1]
-        share, y = float(np.mean(inside)), HEAD_PX + ROW_PX * (k + 0.5)
-        colour = RIGHT if most <= 1.0 else WRONG
-        ink = RIGHT if WANTED_INSIDE[0] <= share <= WANTED_INSIDE[1] else ABSTAINED if share > 0.9 else WRONG
-        label = escape(f"{transfer}: {title(quantity)}")
-        parts += [
-            f'<text x="{LABEL_PX - 8}" y="{y + 4:.0f}" text-anchor="end" fill="#222">{label}</text>',
-            f'<path d="M{x_of(median):.1f} {y:.1f}H{x_of(most):.1f}" stroke="{colour}" stroke-width="3"/>',
-            f'<circle cx="{x_of(median):.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>',
-            f'<text x="{LABEL_PX + PLOT_PX + 8}" y="{y + 4:.0f}" fill="{ink}">{100 * share:.1f} %</text>',
-        ]
-    return "\n".join([*parts, "</svg>\n"])
+def drawing(runs: Mapping[str, CameraRun]) -> str:
+    """Return the deviations of each transfer and quantity as SVG, over what is wanted of 95 % of all: the median, and a
+    bar to 95 %; beside them the share in 95 % intervals."""
+    rows = []
+    for transfer in TRANSFERS:
+        for quantity in WANTED:
+            away, inside = _pooled(_of(runs, transfer), quantity)
+            if not len(away):
+                continue
+            median, most = (float(np.quantile(away, share)) / WANTED[quantity][1] for share in (0.5, 0.95))
+            share = float(np.mean(inside))
+            ink = RIGHT if WANTED_INSIDE[0] <= share <= WANTED_INSIDE[1] else ABSTAINED if share > 0.9 else WRONG
+            mark = Mark(median, RIGHT if most <= 1.0 else WRONG, (median, most))
+            rows.append(Row(f"{transfer}: {title(quantity)}", (mark,), f"{100 * share:.1f} %", ink))
+    head = "deviation over what is wanted of 95 % of all: dot the median, bar to 95 % of all; right, in the interval"
+    return row_plot(head, DEVIATION, rows)
 
 
-def prove(out: Path, seed: int, only: Sequence[str] | None, page: Path | None) -> None:
-    """Predict the cameras `only` (None: all) in every transfer, print the outcome, and write it into a page.
+@dataclass(frozen=True)
+class TwinProof(Experiment[str, CameraRun]):
+    """Concealed cameras fitted at one configuration, and predicted in others."""
 
-    Results are kept in OUT/results. Raises InputError for a camera that there is not.
-    """
-    every = (*case_names(), *budget_names())
-    unknown = sorted(set(only or ()) - set(every))
-    if unknown:
-        raise InputError(f"--only {unknown[0]}: no such camera; there are {', '.join(every)}")
-    run_all(out, [case for case in every if not only or case in only], seed)
-    there = {case: out / "results" / f"{case}.json" for case in every}
-    runs = {case: load(CameraRun, file) for case, file in there.items() if file.exists()}
-    print(section(runs))
-    if page is not None:
-        picture = page.with_name(f"{page.stem}.svg")
-        text = page.read_text(encoding="utf-8") if page.is_file() else "# Proof of the twin\n"
+    result = CameraRun
+
+    seed: int = SEED
+
+    def draw(self) -> dict[str, str]:
+        """Return the cameras that are carried elsewhere, and those whose budget alone is compared."""
+        return {case: case for case in (*case_names(), *budget_names())}
+
+    def diagnose(self, case: str, folder: Path) -> CameraRun:
+        """Fit and diagnose a camera, and predict it in every transfer."""
+        return run_case(case, self.seed)
+
+    def is_current(self, kept: CameraRun, case: str) -> bool:
+        """Return True. Raises InputError for a result of another seed."""
+        if kept.seed != self.seed:
+            raise InputError(f"{case}: its result is of seed {kept.seed}, not {self.seed}; give that, or another --out")
+        return True
+
+    def describe(self, run: CameraRun) -> str:
+        """Return what a camera conceals, what was named, and what the transfers made of that."""
+        names = f"conceals {', '.join(run.concealed) or 'nothing'}, told {', '.join(run.told) or 'nothing'}"
+        return f"{names}; {'; '.join(test.words for test in run.tested)}; {run.cpu_s:.0f} s"
+
+    def score(self, runs: Mapping[str, CameraRun]) -> ScoredExperiment:
+        """Return the deviations of all transfers, what became of names, and the budgets."""
         carried = {case: run for case, run in runs.items() if run.transfers}
-        picture.write_text(drawing(carried), encoding="utf-8")
-        body = f"{section(runs)}\n\n![Deviations over what is wanted]({picture.name})"
-        page.write_text(placed(text, "transfers", body), encoding="utf-8")
+        picture = PagePicture("", "Deviations over what is wanted", drawing(carried))
+        return ScoredExperiment("transfers", section(runs), pictures=[picture], title="Proof of the twin")

@@ -13,22 +13,22 @@ import pytest
 from evaluation.budgets import BudgetCheck, check_budget
 from evaluation.draw import recordings_of
 from evaluation.independent_simulator import WAVELENGTH_NM, ConcealedCamera, Plan
-from evaluation.transfers import (
+from evaluation.truth import store
+from evaluation.twin import (
     DARK_LAW,
     TRANSFERS,
     CameraRun,
     TransferRun,
+    TwinProof,
     budget_names,
     case_names,
     concealed_camera,
     drawing,
     laws_of,
-    run_all,
     run_case,
     section,
     write_lens,
 )
-from evaluation.truth import store
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile
 from lab.formats.model_posterior import ModelPosterior
@@ -127,9 +127,9 @@ def test_the_page_counts_deviations_intervals_and_names(tmp_path: Path) -> None:
     ElementTree.fromstring(drawing(runs))
     for case, run in runs.items():
         store(run, tmp_path / "results" / f"{case}.json")
-    assert run_all(tmp_path, ["healthy-1", "single-1"], 4177) == runs
+    assert TwinProof(4177).run(tmp_path, ["healthy-1", "single-1"]) == runs
     with pytest.raises(InputError, match="is of seed 4177, not 5"):
-        run_all(tmp_path, ["healthy-1"], 5)
+        TwinProof(5).run(tmp_path, ["healthy-1"])
 
 
 def test_a_case_for_the_budget_alone_is_no_camera_of_the_transfers() -> None:
@@ -140,7 +140,7 @@ def test_a_case_for_the_budget_alone_is_no_camera_of_the_transfers() -> None:
 
 
 def _fitted(truth: ConcealedCamera, std: dict[str, float], **wrong: float) -> CameraFile:
-    """The model of a camera of the second former as it is, but for what is `wrong`, with a posterior of `std`."""
+    """The model of a simulated camera as it is, but for what is `wrong`, with a posterior of `std`."""
     curves = {c: Spectrum.of(WAVELENGTH_NM, q) for c, q in truth.quantum_efficiency.items()}
     camera = CameraModel(
         rows=truth.rows, cols=truth.cols, pixel_pitch_um=truth.pitch_um, fill_factor=truth.fill_factor, cfa=truth.cfa,
